@@ -42,6 +42,26 @@ def filled(kind: Any, value: Any = _ABSENT) -> Any:
     return value
 
 
+def diagnosis(
+    axes: Mapping[str, Mapping[str, Any]], sets: Mapping[tuple[str, ...], float] = {(): 1.0}
+) -> dict[str, Any]:
+    """Fields of a diagnosis in which these sets of effects are probable, the first selected.
+
+    Args:
+        axes: what is said of each axis, its verdict at least; sets: with their probabilities.
+    """
+    first = next(iter(sets))
+    names = dict.fromkeys(name for one in sets for name in one)
+    chance = {name: sum(p for one, p in sets.items() if name in one) for name in names}
+    said = {}
+    for axis, given in axes.items():
+        here = [name for name in names if name.partition(":")[2] in ("", axis)]
+        found = {"effects": [n for n in here if n in first]}
+        said[axis] = {**found, "probabilities": {n: chance[n] for n in here}, **given}
+    weighed = [{"effects": one, "probability": p} for one, p in sets.items()]
+    return {"axes": said, "selected": first, "sets": weighed}
+
+
 def write_result(root: Path, kind: type[Result], **given: Any) -> dict[str, Any]:
     """Write the result ``kind`` below ``root`` and return its content."""
     content: dict[str, Any] = filled(kind, given)

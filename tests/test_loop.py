@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from made_results import filled, write_result
+from made_results import diagnosis, filled, write_result
 
 from bampipe.api import loop
 from bampipe.declarations.model import ModelFile
@@ -64,32 +64,35 @@ def test_following_judges_the_model_that_it_starts_from(
 
 
 @pytest.mark.parametrize(
-    ("rival", "beside", "said"),
+    ("sets", "said"),
     [
-        ("actuator_lag:current", "about as likely", "log at a higher rate"),
-        ("stribeck:joint", "about as likely", "`bampipe next --for decision` looks for one"),
-        ("stribeck:joint", "", ""),
+        (
+            {("actuator_delay",): 0.56, ("actuator_lag:joint",): 0.44},
+            "between actuator_delay (0.56) and actuator_lag:joint (0.44): which of them is added is"
+            " arbitrary, it is actuator_delay. A lag weakens",
+        ),
+        (
+            {("a:joint", "b:joint"): 0.7, ("a:joint", "c:joint"): 0.296, (): 0.004},
+            "between b:joint (0.70) and c:joint (0.30) beside a:joint (> 0.99): which of them is"
+            " added is arbitrary, it is b:joint. No trial was found",
+        ),
+        (
+            {(): 0.6, ("a:joint",): 0.4},
+            "between nothing (0.60) and a:joint (0.40): none is added. No trial was found",
+        ),
     ],
 )
 def test_an_effect_that_is_added_undecided_is_called_arbitrary(
-    rival: str, beside: str, said: str
+    sets: dict[tuple[str, ...], float], said: str
 ) -> None:
-    contest = [
-        {"effect": "actuator_delay", "odds": 0.56},
-        {"effect": rival, "odds": 0.44, "beside": beside},
-    ]
-    content = {
-        "axes": {"joint": {"verdict": "undecided"}},
-        "selected": ["actuator_delay"],
-        "contests": {"actuator_delay": contest},
-        "suggested_trial": None,
-    }
-    found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
-    lines = loop._unsettled(found)
-    assert len(lines) == bool(said)
-    if said:
-        assert f"56 % against 44 % for {rival}" in lines[0] and said in lines[0]
-        assert "which of them is added is arbitrary, it is actuator_delay" in lines[0]
+    lines = {}
+    for verdict in ("undecided", "missing"):
+        content = diagnosis({"joint": {"verdict": verdict}}, sets)
+        lines[verdict] = loop._unsettled(
+            DiagnoseResult.model_validate(filled(DiagnoseResult, content))
+        )
+    assert lines["missing"] == []
+    assert lines["undecided"][0].startswith(f"these trials do not decide {said}")
 
 
 @pytest.mark.parametrize("fault", [ZeroDivisionError, KeyboardInterrupt])
@@ -119,19 +122,22 @@ def test_what_came_to_nothing_is_not_weighed_again(
     def run(_: loop.LoopOptions, first: str, last: str, model: str, changed: object = None) -> None:
         ran.extend([changed or None] if first == "diagnose" else [])
 
-    def diagnosis(*_: object) -> DiagnoseResult:
-        found, not_weighed = left[len(ran) - 1 : len(ran)], left[: len(ran) - 1]
-        content = {"axes": {"joint": {"verdict": "missing" if found else "nothing_missing"}}}
-        more = {"selected": found, "not_weighed": not_weighed}
-        return DiagnoseResult.model_validate(filled(DiagnoseResult, {**content, **more}))
+    def diagnosed(*_: object) -> DiagnoseResult:
+        found, not_weighed = tuple(left[len(ran) - 1 : len(ran)]), left[: len(ran) - 1]
+        axes = {"joint": {"verdict": "missing" if found else "nothing_missing"}}
+        content = {**diagnosis(axes, {found: 1.0}), "not_weighed": not_weighed}
+        return DiagnoseResult.model_validate(filled(DiagnoseResult, content))
 
     monkeypatch.setattr(loop.LoopOptions, "run", run)
-    monkeypatch.setattr(loop, "_diagnosis", diagnosis)
+    monkeypatch.setattr(loop, "_diagnosis", diagnosed)
     monkeypatch.setattr(loop, "_add", lambda *_: "")
     lines: list[str] = []
     options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
     assert loop.follow(options, "base", lines.append) == "base"
-    assert lines == ["base, joint: missing"] * 2 + ["base, joint: nothing missing"]
+    assert lines == [
+        *(f"base, joint: missing {name} (> 0.99)" for name in left),
+        "base, joint: nothing missing",
+    ]
     assert ran == [
         None,
         {"diagnose": {"without": ("backlash:joint",)}},

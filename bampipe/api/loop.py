@@ -22,7 +22,7 @@ from bampipe.stages import base
 
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Pipeline
-    from bampipe.results.diagnose import Contender, DiagnoseResult
+    from bampipe.results.diagnose import DiagnoseResult
 
 MOST_ROUNDS = 4
 
@@ -243,9 +243,9 @@ def follow(
 ) -> str:
     """Diagnose, add all that was found at once, and confirm it by one more diagnosis.
 
-    An effect that the identified model gives no strength is left out again. What the confirmation
-    finds beyond the set is added likewise, until it finds nothing more; then what is drafted for
-    the rest, where that is asked for. What came to nothing when it was added is not weighed again.
+    What is drafted for the rest is added with the set, where that is asked for. An effect that the
+    identified model gives no strength is left out again, and what came to nothing when it was added
+    is not weighed again. Should the confirmation find more, that is added likewise.
 
     Args:
         options: run folder, settings, listener.
@@ -285,30 +285,29 @@ def follow(
 
 
 def _unsettled(diagnosis: DiagnoseResult) -> list[str]:
-    """Say of each effect that is added while another one is about as likely, and what decides."""
+    """Say where effects are about as likely as others which of them are added, and what decides."""
+    from bampipe.results import phrases
+
     said = []
-    for name in diagnosis.selected:
-        contest = diagnosis.contests.get(name, ())
-        rivals = [c for c in contest if c.beside]
-        if not rivals:
+    trial = diagnosis.suggested_trial
+    for axis, entry in diagnosis.axes.items():
+        if entry.verdict != "undecided":
             continue
-        odds = f"{100 * contest[0].odds:.0f} % against " + join_names(
-            f"{100 * c.odds:.0f} % for {c.effect}" for c in rivals
-        )
-        trial = diagnosis.suggested_trial
-        asked = trial is not None and name in trial.between
+        known, parts = phrases.undecided(diagnosis, axis)
+        taken = join_names(n for n in entry.effects if n in diagnosis.doubted)
+        which = f"which of them is added is arbitrary, it is {taken}"
+        beside = f" beside {known}" if known else ""
+        asked = trial is not None and {*trial.between} & {*entry.probabilities}
         said.append(
-            f"these trials do not decide between {join_names([name, *(c.effect for c in rivals)])}"
-            f" (odds {odds}): which of them is added is arbitrary, it is {name}. "
-            + (trial.sentence if trial is not None and asked else _what_decides(name, rivals))
+            f"{phrases.open_question(parts)}{beside}: {which if taken else 'none is added'}. "
+            + (trial.sentence if trial is not None and asked else _what_decides(entry.likely))
         )
-    return said
+    return list(dict.fromkeys(said))
 
 
-def _what_decides(name: str, rivals: Sequence[Contender]) -> str:
-    """What to record where no trial was found that would tell an effect from its rivals."""
-    kinds = {each.partition(":")[0] for each in (name, *(c.effect for c in rivals))}
-    if any("delay" in kind for kind in kinds) and any("lag" in kind for kind in kinds):
+def _what_decides(names: Sequence[str]) -> str:
+    """What to record where no trial was found that would tell effects apart."""
+    if any("delay" in name for name in names) and any("lag" in name for name in names):
         return (
             "A lag weakens what changes fast, a delay does not: log at a higher rate, and record"
             " trials in which the force changes faster."

@@ -70,7 +70,7 @@ def show_one(text: str, device_name: str, json: bool) -> None:
         )
     chosen = target or targets[0]
 
-    from bampipe.discover.signature import signature
+    from bampipe.diagnosis.signature import signature
 
     found = signature(device, effect, chosen)
     if json:

@@ -23,7 +23,7 @@ def after_run(root: Path, model: str, name: str) -> str:
         return f"bampipe diagnose {name}{run.model_option(model)}"
     if run.exists(DiagnoseResult.file(model)):
         found = run.read(DiagnoseResult, model)
-        if any(axis.verdict != "nothing_missing" for axis in found.axes.values()):
+        if found.lacking:
             return _after_diagnosis(run, model, found.next).replace("RUN", name)
     elif _is_above_floor(run, model):
         return f"bampipe diagnose {name}{run.model_option(model)}"
@@ -61,9 +61,8 @@ def after_loop(root: Path, model: str, name: str) -> str:
     if not run.exists(DiagnoseResult.file(model)):  # stopped after many rounds
         return f"bampipe diagnose {name}{run.model_option(model)}"
     found = run.read(DiagnoseResult, model)
-    lacking = any(axis.verdict != "nothing_missing" for axis in found.axes.values())
     # What a diagnosis selects and the loop has not added makes no better model.
-    if found.selected or not lacking:
+    if found.selected or not found.lacking:
         return f"bampipe report {name} --open"
     return _after_diagnosis(run, model, found.next).replace("RUN", name)
 

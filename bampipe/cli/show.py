@@ -29,7 +29,8 @@ QUIET_S = 10.0
 FIRST_COLUMNS = (
     *("", "trial_id", "estimate", "sd", "unit", "rmse", "held_out_rmse", "noise_floor"),
     *("verdict", "rmse_before", "rmse_after", "noise_floor_after"),
-    *("effect", "axis", "held_out_rmse_before", "held_out_rmse_after", "p_value"),
+    *("effect", "axis", "held_out_rmse_before", "held_out_rmse_after"),
+    *("probability", "p_value"),
 )
 """In this order, whether a summary has just been made or is read from the run folder."""
 
@@ -243,9 +244,6 @@ def _ladder(rungs: Sequence[Rung]) -> None:
     axes = list(dict.fromkeys(axis for rung in rungs for axis in rung.held_out_rmse))
     body = []
     for rung in rungs:
-        for step in rung.steps:
-            errors = [cell for axis in axes for cell in (number(step.held_out_rmse[axis]), "")]
-            body.append(["  fitted in the search", ", ".join(step.effects), *errors])
         cells = [rung.model, rung.added or ""]
         for axis in axes:
             error, floor = rung.sound_error(axis), rung.sound_floor(axis)

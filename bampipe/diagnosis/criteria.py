@@ -21,22 +21,22 @@ class Criteria:
         most_effects: beyond those of the model.
         bias_error: share by which the common bias of the replicates may be off, sample by sample.
         discrepancy: root mean square error of any model, as a share of the applied force.
+        tails: degrees of freedom of Student's t distribution, as which errors are distributed.
         block_s: length of the stretches of time that are taken as independent, s: one of them alone
             must not decide.
-        above_floor: error over noise floor from which on a model is said to leave more than noise.
         beam: sets that are pursued side by side.
     """
 
     probability: float = 0.9
-    size: float = 0.002
+    size: float = 0.001
     significance: float = 0.01
     replicates: int = 12
     expected_effects: float = 1.0
     most_effects: int = 8
     bias_error: float = 0.2
     discrepancy: float = 0.003
+    tails: float = 4.0
     block_s: float = 2.0
-    above_floor: float = 1.2
     beam: int = 10
 
     def __post_init__(self) -> None:

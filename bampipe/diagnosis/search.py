@@ -9,7 +9,8 @@ nothing is explained by making both sides of the equation small; and by the prio
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,7 @@ class Solution:
     volume: Array = field(default_factory=lambda: np.zeros(0))
     penalty: float = 0.0
     sizes: tuple[float, ...] = ()
+    weight: Array = field(default_factory=lambda: np.zeros(0))
 
 
 class Search:
@@ -77,6 +79,7 @@ class Search:
         self.atoms: dict[Key, Atom | None] = dict(known)
         self._with_base: dict[Key, dict[int, tuple[Array, Array, Array]]] = {}
         self._solved: dict[tuple[Key, ...], Solution] = {}
+        self.least_size = criteria.size
         self._squares: dict[Key, dict[int, Array]] = {}
         self.applied = [max(float(f @ f), 1e-300) for f in p.likelihood.applied]
         self._weight = p.independent / np.maximum(self.yy, 1e-300)
@@ -122,6 +125,31 @@ class Search:
         bounds = [b for key in places for b in self.dictionary.bounds(key[0])]
         self.low, self.high = np.array(bounds).reshape(-1, 2).T
         self.spread = np.array([v for key in places for v in self.dictionary.spreads(key[0])])
+
+    def of_replay(self, replay: int) -> Search:
+        """The same search with the residual of a replay in place of the measured trials."""
+        other = copy(self)
+        p, noise = self.p, self.p.likelihood.noise
+        rows = zip(noise.residuals, p.likelihood.root, strict=True)
+        other.p = replace(p, y=tuple(r[replay] * root for r, root in rows))
+        other.bb, other.by, other.yy = other.p.sums()
+        other.xy = [x.T @ y for x, y in zip(self.columns, other.p.y, strict=True)]
+        other._with_base, other._solved = {}, {}
+        other._weight = p.independent / np.maximum(other.yy, 1e-300)
+        return other
+
+    def largest_gain(self) -> tuple[float, str]:
+        """Log evidence of the candidate that gains most beside the model, nats, and its name.
+
+        Of whatever size: chance has no other.
+        """
+        any_size = copy(self)
+        any_size.least_size, any_size._solved = 0.0, {}
+        beside = any_size.best_beside((), _PROMISING)
+        if not beside:
+            return 0.0, ""
+        cost, key = beside[0]
+        return any_size.cost(()) - cost, key[0]
 
     # --- one set -------------------------------------------------------------------------------
 
@@ -179,14 +207,12 @@ class Search:
             return Solution(np.inf)
         strengths = tuple(b[nb:][h] for h in held)
         volume = self._volume(keys, strengths)
-        if not np.isfinite(volume).all():
+        if volume is None:
             return Solution(np.inf)
         scale, k = solved.left / p.count, int(at[-1])
         sizes: tuple[float, ...] = ()
         # What an effect of the model costs is not in the cost of the model as it is.
-        gone = [name[1:] for name, _ in all_keys if name[0] == "-"]
-        penalty = self.log_prior * (len(gone) - len(keys))
-        penalty -= _STRENGTH * sum(len(p.absence[name]) for name in gone)
+        penalty = self.penalty_of(all_keys)
         if keys:
             normal = np.tensordot(weight, xx, 1)
             normal[:nb, :nb] += p.precision
@@ -195,13 +221,13 @@ class Search:
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
             place = np.repeat(np.arange(len(keys)), widths)[used]
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, place)
-            if min(sizes) < self.criteria.size:
+            if min(sizes) < self.least_size:
                 return Solution(np.inf)
             spread = np.array([s for key in keys for s in self.dictionary.spreads(key[0])])
             shapes = sum(len(key[1]) for key in keys)
             penalty += float(penalise(inside, spread[used], b[nb:][used], shapes))
         cost = solved.cost - float(volume.sum()) + penalty
-        return Solution(cost, strengths, b[:nb], scale, volume, penalty, sizes)
+        return Solution(cost, strengths, b[:nb], scale, volume, penalty, sizes, weight)
 
     def _sizes(
         self,
@@ -234,27 +260,51 @@ class Search:
             for axis, square in self._squares[key].items()
         )
 
-    def _volume(self, keys: Sequence[Key], strengths: Sequence[Array]) -> Array:
-        """By axis, the independent samples times the mean log of what is left of the force."""
-        found = np.zeros(self.n_q)
+    def _volume(self, keys: Sequence[Key], strengths: Sequence[Array]) -> Array | None:
+        """By axis, independent samples times the mean log of what is left of what was measured.
+
+        None where so little is left of the force that the equation has no scale.
+        """
+        rows = self._log_slopes(keys, strengths)
+        means = np.array([float(r.mean()) if len(r) else 0.0 for r in rows])
+        return None if (means < np.log(_LEAST_SLOPE)).any() else self.p.independent * means
+
+    def _log_slopes(self, keys: Sequence[Key], strengths: Sequence[Array]) -> list[Array]:
+        """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
+        found = [np.zeros(len(y)) for y in self.p.y]
         moved: dict[int, Array] = {}
         for key, b in zip(keys, strengths, strict=True):
             atom = self.atoms[key]
             assert atom is not None
-            found += self.p.independent * atom.log_gain
+            found = [f + g if g else f for f, g in zip(found, atom.log_gain, strict=True)]
             for axis, slope in atom.slopes.items():
                 moved[axis] = moved.get(axis, 0.0) + float(b[0]) * slope
         for axis, slope in moved.items():
             plain = self.p.likelihood.slopes[axis]
             bare = np.linalg.norm(plain, axis=1)
-            live = bare > 0.0
-            if live.any():
-                share = np.linalg.norm((plain + slope)[live], axis=1) / bare[live]
-                mean = float(np.log(np.maximum(share, 1e-3)).sum()) / len(bare)
-                if mean < np.log(_LEAST_SLOPE):
-                    return np.full(self.n_q, -np.inf)
-                found[axis] += self.p.independent[axis] * mean
+            share = np.linalg.norm(plain + slope, axis=1) / np.where(bare > 0.0, bare, 1.0)
+            found[axis] = found[axis] + np.where(bare > 0.0, np.log(np.maximum(share, 1e-3)), 0.0)
         return found
+
+    def penalty_of(self, keys: Sequence[Key]) -> float:
+        """What the prior of a set costs, without that of its parameters; of effects of the model,
+        what is gained where they are taken away."""
+        away = gone(keys)
+        saved = _STRENGTH * sum(len(self.p.absence[name]) for name in away)
+        return self.log_prior * (len(away) - len(added(keys))) - saved
+
+    def residual_rows(self, keys: Sequence[Key]) -> list[Array]:
+        """What a set leaves, in units of the noise, by axis, each (n,)."""
+        solution = self.solve(keys)
+        left = [y + b @ solution.base for y, b in zip(self.p.y, self.p.base, strict=True)]
+        for key, strength in zip(added(tuple(sorted(keys))), solution.strengths, strict=True):
+            for axis, (x, _, _) in self._products(key).items():
+                left[axis] = left[axis] + x @ strength
+        return left
+
+    def volume_rows(self, keys: Sequence[Key]) -> list[Array]:
+        """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
+        return self._log_slopes(added(tuple(sorted(keys))), self.solve(keys).strengths)
 
     def cost(self, keys: Sequence[Key]) -> float:
         """Negative log evidence of a set, nats."""

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
+from bampipe.diagnosis.probability import Weighed, weigh_sets
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.search import Pool, Search, added, gone, names
+from bampipe.diagnosis.search import Pool, Search, Solution, added, gone, names
 from bampipe.diagnosis.session import (
     Fit,
     Session,
@@ -27,7 +28,7 @@ Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 """Called with a fraction of the work done and what is being done."""
 
-_MOST_ROUNDS = 8
+_MOST_ROUNDS = 6
 _PARTS = 8
 """Tasks a process into which columns are divided: one candidate may take as long as ten others."""
 _MINOR = 0.05
@@ -35,6 +36,8 @@ _MINOR = 0.05
 linearised far from the truth, a model leaves more than that."""
 _WORTH = 0.5
 """Fall of the cost, nats, that makes another set worth fitting."""
+_TRIED = 4
+"""Most sets that are fitted in a round until one is better."""
 _DEEP = 3
 """Effects added at once beside a set that has been fitted."""
 
@@ -45,49 +48,45 @@ class Selection:
 
     Attributes:
         initial: the model as given, fitted; final: with the set that is most probable.
-        alternatives: sets near it with their log evidence against it, nats, itself first at 0.
+        weighed: sets near it, effects and unknown functions with their probabilities.
+        chance: the largest gain of any candidate beside the final model on each replay, nats.
+        beside: the same on the measured trials, and of which candidate.
         gains: log evidence of the model as given with each single effect, nats, by effect.
         steps: the sets that were fitted, in order.
         cut_short: whether more effects were wanted than may be added.
-        search: over sets beside the final model.
     """
 
     initial: Fit
     final: Fit
-    alternatives: tuple[Alternative, ...]
+    weighed: Weighed
+    chance: tuple[float, ...]
+    beside: tuple[float, str]
     gains: dict[str, float]
     steps: tuple[Fit, ...]
     cut_short: bool
-    search: Search
 
-
-@dataclass(frozen=True)
-class Alternative:
-    """A set of effects beside the most probable one.
-
-    Attributes:
-        effects: of the model, beyond those of the model as given.
-        log_evidence: over that of the most probable set, nats.
-        recipe, start: the model, and where its fit starts.
-    """
-
-    effects: tuple[str, ...]
-    log_evidence: float
-    recipe: Recipe
-    start: Array
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Of the most probable set, beyond those of the model as given."""
+        return tuple(e for e in self.final.recipe.effects if e not in self.initial.recipe.effects)
 
 
 @contextmanager
 def open_search(
-    session: Session, fit: Fit, without: Collection[str] = (), known: Search | None = None
+    session: Session,
+    fit: Fit,
+    without: Collection[str] = (),
+    known: Search | None = None,
+    only: Sequence[str] = (),
 ) -> Iterator[Search]:
     """A search over the candidates beside a fitted model, its columns made by several processes.
 
     Args:
         session: the trials; fit: the model; without: effects that are not weighed.
         known: a search beside another model, of which columns that are the same are taken.
+        only: effects that are weighed in place of all.
     """
-    wanted = session.candidate_names(fit.recipe, without)
+    wanted = only or session.candidate_names(fit.recipe, without)
     candidates = {c.name: c for c in candidates_of(fit.recipe, wanted)}
     # The shapes of a candidate are shares of its range, so that this must stay.
     scale = known.dictionary.scale if known else MachineScale.of_trials(fit.evidence)
@@ -145,7 +144,6 @@ def select_effects(
     steps, tried = [current], {frozenset(recipe.effects)}
     gains: dict[str, float] = {}
     known: Search | None = None
-    cut_short = False
     for number in range(_MOST_ROUNDS):
         progress(0.1 + 0.1 * number, "weighing sets of effects")
         with open_search(session, current, without, known) as search:
@@ -157,24 +155,51 @@ def select_effects(
             room = session.criteria.most_effects - len(current.recipe.effects) + len(recipe.effects)
             pool = _explore(search, room, deep=room if number == 0 else min(_DEEP, room))
             moved = None
-            for cost, keys in sorted(pool.values()):
+            last = number == _MOST_ROUNDS - 1
+            better = [(c, k) for c, k in sorted(pool.values()) if c < none - _WORTH]
+            for _, keys in [] if last else better[:_TRIED]:
                 wider = change_set(current.recipe, keys)
-                if cost > none - _WORTH or frozenset(wider.effects) in tried:
+                if frozenset(wider.effects) in tried:
                     continue
                 tried.add(frozenset(wider.effects))
                 progress(0.15 + 0.1 * number, f"fitting {', '.join(names(keys))}")
                 moved = session.try_fit(wider, start_of(search, keys, wider))
-                if moved is not None:
+                if moved is not None and is_better(current, moved, search.solve(keys)):
                     break
+                moved = None
             if moved is None:
-                cut_short = room <= 0
+                # What promised more by its linear problem did not keep that when it was fitted.
+                pool = {n: (c, k) for n, (c, k) in pool.items() if c >= none - _WORTH}
+                progress(0.9, "holding the model against chance")
+                replays = range(session.criteria.replicates)
+                chance = tuple(search.of_replay(k).largest_gain()[0] for k in replays)
+                weighed = weigh_sets(search, pool, recipe.effects, session.seed)
                 return Selection(
-                    initial, current, _alternatives(search, pool, current, recipe),
-                    gains, tuple(steps), cut_short, search,
+                    initial, current, weighed, chance, search.largest_gain(), gains,
+                    tuple(steps), last or room <= 0,
                 )  # fmt: skip
         current = moved
         steps.append(current)
-    raise RuntimeError("the search did not settle")
+    raise AssertionError("the last round returns")
+
+
+def is_better(before: Fit, after: Fit, promised: Solution) -> bool:
+    """Whether a fitted set is more probable, by the weights of the model without it.
+
+    Args:
+        before, after: the model without and with it; promised: its linear problem solved.
+    """
+    if any(len(a) != len(b) for a, b in zip(before.problem.y, after.problem.y, strict=True)):
+        return True
+    gained = 0.0
+    for axis, root in enumerate(before.likelihood.root):
+        if len(root):
+            squares = [
+                float(np.sum((fit.rows_beyond_bias[axis] * root) ** 2)) for fit in (before, after)
+            ]
+            ratio = max(squares[1], 1e-300) / max(squares[0], 1e-300)
+            gained -= 0.5 * before.problem.independent[axis] * float(np.log(ratio))
+    return gained + float(promised.volume.sum()) - promised.penalty > _WORTH
 
 
 def _explore(search: Search, room: int, deep: int) -> Pool:
@@ -221,31 +246,10 @@ def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
             item.parameters[i].name: v for i, v in zip(item.searched_indices, values, strict=True)
         }
         known |= {
-            item.parameters[i].name: v
-            for i, v in zip(item.linear_indices, strength, strict=False)
+            item.parameters[i].name: v for i, v in zip(item.linear_indices, strength, strict=False)
         }
     system = system_of(wider)
     start = np.array([known.get(q.name, q.prior) for q in system.parameters])
     return np.clip(
         start, [q.lower for q in system.parameters], [q.upper for q in system.parameters]
     )
-
-
-_NEAR = 14.0
-"""Log evidence below the best, nats, beyond which a set is no alternative: one in a million."""
-_MOST_ALTERNATIVES = 12
-
-
-def _alternatives(
-    search: Search, pool: Pool, current: Fit, given: Recipe
-) -> tuple[Alternative, ...]:
-    none, found = search.cost(()), []
-    for cost, keys in sorted(pool.values())[: 4 * _MOST_ALTERNATIVES]:
-        if cost - none > _NEAR or not keys:
-            continue
-        wider = change_set(current.recipe, keys)
-        effects = tuple(e for e in wider.effects if e not in given.effects)
-        found.append(Alternative(effects, none - cost, wider, start_of(search, keys, wider)))
-    own = tuple(e for e in current.recipe.effects if e not in given.effects)
-    first = Alternative(own, 0.0, current.recipe, current.evidence.p)
-    return (first, *found[: _MOST_ALTERNATIVES - 1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,11 +28,15 @@ from bampipe.trials.likelihood import (
     Likelihood,
     Noise,
     Problem,
+    Solved,
     describe_noise,
     lay_out_samples,
+    solve_bounded,
+    take_samples,
 )
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.motion import Motion
+from bampipe.trials.noise_floor import NoiseFloor
 from bampipe.trials.replay import StandIn, keep_motion, replay_motions
 from bampipe.trials.residuals import ModelOnTrial
 from bampipe.workers import process_pool
@@ -122,15 +127,21 @@ class Session:
         extra = [effect_from(e) for e in recipe.extra]
         return list_candidates(recipe.model().device, (*recipe.effects, *without), extra)
 
-    def linearise(self, recipe: Recipe, p: Array, like: Evidence | None = None) -> Evidence:
-        """The model of ``recipe`` at parameters ``p``, (n_p,), on the trials that choose a model."""
+    def linearise(
+        self, recipe: Recipe, p: Array, like: Evidence | None = None, judged: bool = False
+    ) -> Evidence:
+        """The model of ``recipe`` at parameters ``p``, (n_p,), on the trials that choose a model.
+
+        Or, where asked for, on those by which it is ``judged``.
+        """
         t = self.trials
         found = gather_evidence(
             system_of(recipe), t.motions, t.band, p, t.folds,
             most_iterations=0, timing=t.timing,
             like=like,
         )  # fmt: skip
-        kept = [k for k, group in enumerate(t.folds.groups) if group != HELD_OUT]
+        chosen = t.folds.judged if judged else [g != HELD_OUT for g in t.folds.groups]
+        kept = [k for k, counts in enumerate(chosen) if counts]
         return found if len(kept) == len(t.motions) else found.subset(kept)
 
     def replay(self, evidence: Evidence, p: Array, count: int, first: int = 0) -> list[list[Array]]:
@@ -189,6 +200,15 @@ class Session:
             stopping = self.replay_stopping(recipe, evidence)
             noise = describe_noise(replays, stopping, evidence, samples)
         likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
+        evidence, problem = self._descend(recipe, evidence, likelihood)
+        likelihood = likelihood.with_heavy_tails(problem, c.tails)
+        evidence, problem = self._descend(recipe, evidence, likelihood)
+        return Fit(recipe, evidence, likelihood, problem)
+
+    def _descend(
+        self, recipe: Recipe, evidence: Evidence, likelihood: Likelihood
+    ) -> tuple[Evidence, Problem]:
+        """Gauss-Newton steps to the most likely parameters, within their bounds."""
         problem = likelihood.pose(evidence)
         solved = problem.solve()
         for _ in range(_STEPS):
@@ -198,16 +218,40 @@ class Session:
                 p[list(evidence.free)] += share * step[: len(evidence.free)]
                 moved = self.linearise(recipe, np.clip(p, *_bounds(evidence.system)), evidence)
                 tried = likelihood.pose(moved)
-                cost = tried.solve()
-                if cost.cost < solved.cost + _CONVERGED:
+                there = tried.solve()
+                if there.cost < solved.cost + _CONVERGED:
                     break
             else:
                 break
-            fall = solved.cost - cost.cost
-            evidence, problem, solved = moved, tried, cost
+            fall = solved.cost - there.cost
+            evidence, problem, solved = moved, tried, there
             if fall < _CONVERGED:
                 break
-        return Fit(recipe, evidence, likelihood, problem)
+        return evidence, problem
+
+    def judge(self, recipe: Recipe, p: Array) -> Fit:
+        """A model with given parameters, held against replays of it, on all trials that are judged.
+
+        Raises:
+            Runaway: the simulated motion grows without bounds.
+        """
+        evidence, c = self.linearise(recipe, p, judged=True), self.criteria
+        samples = lay_out_samples(evidence, c.block_s)
+        replays = self.replay(evidence, p, c.replicates)
+        stopping = self.replay_stopping(recipe, evidence)
+        noise = describe_noise(replays, stopping, evidence, samples)
+        likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
+        return Fit(recipe, evidence, likelihood, likelihood.pose(evidence))
+
+    def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
+        """Fit a model with noise that is the same for all samples of an axis: nothing is replayed."""
+        evidence = self.linearise(recipe, start)
+        samples = lay_out_samples(evidence, self.criteria.block_s)
+        nothing = [np.zeros_like(r) for r in evidence.residual]
+        noise = describe_noise([nothing, nothing], nothing, evidence, samples)
+        flat = Likelihood.of(evidence, samples, noise, 0.0, 0.0)
+        evidence, problem = self._descend(recipe, evidence, flat)
+        return Fit(recipe, evidence, flat, problem)
 
     def try_fit(self, recipe: Recipe, start: Array) -> Fit | None:
         """`fit`; None where the model cannot be replayed."""
@@ -237,6 +281,86 @@ class Fit:
     evidence: Evidence
     likelihood: Likelihood
     problem: Problem
+
+    @cached_property
+    def solved(self) -> Solved:
+        """The solution of its linear problem, next to zero but for the nuisance parameters."""
+        return self.problem.solve()
+
+    @cached_property
+    def bias(self) -> tuple[Array, ...]:
+        """The bias of filters and of friction that stops, with its fitted factors, by axis, (n,)."""
+        noise, n_q = self.likelihood.noise, len(self.likelihood.samples)
+        factors = (self.problem.to_parameters @ self.solved.base)[-2 * n_q :]
+        pairs = zip(noise.bias, noise.stopping, factors[:n_q], factors[n_q:], strict=True)
+        return tuple(beta * b + gamma * c for b, c, beta, gamma in pairs)
+
+    @cached_property
+    def noise_floor(self) -> NoiseFloor:
+        """What a model leaves that is the whole truth, by axis: noise of the sensors, and the bias.
+
+        That of replays, with the factors of the bias that the measurement has.
+        """
+        noise, rms = self.likelihood.noise, []
+        for of_replays, b, bias in zip(noise.residuals, noise.bias, self.bias, strict=True):
+            rows = of_replays - b + bias
+            rms.append(np.sqrt(np.mean(rows**2, axis=1)) if b.size else np.zeros(len(rows)))
+        return NoiseFloor.of_errors(np.array(rms).T)
+
+    @cached_property
+    def stopping_rms(self) -> Array:
+        """Of the bias, what friction that stops the machine leaves, by axis, (n_q,), N.m or N."""
+        n_q = len(self.likelihood.samples)
+        factors = (self.problem.to_parameters @ self.solved.base)[-n_q:]
+        pairs = zip(self.likelihood.noise.stopping, factors, strict=True)
+        return np.array([rms(factor * c) for c, factor in pairs])
+
+    @cached_property
+    def rows_beyond_bias(self) -> tuple[Array, ...]:
+        """What is left once the bias is taken off, by axis, each (n,), N.m or N."""
+        rows = zip(self.problem.y, self.problem.base, self.likelihood.root, strict=True)
+        return tuple((y + x @ self.solved.base) / root for y, x, root in rows)
+
+    @property
+    def rmse_beyond_bias(self) -> Array:
+        """Its root mean square, (n_q,)."""
+        return np.array([rms(rows) for rows in self.rows_beyond_bias])
+
+    @cached_property
+    def held_out_rmse(self) -> Array:
+        """Error on trials that the parameters have not seen, (n_q,), N.m or N, by a linear step.
+
+        With one group of trials only, that of the fit.
+        """
+        e, p, samples = self.evidence, self.problem, self.likelihood.samples
+        group_of = np.array(e.folds.groups)
+        groups = [group_of[here.trial] for here in samples]
+        plain = [take_samples(e.residual, here, axis) for axis, here in enumerate(samples)]
+        slopes = [take_samples(e.jacobian, here, axis) for axis, here in enumerate(samples)]
+        xx, xy, yy = p.sums()
+        squares = np.zeros(len(samples))
+        for group in np.unique(group_of):
+            inside = [g == group for g in groups]
+            if len(np.unique(group_of)) == 1:
+                change = np.zeros(slopes[0].shape[1])
+            else:
+                rows = [(b[i], y[i]) for b, y, i in zip(p.base, p.y, inside, strict=True)]
+                others = solve_bounded(
+                    p,
+                    xx - np.array([b.T @ b for b, _ in rows]),
+                    xy - np.array([b.T @ y for b, y in rows]),
+                    np.maximum(yy - np.array([float(y @ y) for _, y in rows]), 1e-300),
+                    weight=self.solved.weight,
+                )
+                change = (p.to_parameters @ others.base)[: slopes[0].shape[1]]
+            for axis, i in enumerate(inside):
+                squares[axis] += float(np.sum((plain[axis][i] + slopes[axis][i] @ change) ** 2))
+        return np.asarray(np.sqrt(squares / p.count))
+
+
+def rms(values: Array) -> float:
+    """Root mean square; 0 of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
 def _residuals_of_replay(seed: tuple[int, ...]) -> list[Array]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.shape import Variable, variables
+from bampipe.diagnosis.shape import Variable, variables
 from bampipe.errors import InputError
 from bampipe.physics import System
 from bampipe.physics.effect import Effect

@@ -166,6 +166,8 @@ def _decide(
     ``has``: effects of the model that counts; ``limited``: whether its device has control limits.
     """
     diagnose = f"bampipe diagnose {judged.session} --model {judged.model}"
+    last = _last(judged, mine["verdicts"])
+    unjudged = join_names(row["axis"] for row in last if row["verdict"] == "no_verdict")
     if not outside:
         if lacking := _named(judged, mine["verdicts"], has):
             limits = "; no parameter is beyond its limits" if limited else ""
@@ -176,10 +178,14 @@ def _decide(
                 f"{judged.worst[1]}: something is missing, not yet asked what"
             )
             return UNKNOWN, sentence, diagnose
+        if unjudged:
+            return UNKNOWN, f"no verdict on {unjudged}", f"bampipe report {judged.session}"
         return IN_CONTROL, "", ""
     what = join_names(_named(judged, mine["verdicts"]))
     moved = ", ".join(_in_words(entry) for entry in judged.moved)
     if not what:
+        if unjudged:
+            return UNKNOWN, f"{moved}; no verdict on {unjudged}", f"bampipe report {judged.session}"
         if judged.diagnosed:
             return DEVICE, f"{moved}; its diagnosis finds nothing missing: the device changed", ""
         return UNKNOWN, f"{moved}; whether an effect is missing has not been asked", diagnose
@@ -203,19 +209,28 @@ def _decide(
 def _named(
     judged: SessionVerdict, verdicts: Sequence[TableRow], has: Sequence[str] = ()
 ) -> list[str]:
-    """Return what is missing in words, but for what a model ``has``: effects, rivals, unknowns."""
+    """Return what is missing in words, but for what a model ``has``; unknowns, too."""
+    # On an axis that is undecided one phrase speaks of all its effects.
     words = {
-        effect: said
+        effect: row["named"]
         for row in verdicts
-        for effect, said in zip(row["effects"], row["named"], strict=True)
+        for effect in row["effects"]
+        if row["verdict"] == "undecided"
     }
     said = [words.get(effect, effect) for effect in judged.effects if effect not in has]
-    last = judged.model if judged.diagnosed else BASE
-    for row in verdicts:
-        if row["model"] == last and row["likely"] and not row["effects"]:
-            said.append(f"perhaps {' or '.join(row['likely'])} on {row['axis']} (undecided)")
+    said += [
+        row["named"]
+        for row in _last(judged, verdicts)
+        if row["verdict"] == "undecided" and not row["effects"]
+    ]
     unknown = (f"something unknown on {axis}" for axis in judged.unexplained)
     return [*dict.fromkeys(said), *unknown]
+
+
+def _last(judged: SessionVerdict, verdicts: Sequence[TableRow]) -> list[TableRow]:
+    """Return the verdicts on the model that counts; on the base model where it has none."""
+    model = judged.model if judged.diagnosed else BASE
+    return [row for row in verdicts if row["model"] == model]
 
 
 def _with_the_effect(

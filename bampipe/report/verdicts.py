@@ -8,18 +8,13 @@ from bampipe.lists import join_names
 from bampipe.report import wording
 from bampipe.report.document import Callout
 from bampipe.report.results import Results
-from bampipe.results.diagnose import DiagnoseResult, in_words
-from bampipe.results.standing import FLOOR_WRONG, STANDINGS_IN_WORDS
+from bampipe.results import phrases
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.standing import STANDINGS_IN_WORDS
 from bampipe.results.validate import ValidateResult
 
 _MOST_NAMED = 3
 """Held-out trials that a note can name."""
-VERDICTS_IN_WORDS = {
-    "nothing_missing": "nothing missing",
-    "missing": "an effect is missing",
-    "undecided": "undecided",
-    "unknown_effect": "an effect that no library entry explains",
-}
 
 
 def error_over_floor(results: Results, model: str) -> dict[str, float] | None:
@@ -138,33 +133,25 @@ def _ratios(ratios: dict[str, float]) -> str:
 
 
 def _diagnosed(results: Results, diagnosis: DiagnoseResult) -> Callout:
-    axes = diagnosis.axes
-    found = {axis: axes[axis].verdict for axis in ordered(results, axes)}
-    by_verdict = {
-        verdict: [axis for axis in found if found[axis] == verdict] for verdict in VERDICTS_IN_WORDS
-    }
+    axes = {axis: diagnosis.axes[axis] for axis in ordered(results, diagnosis.axes)}
     effects = results.effects(results.model)
     with_effects = f" with {join_names(f'`{name}`' for name in effects)}" if effects else ""
-    sentence = "\n".join(axes[axis].sentence for axis in found)
-    if by_verdict["missing"]:
-        contests = diagnosis.contests
-        named = (in_words(name, contests.get(name, ()), "`") for name in diagnosis.selected)
-        what = join_names(named) or "an effect"
-        where = join_names(by_verdict["missing"])
-        return Callout("attention", f"The model{with_effects} lacks {what} ({where})", sentence)
-    if by_verdict["unknown_effect"]:
-        where = join_names(by_verdict["unknown_effect"])
-        return Callout(
-            "unknown",
-            f"Something that no known effect explains acts on {where}",
-            sentence,
-        )
-    if by_verdict["undecided"]:
-        where = join_names(by_verdict["undecided"])
-        wrong = [axis for axis in found if axes[axis].standing in FLOOR_WRONG]
-        title = f"Undecided on {where}: the error is above its floor, and no effect is sure"
-        if wrong:
-            title = f"No verdict on {join_names(wrong)}: the noise floor is wrong"
+    sentence = "\n".join(entry.sentence for entry in axes.values())
+
+    def found(verdict: str) -> list[str]:
+        return [axis for axis, entry in axes.items() if entry.verdict == verdict]
+
+    if lacking := found("missing"):
+        what = (f"{phrases.missing(diagnosis, axis, '`')} on {axis}" for axis in lacking)
+        title = f"The model{with_effects} lacks {'; '.join(what)}"
         return Callout("attention", title, sentence)
+    if unknown := found("unknown_effect"):
+        title = f"Something that no known effect explains acts on {join_names(unknown)}"
+        return Callout("unknown", title, sentence)
+    if unjudged := found("no_verdict"):
+        return Callout("attention", f"No verdict on {join_names(unjudged)}", sentence)
+    if undecided := found("undecided"):
+        which = (f"{axis}: {phrases.missing(diagnosis, axis, '`')}" for axis in undecided)
+        return Callout("attention", f"Undecided on {'; '.join(which)}", sentence)
     title = f"The model{with_effects} explains this session: nothing is missing"
     return Callout("good", title, sentence)

@@ -8,7 +8,6 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.diagnose import SearchStep
 from bampipe.results.record import Names, Record, Result, Size
 from bampipe.results.standing import Standing
 from bampipe.results.validate import AxisDrift, FreeRunError
@@ -24,9 +23,6 @@ class Rung(Record):
     parent: str | None
     added: str | None = Field(description="Effects that the parent lacks")
     effects: Names
-    steps: tuple[SearchStep, ...] = Field(
-        description="Between the parent and this model, where its diagnosis added several effects"
-    )
     held_out_rmse: dict[str, Size]
     noise_floor: dict[str, Size | None] = Field(description="null where none was computed")
     standing: dict[str, Standing]

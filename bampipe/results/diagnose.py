@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from bampipe.results import phrases
 from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.results.standing import Standing
 from bampipe.results.terms import EffectText
@@ -64,7 +65,8 @@ class RankedEffect(Record):
     held_out_rmse_before: Size = Field(description="Of the model diagnosed")
     held_out_rmse_after: Size = Field(
         description="Of an effect of the most probable set, without and with it beside the others;"
-        " else of the model diagnosed with it alone, as if both sides of the equation kept their size"
+        " else of the model diagnosed with it alone, as if both sides of the equation kept their"
+        " size"
     )
     unit: str
     probability: Share
@@ -78,6 +80,9 @@ class WeighedSet(Record):
     """A set of effects and how probable it is."""
 
     effects: Names = Field(description="Beyond those of the model diagnosed")
+    unknown: str | None = Field(
+        default=None, description="Axis on which something unknown stands beside them"
+    )
     probability: Share
     log_evidence: float = Field(description="Over that of the first set, nats")
 
@@ -171,19 +176,27 @@ class DiagnoseResult(Result):
     @property
     def verdicts_in_words(self) -> dict[str, str]:
         """By axis, in a few words, with what is missing there."""
-        found = {}
-        for axis, entry in self.axes.items():
-            words = entry.verdict.replace("_", " ")
-            if entry.verdict == "missing":
-                words = f"missing {' and '.join(entry.effects)}"
-            elif entry.verdict == "undecided":
-                words = f"undecided: {self.alternatives_in_words(entry)}"
-            found[axis] = words
-        return found
+        return {axis: phrases.verdict(self, axis) for axis in self.axes}
 
-    def alternatives_in_words(self, entry: AxisVerdict) -> str:
-        """The effects that may be missing on an axis, with their probabilities."""
-        return ", ".join(f"{n} ({100 * entry.probabilities[n]:.0f} %)" for n in entry.likely)
+    @property
+    def lacking(self) -> Names:
+        """Axes whose verdict is another one than that nothing is missing."""
+        return tuple(a for a, entry in self.axes.items() if entry.verdict != "nothing_missing")
+
+    def sets_on(self, axis: str) -> list[tuple[Names, float]]:
+        """What the sets come to on one axis, by probability: the most probable first."""
+        known, found = self.axes[axis].probabilities, dict[Names, float]()
+        for one in self.sets:
+            here = tuple(name for name in known if name in one.effects)
+            found[here] = found.get(here, 0.0) + one.probability
+        return sorted(found.items(), key=lambda pair: -pair[1])
+
+    @property
+    def doubted(self) -> frozenset[str]:
+        """Effects that these trials do not decide on: not all probable sets hold them."""
+        open_axes = [axis for axis, e in self.axes.items() if e.verdict == "undecided"]
+        known = {n for axis in open_axes for n in phrases.split_sets(self, axis)[0]}
+        return frozenset(n for a in open_axes for n in self.axes[a].probabilities) - known
 
     @property
     def alternatives(self) -> dict[str, Names]:

@@ -54,17 +54,18 @@ class DraftedEffect(Record):
 class ChanceOfDraft(Record):
     """What the same search finds where nothing is missing: on replays of the model."""
 
-    gain: float = Field(description="Of the best formula, log likelihood ratio on trials left out")
+    gain: float = Field(description="Of the best formula on the grid, log evidence in nats")
     gains: tuple[float, ...] = Field(description="Of the best formula on each replay")
     p_value: Share
 
 
 class DraftOption(Record):
-    """One length of formula and the error that it leaves."""
+    """A formula that was fitted with the model."""
 
     effects: Names = Field(description="None for the model as it is")
     constants: Count
     held_out_rmse: Size
+    log_evidence: float = Field(description="Over the model as it is, nats")
 
 
 class NearestEffect(Record):
@@ -73,15 +74,6 @@ class NearestEffect(Record):
     effect: str
     held_out_rmse: Size
     sentence: str
-
-
-class CurveBound(Record):
-    """What a free curve leaves: no formula of the same quantity could do much better."""
-
-    variable: str
-    acts_as: ActsAs
-    points: Count
-    held_out_rmse: Size
 
 
 class AxisDraft(Record):
@@ -95,12 +87,8 @@ class AxisDraft(Record):
     options: tuple[DraftOption, ...] = Field(description="Shortest first")
     rmse_before: Size = Field(description="On held-out trials")
     rmse_after: Size
-    noise_floor: Size = Field(description="Median error of the replays that give the chance level")
+    noise_floor: Size = Field(description="Median error of replays of the final model")
     unit: str
-    bound: CurveBound | None = Field(
-        description="A curve of what the first formula follows; null where nothing was drafted, and"
-        " where it follows several quantities"
-    )
     nearest: tuple[NearestEffect, ...]
     sentence: str
 

@@ -13,19 +13,13 @@ from bampipe.declarations.model import ModelFile, read_model_file
 from bampipe.errors import InputError
 from bampipe.progress import Progress
 from bampipe.results.compare import CompareResult, Moved, Rung, Value
-from bampipe.results.diagnose import DiagnoseResult, SearchStep
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.rounding import round_with_sd
 from bampipe.results.validate import ValidateResult
 from bampipe.schema import STRICT, Positive
 
 SUMMARY = "Held-out error of every model version, and which parameters moved"
-INPUTS = (
-    "models/*/model.toml",
-    "models/*/identify.json",
-    "models/*/validate.json",
-    "models/*/diagnose.json",
-)
+INPUTS = ("models/*/model.toml", "models/*/identify.json", "models/*/validate.json")
 OUTPUTS = ("compare.json",)
 
 
@@ -89,7 +83,6 @@ def _rung(
         parent=parent or None,
         added=", ".join(e for e in effects if e not in had) or None,
         effects=effects,
-        steps=_search_steps(run, parent, [e for e in effects if e not in had]),
         held_out_rmse={axis: entry.held_out_rmse for axis, entry in axes.items()},
         noise_floor={axis: entry.noise_floor for axis, entry in axes.items()},
         standing={axis: entry.standing for axis, entry in axes.items()},
@@ -105,18 +98,6 @@ def _rung(
     if before is None or not before.confirmed or validated.is_refused:
         return rung
     return rung.model_copy(update={"confirmed": rung.improves_on(before)})
-
-
-def _search_steps(run: RunFolder, parent: str, added: list[str]) -> tuple[SearchStep, ...]:
-    """Sets of some of ``added`` that the diagnosis of the parent went through, each larger."""
-    if not parent or not run.exists(f"models/{parent}/diagnose.json"):
-        return ()
-    steps: list[SearchStep] = []
-    for step in run.read(DiagnoseResult, parent).steps:
-        larger = len(step.effects) > (len(steps[-1].effects) if steps else 0)
-        if larger and set(step.effects) < set(added):
-            steps.append(step)
-    return tuple(steps)
 
 
 def _moved(

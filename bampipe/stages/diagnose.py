@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,49 +16,64 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
-from bampipe.discover.candidates import list_candidates
-from bampipe.discover.diagnosis import diagnose
-from bampipe.discover.findings import Diagnosis
-from bampipe.discover.settings import Settings
-from bampipe.discover.shape import residual_map, variables, worst_windows
+from bampipe.diagnosis.candidates import list_candidates
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.description import describe
+from bampipe.diagnosis.select import Selection, select_effects
+from bampipe.diagnosis.sentences import axis_sentences
+from bampipe.diagnosis.session import Session
+from bampipe.diagnosis.shape import residual_map, variables, worst_windows
+from bampipe.diagnosis.verdict import conclude
 from bampipe.errors import InputError, NothingToDoError, did_you_mean
 from bampipe.estimate.simulation import Runaway
 from bampipe.identification.terms import effect_text
+from bampipe.next_trial.suggestion import suggest_trial
 from bampipe.physics import compile_model, registry
 from bampipe.physics.effect import effect_from
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.diagnose import (
+    AxisVerdict,
     DiagnoseResult,
     RankedEffect,
     ResidualMap,
 )
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.setup import SetupResult
-from bampipe.results.standing import FLOOR_WRONG
 from bampipe.results.terms import EffectText
-from bampipe.schema import STRICT, Count, Distinct
+from bampipe.schema import STRICT, Count, Distinct, Positive
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.folds import HELD_OUT
-from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_of_block
+from bampipe.trials.measured import read_measured_trials, trial_of_block
 
 _DESCRIBED = 12
 """Effects of the ranking whose formulas are stored with it."""
+_DEFAULT = Criteria()
 
 SUMMARY = "Find which physical effect the model lacks"
 INPUTS = (*INGESTED, *FILTERED, "filter/setup.json?", *IDENTIFIED_MODEL)
 OUTPUTS = ("models/{model}/diagnose.json", "models/{model}/map_variables.parquet")
 
+Fraction = Annotated[float, Field(gt=0, lt=1)]
+
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config:
-    """Settings of the stage.
+    """Settings of the stage; what each number decides is in docs/method.md.
 
     Attributes:
         model: which model version to diagnose.
-        replicates: replays of the fitted model for the chance level, and up to three times as many
-            where a decision is close; more is slower and sharper.
-        significance: chance of a false alarm in a session that is accepted.
-        most_effects: the most effects that are tried before the search ends.
+        probability: from which an effect is called missing.
+        size: least share of the applied force of an axis that an effect must add to matter.
+        significance: chance of a false alarm in a session where nothing is missing.
+        replicates: replays of the fitted model, as in a parametric bootstrap.
+        expected_effects: how many effects a model is expected to lack.
+        most_effects: beyond those of the model.
+        bias_error: relative error of the bias that filters leave where friction turns.
+        discrepancy: error of any model, as a share of the applied force.
+        tails: degrees of freedom of Student's t distribution, as which errors are distributed.
+        block_s: stretches of time that are independent, s: one alone must not decide.
+        beam: sets of effects that are pursued side by side.
         jobs: worker processes; 0 means one for each processor, eight at most.
         seed: of the noise in the replays.
         trust_setup: whether to diagnose in spite of a mistake that was named in the set-up.
@@ -66,13 +81,25 @@ class Config:
     """
 
     model: str = "base"
-    replicates: Annotated[int, Field(ge=4)] = 10
-    significance: Annotated[float, Field(gt=0, lt=1)] = 0.01
-    most_effects: Annotated[int, Field(ge=1)] = 8
+    probability: Annotated[float, Field(gt=0.5, lt=1)] = _DEFAULT.probability
+    size: Fraction = _DEFAULT.size
+    significance: Fraction = _DEFAULT.significance
+    replicates: Annotated[int, Field(ge=4)] = _DEFAULT.replicates
+    expected_effects: Positive = _DEFAULT.expected_effects
+    most_effects: Annotated[int, Field(ge=1)] = _DEFAULT.most_effects
+    bias_error: Positive = _DEFAULT.bias_error
+    discrepancy: Positive = _DEFAULT.discrepancy
+    tails: Positive = _DEFAULT.tails
+    block_s: Positive = _DEFAULT.block_s
+    beam: Annotated[int, Field(ge=1)] = _DEFAULT.beam
     jobs: Count = 0
     seed: Count = 0
     trust_setup: bool = False
     without: Distinct[str] = ()
+
+    def criteria(self) -> Criteria:
+        """The numbers that decide."""
+        return Criteria(**{f.name: getattr(self, f.name) for f in fields(Criteria)})
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -106,25 +133,25 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     recipe = read_recipe(run, config.model, model)
     _require_known(config.without, recipe)
     start = identified(run, config.model, system)
-    settings = Settings(
-        replicates=config.replicates,
-        significance=config.significance,
-        most_effects=config.most_effects,
-        jobs=config.jobs or min(8, os.cpu_count() or 1),
-        seed=config.seed,
-    )
+    jobs = config.jobs or min(8, os.cpu_count() or 1)
+    session = Session(trials, config.criteria(), jobs, config.seed)
     try:
-        found = diagnose(trials, recipe, start, settings, progress, config.without)
+        selection = select_effects(session, recipe, start, config.without, progress)
     except Runaway as error:
         raise NothingToDoError(
             f"model {config.model!r} cannot be diagnosed, for it cannot be replayed and so has no"
-            f" chance level: {error.what}",
+            f" noise to be held against: {error.what}",
             where=str(run.root),
             remedy="judge it by validate and compare, and diagnose the model that it came from",
         ) from error
-    samples = _map_variables(found)
+    given = selection.initial.evidence
+    samples = _map_variables(given)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
-    result = _result(found, trials, recipe, config)
+    progress(0.95, "the trial that would decide what these do not")
+    result = _result(session, selection, recipe, config)
+    result = result.model_copy(
+        update={"suggested_trial": suggest_trial(session, selection.final, result)}
+    )
     headline = "; ".join(f"{axis}: {words}" for axis, words in result.verdicts_in_words.items())
     return {"headline": headline, **_summary(result.write(out), result.limits)}
 
@@ -178,28 +205,41 @@ def _summary(result: dict[str, Any], limits: str) -> dict[str, object]:
 
 
 def _result(
-    found: Diagnosis, trials: MeasuredTrials, recipe: Recipe, config: Config
+    session: Session, selection: Selection, recipe: Recipe, config: Config
 ) -> DiagnoseResult:
-    names = found.evidence.system.coordinates
-    return DiagnoseResult(
+    found, given = conclude(session, selection), selection.initial.evidence
+    names = given.system.coordinates
+    ranking = found.ranking
+    result = DiagnoseResult(
         model=config.model,
-        trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in trials.weighed)),
+        trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in session.trials.weighed)),
         axes=dict(zip(names, found.axes, strict=True)),
-        ranking=found.ranking,
-        descriptions=_descriptions(found.ranking[:_DESCRIBED], recipe),
+        ranking=ranking,
+        descriptions=_descriptions(ranking[:_DESCRIBED], recipe),
         selected=found.selected,
-        groups=dict(found.groups),
-        contests=dict(found.contests),
-        steps=found.steps,
-        transients=found.transients,
-        refused=found.refused,
+        sets=found.sets,
+        chance=found.chance,
+        cut_short=selection.cut_short,
         suggested_trial=None,
-        maps=_maps(found),
-        worst_windows=tuple(worst_windows(found.initial)),
+        maps=_maps(given),
+        worst_windows=tuple(worst_windows(given)),
         not_weighed=config.without,
-        sentence=" ".join(a.sentence for a in found.axes),
-        next=_next(found, config.model),
+        sentence="",
+        next=_next(found.axes, names, found.selected, config.model),
     )
+    shapes = {
+        axis: describe(
+            (selection.final if result.axes[axis].effects else selection.initial).evidence, i
+        )
+        for i, axis in enumerate(names)
+        if result.axes[axis].remains
+    }
+    said = axis_sentences(result, shapes)
+    axes = {
+        axis: entry.model_copy(update={"sentence": said[axis]})
+        for axis, entry in result.axes.items()
+    }
+    return result.model_copy(update={"axes": axes, "sentence": " ".join(said.values())})
 
 
 def _descriptions(ranking: Sequence[RankedEffect], recipe: Recipe) -> dict[str, EffectText]:
@@ -208,10 +248,10 @@ def _descriptions(ranking: Sequence[RankedEffect], recipe: Recipe) -> dict[str, 
     return {name: effect_text(own.get(name) or registry.effect(name)) for name in sorted(names)}
 
 
-def _maps(found: Diagnosis) -> dict[str, dict[str, ResidualMap]]:
+def _maps(evidence: Evidence) -> dict[str, dict[str, ResidualMap]]:
     maps: dict[str, dict[str, ResidualMap]] = {}
-    for i, axis in enumerate(found.initial.system.coordinates):
-        drawn = [residual_map(found.initial, i, v) for v in variables(found.initial, i)]
+    for i, axis in enumerate(evidence.system.coordinates):
+        drawn = [residual_map(evidence, i, v) for v in variables(evidence, i)]
         maps[axis] = {
             m.variable: ResidualMap(
                 unit=m.unit,
@@ -227,9 +267,8 @@ def _maps(found: Diagnosis) -> dict[str, dict[str, ResidualMap]]:
     return maps
 
 
-def _map_variables(found: Diagnosis) -> pd.DataFrame:
+def _map_variables(evidence: Evidence) -> pd.DataFrame:
     """Return map_variables.parquet: the variables of every axis' maps, sample by sample."""
-    evidence = found.initial
     motions, band = evidence.motions, evidence.band
     rows = [band.thinned_rows(len(motion.t)) for motion in motions]
     trials = [trial_of_block(motion.trial_id) for motion in motions]
@@ -243,20 +282,19 @@ def _map_variables(found: Diagnosis) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def _next(found: Diagnosis, model: str) -> str:
-    by_axis = dict(zip(found.evidence.system.coordinates, found.axes, strict=True))
-    undecided = [axis for axis, a in by_axis.items() if a.verdict == "undecided" and a.likely]
-    if undecided:
+def _next(
+    axes: Sequence[AxisVerdict], names: Sequence[str], selected: Sequence[str], model: str
+) -> str:
+    if any(a.verdict == "undecided" for a in axes):
         return f"bampipe next RUN --model {model}"
-    if found.selected:
-        return f"bampipe extend RUN {' '.join(found.selected)} --model {model}"
-    wrong = [axis for axis, a in by_axis.items() if a.standing in FLOOR_WRONG]
+    if selected:
+        return f"bampipe extend RUN {' '.join(selected)} --model {model}"
+    wrong = [axis for axis, a in zip(names, axes, strict=True) if a.verdict == "no_verdict"]
     if wrong:
         return (
-            f"the noise floor of {', '.join(wrong)} is wrong: hold the noise and resolution in "
-            "session.toml against what `bampipe ingest` measured"
+            f"{', '.join(wrong)} cannot be judged: hold the noise and resolution in session.toml"
+            " against what `bampipe ingest` measured"
         )
-    unknown = [axis for axis, a in by_axis.items() if a.verdict == "unknown_effect"]
-    if unknown:
+    if any(a.verdict == "unknown_effect" for a in axes):
         return f"bampipe draft RUN --model {model}"
     return "nothing to add; `bampipe report RUN` writes it up"

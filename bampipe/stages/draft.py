@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
-from bampipe.discover.drafts import symbolic
-from bampipe.discover.drafts.effect_file import declare, write_toml
-from bampipe.discover.drafts.search import FoundDraft, Term, draft
-from bampipe.discover.settings import Settings
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.drafts import symbolic
+from bampipe.diagnosis.drafts.effect_file import declare, write_toml
+from bampipe.diagnosis.drafts.search import FoundDraft, Term, draft_formulas
+from bampipe.diagnosis.session import Session
 from bampipe.errors import NothingToDoError
 from bampipe.files import write_text
 from bampipe.physics import compile_model
-from bampipe.physics.system import System
 from bampipe.progress import Progress
-from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
+from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, RankedEffect
 from bampipe.results.draft import (
     AxisDraft,
     DraftCurve,
@@ -58,7 +56,7 @@ class Config:
 
     Attributes:
         model: which model version to draft for.
-        replicates: replays on which a formula is searched as on the measurement.
+        replicates: replays of the model, which are recombined to the null distribution.
         significance: chance of a formula where nothing is missing.
         jobs: worker processes; 0 means one for each processor, eight at most.
         seed: of the noise in the replays.
@@ -66,8 +64,8 @@ class Config:
     """
 
     model: str = "base"
-    replicates: Annotated[int, Field(ge=4)] = 6
-    significance: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    replicates: Annotated[int, Field(ge=4)] = Criteria.replicates
+    significance: Annotated[float, Field(gt=0, lt=1)] = Criteria.significance
     jobs: Count = 0
     seed: Count = 0
     curve: bool = False
@@ -80,80 +78,76 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         InputError: there is no diagnosis of the model, or nothing is left by it without a name.
     """
     diagnosis = run.read(DiagnoseResult, config.model)
-    model = load_model(run, config.model)
-    system = compile_model(model)
-    axes = _axes_to_draft(diagnosis, system, run)
-    timing = run.read(IdentifyResult, config.model).input_timing
-    trials = read_measured_trials(run, system, every_input=True, timing=timing)
-    trials = replace(trials, motions=tuple(trials.motions))
-    settings = Settings(
-        draft_replicates=config.replicates,
-        draft_significance=config.significance,
-        jobs=config.jobs or min(8, os.cpu_count() or 1),
-        seed=config.seed,
-    )
-    source = _source(run.read(IngestResult))
-    recipe = read_recipe(run, config.model, model)
-    start = identified(run, config.model, system)
-    found = draft(trials, recipe, start, axes, settings, source, config.curve, progress)
-    effects: dict[str, DraftedEffect] = {}
-    for axis in found:
-        if not _beats_named_effects(axis, diagnosis, system, settings):
-            continue
-        for term in axis.terms:
-            file = f"models/{config.model}/drafts/{term.name}.toml"
-            write_text(out / file, write_toml(declare(term, source)))
-            effects[term.canonical] = _effect(term, file, system)
-    result = _result(found, effects, diagnosis, system)
-    content = result.write(out)
-    return {
-        "axes": {
-            axis: {
-                "verdict": entry.verdict,
-                "rmse_before": entry.rmse_before,
-                "rmse_after": entry.rmse_after,
-                "noise_floor": entry.noise_floor,
-                "unit": entry.unit,
-                "p_value": entry.chance[0].p_value,
-                "sentence": entry.sentence,
-            }
-            for axis, entry in result.axes.items()
-        },
-        "selected": content["selected"],
-    }
-
-
-def _axes_to_draft(diagnosis: DiagnoseResult, system: System, run: RunFolder) -> list[int]:
-    """Numbers of the axes that lack something without a name.
-
-    Raises:
-        NothingToDoError: there are none.
-    """
-    found = [system.coordinates.index(axis) for axis in diagnosis.unnamed_axes]
-    if not found:
+    if not diagnosis.unnamed_axes:
         raise NothingToDoError(
             f"nothing to draft: the diagnosis of model {diagnosis.model!r} leaves nothing unnamed",
             where=str(run.root),
             remedy="a formula is drafted where `remains` is true: something is left without a name",
         )
-    return found
+    model = load_model(run, config.model)
+    system = compile_model(model)
+    timing = run.read(IdentifyResult, config.model).input_timing
+    trials = read_measured_trials(run, system, every_input=True, timing=timing)
+    criteria = Criteria(replicates=config.replicates, significance=config.significance)
+    session = Session(
+        replace(trials, motions=tuple(trials.motions)),
+        criteria,
+        config.jobs or min(8, os.cpu_count() or 1),
+        config.seed,
+    )
+    # Dated by the recording, so that a file is the same whenever it is made.
+    ingested = run.read(IngestResult)
+    on = f", recorded on {ingested.recorded_at[:10]}" if ingested.recorded_at else ""
+    source = f"drafted by bampipe from {ingested.session_id}{on}"
+    axes = [system.coordinates.index(axis) for axis in diagnosis.unnamed_axes]
+    found = draft_formulas(
+        session, read_recipe(run, config.model, model), identified(run, config.model, system),
+        axes, source, config.curve, progress,
+    )  # fmt: skip
+    effects: dict[str, DraftedEffect] = {}
+    entries: dict[str, AxisDraft] = {}
+    for one in found:
+        axis = system.coordinates[one.axis]
+        drafted: dict[str, DraftedEffect] = {}
+        if _beats_named_effects(one, diagnosis.axes[axis]):
+            for term in one.terms:
+                file = f"models/{config.model}/drafts/{term.form.name}.toml"
+                write_text(out / file, write_toml(declare(term, source)))
+                drafted[term.form.canonical] = _effect(term, file)
+        rows = [row for row in diagnosis.ranking if row.axis == axis]
+        entries[axis] = _axis(axis, one, drafted, diagnosis.axes[axis], rows)
+        effects |= drafted
+    selected = tuple(effects)
+    advice = (
+        "record more trials like these: what is missing follows nothing that a formula could be "
+        "held against"
+    )
+    if added := selected or diagnosis.selected:
+        advice = f"bampipe extend RUN {' '.join(added)} --model {diagnosis.model}"
+    DraftResult(
+        model=diagnosis.model,
+        sentence=" ".join(entry.sentence for entry in entries.values()),
+        next=advice,
+        axes=entries,
+        effects=effects,
+        selected=selected,
+    ).write(out)
+    told = {"verdict", "rmse_before", "rmse_after", "noise_floor", "unit", "sentence"}
+    return {
+        "axes": {
+            axis: entry.model_dump(include=told) | {"p_value": entry.chance[0].p_value}
+            for axis, entry in entries.items()
+        },
+        "selected": selected,
+    }
 
 
-def _beats_named_effects(
-    found: FoundDraft, diagnosis: DiagnoseResult, system: System, settings: Settings
-) -> bool:
+def _beats_named_effects(found: FoundDraft, diagnosed: AxisVerdict) -> bool:
     """Whether the terms found leave less than the effects that the diagnosis names there."""
-    entry = diagnosis.axes[system.coordinates[found.axis]]
-    return not entry.effects or found.after < entry.rmse_after * np.exp(-settings.draft_worth)
+    return not diagnosed.effects or found.chosen.held_out_rmse < diagnosed.rmse_after
 
 
-def _source(session: IngestResult) -> str:
-    """Where a draft comes from: dated by the recording, so that it is the same whenever made."""
-    on = f", recorded on {session.recorded_at[:10]}" if session.recorded_at else ""
-    return f"drafted by bampipe from {session.session_id}{on}"
-
-
-def _effect(term: Term, file: str, system: System) -> DraftedEffect:
+def _effect(term: Term, file: str) -> DraftedEffect:
     form, unit = term.form, term.form.unit
     units = {name: unit for name in form.shape.strengths}
     units |= {name: of for name, (_, _, of) in form.limits().items()}
@@ -167,11 +161,11 @@ def _effect(term: Term, file: str, system: System) -> DraftedEffect:
         )
         for name, value in term.values.items()
     }
-    is_curve = form.shape.name == "curve"
     numbers = ", ".join(
-        f"{name} {round_with_sd(c.value, 0.5 * (c.high - c.low))} {c.unit}"
+        f"{name} {round_with_sd(c.value, 0.5 * (c.high - c.low))} {c.unit}".rstrip()
         for name, c in constants.items()
     )
+    is_curve = form.shape.name == "curve"
     return DraftedEffect(
         file=file,
         axis=form.axis.name,
@@ -194,124 +188,73 @@ def _effect(term: Term, file: str, system: System) -> DraftedEffect:
     )
 
 
-def _result(
-    found: Sequence[FoundDraft],
-    effects: dict[str, DraftedEffect],
-    diagnosis: DiagnoseResult,
-    system: System,
-) -> DraftResult:
-    axes = {
-        system.coordinates[axis.axis]: _axis(axis, effects, diagnosis, system) for axis in found
-    }
-    selected = tuple(effects)
-    if not selected and diagnosis.selected:
-        named = " ".join(diagnosis.selected)
-        advice = f"bampipe extend RUN {named} --model {diagnosis.model}"
-    elif selected:
-        advice = f"bampipe extend RUN {' '.join(selected)} --model {diagnosis.model}"
-    else:
-        advice = (
-            "record more trials like these: what is missing follows nothing that a formula could "
-            "be held against"
-        )
-    return DraftResult(
-        model=diagnosis.model,
-        sentence=" ".join(entry.sentence for entry in axes.values()),
-        next=advice,
-        axes=axes,
-        effects=effects,
-        selected=selected,
-    )
-
-
 def _axis(
+    axis: str,
     found: FoundDraft,
     effects: dict[str, DraftedEffect],
-    diagnosis: DiagnoseResult,
-    system: System,
+    diagnosed: AxisVerdict,
+    ranked: list[RankedEffect],
 ) -> AxisDraft:
-    axis, unit = system.coordinates[found.axis], system.torque_units[found.axis]
-    names = tuple(term.canonical for term in found.terms if term.canonical in effects)
-    beats_chance = len(found.options) > 1
-    verdict: DraftVerdict = "drafted" if names else "nothing_beyond_chance"
-    if beats_chance and not names:
+    """What was found on an axis; ``effects`` were drafted, ``ranked`` are those of the library."""
+    fitted = len(found.options) > 1
+    verdict: DraftVerdict = "drafted" if effects else "nothing_beyond_chance"
+    if fitted and not effects:
         verdict = "no_lower_error"
-    options = tuple(
-        DraftOption(
-            effects=tuple(name for _, name in option.terms),
-            constants=option.constants,
-            held_out_rmse=option.held_out_rmse[found.axis],
-        )
-        for option in found.options
-    )
+    before, after = found.options[0].held_out_rmse, found.chosen.held_out_rmse
+    ranked = sorted(ranked, key=lambda row: row.held_out_rmse_after)[: _NEAREST if effects else 0]
     return AxisDraft(
         verdict=verdict,
-        effects=names,
+        effects=tuple(effects),
         chance=found.chance,
-        options=options,
-        rmse_before=found.before,
-        rmse_after=found.after if names else found.before,
+        options=tuple(
+            DraftOption(
+                effects=tuple(form.name for form in option.terms),
+                constants=option.constants,
+                held_out_rmse=option.held_out_rmse,
+                log_evidence=option.log_evidence,
+            )
+            for option in found.options
+        ),
+        rmse_before=before,
+        rmse_after=after if effects else before,
         noise_floor=found.noise_floor,
-        unit=unit,
-        bound=found.bound,
-        nearest=_nearest(axis, found, diagnosis, unit) if names else (),
-        sentence=_sentence(found, [effects[name] for name in names], diagnosis.axes[axis], axis)
-        + (_MORE_FORMULAS if found.wants_formulas else ""),
+        unit=diagnosed.unit,
+        nearest=tuple(
+            NearestEffect(
+                effect=row.effect,
+                held_out_rmse=row.held_out_rmse_after,
+                sentence=f"{row.effect} leaves {significant(row.held_out_rmse_after)} "
+                f"{diagnosed.unit}, {row.held_out_rmse_after / max(after, 1e-30):.2g} times what "
+                "the draft leaves",
+            )
+            for row in ranked
+        ),
+        sentence=f"{axis.capitalize()}: {_say(found, [*effects.values()], diagnosed)}"
+        + _MORE_FORMULAS * found.wants_formulas,
     )
 
 
-def _nearest(
-    axis: str, found: FoundDraft, diagnosis: DiagnoseResult, unit: str
-) -> tuple[NearestEffect, ...]:
-    """Effects of the library that come closest, and by how much the draft does better."""
-    rows = [row for row in diagnosis.ranking if row.axis == axis]
-    rows.sort(key=lambda row: row.held_out_rmse_after)
-    return tuple(
-        NearestEffect(
-            effect=row.effect,
-            held_out_rmse=row.held_out_rmse_after,
-            sentence=(
-                f"{row.effect} leaves {significant(row.held_out_rmse_after)} {unit}, "
-                f"{row.held_out_rmse_after / max(found.after, 1e-30):.2g} times what the draft "
-                "leaves"
-            ),
-        )
-        for row in rows[:_NEAREST]
-    )
-
-
-def _sentence(
-    found: FoundDraft, effects: Sequence[DraftedEffect], diagnosed: AxisVerdict, axis: str
-) -> str:
-    name, chance, unit = axis.capitalize(), found.chance[0], diagnosed.unit
+def _say(found: FoundDraft, effects: list[DraftedEffect], diagnosed: AxisVerdict) -> str:
+    chance, unit = found.chance[0], diagnosed.unit
+    before, after = found.options[0].held_out_rmse, found.chosen.held_out_rmse
     by_chance = (
-        f"the best formula gains {chance.gain:.3g} in log likelihood on trials left out; on "
-        f"{len(chance.gains)} replays, where nothing is missing, the same search gains "
-        f"{np.mean(chance.gains):.2g} (p = {chance.p_value:.2g})"
+        f"the best formula gains {chance.gain:.3g} nats of log evidence; on {len(chance.gains)} "
+        f"replays, where nothing is missing, the same search gains {max(chance.gains):.2g} at most "
+        f"(p = {chance.p_value:.2g})"
     )
-    if not effects and found.terms:
+    if effects:
+        ratio = after / max(found.noise_floor, 1e-30)
         return (
-            f"{name}: no draft, for {', '.join(diagnosed.effects)} leaves no more "
-            f"({significant(diagnosed.rmse_after)} {unit}) than the best formula "
-            f"({significant(found.after)} {unit})."
+            f"{' '.join(effect.sentence for effect in effects)} The held-out error falls from "
+            f"{significant(before)} to {significant(after)} {unit}, {ratio:.2f} times the noise "
+            f"floor; {by_chance}."
         )
-    if not effects and len(found.options) > 1:
-        return f"{name}: no draft, for no formula lowers the held-out error enough; {by_chance}."
-    if not effects:
-        return f"{name}: no draft, for chance would have given as good a formula; {by_chance}."
-    ratio = found.after / max(found.noise_floor, 1e-30)
-    return (
-        f"{name}: {' '.join(effect.sentence for effect in effects)} The held-out error falls from "
-        f"{significant(found.before)} to {significant(found.after)} {unit}, {ratio:.2f} "
-        f"times the noise floor{_beside_curve(found, unit)}; {by_chance}."
-    )
-
-
-def _beside_curve(found: FoundDraft, unit: str) -> str:
-    """What a free curve would leave, where that is less."""
-    if found.bound is None or found.bound.held_out_rmse > found.after:
-        return ""
-    return (
-        f" (a free curve along {found.bound.variable} leaves "
-        f"{significant(found.bound.held_out_rmse)} {unit})"
-    )
+    if found.terms:
+        return (
+            f"no draft, for {', '.join(diagnosed.effects)} leaves no more "
+            f"({significant(diagnosed.rmse_after)} {unit}) than the best formula "
+            f"({significant(after)} {unit})."
+        )
+    if len(found.options) > 1:
+        return f"no draft, for no formula lowers the held-out error; {by_chance}."
+    return f"no draft, for chance would have given as good a formula; {by_chance}."

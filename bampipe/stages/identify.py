@@ -15,8 +15,8 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recipe
-from bampipe.discover.sign_width import SignWidth, choose_sign_width
-from bampipe.discover.start import search_start
+from bampipe.diagnosis.sign_width import SignWidth, choose_sign_width
+from bampipe.diagnosis.start import search_start
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import LeastSquares, Problem, fit, independent_samples
 from bampipe.identification.bodies import base_estimates, make_possible, summarise_bases

@@ -2,11 +2,11 @@
 
 Of the samples of an axis that count, in the words of docs/method:
 
-    y = f(motion; theta) + beta b + gamma c + e,   var e = s^2 (v(z) + (tau b)^2 + (delta F)^2)
+    y = f(motion; theta) + beta b + gamma c + e,   var e ~ s^2 (v(z) + tau^2 (b^2 + g^2 c^2) + (delta F)^2)
 
 y is what the fitted model leaves, low-passed; b the mean of replays of the model (what filters do
 to its residual where friction turns, which the measurement shares); c the residual of a replay whose
-friction truly stops the machine where it turns; v what single replays leave around b, by speed; F
+friction truly stops the machine where it turns, g a first guess of its factor; v what single replays leave around b, by speed; F
 the applied force; s a scale of each axis, which is found with the rest. Parameters have their priors
 and bounds; so have the nuisance parameters: the factors beta and gamma of each axis, and the time by
 which inputs were sampled late.
@@ -15,7 +15,7 @@ which inputs were sampled late.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,12 +86,28 @@ class Noise:
         variance: of what single replays leave around it, smoothed by speed, each (n,).
         stopping: of a replay without noise whose friction truly stops it, each (n,).
         residuals: of each replay, by axis, each (replays, n).
+        speed: class of speed of each sample, by axis, each (n,).
     """
 
     bias: tuple[Array, ...]
     variance: tuple[Array, ...]
     stopping: tuple[Array, ...]
     residuals: tuple[Array, ...]
+    speed: tuple[NDArray[np.int64], ...]
+
+    def variance_of_bias(self, axis: int, y: Array) -> Array:
+        """How far the bias of a residual ``y``, (n,), may be off, for a relative error of one.
+
+        Half of it where the replays have it, half wherever the axis is as slow: where exactly a
+        machine turns, no replay knows.
+        """
+        b, c, at = self.bias[axis], self.stopping[axis], self.speed[axis]
+        both = np.column_stack([b, c]) / np.sqrt(self.variance[axis] + 1e-300)[:, None]
+        target = y / np.sqrt(self.variance[axis] + 1e-300)
+        factor = np.linalg.lstsq(both, target, rcond=1e-6)[0][1] if len(y) else 0.0
+        square = b**2 + (np.clip(factor, 0.0, _MOST_STOPPING) * c) ** 2
+        count = np.maximum(np.bincount(at, minlength=_SPEEDS), 1)
+        return 0.5 * (square + (np.bincount(at, square, minlength=_SPEEDS) / count)[at])
 
     def without(self, replay: int) -> tuple[Array, ...]:
         """The bias by all replays but one."""
@@ -115,7 +131,7 @@ def describe_noise(
         evidence: the model on the measured trials; samples: of it that count.
     """
     speeds = _by_row(evidence, lambda motion, kept: np.abs(motion.qd[kept]))
-    biases, variances, by_axis = [], [], []
+    biases, variances, by_axis, classes = [], [], [], []
     for axis, here in enumerate(samples):
         left = np.array([take_samples(r, here, axis) for r in residuals])
         around = left.var(axis=0, ddof=1)
@@ -126,8 +142,9 @@ def describe_noise(
         biases.append(left.mean(axis=0))
         variances.append((np.bincount(at, around, minlength=_SPEEDS) / count)[at])
         by_axis.append(left)
+        classes.append(at)
     stops = tuple(take_samples(stopping, here, axis) for axis, here in enumerate(samples))
-    return Noise(tuple(biases), tuple(variances), stops, tuple(by_axis))
+    return Noise(tuple(biases), tuple(variances), stops, tuple(by_axis), tuple(classes))
 
 
 def _by_row(
@@ -175,18 +192,37 @@ class Likelihood:
         ]
         root, force = [], []
         for axis, here in enumerate(samples):
-            f = take_samples(applied, here, axis)
+            f, y = take_samples(applied, here, axis), take_samples(e.residual, here, axis)
             variance = (
-                noise.variance[axis] + (bias_error * noise.bias[axis]) ** 2 + (discrepancy * f) ** 2
+                noise.variance[axis]
+                + bias_error**2 * noise.variance_of_bias(axis, y)
+                + (discrepancy * f) ** 2
             )
             least = _LEAST * float(variance.mean()) if variance.size else 0.0
-            root.append(1.0 / np.sqrt(np.maximum(variance, least) + 1e-300))
+            # Where nothing scatters, all samples weigh alike.
+            root.append(1.0 / np.sqrt(np.maximum(variance, least)) if least else np.ones(len(f)))
             force.append(f)
         return cls(
             samples, noise, tuple(root),
             tuple(force),
             tuple(take_samples(plain, here, axis) for axis, here in enumerate(samples)),
         )  # fmt: skip
+
+    def with_heavy_tails(self, problem: Problem, tails: float) -> Likelihood:
+        """Weights of samples as under Student's t distribution, at a fit of the model.
+
+        A few fast reversals that no replay has would otherwise decide (Lange, Little and Taylor
+        1989, Journal of the American Statistical Association 84, 881).
+
+        Args:
+            problem: the fit, its solution at zero; tails: degrees of freedom.
+        """
+        solved, root = problem.solve(), []
+        for axis, (y, base) in enumerate(zip(problem.y, problem.base, strict=True)):
+            square = (y + base @ solved.base) ** 2
+            mean = max(float(solved.left[axis]) / problem.count[axis], 1e-300)
+            root.append(self.root[axis] * np.sqrt((tails + 1.0) / (tails + square / mean)))
+        return replace(self, root=tuple(root))
 
     def pose(
         self,

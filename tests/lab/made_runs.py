@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from made_results import write_result
+from made_results import diagnosis, write_result
 
 from bampipe.data import store
 from bampipe.files import write_json, write_text
@@ -68,21 +68,17 @@ class Made:
             "sample_rate_hz": [500.0, 500.0],
         }
         store.write_parquet(root / "ingest/trials.parquet", trials)  # type: ignore[arg-type]
-        axes = {} if self.stiffness is None else {"yaw": _stiffness(self.stiffness)}
-        write_result(root, StiffnessResult, axes=axes)
+        stiff = {} if self.stiffness is None else {"yaw": _stiffness(self.stiffness)}
+        write_result(root, StiffnessResult, axes=stiff)
         self._model(root, "base", [], self.parameters, self.error)
         if self.verdicts is not None:
-            verdicts = {
-                axis: {
-                    "verdict": verdict,
-                    "effects": list(effects),
-                    "explainable_share": 0.4 if effects else 0.01,
-                    "sentence": f"{axis}: {verdict}",
-                    "unit": "N.m",
-                }
-                for axis, (verdict, effects) in self.verdicts.items()
+            axes = {
+                axis: {"verdict": verdict, "sentence": f"{axis}: {verdict}", "unit": "N.m"}
+                for axis, (verdict, _) in self.verdicts.items()
             }
-            write_result(root, DiagnoseResult, model="base", axes=verdicts)
+            effects = tuple(name for _, found in self.verdicts.values() for name in found)
+            fields = diagnosis(axes, {effects: 1.0})
+            write_result(root, DiagnoseResult, model="base", **fields)
         if self.child is not None:
             effect, parameters = self.child
             name = f"base+{effect.replace(':', '.')}"

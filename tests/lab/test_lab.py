@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import misfits
-from made_results import write_result
+from made_results import diagnosis, write_result
 from made_runs import Made
 
 from bampipe.cli import lab as lab_command
@@ -101,23 +101,29 @@ def test_an_effect_on_another_axis_does_not_account_for_a_parameter(tmp_path: Pa
     assert one["remedy"] == "bampipe extend s07 --auto, then bampipe lab"
 
 
-def test_rivals_and_what_is_undecided_are_named(tmp_path: Path) -> None:
-    runs = make_lab(tmp_path, {7: changed(7, estimates(7), verdicts=MISSING)})
-    rival = {"effect": "presliding:yaw", "beside": "about as likely"}
-    contests = {"stribeck:yaw": [{"effect": "stribeck:yaw"}, rival]}
-    axes = {"yaw": {"verdict": "missing", "effects": ["stribeck:yaw"]}}
-    write_result(runs / "s07", DiagnoseResult, model="base", axes=axes, contests=contests)
-    odds = {"stribeck:yaw": 0.6, "presliding:yaw": 0.4}
-    for number, effects in ((4, ["stribeck:yaw"]), (5, [])):
-        axes = {"yaw": {"verdict": "undecided", "effects": effects, "likely": odds}}
-        write_result(runs / f"s0{number}", DiagnoseResult, model="base", axes=axes)
+def test_what_is_undecided_or_has_no_verdict_is_said(tmp_path: Path) -> None:
+    runs = make_lab(tmp_path)
+    first, second = ("stribeck:yaw",), ("presliding:yaw",)
+    for number, verdict, sets in (
+        (4, "undecided", {first: 0.6, second: 0.4}),
+        (5, "undecided", {(): 0.6, first: 0.4}),
+        (6, "undecided", {(*first, *second): 0.7, first: 0.3}),
+        (7, "missing", {first: 0.995, (): 0.005}),
+        (8, "no_verdict", {(): 1.0}),
+    ):
+        fields = diagnosis({"yaw": {"verdict": verdict}}, sets)
+        write_result(runs / f"s0{number}", DiagnoseResult, model="base", **fields)
     found = verdicts(runs)
     within = "; no parameter is beyond its limits"
-    assert {number: found[f"s0{number}"]["sentence"] for number in (4, 5, 7)} == {
-        4: f"lacks stribeck:yaw or presliding:yaw (undecided){within}",
-        5: f"lacks perhaps stribeck:yaw or presliding:yaw on yaw (undecided){within}",
-        7: f"lacks stribeck:yaw or, about as likely, presliding:yaw{within}",
+    assert {number: found[f"s0{number}"]["sentence"] for number in range(4, 9)} == {
+        4: f"lacks either stribeck:yaw (0.60) or presliding:yaw (0.40){within}",
+        5: f"lacks either nothing (0.60) or stribeck:yaw (0.40){within}",
+        6: "lacks stribeck:yaw (> 0.99), and either presliding:yaw (0.70) or nothing more (0.30)"
+        + within,
+        7: f"lacks stribeck:yaw{within}",
+        8: "no verdict on yaw",
     }
+    assert found["s08"]["verdict"] == "not diagnosed"
 
 
 def test_what_was_not_diagnosed_is_said(tmp_path: Path) -> None:

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from made_results import write_result
+from made_results import diagnosis, filled, write_result
 
 from bampipe.data.store import write_parquet
+from bampipe.diagnosis.sentences import axis_sentences
 from bampipe.files import write_text
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
@@ -315,11 +316,10 @@ def write_diagnosis(root: Path, model: str) -> None:
         lacking = missing and axis == "yaw"
         axes[axis] = {
             "verdict": "missing" if lacking else "nothing_missing",
-            "explainable_share": 0.812 if lacking else 0.013, "explainable_chance": 0.031,
+            "unknown": 0.012, "explained": 0.9883, "force_rms": 3.1,
+            "explainable_share": 0.812 if lacking else 0.013,
             "rmse_before": error, "rmse_after": 0.2117 if lacking else error,
-            "noise_floor": FLOOR[axis], "unit": TORQUE_UNIT[axis],
-            "sentence": f"The residual of {axis} "
-            + ("grows as the speed falls to zero." if lacking else "is what the sensors leave."),
+            "rmse_beyond_bias": 0.1834, "noise_floor": FLOOR[axis], "unit": TORQUE_UNIT[axis],
         }  # fmt: skip
     speed = np.linspace(-0.8, 0.8, 15)
     size = 1.0 if missing else 0.0
@@ -334,9 +334,9 @@ def write_diagnosis(root: Path, model: str) -> None:
         for axis in AXES
     }
     ranking = [
-        _candidate("stribeck:yaw", 0.2117, 0.0004, ["presliding:yaw"]),
-        _candidate("presliding:yaw", 0.2323, 0.0021, ["stribeck:yaw"]),
-        _candidate("asymmetric_coulomb:yaw", 0.5589, 0.41, []),
+        _candidate("stribeck:yaw", 0.2117, 0.0004, 0.973, ["presliding:yaw"]),
+        _candidate("presliding:yaw", 0.2323, 0.0021, 0.027, ["stribeck:yaw"]),
+        _candidate("asymmetric_coulomb:yaw", 0.5589, 0.41, 0.0, []),
     ]
 
     def variables(number: int) -> pd.DataFrame:
@@ -349,41 +349,35 @@ def write_diagnosis(root: Path, model: str) -> None:
         "axis": "yaw", "trial_id": FREE[1], "t_start": 3.2, "t_end": 3.7, "rmse": 1.234,
         "doing": "reversing slowly with the arm extended",
     }  # fmt: skip
-    write_result(
-        root,
+    sets = {("stribeck:yaw",): 0.973, ("presliding:yaw",): 0.027} if missing else {(): 1.0}
+    found = filled(
         DiagnoseResult,
-        model=model,
-        axes=axes,
-        ranking=ranking if missing else [],
-        selected=["stribeck:yaw"] if missing else [],
-        groups={"stribeck:yaw": ["presliding:yaw"]} if missing else {},
-        contests={
-            "stribeck:yaw": [
-                {"effect": effect, "axis": "yaw", "held_out_rmse": error, "odds": odds}
-                for effect, error, odds in (
-                    ("stribeck:yaw", 0.2117, 0.7),
-                    ("presliding:yaw", 0.2323, 0.3),
-                )
-            ]
-        }
-        if missing
-        else {},
-        descriptions={
-            "presliding": _text("Friction builds up over a distance", "torque = -z"),
-            "asymmetric_coulomb": _text("Friction differs by direction", "torque = -abs(qd)"),
-        }
-        if missing
-        else {},
-        suggested_trial={"sentence": "Move yaw back and forth at 0.02 rad/s for 20 s."}
-        if missing
-        else None,
-        maps=maps,
-        worst_windows=[window],
-        next="bampipe extend RUN stribeck:yaw --model base" if missing else "nothing to add",
-        sentence="Yaw lacks friction that rises as it slows down."
-        if missing
-        else "Nothing that could be explained is left.",
-    )
+        {
+            **diagnosis(axes, sets),
+            "model": model,
+            "ranking": ranking if missing else [],
+            "descriptions": {
+                "presliding": _text("Friction builds up over a distance", "torque = -z"),
+                "asymmetric_coulomb": _text("Friction differs by direction", "torque = -abs(qd)"),
+            }
+            if missing
+            else {},
+            "chance": {
+                "replicates": 12, "largest": [1.23, 4.56], "measured": 2.34,
+                "effect": "backlash:pitch", "p_value": 0.412,
+            },
+            "suggested_trial": {"sentence": "Move yaw back and forth at 0.02 rad/s for 20 s."}
+            if missing
+            else None,
+            "maps": maps,
+            "worst_windows": [window],
+            "next": "bampipe extend RUN stribeck:yaw --model base" if missing else "nothing to add",
+        },
+    )  # fmt: skip
+    said = axis_sentences(DiagnoseResult.model_validate(found))
+    for axis, sentence in said.items():
+        found["axes"][axis]["sentence"] = sentence
+    write_result(root, DiagnoseResult, **{**found, "sentence": " ".join(said.values())})
 
 
 def _map(unit: str, centre: object, mean: np.ndarray) -> dict[str, object]:
@@ -393,10 +387,13 @@ def _map(unit: str, centre: object, mean: np.ndarray) -> dict[str, object]:
     }  # fmt: skip
 
 
-def _candidate(effect: str, after: float, p: float, alike: list[str]) -> dict[str, object]:
+def _candidate(
+    effect: str, after: float, p: float, probability: float, alike: list[str]
+) -> dict[str, object]:
     return {
         "effect": effect, "axis": "yaw", "held_out_rmse_before": held_out("base")["yaw"],
-        "held_out_rmse_after": after, "p_value": p, "score": 1.0, "indistinguishable_from": alike,
+        "held_out_rmse_after": after, "unit": "N.m", "p_value": p, "score": 1.0,
+        "probability": probability, "indistinguishable_from": alike,
     }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import synthetic_run
-from made_results import write_result
+from made_results import diagnosis, write_result
 
 from bampipe.data.store import write_parquet
 from bampipe.errors import InputError
@@ -21,6 +21,7 @@ from bampipe.report import style, typeset
 from bampipe.report.build import Report, build
 from bampipe.report.results import Results
 from bampipe.report.sections import identification, validation
+from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.draft import DraftResult
 from bampipe.results.validate import ValidateResult
 
@@ -152,8 +153,14 @@ def test_a_long_remark_of_several_trials_stands_once_below_the_table(tmp_path: P
 def test_diagnosis_names_effect_group_and_trial(full: Report) -> None:
     words = text_of(full.html)
     assert row_of(full.html, "stribeck:yaw", "yaw")[2:] == [
-        "0.562", "0.212", "N·m", "< 0.001", "presliding:yaw",
+        "presliding:yaw", "0.562", "0.212", "N·m", "0.97", "< 0.001",
     ]  # fmt: skip
+    assert row_of(full.html, "yaw", "missing stribeck:yaw (0.97)")[2:] == [
+        "98.8 %", "0.562", "0.212", "0.183", "0.203", "N·m", "81 %",
+    ]  # fmt: skip
+    assert "Yaw: stribeck:yaw is missing (probability 0.97); adding it takes the held-out" in words
+    assert row_of(full.html, "presliding:yaw", "0.03")
+    assert "nothing, the largest gain of any candidate is 1.23 to 4.56 nats" in words
     assert "Move yaw back and forth at 0.02 rad/s" in words
     assert "reversing slowly with the arm extended" in words
     assert "residual-maps-base-yaw" in full.figures
@@ -167,9 +174,7 @@ def test_each_effect_found_is_explained(full: Report) -> None:
     assert "Friction rises as the speed falls. Found: force 1.021 ± 0.064 N·m; speed" in words
     assert "torque = -force*exp(-qd**2)" in words
     assert "On the machine. Grease the joint." in words
-    assert "In its place presliding:yaw leaves 0.232 N·m (odds 30 %) on held-out trials" in words
-    assert "of yaw, against 0.212 N·m, before either is fitted in full." in words
-    assert "fits better beyond chance" not in words
+    assert "Its probability is 0.97. In its place: presliding:yaw (0.03)." in words
     assert "Right: the worst window of yaw without stribeck:yaw (reversing slowly" in words
     assert "the residual falls from 0.2" in words
     assert {"friction", "effect-stribeck-yaw"} <= full.figures.keys()
@@ -222,12 +227,27 @@ def test_a_version_without_a_floor_is_not_said_to_have_no_lower_error(tmp_path: 
     assert "no noise floor could be computed for it" in words
 
 
-def test_a_rival_with_odds_of_its_own_is_not_said_to_be_beaten(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("verdict", "sets", "title"),
+    [
+        ("missing", {("a:yaw", "b:yaw"): 1.0}, "lacks a:yaw (> 0.99) and b:yaw (> 0.99) on yaw"),
+        ("unknown_effect", {(): 1.0}, "Something that no known effect explains acts on yaw"),
+        ("no_verdict", {(): 1.0}, "No verdict on yaw"),
+        (
+            "undecided",
+            {("a:yaw",): 0.6, ("b:yaw",): 0.4},
+            "Undecided on yaw: either a:yaw (0.60) or b:yaw (0.40)",
+        ),
+    ],
+)
+def test_the_verdict_on_the_session_is_that_of_its_diagnosis(
+    tmp_path: Path, verdict: str, sets: dict[tuple[str, ...], float], title: str
+) -> None:
     root = synthetic_run.write_all(tmp_path / "s01")
-    path = root / "models/base/diagnose.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"groups": {}}))
-    words = text_of(page_of(root))
-    assert "(odds 30 %)" in words and "fits better beyond chance" not in words
+    axes = {"pitch": {"verdict": "nothing_missing"}, "yaw": {"verdict": verdict}}
+    fields = diagnosis(axes, sets)
+    write_result(root, DiagnoseResult, model=synthetic_run.CHILD, **fields)
+    assert title in text_of(page_of(root))
 
 
 @pytest.mark.parametrize(

@@ -214,18 +214,10 @@ def _maps(results: Results) -> list[Content]:
         diagnosis = results.read(DiagnoseResult, model)
         for axis, maps in (diagnosis.maps if diagnosis else {}).items():
             for variable, drawn in maps.items():
+                plain = drawn.model_dump(mode="json", include={"center", "mean", "low", "high"})
+                about = {"unit": wording.unit(drawn.unit), "share": drawn.variance_share}
                 found.append(
-                    {
-                        "model": number,
-                        "axis": axis,
-                        "variable": variable,
-                        "unit": wording.unit(drawn.unit),
-                        "share": drawn.variance_share,
-                        "center": list(drawn.center),
-                        "mean": list(drawn.mean),
-                        "low": list(drawn.low),
-                        "high": list(drawn.high),
-                    }
+                    {"model": number, "axis": axis, "variable": variable, **about, **plain}
                 )
     return found
 
@@ -268,7 +260,7 @@ def _parameters(results: Results) -> list[Content]:
                 "name": name,
                 "unit": wording.unit(unit),
                 "values": [
-                    {"estimate": v.estimate, "sd": v.sd, "at_bound": v.at_bound} if v else None
+                    v.model_dump(include={"estimate", "sd", "at_bound"}) if v else None
                     for v in values
                 ],
             }
@@ -340,9 +332,12 @@ def _trial_errors(results: Results) -> Content:
 def _candidates(diagnosis: DiagnoseResult, label: str) -> Content:
     return {
         "title": f"Candidate effects, {label}",
-        "note": "Held-out error without and with each effect; p: chance of such a fall in error "
-        "where the effect is absent.",
-        "head": ["Effect", "Axis", "Without", "With", "Unit", "p", "Indistinguishable from"],
+        "note": "Held-out error without and with each effect; p: chance that replays give any "
+        "candidate as large a gain.",
+        "head": [
+            *("Effect", "Axis", "Without", "With", "Unit", "Probability", "p"),
+            "Indistinguishable from",
+        ],
         "rows": [
             [
                 entry.effect,
@@ -350,6 +345,7 @@ def _candidates(diagnosis: DiagnoseResult, label: str) -> Content:
                 entry.held_out_rmse_before,
                 entry.held_out_rmse_after,
                 wording.unit(entry.unit),
+                entry.probability,
                 entry.p_value,
                 ", ".join(entry.indistinguishable_from),
             ]

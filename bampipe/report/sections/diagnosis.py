@@ -22,6 +22,7 @@ from bampipe.report.document import (
 )
 from bampipe.report.results import Results
 from bampipe.report.sections import next_trial
+from bampipe.results import phrases
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import (
     AxisVerdict,
@@ -37,6 +38,8 @@ Maps = Mapping[str, ResidualMap]
 TITLE = "Diagnosis"
 _RANKED = 8
 _WINDOWS = 6
+LONG = "What it is, and its formula"
+"""A column of text, wider than others."""
 _MAPS = 6
 """Most maps of one axis: those that tell most, best first."""
 
@@ -68,12 +71,12 @@ def _model(
     axes = found.axes
     names = verdicts.ordered(results, axes)
     sentences = tuple(axes[axis].sentence for axis in names)
-    blocks: list[Block] = [Bullets(sentences), _verdicts(names, axes)]
+    blocks: list[Block] = [Bullets(sentences), _verdicts(found, names)]
     if found.limits:
         blocks.append(Paragraph(found.limits))
-    lacking = [axis for axis in names if axes[axis].verdict != "nothing_missing"]
+    lacking = [axis for axis in names if axis in found.lacking]
     if found.ranking and lacking:
-        blocks.append(_ranking(results, found.ranking))
+        blocks += [_ranking(found.ranking), *_sets(found)]
     if lacking:
         blocks += _next(results, model, found)
     else:
@@ -118,80 +121,106 @@ def _next(results: Results, model: str, found: DiagnoseResult) -> list[Block]:
     return [Paragraph(f"Next: `{what}`" if what.startswith("bampipe ") else f"Next: {what}.")]
 
 
-def _verdicts(names: tuple[str, ...], axes: Mapping[str, AxisVerdict]) -> Table:
-    rows = []
-    for axis in names:
-        entry = axes[axis]
-        rows.append(
-            (
-                axis,
-                verdicts.VERDICTS_IN_WORDS.get(entry.verdict, wording.words(entry.verdict)),
-                wording.percent(entry.explainable_share),
-                wording.percent(entry.explainable_chance),
-                wording.significant(entry.rmse_before),
-                wording.significant(entry.rmse_after),
-                wording.significant(entry.noise_floor),
-                wording.unit(entry.unit),
-            )
+def _verdicts(found: DiagnoseResult, names: Sequence[str]) -> Table:
+    rows = [
+        (
+            axis,
+            phrases.verdict(found, axis),
+            phrases.percent_of_force(entry.explained),
+            wording.significant(entry.rmse_before),
+            wording.significant(entry.rmse_after),
+            wording.significant(entry.rmse_beyond_bias),
+            wording.significant(entry.noise_floor),
+            wording.unit(entry.unit),
+            wording.percent(entry.explainable_share),
         )
+        for axis in names
+        for entry in (found.axes[axis],)
+    ]
     return Table(
         "Verdict by axis",
         (
-            "Axis",
-            "Verdict",
-            "Explainable",
-            "by chance",
-            "Error now",
-            "with effects",
-            "Floor",
-            "Unit",
+            *("Axis", "Verdict", "Explained", "Error now", "with the set", "beyond bias", "Floor"),
+            *("Unit", "Explainable"),
         ),
         tuple(rows),
-        "llrrrrrl",
-        note="Explainable: share of the residual that any function of motion and load could "
-        "predict on unseen trials; by chance: the same where nothing is missing. Errors are RMSE "
-        "on held-out trials; floor: of the model with the effects.",
+        "llrrrrrlr",
+        (0.0, 1.0, *7 * (0.0,)),
+        note="In brackets: probabilities. Explained: share of the mean square of the applied "
+        "force, with the most probable set of effects. Errors are RMSE on held-out trials; beyond "
+        "bias: with the set, but for what filters leave where friction turns; floor: of replays of "
+        "the model with the set. Explainable: share of the residual now that any smooth function "
+        "of motion and load predicts on unseen trials.",
     )
 
 
-def _ranking(results: Results, ranking: Sequence[RankedEffect]) -> Table:
-    shown = ranking[:_RANKED]
-    imitated = any(entry.indistinguishable_from for entry in shown)
+def _sets(found: DiagnoseResult) -> list[Block]:
+    """Return the sets of effects that are probable, where there are several, and chance beside."""
+    shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
+    chance = Paragraph(phrases.chance(found.chance))
+    if len(shown) < 2:
+        return [chance]
     rows = [
         (
-            f"`{entry.effect}`",
-            entry.axis,
-            wording.significant(entry.held_out_rmse_before),
-            wording.significant(entry.held_out_rmse_after),
-            wording.unit(results.force_unit(entry.axis)) if entry.axis in results.axes else "",
-            wording.probability(entry.p_value),
-            *((join_names(f"`{n}`" for n in entry.indistinguishable_from),) if imitated else ()),
+            join_names(f"`{name}`" for name in one.effects) or "none",
+            phrases.probability(one.probability),
+            wording.significant(one.log_evidence),
         )
-        for entry in shown
+        for one in shown[:_RANKED]
     ]
-    more = len(ranking) - len(rows)
-    note = (
-        "Without: of the model, for an effect found of the one it was added to. With: its shape at "
-        "the best of a few values, while what is added is then fitted in full. p: chance of such a "
-        "fall in error where the effect is absent."
-    )
-    if more:
-        note += f" {wording.count(more, 'candidate')} further down not shown."
+    heads = ("Effects", "Probability", "Log evidence over the first (nats)")
+    return [Table("Sets of effects, the most probable first", heads, tuple(rows), "lrr"), chance]
+
+
+def ranking_table(
+    title: str, rows: Sequence[tuple[RankedEffect, Sequence[str]]], about: Sequence[str], note: str
+) -> Table:
+    """Return candidate effects with the error without and with each, and how probable it is.
+
+    Args:
+        title: of the table; note: below it.
+        rows: candidates, each with the cells of the columns ``about``, which may be long.
+    """
     return Table(
-        "Candidate effects, best first: error on held-out trials without and with each",
-        (
-            "Effect",
-            "Axis",
-            "Without",
-            "With",
-            "Unit",
-            "p",
-            *(("Indistinguishable from",) if imitated else ()),
+        title,
+        ("Effect", *about, "Without", "With", "Unit", "Probability", "p"),
+        tuple(
+            (
+                f"`{entry.effect}`",
+                *more,
+                wording.significant(entry.held_out_rmse_before),
+                wording.significant(entry.held_out_rmse_after),
+                wording.unit(entry.unit),
+                phrases.probability(entry.probability),
+                wording.probability(entry.p_value),
+            )
+            for entry, more in rows
         ),
-        tuple(rows),
-        "llrrlr" + "l" * imitated,
-        (0.0,) * 6 + (1.0,) * imitated,
-        note,
+        "l" + "l" * len(about) + "rrlrr",
+        (0.0, *(2.6 if name == LONG else 0.0 for name in about), *5 * (0.0,)),
+        f"{note} Without and with: RMSE on held-out trials; p: chance that replays give any "
+        "candidate as large a gain.",
+    )
+
+
+def _ranking(ranking: Sequence[RankedEffect]) -> Table:
+    shown = ranking[:_RANKED]
+    imitated = any(entry.indistinguishable_from for entry in shown)
+    more = len(ranking) - len(shown)
+    return ranking_table(
+        "Candidate effects, best first",
+        [
+            (
+                entry,
+                (
+                    entry.axis,
+                    *([join_names(f"`{n}`" for n in entry.indistinguishable_from)] * imitated),
+                ),
+            )
+            for entry in shown
+        ],
+        ("Axis", *(["Indistinguishable from"] * imitated)),
+        f"{wording.count(more, 'candidate')} further down not shown." if more else "",
     )
 
 

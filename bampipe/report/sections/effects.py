@@ -18,11 +18,12 @@ from bampipe.report.document import (
     Paragraph,
     Section,
     Subheading,
-    Table,
 )
 from bampipe.report.results import Results
+from bampipe.report.sections.diagnosis import LONG, ranking_table
+from bampipe.results import phrases
 from bampipe.results.compare import CompareResult
-from bampipe.results.diagnose import DiagnoseResult, RankedEffect, WorstWindow
+from bampipe.results.diagnose import DiagnoseResult, WorstWindow
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.terms import ModelTerm, TermCurve, TermsResult
 
@@ -255,26 +256,15 @@ def _diagnoses(results: Results) -> Iterable[DiagnoseResult]:
 
 
 def _rivals(results: Results, effect: str) -> str:
-    """Say what else could take the place of ``effect``, all others found being in the model."""
+    """Say how probable ``effect`` is, and what else could stand in its place."""
     for diagnosis in _diagnoses(results):
         if effect not in diagnosis.selected:
             continue
-        own, *others = diagnosis.contests.get(effect, ()) or (None,)
-        if own is None or not others:
-            return "None comes close to it on these trials."
-        unit = wording.unit(results.force_unit(own.axis)) if own.axis in results.axes else ""
-        shown = [
-            f"`{one.effect}` leaves {wording.significant(one.held_out_rmse)} {unit}"
-            + (f" (odds {wording.percent(one.odds)})" if one.odds else "")
-            for one in others[:_RIVALS]
-        ]
-        unsure = diagnosis.groups.get(effect) or any(one.odds for one in others)
-        sure = "" if unsure else " It fits better beyond chance."
-        return (
-            f"In its place {join_names(shown)} on held-out trials of {own.axis}, against "
-            f"{wording.significant(own.held_out_rmse)} {unit}, before either is fitted in full."
-            f"{sure}"
-        )
+        chance = {n: p for e in diagnosis.axes.values() for n, p in e.probabilities.items()}
+        others = diagnosis.alternatives[effect][:_RIVALS]
+        named = (f"`{n}` ({phrases.probability(chance.get(n, 0.0))})" for n in others)
+        place = f"In its place: {join_names(named)}" if others else "Nothing else takes its place"
+        return f"Its probability is {phrases.probability(chance[effect])}. {place}."
     return "It was not found by a diagnosis of this run: none has weighed it against others."
 
 
@@ -283,34 +273,15 @@ def _weighed(results: Results, added: set[str]) -> list[Block]:
     diagnosis = next((found for found in _diagnoses(results) if found.descriptions), None)
     if diagnosis is None:
         return []
+    texts = diagnosis.descriptions
     shown = [
-        entry for entry in diagnosis.ranking
-        if entry.effect not in added and entry.effect.partition(":")[0] in diagnosis.descriptions
-    ][:_WEIGHED]  # fmt: skip
-    if not shown:
-        return []
-    rows = tuple(_weighed_row(diagnosis, entry) for entry in shown)
-    return [
-        Table(
-            f"Weighed on model `{diagnosis.model}`, best first",
-            ("Effect", "What it is, and its formula", "Without", "With", "Unit", "p"),
-            rows,
-            "llrrlr",
-            (0.9, 2.6, 0.0, 0.0, 0.0, 0.0),
-            "Held-out RMSE without and with it; p: chance of such a fall where the effect is "
-            "absent. A p near 1 says that these trials show nothing of it.",
-        )
+        (entry, text)
+        for entry in diagnosis.ranking
+        if entry.effect not in added and (text := texts.get(entry.effect.partition(":")[0]))
+    ][:_WEIGHED]
+    rows = [
+        (entry, [f"{text.summary}. " + "; ".join(f"`{line}`" for line in text.formulas[:2])])
+        for entry, text in shown
     ]
-
-
-def _weighed_row(diagnosis: DiagnoseResult, entry: RankedEffect) -> tuple[str, ...]:
-    text = diagnosis.descriptions[entry.effect.partition(":")[0]]
-    formulas = "; ".join(f"`{line}`" for line in text.formulas[:2])
-    return (
-        f"`{entry.effect}`",
-        f"{text.summary}. {formulas}",
-        wording.significant(entry.held_out_rmse_before),
-        wording.significant(entry.held_out_rmse_after),
-        wording.unit(entry.unit),
-        wording.probability(entry.p_value),
-    )
+    title = f"Weighed on model `{diagnosis.model}`, best first"
+    return [ranking_table(title, rows, (LONG,), "")] if rows else []

@@ -45,9 +45,6 @@ def _steps(results: Results, rungs: Sequence[Rung]) -> Table:
     axes = _axes(results, rungs)
     rows = []
     for rung in rungs:
-        for step in rung.steps:
-            errors = [wording.significant(step.held_out_rmse.get(axis)) for axis in axes]
-            rows.append(("in the search", f"`{', '.join(step.effects)}`", *errors))
         cells = []
         for axis in axes:
             error, floor = rung.sound_error(axis), rung.sound_floor(axis)

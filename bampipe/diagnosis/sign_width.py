@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.discover.chance import fit_trials
-from bampipe.discover.scorer import Scorer
-from bampipe.discover.start import search_start
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.session import Fit, Session
+from bampipe.diagnosis.start import search_start
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.measured import MeasuredTrials
 
@@ -49,24 +49,25 @@ def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
     Raises:
         ValueError: the trials are too short to be fitted.
     """
-    scorers = {1.0: score_width(trials, recipe, 1.0), _STOPS: score_width(trials, recipe, _STOPS)}
-    declared = scorers[1.0].base_error
-    count = scorers[1.0].independent_samples
+    fits = {1.0: fit_width(trials, recipe, 1.0), _STOPS: fit_width(trials, recipe, _STOPS)}
+    declared = fits[1.0].held_out_rmse
+    count = fits[1.0].problem.independent
 
     def drop(factor: float) -> float:
-        ratio = np.log(declared / np.maximum(scorers[factor].base_error, 1e-300))
+        ratio = np.log(declared / np.maximum(fits[factor].held_out_rmse, 1e-300))
         return float(count @ ratio / max(count.sum(), 1.0))
 
     if not drop(_STOPS) > WORTH:
         return SignWidth(1.0, declared, declared)
     for factor in _NARROWER:
-        if factor not in scorers:
-            scorers[factor] = score_width(trials, recipe, factor)
+        if factor not in fits:
+            fits[factor] = fit_width(trials, recipe, factor)
     best = max(_NARROWER, key=drop)
-    return SignWidth(best, declared, scorers[best].base_error)
+    return SignWidth(best, declared, fits[best].held_out_rmse)
 
 
-def score_width(trials: MeasuredTrials, recipe: Recipe, factor: float) -> Scorer:
+def fit_width(trials: MeasuredTrials, recipe: Recipe, factor: float) -> Fit:
     """Fit a model with its widths times ``factor``."""
     narrowed = recipe.with_sign_widths(factor)
-    return Scorer(fit_trials(trials, narrowed, search_start(trials, narrowed)))
+    session = Session(trials, Criteria())
+    return session.fit_plainly(narrowed, search_start(trials, narrowed))

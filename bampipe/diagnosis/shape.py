@@ -17,9 +17,6 @@ Array = NDArray[np.float64]
 
 BINS = 16
 _LEAST = 12
-_TREES = 8
-_LEAF = 3
-"""Of the flexible regressor: trees, and the fewest samples that one of their leaves averages."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,7 @@ def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
         kept = band.thinned_rows(len(motion.t))
         memory = evidence.fitted[index].memory
         load = evidence.fitted[index].applied[:, axis]
-        since, distance = _since_reversal(motion, axis)
+        since, distance = since_reversal(motion, axis)
         put("position", unit, motion.q[kept, axis])
         put("velocity", f"{unit}/s", motion.qd[kept, axis])
         put("acceleration", f"{unit}/s2", motion.qdd[kept, axis])
@@ -93,7 +90,7 @@ def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
     return tuple(Variable(name, u, tuple(v)) for name, (u, v) in columns.items())
 
 
-def _since_reversal(motion: Motion, axis: int) -> tuple[Array, Array]:
+def since_reversal(motion: Motion, axis: int) -> tuple[Array, Array]:
     """Time (s) and distance travelled since the velocity last changed sign, each (T,)."""
     sign = motion.qd[:, axis] > 0.0
     last = np.zeros(len(sign), dtype=int)
@@ -129,37 +126,6 @@ def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = 
     half = 1.96 * sd / np.sqrt(np.maximum(independent, 2.0))
     share = float(np.sum(n * (mean - r.mean()) ** 2) / max(np.sum((r - r.mean()) ** 2), 1e-30))
     return Map(variable.name, variable.unit, center, mean, mean - half, mean + half, n, share)
-
-
-def explainable_share(evidence: Evidence, axis: int, seed: int = 0) -> float:
-    """Share of the residual's variance that a flexible regressor predicts on unseen trials.
-
-    Extremely randomised trees (Geurts, Ernst and Wehenkel 2006) on the variables of the residual
-    maps, each trial predicted from the others, at samples far enough apart to be independent. Zero
-    where it predicts nothing.
-    """
-    from sklearn.ensemble import ExtraTreesRegressor
-
-    chosen = [v for v in variables(evidence, axis) if v.name not in ("trial", "time")]
-    apart = max(1, int(1.0 / evidence.band.independent_share[axis]))
-    use = [np.flatnonzero(u[:, axis] > 0)[::apart] for u in evidence.used]
-    x = [
-        np.column_stack([v.values[k] for v in chosen])[use[k]] for k in range(len(evidence.motions))
-    ]
-    y = [r[:, axis][use[k]] for k, r in enumerate(evidence.residual)]
-    left = total = 0.0
-    for k in range(len(x)):
-        others = [i for i in range(len(x)) if i != k and len(y[i])]
-        if not others or not len(y[k]):
-            continue  # an axis that rests through a trial says nothing there
-        trees = ExtraTreesRegressor(
-            n_estimators=_TREES, min_samples_leaf=_LEAF, max_features=1.0, random_state=seed,
-            n_jobs=1,
-        )  # fmt: skip
-        trees.fit(np.concatenate([x[i] for i in others]), np.concatenate([y[i] for i in others]))
-        left += float(np.sum((y[k] - trees.predict(x[k])) ** 2))
-        total += float(np.sum(y[k] ** 2))
-    return max(0.0, 1.0 - left / max(total, 1e-30))
 
 
 def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> list[WorstWindow]:

@@ -9,12 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import gamma
 
-from bampipe.discover.settings import Settings
-from bampipe.discover.shape import BINS, Map, Variable, residual_map, variables
+from bampipe.diagnosis.shape import BINS, Map, Variable, residual_map, variables
 from bampipe.results.rounding import significant
 from bampipe.trials.evidence import Evidence
 
 Array = NDArray[np.float64]
+
+_VARIABLE, _MENTIONED = 0.2, 0.005
+"""Least share of a residual's variance that a variable carries to be named, and to be mentioned
+where the residual is scattered."""
+_RIPPLE = 0.5
+"""Least share of that which a sine carries to be called a ripple."""
+_ALIKE = 0.6
+"""Correlation of the residual in both directions from which on it is called the same, as of a
+spring, or opposite, as of friction."""
+_BUMP_HEIGHT, _BUMP_WIDTH = 0.5, 1.0 / 3.0
+"""Share of the largest mean residual from which on a place belongs to a bump, and share of the
+range up to which it is one and not a broad change."""
+_SIGNIFICANT = 0.01
+"""Chance of a vibration where there is none."""
 
 
 @dataclass(frozen=True)
@@ -26,43 +39,43 @@ class _Sine:
     frequency: float
 
 
-def describe(evidence: Evidence, axis: int, s: Settings) -> str:
+def describe(evidence: Evidence, axis: int) -> str:
     """The residual's shape in one sentence: what it varies with most, where, which way."""
     known = [v for v in variables(evidence, axis) if v.name not in ("trial", "direction")]
     maps = [residual_map(evidence, axis, v, 3 * BINS) for v in known]
     best = int(np.argmax([m.share for m in maps]))
     most, variable = maps[best], known[best]
     unit = evidence.system.torque_units[axis]
-    if most.share < s.variable_share or most.variable == "time":
-        vibration = _vibration(evidence, axis, s.significance)
-        if vibration is not None and vibration.share > max(most.share, s.variable_share):
+    if most.share < _VARIABLE or most.variable == "time":
+        vibration = _vibration(evidence, axis, _SIGNIFICANT)
+        if vibration is not None and vibration.share > max(most.share, _VARIABLE):
             return (
                 f"a vibration of {significant(vibration.amplitude, 2)} {unit} at "
                 f"{vibration.frequency:.3g} Hz in time, whatever the machine does; it carries "
                 f"{100 * vibration.share:.0f} % of the residual's variance"
             )
-    if most.share < s.variable_share:
+    if most.share < _VARIABLE:
         return (
             "scattered over all motions; of all that the machine does, "
             f"{most.variable} explains most of it, {100 * most.share:.0f} %"
-            if most.share >= s.mentioned_share
+            if most.share >= _MENTIONED
             else "scattered over all motions; it follows nothing that the machine does"
         )
     carries = f"{most.variable} carries {100 * most.share:.0f} % of the residual's variance"
-    turning = _by_direction(evidence, axis, variable, s.direction_likeness)
+    turning = _by_direction(evidence, axis, variable, _ALIKE)
     ripple = _ripple(evidence, axis, variable)
-    if ripple is not None and ripple.share > s.ripple_share * most.share:
+    if ripple is not None and ripple.share > _RIPPLE * most.share:
         period = 1.0 / ripple.frequency
         return (
             f"a ripple of {significant(ripple.amplitude, 2)} {unit} along {most.variable} that "
             f"repeats every {period:.3g} {most.unit}, {turning}; {carries}"
         )
-    return f"{_bumps(most, unit, s)}, {turning}; {carries}"
+    return f"{_bumps(most, unit)}, {turning}; {carries}"
 
 
-def _bumps(most: Map, torque_unit: str, s: Settings) -> str:
+def _bumps(most: Map, torque_unit: str) -> str:
     unit = f"{torque_unit} near {most.variable}"
-    strong = np.abs(most.mean) > s.bump_height * np.max(np.abs(most.mean))
+    strong = np.abs(most.mean) > _BUMP_HEIGHT * np.max(np.abs(most.mean))
     places = []
     for side in (strong & (most.mean < 0.0), strong & (most.mean > 0.0)):
         if side.any():
@@ -71,7 +84,7 @@ def _bumps(most: Map, torque_unit: str, s: Settings) -> str:
             peak = most.mean[side][int(np.argmax(weight))]
             places.append((middle, f"{peak:+.2g} {unit} {middle:.3g} {most.unit}".strip()))
     places.sort()
-    narrow = strong.sum() <= s.bump_width * len(strong)
+    narrow = strong.sum() <= _BUMP_WIDTH * len(strong)
     form = "a bump of" if narrow else "a broad change,"
     if len(places) == 2:
         form = "opposite bumps of" if narrow else "a change of sign,"

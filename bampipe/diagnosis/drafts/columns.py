@@ -1,0 +1,318 @@
+"""Forms as candidates: what each adds to the residual along the course of the trials.
+
+A `FormDictionary` stands where a `Dictionary` of compiled effects does. Nothing is compiled:
+columns are made at a few times the rate of the thinned residual, and pass the same low-pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from itertools import combinations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.diagnosis.dictionary import Atom, Key
+from bampipe.diagnosis.drafts.forms import (
+    DAMPING,
+    FORCE,
+    FRICTION,
+    INERTIA,
+    READING,
+    Form,
+    list_forms,
+)
+from bampipe.diagnosis.drafts.quantities import Span, coordinates
+from bampipe.estimate.low_pass import low_pass_at
+from bampipe.trials.evidence import Evidence
+from bampipe.trials.likelihood import Samples
+
+Array = NDArray[np.float64]
+
+_FINER = 5
+"""Times the thinned rate at which columns are made, at least."""
+_RANGE = (0.002, 0.998)
+"""Quantiles of a coordinate between which it is said to vary."""
+_LENGTHS = (0.02, 0.6, 6)
+"""Of the range, from, to, how many."""
+_LAGS = 12
+_PLACES_APART = 0.05
+"""Of the range, for shapes without a length of their own."""
+_NEAREST = 1.3
+"""Distance of neighbouring places, in lengths of the shape."""
+_WAVES_APART = 0.4
+"""Between neighbouring wavenumbers, in waves on the range: they still resemble each other."""
+_PARTS_OF_A_WAVE = (0.25, 0.4, 0.6, 0.8)
+_MOST_WAVES, _MOST_WAVES_IN_TIME = 30.0, 300.0
+_LOAD, _APPLIED = "load", "applied"
+"""Of the signals: what drives the axis, without and with its sign."""
+
+
+class FormDictionary:
+    """The forms that may act on one axis, beside one fitted model.
+
+    Attributes:
+        evidence: the model on the trials; samples: of it that count.
+        axis: number of the coordinate.
+        candidates: forms by name.
+        starts: of candidates that have no grid, the searched constants to begin with.
+    """
+
+    def __init__(self, evidence: Evidence, samples: Sequence[Samples], axis: int) -> None:
+        self.evidence, self.samples, self.axis = evidence, samples, axis
+        self.candidates: dict[str, Form] = {}
+        self.starts: dict[str, Mapping[str, float]] = {}
+
+    def add_grammar(self, curves: bool = False, left: Array | None = None) -> None:
+        """Add every form of the grammar.
+
+        Args:
+            curves: curves through points in place of formulas.
+            left: residual of the axis (n,), where points of curves belong.
+        """
+        spans = self.spans
+        if left is not None:
+            spans = {n: self._where_left(n, span, left) for n, span in spans.items()}
+        device = self.evidence.system.model.device
+        for form in list_forms(device, self.axis, spans, self.times, self.scales, curves):
+            self.candidates[form.canonical] = form
+
+    def grid(self, name: str) -> list[Key]:
+        """The shapes of a form at which its columns are made to begin with."""
+        form = self.candidates[name]
+        points = [self.starts[name]] if name in self.starts else self._points(form)
+        return [self.key(name, point) for point in points]
+
+    def key(self, name: str, searched: Mapping[str, float]) -> Key:
+        """A form at given values of its searched constants."""
+        shape = []
+        for constant, low, high, by_ratio in self._ranges(name):
+            ends = [low, float(np.clip(searched[constant], low, high)), high]
+            at = np.log(ends) if by_ratio else ends
+            shape.append(float((at[1] - at[0]) / (at[2] - at[0])))
+        return name, tuple(shape)
+
+    def values(self, key: Key) -> dict[str, float]:
+        """The searched constants of a form at one shape."""
+        return {
+            constant: float(low * (high / low) ** u if by_ratio else low + u * (high - low))
+            for u, (constant, low, high, by_ratio) in zip(key[1], self._ranges(key[0]), strict=True)
+        }
+
+    def _ranges(self, name: str) -> list[tuple[str, float, float, bool]]:
+        """Searched constants with the ends of their ranges, and whether to step by ratios."""
+        form = self.candidates[name]
+        by_ratio = {
+            n: k in ("length", "time", "wavenumber") for n, k in form.shape.searched.items()
+        }
+        return [(n, low, high, by_ratio[n]) for n, (low, high, _) in form.limits().items()]
+
+    def bounds(self, name: str) -> list[tuple[float, float]]:
+        """Of each strength of a form: a file states none."""
+        return [(-np.inf, np.inf)] * len(self.candidates[name].shape.strengths)
+
+    def spreads(self, name: str) -> list[float]:
+        """Standard deviation of each strength before any data: of what drives the axis."""
+        form = self.candidates[name]
+        size = self._sizes[form.coordinate.words if form.factor == READING else _LOAD]
+        return [max(size, 1e-300)] * len(form.shape.strengths)
+
+    def make(self, key: Key) -> Atom | None:
+        """Columns of a form at one shape; None where it does nothing in these trials."""
+        form, searched = self.candidates[key[0]], self.values(key)
+        constants = form.constants_at(searched, 1.0 / self._rate_hz)
+        # An error of a reading acts wherever the force does.
+        axes = range(len(self.samples)) if form.factor == READING else [self.axis]
+        rows: dict[int, list[Array]] = {axis: [] for axis in axes}
+        slopes: dict[int, list[Array]] = {axis: [] for axis in axes}
+        for i, (_, kept) in enumerate(self._sampling):
+            x = np.hstack([self._signals[q.words][i] for q, _ in form.quantities])
+            with np.errstate(all="ignore"):
+                values = form.shape.columns(x, constants)
+            for axis in axes:
+                lever = self._lever(form, axis, i) / form.scale
+                acting = values * lever
+                if form.factor == INERTIA:
+                    # By Lagrange's equation of the kinetic energy.
+                    turning = (
+                        np.gradient(values, axis=0) * self._rate_hz * self._signals[DAMPING][i]
+                    )
+                    acting = -acting - (0.5 if form.is_own else 1.0) * turning / form.scale
+                cutoff = float(self.evidence.band.cutoff_hz[axis])
+                rows[axis].append(low_pass_at(acting, cutoff, self._rate_hz, kept))
+                if form.coordinate.quantity in (_LOAD, READING):
+                    slope = _slopes(values, x[:, 0])[kept] * lever[kept]
+                    slopes[axis].append(slope[:, None, :] * self._by_forces(form, i, kept))
+        here = {axis: np.concatenate(r)[self.samples[axis].rows] for axis, r in rows.items()}
+        found = {axis: r for axis, r in here.items() if r.any()}
+        enough = found and all(np.isfinite(r).all() for r in found.values())
+        if not enough or not np.any([r.any(axis=0) for r in found.values()], axis=0).all():
+            return None
+        by_force = {
+            axis: np.concatenate(s)[self.samples[axis].rows] for axis, s in slopes.items() if s
+        }
+        return Atom(found, by_force, np.zeros(len(self.samples)))
+
+    def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
+        """`make` each."""
+        return [(key, self.make(key)) for key in keys]
+
+    def thinned(self, words: str) -> Array:
+        """A coordinate where the residual is, low-passed as that is, (n,)."""
+        cutoff = float(self.evidence.band.cutoff_hz[self.axis])
+        found = [
+            low_pass_at(signal, cutoff, self._rate_hz, kept)[:, 0]
+            for signal, (_, kept) in zip(self._signals[words], self._sampling, strict=True)
+        ]
+        return np.asarray(np.concatenate(found)[self.samples[self.axis].rows])
+
+    def _where_left(self, words: str, span: Span, left: Array) -> Span:
+        """The part of the range of a coordinate that holds nearly all of a residual."""
+        at = self.thinned(words)
+        order = np.argsort(at, kind="stable")
+        mass = np.cumsum(left[order] ** 2)
+        ends = np.searchsorted(mass, mass[-1] * np.array([0.005, 0.995]))
+        low, high = at[order][np.minimum(ends, len(at) - 1)] + 0.03 * span.width * np.array([-1, 1])
+        return Span(max(float(low), span.low), min(float(high), span.high))
+
+    @cached_property
+    def _sampling(self) -> list[tuple[slice, NDArray[np.int64]]]:
+        """By trial: the samples at which columns are made, and which of these are kept."""
+        band = self.evidence.band
+        fits = [d for d in range(1, band.step + 1) if band.step % d == 0]
+        every = max(d for d in fits if d * _FINER <= band.step or d == 1)
+        found = []
+        for motion in self.evidence.motions:
+            kept = band.thinned_rows(len(motion.t))
+            first = int(kept[0]) % every if len(kept) else 0
+            found.append((slice(first, None, every), (kept - first) // every))
+        return found
+
+    @cached_property
+    def _sizes(self) -> dict[str, float]:
+        """Root mean square of each signal."""
+        return {
+            n: float(np.sqrt(np.mean(np.concatenate(s) ** 2))) for n, s in self._signals.items()
+        }
+
+    @property
+    def _rate_hz(self) -> float:
+        return float(self.evidence.band.rate_hz / self._sampling[0][0].step)
+
+    @cached_property
+    def _signals(self) -> dict[str, list[Array]]:
+        """The coordinates by words, and velocity and acceleration of the axis, each (T, 1)."""
+        e, axis = self.evidence, self.axis
+        system, device = e.system, e.system.model.device
+        found: dict[str, list[Array]] = {}
+        for fitted, (rows, _) in zip(e.fitted, self._sampling, strict=True):
+            motion = fitted.mechanism
+            q, qd, qdd = motion.q[rows], motion.qd[rows], motion.qdd[rows]
+            u, z = motion.inputs(system.inputs)[rows], fitted.memory[rows]
+            applied = system.applied(q, qd, qdd, z, u, e.p)[:, axis]
+            sign = np.tanh(qd[:, axis] / device.coordinates[axis].sign_width)
+            values = {
+                _APPLIED: applied,
+                FRICTION: sign,
+                DAMPING: qd[:, axis],
+                INERTIA: qdd[:, axis],
+            }
+            for c in coordinates(device, axis):
+                by_quantity = {
+                    "position": q[:, c.axis],
+                    "speed": np.abs(qd[:, c.axis]),
+                    "velocity": qd[:, c.axis],
+                    "direction": sign,
+                    _LOAD: np.abs(applied),
+                    "time": motion.t[rows],
+                }
+                logged = motion.channels.get(c.channel, np.zeros(len(motion.t)))[rows]
+                values[c.words] = logged if c.channel else by_quantity[c.quantity]
+            for name, column in values.items():
+                found.setdefault(name, []).append(column[:, None])
+        return found
+
+    @cached_property
+    def _pulls(self) -> list[Array]:
+        """Force on each axis by each measured force, by trial, (T, n_q, n_forces)."""
+        e, found = self.evidence, []
+        for fitted, (rows, _) in zip(e.fitted, self._sampling, strict=True):
+            motion = fitted.mechanism
+            u = motion.inputs(e.system.inputs)[rows]
+            found.append(np.asarray(e.system.input_map(motion.q[rows], u, e.p)))
+        return found
+
+    def _lever(self, form: Form, axis: int, trial: int) -> Array:
+        """What the shape of a form is multiplied by on an axis, (T, 1)."""
+        if form.factor == READING:
+            component = self.evidence.system.model.device.forces.index(form.coordinate.channel)
+            return -self._pulls[trial][:, axis, [component]]
+        return np.ones((1, 1)) if form.factor == FORCE else self._signals[form.factor][trial]
+
+    def _by_forces(self, form: Form, trial: int, kept: NDArray[np.int64]) -> Array:
+        """Slope of what a form follows by the measured forces, (K, n_forces, 1)."""
+        forces = self.evidence.system.model.device.forces
+        if form.factor == READING:
+            return np.array([[[float(f == form.coordinate.channel)] for f in forces]])
+        pulls, applied = self._pulls[trial][kept, self.axis], self._signals[_APPLIED][trial][kept]
+        return np.asarray(pulls * np.sign(applied))[:, :, None]
+
+    @cached_property
+    def spans(self) -> dict[str, Span]:
+        """The range of each coordinate that varies."""
+        words = [c.words for c in coordinates(self.evidence.system.model.device, self.axis)]
+        ends = {n: np.quantile(np.concatenate(self._signals[n]), _RANGE) for n in words}
+        return {n: Span(float(a), float(b)) for n, (a, b) in ends.items() if b - a > 1e-9}
+
+    @cached_property
+    def scales(self) -> dict[str, float]:
+        """Highest speed and acceleration of the axis."""
+        largest = {
+            f: float(np.quantile(np.abs(np.concatenate(self._signals[f])), _RANGE[1]))
+            for f in (DAMPING, INERTIA)
+        }
+        return {f: value for f, value in largest.items() if value > 0.0}
+
+    @cached_property
+    def times(self) -> Span:
+        """Time between samples and of a trial, s."""
+        trials = [motion.t for motion in self.evidence.motions]
+        return Span(float(np.median(np.diff(trials[0]))), max(float(np.ptp(t)) for t in trials))
+
+    def _points(self, form: Form) -> list[dict[str, float]]:
+        """Values of the searched constants of a form to try."""
+        span, names = form.span, tuple(form.shape.searched)
+        lengths = span.width * np.geomspace(*_LENGTHS)
+        points: Iterable[Sequence[float]] = [()]
+        if names == ("place", "width"):
+            points = [(at, width) for width in lengths for at in _places(span, width)]
+        elif names == ("place",):
+            points = product(_places(span, _PLACES_APART * span.width))
+        elif names == ("width",):
+            points = product(lengths)
+        elif names == ("width", "longer"):
+            points = combinations(lengths, 2)
+        elif names == ("lag",):
+            points = product(np.geomspace(4.0 * self.times.low, self.times.high, _LAGS))
+        elif names == ("wavenumber",):
+            most = _MOST_WAVES
+            if form.coordinate.quantity == "time":
+                cutoff = float(self.evidence.band.cutoff_hz[self.axis])
+                most = min(span.width * cutoff, _MOST_WAVES_IN_TIME)
+            waves = [*_PARTS_OF_A_WAVE, *np.arange(1.0, max(most, 2.0), _WAVES_APART)]
+            points = product(2.0 * np.pi * np.array(waves) / span.width)
+        return [dict(zip(names, map(float, point), strict=True)) for point in points]
+
+
+def _places(span: Span, length: float) -> Array:
+    """Places along a span, near enough that none of that length is missed."""
+    count = max(4, int(np.ceil(span.width / (_NEAREST * length))))
+    return np.asarray(span.low + span.width * (np.arange(count) + 0.5) / count)
+
+
+def _slopes(values: Array, x: Array) -> Array:
+    """Slope along a trial of columns (T, m) by what they follow, (T,)."""
+    rate = np.gradient(x)[:, None]
+    moves = np.abs(rate) > 1e-9 * max(float(np.ptp(x)), 1e-300)
+    return np.divide(np.gradient(values, axis=0), rate, out=np.zeros_like(values), where=moves)

@@ -1,0 +1,430 @@
+"""The search for a formula on one axis: forms weighed as effects are, held against chance, fitted.
+
+A form is a candidate of a `Search` like an effect of the library: the same likelihood, the same
+penalties, the same log evidence in nats. Every form passes the grid of its shapes; the best are
+refined, and the best of these fitted with all parameters of the model.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
+from bampipe.diagnosis.drafts import symbolic
+from bampipe.diagnosis.drafts.columns import FormDictionary
+from bampipe.diagnosis.drafts.forms import Form
+from bampipe.diagnosis.search import Search
+from bampipe.diagnosis.session import Fit, Session, shared, system_of, workers
+from bampipe.physics.recipe import Recipe
+from bampipe.results.draft import ChanceOfDraft
+from bampipe.trials.evidence import Evidence, gather_evidence
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, str], None]
+"""Called with a fraction of the work done and what is being done."""
+
+MOST_TERMS = 2
+"""What is left beside two formulas is for a diagnosis of the model with them."""
+_PARTS = 8
+"""Tasks a process into which columns are divided."""
+_REFINED, _FITTED = 12, 4
+"""Forms whose shapes are refined, and of those the ones that are fitted with the model."""
+_PROMISING = 8
+"""Forms weighed exactly on each replay, those that gain most at given weights."""
+_TRIES = 90
+"""Evaluations in refining one."""
+_STEPS = {"place": 0.02, "length": 0.03, "time": 0.03, "wavenumber": 2e-4, "number": 0.003}
+"""Of its range: the first step in refining a shape, by kind."""
+_SEED = 11
+"""First number, after the user's, of the seed by which replays are recombined."""
+
+
+@dataclass(frozen=True)
+class Term:
+    """A form with its numbers.
+
+    Attributes:
+        form: what it is.
+        values: of its constants, by name, as fitted with the model.
+        covariance: of them, in that order.
+    """
+
+    form: Form
+    values: dict[str, float]
+    covariance: Array
+
+    @property
+    def sd(self) -> dict[str, float]:
+        """Standard deviations of the constants."""
+        spread = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return dict(zip(self.values, map(float, spread), strict=True))
+
+    def curve(self, count: int = 121) -> tuple[Array, Array, Array]:
+        """Coordinate, torque and its standard deviation along the range travelled, (count,) each.
+
+        At full speed or acceleration where the term is in proportion to these, in the positive
+        direction of motion where it is friction, and at the upper end of what else it follows.
+        """
+        x = np.linspace(self.form.span.low, self.form.span.high, count)[:, None]
+        others = [np.full((count, 1), span.high) for _, span in self.form.beside]
+        x = np.hstack([x, *others])
+        values = np.array(list(self.values.values()))
+        middle = self._at(x, values)
+        slopes = []
+        for k in range(len(values)):
+            moved, step = values.copy(), 1e-4 * max(abs(values[k]), 1e-9)
+            moved[k] += step
+            slopes.append((self._at(x, moved) - middle) / step)
+        slope = np.array(slopes)
+        variance = np.einsum("kt,kl,lt->t", slope, self.covariance, slope)
+        return x[:, 0], middle, np.sqrt(np.maximum(variance, 0.0))
+
+    def _at(self, x: Array, values: Array) -> Array:
+        known = dict(zip(self.values, values, strict=True))
+        columns = self.form.shape.columns(x, self.form.constants_at(known, 0.0), drawn=True)
+        return np.asarray(columns @ [known[n] for n in self.form.shape.strengths])
+
+
+@dataclass(frozen=True)
+class Option:
+    """A model with some terms, fitted.
+
+    Attributes:
+        terms: their forms.
+        held_out_rmse: on the axis, N.m or N.
+        log_evidence: over the model as given, nats.
+        recipe: the model; p: its parameters, (n_p,).
+    """
+
+    terms: tuple[Form, ...]
+    held_out_rmse: float
+    log_evidence: float
+    recipe: Recipe
+    p: Array
+
+    @property
+    def constants(self) -> int:
+        """How many numbers its terms have."""
+        return sum(len(form.parameters) for form in self.terms)
+
+
+@dataclass(frozen=True)
+class FoundDraft:
+    """What a search for a formula on one axis came to.
+
+    Attributes:
+        axis: its number.
+        terms: found, at most `MOST_TERMS`.
+        chance: of the first term, and of the next where one was looked for.
+        noise_floor: error of replays of the final model, N.m or N.
+        options: everything that was fitted, the model as given first.
+        chosen: the final model.
+        wants_formulas: whether the structured forms left much, and pyoperon is not installed.
+    """
+
+    axis: int
+    terms: tuple[Term, ...]
+    chance: tuple[ChanceOfDraft, ...]
+    noise_floor: float
+    options: tuple[Option, ...]
+    chosen: Option
+    wants_formulas: bool
+
+
+class FormSearch(Search):
+    """A search over forms beside one fitted model."""
+
+    def __init__(self, session: Session, fit: Fit, forms: FormDictionary) -> None:
+        self.forms, self.fit = forms, fit
+        known = cast(Dictionary, forms)  # to a search they are alike
+        keys = [key for name in forms.candidates for key in forms.grid(name)]
+        parts = _PARTS * session.jobs
+        with workers(forms, session.jobs) as spread:
+            made = spread(_make_columns, [keys[k::parts] for k in range(parts)])
+            atoms = {key: atom for part in made for key, atom in part}
+        super().__init__(fit.problem, known, forms.make_all, session.criteria, atoms)
+
+    def on_replay(self, y: tuple[Array, ...]) -> FormSearch:
+        """The same on another residual along the same course, by axis, (n,), in units of noise."""
+        other = copy.copy(self)
+        other.p = replace(self.p, y=y)
+        other.bb, other.by, other.yy = other.p.sums()
+        other.xy = [x.T @ v for x, v in zip(self.columns, y, strict=True)]
+        other._with_base, other._solved = {}, {}
+        other._weight = other.p.independent / np.maximum(other.yy, 1e-300)
+        return other
+
+    def _volume(self, keys: Sequence[Key], strengths: Sequence[Array]) -> Array:
+        """As of effects, but that a form by the load or by a reading may have several strengths."""
+        other, ones = copy.copy(self), [np.ones(1)] * len(keys)
+        other.atoms = {
+            key: replace(atom, slopes={a: slope @ b for a, slope in atom.slopes.items()})
+            for key, b in zip(keys, strengths, strict=True)
+            if (atom := self.atoms[key]) is not None
+        }
+        return Search._volume(other, keys, ones)
+
+    def largest_gain(self) -> float:
+        """Log evidence that the best form on the grid adds, nats; 0 where none adds any."""
+        best = self.best_beside((), _PROMISING, shapes=1)
+        return max(self.cost(()) - best[0][0], 0.0) if best else 0.0
+
+    def best_forms(self, count: int, jobs: int) -> list[Key]:
+        """The forms that gain most, their shapes refined, best first."""
+        with workers(self, jobs) as spread:
+            found = list(spread(_refine, [key for _, key in self.best_beside((), count)]))
+        self.ensure(found)
+        found = [key for key in found if self.cost((key,)) < self.cost(())]
+        return sorted(found, key=lambda key: self.cost((key,)))
+
+    def refined(self, key: Key) -> Key:
+        """A form with its shape where the cost is least nearby."""
+        name, shape = key
+        if not shape:
+            return key
+
+        def cost(u: Array) -> float:
+            here = (name, tuple(map(float, np.clip(u, 0.0, 1.0))))
+            self.ensure([here])
+            return min(self.cost((here,)), 1e30)
+
+        kinds = self.forms.candidates[name].shape.searched.values()
+        start, steps = np.array(shape), np.array([_STEPS[kind] for kind in kinds])
+        steps = np.where(start + steps > 1.0, -steps, steps)
+        simplex = np.vstack([start, start + np.diag(steps)])
+        options = {"maxfev": _TRIES, "initial_simplex": simplex, "xatol": 1e-7, "fatol": 1e-3}
+        found = minimize(cost, start, method="Nelder-Mead", options=options).x
+        return name, tuple(map(float, np.clip(found, 0.0, 1.0)))
+
+
+def _make_columns(keys: Sequence[Key]) -> list[tuple[Key, Atom | None]]:
+    forms: FormDictionary = shared()
+    return forms.make_all(keys)
+
+
+def _refine(key: Key) -> Key:
+    search: FormSearch = shared()
+    return search.refined(key)
+
+
+def draft_formulas(
+    session: Session,
+    recipe: Recipe,
+    start: Array,
+    axes: Sequence[int],
+    source: str,
+    curves: bool = False,
+    progress: Progress = lambda fraction, message: None,
+) -> list[FoundDraft]:
+    """Search a formula for what a model leaves on each of some axes, one after the other.
+
+    Args:
+        session: the trials; recipe: the model; start: of its parameters, (n_p,).
+        axes: numbers of the coordinates.
+        source: that the effect files state.
+        curves: whether a curve through points will do, where prediction is all that is wanted.
+        progress: called with a fraction and a message.
+
+    Raises:
+        Runaway: the model cannot be replayed.
+    """
+    found: list[FoundDraft] = []
+    for k, axis in enumerate(axes):
+        name = recipe.model().device.coordinates[axis].name
+
+        def tell(share: float, message: str, k: int = k, name: str = name) -> None:
+            progress((k + share) / len(axes), f"{name}: {message}")
+
+        found.append(_AxisSearch(session, axis, source, curves).run(recipe, start, tell))
+        recipe, start = found[-1].chosen.recipe, found[-1].chosen.p
+    return found
+
+
+@dataclass(frozen=True)
+class _AxisSearch:
+    """The search for a formula on one axis."""
+
+    session: Session
+    axis: int
+    source: str
+    curves: bool
+
+    def run(self, recipe: Recipe, start: Array, progress: Progress) -> FoundDraft:
+        """Add terms to a model as long as one beats chance and lowers the held-out error."""
+        fit = bare = self.session.fit(recipe, start)
+        given = chosen = Option((), self.held_out(bare), 0.0, recipe, bare.evidence.p)
+        options, chances, left = [given], [], True
+        for number in range(MOST_TERMS):
+            progress(0.05 + 0.4 * number, "holding every form against the residual")
+            search = self._open(fit)
+            progress(0.15 + 0.4 * number, "searching replays for as good a formula")
+            chances.append(weigh_chance(self.session, search))
+            if chances[-1].p_value > self.session.criteria.significance:
+                break
+            progress(0.3 + 0.4 * number, "fitting the best forms with the model")
+            tried = self._fit_forms(search, chosen)
+            options += tried
+            best = _best((chosen, *tried))
+            if best is chosen:
+                break
+            fit, chosen = self._fit(best), best
+            left = self._leaves_much(fit, chosen)
+            if not left:
+                break
+        wanted = left and chances[0].p_value <= self.session.criteria.significance
+        wanted = wanted and not self.curves
+        if wanted and symbolic.is_available():
+            progress(0.85, "symbolic regression")
+            bred = self._fit_forms(self._breed(bare), given)
+            options += bred
+            if (best := _best((chosen, *bred))) is not chosen:
+                fit, chosen = self._fit(best), best
+        chosen = replace(chosen, held_out_rmse=self.held_out(fit), p=fit.evidence.p)
+        options = [chosen if o.terms == chosen.terms else o for o in options]
+        return FoundDraft(
+            self.axis, _terms(fit, chosen), tuple(chances), self._floor(fit), tuple(options),
+            chosen, wanted and not symbolic.is_available(),
+        )  # fmt: skip
+
+    def _open(self, fit: Fit) -> FormSearch:
+        forms = FormDictionary(fit.evidence, fit.likelihood.samples, self.axis)
+        left = fit.problem.y[self.axis] / fit.likelihood.root[self.axis] if self.curves else None
+        forms.add_grammar(self.curves, left)
+        return FormSearch(self.session, fit, forms)
+
+    def _breed(self, fit: Fit) -> FormSearch:
+        """A search over formulas in several quantities."""
+        forms = FormDictionary(fit.evidence, fit.likelihood.samples, self.axis)
+        symbolic.breed(forms, fit.problem)
+        return FormSearch(self.session, fit, forms)
+
+    def _fit(self, option: Option) -> Fit:
+        """The model of an option with noise by replays of itself."""
+        return self.session.fit(option.recipe, option.p)
+
+    def _floor(self, fit: Fit) -> float:
+        replays = fit.likelihood.noise.residuals[self.axis]
+        return float(np.median(np.sqrt(np.mean(replays**2, axis=1))))
+
+    def held_out(self, fit: Fit) -> float:
+        """Error of a model on trials that its parameters have not seen, N.m or N."""
+        t, e = self.session.trials, fit.evidence
+        found = gather_evidence(e.system, t.motions, t.band, e.p, t.folds, most_iterations=0)
+        return float(found.held_out_rmse[self.axis])
+
+    def _leaves_much(self, fit: Fit, option: Option) -> bool:
+        return option.held_out_rmse >= self.session.criteria.above_floor * self._floor(fit)
+
+    def _fit_forms(self, search: FormSearch, current: Option) -> list[Option]:
+        """The model with each of the best forms, all parameters fitted together."""
+        keys = search.best_forms(_REFINED, self.session.jobs)[:_FITTED]
+        terms, tasks = [], []
+        for key in keys:
+            form, solution = search.forms.candidates[key[0]], search.solve((key,))
+            if form.name in [one.name for one in current.terms]:
+                form = replace(form, prefix="other_")
+            wider = replace(
+                current.recipe,
+                effects=(*current.recipe.effects, form.canonical),
+                extra=(*current.recipe.extra, form.declaration(self.source)),
+            )
+            strengths = dict(zip(form.shape.strengths, solution.strengths[0], strict=True))
+            values = search.forms.values(key) | strengths
+            known = {form.parameters[name]: value for name, value in values.items()}
+            start = _start(search, wider, known, solution.base)
+            terms.append((*current.terms, form))
+            tasks.append((wider, start))
+        jobs = min(self.session.jobs, len(tasks))
+        with workers((self, search.fit.likelihood.noise), jobs) as spread:
+            fits = list(spread(_fit_form, tasks))
+        found = []
+        for key, term, (wider, _), (cost, held_out, p) in zip(
+            keys, terms, tasks, fits, strict=True
+        ):
+            solution = search.solve((key,))
+            gain = _cost(search.fit) - cost + float(solution.volume.sum()) - solution.penalty
+            found.append(Option(term, held_out, current.log_evidence + gain, wider, p))
+        return found
+
+
+def _fit_form(task: tuple[Recipe, Array]) -> tuple[float, float, Array]:
+    """Cost and held-out error of a model with a form, and its parameters."""
+    search, noise = shared()
+    fit = search.session.fit(*task, noise)
+    return _cost(fit), search.held_out(fit), fit.evidence.p
+
+
+def weigh_chance(session: Session, search: FormSearch) -> ChanceOfDraft:
+    """Hold the gain of the best form against that on replays of the model, which lacks nothing.
+
+    There are as many replays as the smallest chance that decides takes, recombined from those of
+    the noise: what each left around the bias of the others, stretch by stretch.
+    """
+    noise, samples = search.fit.likelihood.noise, search.fit.likelihood.samples
+    replays = len(noise.residuals[0])
+    around = [
+        r - np.array([noise.without(k)[axis] for k in range(replays)])
+        for axis, r in enumerate(noise.residuals)
+    ]
+    blocks = 1 + max(int(s.block.max(initial=0)) for s in samples)
+    random = np.random.default_rng((session.seed, _SEED, search.forms.axis))
+    gains = []
+    for _ in range(int(np.ceil(1.0 / session.criteria.significance)) - 1):
+        of = random.integers(replays, size=blocks)
+        y = tuple(
+            (noise.bias[axis] + around[axis][of[s.block], np.arange(len(s.rows))])
+            * search.fit.likelihood.root[axis]
+            for axis, s in enumerate(samples)
+        )
+        gains.append(search.on_replay(y).largest_gain())
+    gain = search.largest_gain()
+    p_value = (1 + sum(g >= gain for g in gains)) / (1 + len(gains))
+    return ChanceOfDraft(gain=gain, gains=tuple(gains), p_value=p_value)
+
+
+def _best(options: Sequence[Option]) -> Option:
+    """The most probable of some models that lower the held-out error of the first; else that."""
+    lower = [o for o in options[1:] if o.held_out_rmse < options[0].held_out_rmse]
+    return max((options[0], *lower), key=lambda o: o.log_evidence)
+
+
+def _cost(fit: Fit) -> float:
+    """Negative log likelihood of a fit with what is known of its parameters, nats."""
+    e: Evidence = fit.evidence
+    return fit.problem.solve().cost + 0.5 * float(e.precision @ e.known**2)
+
+
+def _start(search: FormSearch, wider: Recipe, values: dict[str, float], base: Array) -> Array:
+    """Parameters of a model with a form from the solution of its linear problem, (n_p,)."""
+    e = search.fit.evidence
+    known = {q.name: float(v) for q, v in zip(e.system.parameters, e.p, strict=True)}
+    change = search.p.to_parameters @ base
+    for place, number in enumerate(e.free):
+        known[e.system.parameters[number].name] += float(change[place])
+    known |= values
+    parameters: Sequence[Any] = system_of(wider).parameters
+    start = np.array([known.get(q.name, q.prior) for q in parameters])
+    bounds = [q.lower for q in parameters], [q.upper for q in parameters]
+    return np.asarray(np.clip(start, *bounds))
+
+
+def _terms(fit: Fit, option: Option) -> tuple[Term, ...]:
+    """The terms of a fitted model with values and covariance, all parameters free."""
+    e, p = fit.evidence, fit.problem
+    solved = p.solve()
+    normal = np.tensordot(solved.weight, p.sums()[0], 1) + p.precision
+    covariance = p.to_parameters @ np.linalg.pinv(normal, hermitian=True) @ p.to_parameters.T
+    place = {e.system.parameters[i].name: k for k, i in enumerate(e.free)}
+    found = []
+    for form in option.terms:
+        rows = [place[name] for name in form.parameters.values()]
+        values = {c: float(e.p[e.system.index(n)]) for c, n in form.parameters.items()}
+        found.append(Term(form, values, covariance[np.ix_(rows, rows)]))
+    return tuple(found)

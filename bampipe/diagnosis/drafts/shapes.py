@@ -1,0 +1,232 @@
+"""Functions of one coordinate that a draft may use, with the constants that shape them.
+
+Arguments of functions are ratios, so that every strength is a force or torque.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from bampipe.estimate.play import drag_along
+from bampipe.physics.expression import parse
+
+Array = NDArray[np.float64]
+Constants = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Memory:
+    """An internal state that follows the coordinate, in the unit of that.
+
+    Attributes:
+        rate, initial: as an effect file writes them.
+        along: its course by that of the coordinate along a trial (T,) and the constants, (T,).
+        drawn: the same for motion that is quicker than what it remembers, upwards.
+    """
+
+    rate: str
+    initial: str
+    along: Callable[[Array, Constants], Array]
+    drawn: Callable[[Array, Constants], Array]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A function of one coordinate ``x``, linear in its strengths; or of ``x``, ``x2``, ...
+
+    Attributes:
+        name, text: as in names and in expressions, where ``x`` stands for the coordinate.
+        strengths: what it is linear in, each with what it means.
+        searched: constants that shape it, each with its kind: ``place``, ``length``,
+            ``wavenumber``, ``time``, ``number``.
+        fixed: constants that scale it and are not estimated: ``middle``, ``reach`` of the span.
+        words: what it does, of ``{x}``.
+        states: what it remembers, by name.
+    """
+
+    name: str
+    text: str
+    strengths: Mapping[str, str]
+    searched: Mapping[str, str]
+    fixed: tuple[str, ...]
+    words: str
+    states: Mapping[str, Memory] = field(default_factory=dict)
+
+    def columns(self, x: Array, constants: Constants, drawn: bool = False) -> Array:
+        """What each strength adds at one, (T, m).
+
+        Args:
+            x: what it follows along a trial, (T, k).
+            constants: searched and fixed ones; with states, the ``interval`` of samples, s.
+            drawn: whether the motion is quicker than what it remembers.
+        """
+        known = dict(constants) | {_x(k): column for k, column in enumerate(x.T)}
+        for name, state in self.states.items():
+            known[name] = (state.drawn if drawn else state.along)(x[:, 0], known)
+        tree, nothing = _parsed(self.text), dict.fromkeys(self.strengths, 0.0)
+        values = [_evaluate(tree, known | nothing | {name: 1.0}) for name in self.strengths]
+        return np.column_stack([np.broadcast_to(value, len(x)) for value in values])
+
+
+_parsed = cache(lambda text: parse(text, "a shape"))
+_OPERATORS: Mapping[type, Callable[[Any, Any], Any]] = {
+    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
+    ast.Pow: np.power,
+}  # fmt: skip
+_FUNCTIONS: Mapping[str, Callable[..., Any]] = {
+    "exp": np.exp, "tanh": np.tanh, "sin": np.sin, "cos": np.cos, "abs": np.abs,
+    "max": np.maximum, "min": np.minimum, "clip": np.clip,
+}  # fmt: skip
+
+
+def _evaluate(node: ast.AST, known: Constants) -> Any:
+    """The value of a checked expression."""
+    match node:
+        case ast.Constant(value=value):
+            return float(value)  # type: ignore[arg-type]
+        case ast.Name(id=name):
+            return known[name]
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return -_evaluate(operand, known)
+        case ast.BinOp(left=left, op=op, right=right):
+            return _OPERATORS[type(op)](_evaluate(left, known), _evaluate(right, known))
+        case ast.Call(func=ast.Name(id=name), args=args):
+            return _FUNCTIONS[name](*(_evaluate(argument, known) for argument in args))
+    raise AssertionError(f"unchecked node {type(node).__name__}")
+
+
+def _x(k: int) -> str:
+    """Name of the quantity number ``k`` from 0: ``x``, ``x2``, ``x3``."""
+    return f"x{k + 1}" if k else "x"
+
+
+def _lagged(x: Array, c: Constants, first: float) -> Array:
+    """x behind a first-order lag of ``c["lag"]``."""
+    keeps = np.exp(-c["interval"] / c["lag"])
+    gain = 0.5 * (1.0 - keeps)
+    return np.asarray(lfilter([gain, gain], [1.0, -keeps], x - first)) + first
+
+
+def _slip(name: str, play: str) -> dict[str, Memory]:
+    """The state that x drags along with a ``play``, within the time ``settling``."""
+    rate = f"(x - {name} - clip(x - {name}, -{play}, {play}))/settling"
+
+    def along(x: Array, c: Constants) -> Array:
+        return np.asarray(drag_along(np.ascontiguousarray(x), np.array([float(c[play])])))[:, 0]
+
+    def drawn(x: Array, c: Constants) -> Array:
+        return np.asarray(np.maximum(x - c[play], x.min() + c[play]))
+
+    return {name: Memory(rate, "x", along, drawn)}
+
+
+_RELAXING = Memory(
+    "(x - rest)/lag", "x",
+    lambda x, c: _lagged(x, c, float(x[0])), lambda x, c: np.full_like(x, x.mean()),
+)  # fmt: skip
+_TRAILING = Memory("(x - trail)/lag", "0", lambda x, c: _lagged(x, c, 0.0), lambda x, c: x)
+KNOTS = 16
+"""Points of a curve in an effect file: an expression has no room for many more."""
+_AT_END = "what it comes to at the end of the range"
+_PER_REACH = "what it grows by over half the range"
+_LINEAR, _SQUARE = "its linear part at the end of the range", "its quadratic part there"
+_U = "((x - middle)/reach)"
+_V = "((x - place)/width)"
+_PLACED = {"place": "place", "width": "length"}
+SHAPES = {
+    shape.name: shape
+    for shape in (
+        Shape(
+            "slope", f"height*{_U}", {"height": _AT_END}, {}, ("middle", "reach"),
+            "changes in proportion to {x}",
+        ),
+        Shape(
+            "parabola", f"slope*{_U} + bow*{_U}**2", {"slope": _LINEAR, "bow": _SQUARE}, {},
+            ("middle", "reach"), "follows a parabola in {x}",
+        ),
+        Shape(
+            "cubic", f"slope*{_U} + bow*{_U}**2 + twist*{_U}**3",
+            {"slope": _LINEAR, "bow": _SQUARE, "twist": "its cubic part there"}, {},
+            ("middle", "reach"), "follows a cubic curve in {x}",
+        ),
+        Shape(
+            "bump", f"height*exp(-{_V}**2)", {"height": "at its top"}, _PLACED, (),
+            "has a bump at one {x}",
+        ),
+        Shape(
+            "snag", f"height*{_V}*exp((1 - {_V}**2)/2)", {"height": "at either bump"}, _PLACED, (),
+            "has opposite bumps on the two sides of one {x}",
+        ),
+        Shape(
+            "step", f"height*tanh{_V}", {"height": "half of the step"}, _PLACED, (),
+            "changes from one level to another at one {x}",
+        ),
+        Shape(
+            "rise", "height*max(x - place, 0)/reach", {"height": _PER_REACH}, {"place": "place"},
+            ("reach",), "begins at one {x} and grows in proportion beyond it",
+        ),
+        Shape(
+            "fall", "height*max(place - x, 0)/reach", {"height": _PER_REACH}, {"place": "place"},
+            ("reach",), "ends at one {x} and grows in proportion below it",
+        ),
+        Shape(
+            "dead_zone", "height*(x - clip(x, place - width, place + width))/reach",
+            {"height": _PER_REACH}, _PLACED, ("reach",),
+            "is nothing within a range of {x} and grows in proportion beyond either end of it",
+        ),
+        Shape(
+            "ripple", "sine*sin(wavenumber*x) + cosine*cos(wavenumber*x)",
+            {"sine": "in phase with the sine", "cosine": "in phase with the cosine"},
+            {"wavenumber": "wavenumber"}, (), "ripples with {x}",
+        ),
+        Shape(
+            "decay", "height*exp(-x/width)", {"height": "at zero"}, {"width": "length"}, (),
+            "fades as {x} grows",
+        ),
+        Shape(
+            "relaxing", "height*(x - rest)/reach",
+            {"height": "what a quick motion over half the range builds up"}, {"lag": "time"},
+            ("reach",), "builds up with {x} and relaxes with time", {"rest": _RELAXING},
+        ),
+        Shape(
+            "lagging", "height*trail/reach", {"height": _AT_END}, {"lag": "time"}, ("reach",),
+            "follows {x} with a lag", {"trail": _TRAILING},
+        ),
+        Shape(
+            "play", "height*(trail - middle)/reach", {"height": _AT_END}, {"width": "length"},
+            ("middle", "reach", "settling"),
+            "follows {x} with play, up to its width behind it", _slip("trail", "width"),
+        ),
+        Shape(
+            "hysteresis", "height*clip((x - trail)/width, -1, 1)", {"height": "what it comes to"},
+            {"width": "length"}, ("settling",),
+            "builds up as {x} turns round and stays once that has changed by twice its width",
+            _slip("trail", "width"),
+        ),
+        Shape(
+            "two_hystereses",
+            "short*clip((x - near)/width, -1, 1) + long*clip((x - far)/longer, -1, 1)",
+            {"short": "what the part of the shorter width comes to",
+             "long": "what the other part comes to"},
+            {"width": "length", "longer": "length"}, ("settling",),
+            "builds up in two parts as {x} turns round, each of which stays once that has changed "
+            "by twice its width",
+            _slip("near", "width") | _slip("far", "longer"),
+        ),
+        Shape(
+            "curve",
+            " + ".join(f"h{k}*max(1 - abs((x - start)/spacing - {k}), 0)" for k in range(KNOTS)),
+            {f"h{k}": f"at point {k + 1} of {KNOTS}" for k in range(KNOTS)}, {},
+            ("start", "spacing"),
+            f"is a curve through {KNOTS} points along {{x}}; it is no formula",
+        ),
+    )
+}  # fmt: skip

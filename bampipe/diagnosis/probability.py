@@ -1,0 +1,224 @@
+"""Probabilities of sets of effects, of single effects, and of something unknown.
+
+The log evidence of a set near the most probable one is a sum over samples. Blocks of time are drawn
+anew, as in a bootstrap, and the probabilities averaged over the draws: an event that a single block
+shows decides nothing (pseudo-Bayesian model averaging with a bootstrap, after Yao, Vehtari, Simpson
+and Gelman 2018, Bayesian Analysis 13, 917).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import softmax
+
+from bampipe.diagnosis.dictionary import Key
+from bampipe.diagnosis.search import Pool, Search, added, gone
+from bampipe.diagnosis.unknown import Unknown, spline_columns, weigh_unknown
+
+Array = NDArray[np.float64]
+
+_DRAWS = 1000
+_NEAR = 14.0
+"""Log evidence below the best, nats, beyond which a set is none of the alternatives: one in a
+million."""
+_MOST = 40
+LEAST_CHANCE = 1e-4
+"""No chance is known to be smaller from a dozen replays."""
+_EULER = 0.5772156649015329
+
+
+@dataclass(frozen=True)
+class WeighedSet:
+    """A set of effects.
+
+    Attributes:
+        keys: as changes of the most probable one.
+        effects: that the model then has, beyond those of the model diagnosed.
+        unknown: axis on which something unknown stands beside them; None if nowhere.
+        log_evidence: over that of the most probable set, nats; probability: of the set.
+    """
+
+    keys: tuple[Key, ...]
+    effects: tuple[str, ...]
+    unknown: int | None
+    log_evidence: float
+    probability: float
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """How probable everything is.
+
+    Attributes:
+        sets: the most probable first.
+        effects: probability of each effect of any of them.
+        unknown: probability that an axis lacks something unknown, (n_q,).
+        functions: what that would be, by axis; None where an axis does not move.
+        drops: log evidence lost without each effect of the most probable set, nats.
+    """
+
+    sets: tuple[WeighedSet, ...]
+    effects: Mapping[str, float]
+    unknown: Array
+    functions: tuple[Unknown | None, ...]
+    drops: Mapping[str, float]
+
+
+def weigh_sets(search: Search, pool: Pool, given: Sequence[str], seed: int) -> Weighed:
+    """Weigh the sets of a pool, each member's absence, and unknown functions beside them.
+
+    Args:
+        search: over sets beside the most probable model; pool: sets near it.
+        given: effects of the model diagnosed, which are not in question; seed: of the bootstrap.
+    """
+    none, evidence = search.cost(()), search.dictionary.evidence
+    own = [e for e in search.p.absence if e not in given]
+    near = sorted((c, k) for c, k in pool.values() if c < none + _NEAR and k)[:_MOST]
+    absent = [((f"-{e}", ()),) for e in own]
+    named = [
+        _Listed(keys, None, none - search.cost(keys), _by_block(search, keys, None))
+        for keys in dict.fromkeys([(), *(k for _, k in near), *absent])
+        if np.isfinite(search.cost(keys))
+    ]
+    sets = _share(search, named, given, seed)
+    effects = _by_effect(sets)
+    unknown, functions = np.zeros(len(search.p.y)), []
+    for axis in range(len(unknown)):
+        columns = spline_columns(evidence, axis)
+        here = weigh_unknown(search, axis, columns)
+        functions.append(here)
+        if here is None or here.size < search.criteria.size or here.cost > none + _NEAR:
+            continue
+        beside = [
+            _Listed(
+                keys, axis, none - found.cost + search.log_prior, _by_block(search, keys, found)
+            )
+            for keys, found in _beside_unknown(search, axis, columns, here, own)
+        ]
+        # What one axis lacks is independent of what another one does.
+        with_unknown = _share(search, [*named, *beside], given, seed)
+        here_too = _by_effect(with_unknown)
+        unknown[axis] = sum(s.probability for s in with_unknown if s.unknown is not None)
+        for effect in own:
+            if axis in touched_axes(search, effect):
+                effects[effect] = min(effects[effect], here_too.get(effect, 0.0))
+        if unknown[axis] == unknown.max():
+            sets = with_unknown
+    drops = {one.keys[0][0][1:]: -one.gain for one in named if one.keys in absent}
+    return Weighed(sets, effects, unknown, tuple(functions), drops)
+
+
+@dataclass(frozen=True)
+class _Listed:
+    """A set with its log evidence over that of the most probable one, whole and by block of time."""
+
+    keys: tuple[Key, ...]
+    unknown: int | None
+    gain: float
+    by_block: Array
+
+
+def _share(
+    search: Search, listed: Sequence[_Listed], given: Sequence[str], seed: int
+) -> tuple[WeighedSet, ...]:
+    """Probabilities of sets, the most probable first."""
+    total, blocks = np.array([s.gain for s in listed]), np.array([s.by_block for s in listed])
+    count = blocks.shape[1]
+    rng = np.random.default_rng([seed, count])
+    drawn = rng.multinomial(count, np.full(count, 1.0 / count), _DRAWS)
+    shares = softmax((drawn - 1.0) @ blocks.T + total, axis=1).mean(axis=0)
+    sets = [
+        WeighedSet(s.keys, _effects(search, s.keys, given), s.unknown, s.gain, float(share))
+        for s, share in zip(listed, shares, strict=True)
+    ]
+    return tuple(sorted(sets, key=lambda s: -s.probability))
+
+
+def _by_effect(sets: Sequence[WeighedSet]) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for one in sets:
+        for effect in one.effects:
+            found[effect] = found.get(effect, 0.0) + one.probability
+    return found
+
+
+def _beside_unknown(
+    search: Search, axis: int, columns: Sequence[Array], here: Unknown, own: Sequence[str]
+) -> list[tuple[tuple[Key, ...], Unknown]]:
+    """Sets beside an unknown function, and less each of their effects.
+
+    Effects that explain less than the function does beyond them may be mere resemblances of what is
+    missing: those whose place it takes, but for less than a size that matters, are left out.
+    """
+    p, size = search.p, search.criteria.size
+    root = p.likelihood.root[axis]
+    force = float(np.sqrt(np.mean(p.likelihood.applied[axis] ** 2)))
+
+    def without(effects: Sequence[str]) -> Unknown:
+        keys = tuple((f"-{e}", ()) for e in sorted(effects))
+        found = weigh_unknown(search, axis, columns, keys)
+        assert found is not None
+        return found
+
+    def replaces(effect: str) -> bool:
+        moved = (without([effect]).residual[axis] - here.residual[axis]) / root
+        return float(np.sqrt(np.mean(moved**2))) < size * force
+
+    beside = [e for e in own if axis in touched_axes(search, e)]
+    none, bare = search.cost(()), search.cost(tuple((f"-{e}", ()) for e in sorted(beside)))
+    resembles = none - here.cost > bare - none
+    gone_all = [e for e in beside if resembles and replaces(e)]
+    sets = [gone_all, *([*gone_all, e] for e in beside if e not in gone_all)]
+    return [(tuple((f"-{e}", ()) for e in sorted(one)), without(one)) for one in sets]
+
+
+def touched_axes(search: Search, effect: str) -> tuple[int, ...]:
+    """Axes whose equation an effect of the model changes."""
+    system = search.dictionary.evidence.system
+    item = next(i for i in system.model.effects if i.name == effect)
+    axes = [system.coordinates.index(a) for a in item.axes]
+    return tuple(axes) or tuple(range(len(system.coordinates)))
+
+
+def _effects(search: Search, keys: Sequence[Key], given: Sequence[str]) -> tuple[str, ...]:
+    away = gone(keys)
+    kept = [e for e in search.p.absence if e not in away and e not in given]
+    return (*kept, *(name for name, _ in added(keys)))
+
+
+def _by_block(search: Search, keys: tuple[Key, ...], unknown: Unknown | None) -> Array:
+    """Log likelihood of a set over that of none, nats, by block of time, (n_blocks,)."""
+    p = search.p
+    before = search.residual_rows(())
+    after = list(unknown.residual) if unknown else search.residual_rows(keys)
+    w_before = search.solve(()).weight
+    w_after = unknown.weight if unknown else search.solve(keys).weight
+    volume = search.volume_rows(keys)
+    count = 1 + max((int(s.block.max()) for s in p.likelihood.samples if len(s.block)), default=0)
+    found = np.zeros(count)
+    for axis, here in enumerate(p.likelihood.samples):
+        if not len(here.rows):
+            continue
+        share = here.independent / len(here.rows)
+        scale = 0.5 * np.log(w_after[axis] / w_before[axis])
+        rows = share * scale + 0.5 * (
+            w_before[axis] * before[axis] ** 2 - w_after[axis] * after[axis] ** 2
+        )
+        found += np.bincount(here.block, rows + share * volume[axis], minlength=count)
+    return found
+
+
+def chance_of(gain: float, by_chance: Sequence[float]) -> float:
+    """Probability that chance gives a largest gain of ``gain`` or more, from those of replays.
+
+    By the law of largest values (Gumbel 1935), with the mean and the scatter of those.
+    """
+    values = np.asarray(by_chance, dtype=float)
+    # The evidence of one candidate alone scatters by half a nat a strength.
+    scale = max(float(values.std(ddof=1)) * np.sqrt(6.0) / np.pi, 1.0)
+    mode = float(values.mean()) - _EULER * scale
+    return max(float(-np.expm1(-np.exp(-(gain - mode) / scale))), LEAST_CHANCE)

@@ -1,0 +1,231 @@
+"""The rule: what is said of each axis, from the probabilities, the sizes and the noise floor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.diagnosis.probability import chance_of, touched_axes
+from bampipe.diagnosis.select import Selection
+from bampipe.diagnosis.session import Fit, Session, candidates_of, rms
+from bampipe.results.diagnose import (
+    AxisVerdict,
+    NullDistribution,
+    RankedEffect,
+    Verdict,
+    WeighedSet,
+)
+from bampipe.results.standing import standing
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """What a diagnosis says.
+
+    Attributes:
+        axes: by coordinate, in order, without their sentences.
+        selected: effects to add; ranking: candidates, best first.
+        sets: by their probability; chance: the null distribution.
+    """
+
+    axes: tuple[AxisVerdict, ...]
+    selected: tuple[str, ...]
+    ranking: tuple[RankedEffect, ...]
+    sets: tuple[WeighedSet, ...]
+    chance: NullDistribution
+
+
+def conclude(session: Session, selection: Selection) -> Conclusion:
+    """Say of each axis what is missing there, how probable that is, and what remains."""
+    c, weighed = session.criteria, selection.weighed
+    initial, final = selection.initial, selection.final
+    p_values = {e: chance_of(drop, selection.chance) for e, drop in weighed.drops.items()}
+    # Of what chance gives as well, nothing is sure.
+    probability = {
+        e: share if p_values.get(e, 0.0) <= c.significance else min(share, 1.0 - p_values[e])
+        for e, share in weighed.effects.items()
+    }
+    where = {e: effect_axes(initial, final, e) for e in probability}
+    selected = tuple(e for e in selection.effects if probability.get(e, 0.0) >= 1.0 - c.probability)
+    axes = []
+    for axis, name in enumerate(final.evidence.system.coordinates):
+        here = {e: p for e, p in probability.items() if axis in where[e]}
+        listed = {e: p for e, p in here.items() if p >= 1.0 - c.probability}
+        listed = dict(sorted(listed.items(), key=lambda pair: -pair[1]))
+        unknown = float(weighed.unknown[axis])
+        axes.append(_judge(session, selection, axis, name, listed, unknown))
+    ranking = rank_effects(selection, probability, p_values)
+    return Conclusion(
+        tuple(axes), selected, tuple(ranking), _sets(selection),
+        NullDistribution(
+            replicates=len(selection.chance),
+            largest=tuple(map(float, selection.chance)),
+            measured=selection.beside[0],
+            effect=selection.beside[1],
+            p_value=chance_of(selection.beside[0], selection.chance),
+        ),
+    )  # fmt: skip
+
+
+def _judge(
+    session: Session,
+    selection: Selection,
+    axis: int,
+    name: str,
+    listed: Mapping[str, float],
+    unknown: float,
+) -> AxisVerdict:
+    c, final, initial = session.criteria, selection.final, selection.initial
+    floor = final.noise_floor
+    before, after = float(initial.held_out_rmse[axis]), float(final.held_out_rmse[axis])
+    level, scatter = float(floor.level[axis]), float(floor.sd[axis])
+    against_floor = standing(after, level, scatter)
+    named = tuple(e for e in listed if e in selection.effects)
+    sure = [e for e, p in listed.items() if p >= c.probability]
+    open_question = [e for e, p in listed.items() if p < c.probability]
+    remains = unknown >= c.probability or _exceeds_any_model(final, axis)
+    verdict: Verdict
+    if against_floor == "floor_missing":
+        verdict = "no_verdict"
+    elif open_question or 1.0 - c.probability <= unknown < c.probability:
+        verdict = "undecided"
+    elif sure:
+        verdict = "missing"
+    else:
+        verdict = "unknown_effect" if remains else "nothing_missing"
+    force = rms(final.likelihood.applied[axis])
+    excess = max(before**2 - level**2, 0.0)
+    left = max(after**2 - level**2, 0.0)
+    function = selection.weighed.functions[axis]
+    share = min(max(function.share, 0.0), 1.0) if function else 0.0
+    rest = after**2 * (1.0 - share) / max(before**2, 1e-300)
+    return AxisVerdict(
+        verdict=verdict,
+        effects=named,
+        probabilities=dict(listed),
+        unknown=unknown,
+        rmse_before=before,
+        rmse_after=after,
+        rmse_beyond_bias=float(final.rmse_beyond_bias[axis]),
+        noise_floor=level,
+        noise_floor_sd=scatter,
+        standing=against_floor,
+        unit=final.evidence.system.torque_units[axis],
+        force_rms=force,
+        explained=max(0.0, 1.0 - (after / max(force, 1e-300)) ** 2),
+        explainable_share=max(0.0, 1.0 - rest),
+        explainable_after=share,
+        explained_by_effects=max(0.0, 1.0 - left / max(excess, 1e-300)) if named else 0.0,
+        remains=bool(remains),
+        sentence="",
+    )
+
+
+_BEYOND_MODELS = 3.0
+"""Scale of the noise, in units of sensors, filters and the discrepancy of any model together."""
+
+
+def _exceeds_any_model(fit: Fit, axis: int) -> bool:
+    """Whether an axis leaves more than sensors, filters and the discrepancy of any model explain."""
+    solved = fit.solved
+    return bool(np.sqrt(solved.left[axis] / fit.problem.count[axis]) > _BEYOND_MODELS)
+
+
+def effect_axes(initial: Fit, final: Fit, effect: str) -> tuple[int, ...]:
+    """Axes on which an effect changes the equation."""
+    model = final if effect in final.recipe.effects else None
+    if model is not None:
+        system = model.evidence.system
+        item = next(i for i in system.model.effects if i.name == effect)
+    else:
+        candidate = candidates_of(initial.recipe, (effect,))[0]
+        system, item = candidate.system, candidate.system.model.effects[-1]
+    axes = tuple(system.coordinates.index(a) for a in item.axes)
+    if axes:
+        return axes
+    alone = candidates_of(initial.recipe, (effect,))[0].system
+    return tuple(range(len(system.coordinates))) if alone.moves_sensors else tuple(alone.touched)
+
+
+def rank_effects(
+    selection: Selection, probability: Mapping[str, float], p_values: Mapping[str, float]
+) -> list[RankedEffect]:
+    """Effects of the most probable set, then the others by what each gains alone.
+
+    The error without an effect of the set, beside the others, or with another one alone, follows
+    from the log evidence by the independent samples of the axis.
+    """
+    initial, final = selection.initial, selection.final
+    values = dict(
+        zip((q.name for q in final.evidence.system.parameters), final.evidence.p, strict=True)
+    )
+    others = sorted(
+        (e for e in selection.gains if e not in selection.effects),
+        key=lambda e: -selection.gains[e],
+    )
+    chosen = sorted(selection.effects, key=lambda e: -selection.weighed.drops.get(e, 0.0))
+    rows = []
+    for effect in (*chosen, *others):
+        is_chosen = effect in selection.effects
+        fit = final if is_chosen else initial
+        gain = selection.weighed.drops.get(effect, 0.0) if is_chosen else selection.gains[effect]
+        axes = effect_axes(initial, final, effect)
+        axis = max(
+            axes, key=lambda a: float(initial.problem.independent[a] * initial.solved.left[a])
+        )
+        ratio = float(np.exp(-gain / max(fit.problem.independent[axis], 1.0)))
+        here = float(fit.held_out_rmse[axis])
+        system = fit.evidence.system
+        rows.append(
+            RankedEffect(
+                effect=effect,
+                axis=system.coordinates[axis],
+                held_out_rmse_before=here / ratio if is_chosen else here,
+                held_out_rmse_after=here if is_chosen else here * ratio,
+                unit=system.torque_units[axis],
+                probability=min(probability.get(effect, 0.0), 1.0),
+                p_value=p_values.get(effect, chance_of(gain, selection.chance)),
+                score=gain,
+                parameters={n: float(v) for n, v in values.items() if n in _own(final, effect)},
+                indistinguishable_from=_alike(selection, effect),
+            )
+        )
+    return rows
+
+
+def _own(fit: Fit, effect: str) -> frozenset[str]:
+    found = (i for i in fit.evidence.system.model.effects if i.name == effect)
+    return frozenset(q.name for item in found for q in item.parameters)
+
+
+def _alike(selection: Selection, effect: str) -> tuple[str, ...]:
+    """Effects that take the place of one in a set which is as good as undecided against it."""
+    best = {*selection.effects}
+    found = []
+    for one in selection.weighed.sets[1:]:
+        swapped = {*one.effects} ^ best
+        if len(swapped) == 2 and effect in swapped and one.probability >= 0.1:
+            found += [e for e in swapped if e != effect]
+    return tuple(sorted({*found}))
+
+
+def _sets(selection: Selection) -> tuple[WeighedSet, ...]:
+    listed = [s for s in selection.weighed.sets if s.probability >= 0.001] or list(
+        selection.weighed.sets[:1]
+    )
+    return tuple(
+        WeighedSet(
+            effects=one.effects,
+            unknown=None
+            if one.unknown is None
+            else selection.final.evidence.system.coordinates[one.unknown],
+            probability=min(one.probability, 1.0),
+            log_evidence=one.log_evidence,
+        )
+        for one in sorted(listed, key=lambda s: -s.probability)
+    )

@@ -1,1 +1,0 @@
-"""What a model lacks: residual maps, explainable share, candidates and their chance level."""
