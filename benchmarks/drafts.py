@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,9 @@ from independent.sensors import Conditions, hold_back
 import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model_file import identified, load_model, read_recipe
-from bampipe.discover.drafts.search import draft
-from bampipe.discover.settings import Settings
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.drafts.search import draft_formulas
+from bampipe.diagnosis.session import Session
 from bampipe.physics import compile_model
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
@@ -181,14 +182,15 @@ def force_drafts(machine: str, seed: int) -> dict[str, tuple[float, tuple[str, .
         system = compile_model(model)
         timing = run.read(IdentifyResult, "base").input_timing
         trials = read_measured_trials(run, system, every_input=True, timing=timing)
-        found = draft(
-            trials, read_recipe(run, "base", model), identified(run, "base", system),
-            range(len(system.coordinates)), Settings(jobs=1), "a benchmark",
+        session = Session(replace(trials, motions=tuple(trials.motions)), Criteria())
+        found = draft_formulas(
+            session, read_recipe(run, "base", model), identified(run, "base", system),
+            range(len(system.coordinates)), "a benchmark",
         )  # fmt: skip
         return {
             system.coordinates[axis.axis]: (
                 axis.chance[0].p_value,
-                tuple(term.canonical for term in axis.terms),
+                tuple(term.form.canonical for term in axis.terms),
             )
             for axis in found
         }

@@ -12,7 +12,7 @@ from independent.sensors import Conditions
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
-from bampipe.discover.chance import system_of
+from bampipe.diagnosis.session import system_of
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.recipe import Recipe

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.signal import oaconvolve
 from bampipe.data.angle_torque import AngleTorque, angle_torque, least_squares
 from bampipe.data.quality.clock import rate_of
 from bampipe.data.session import SECONDS
+from bampipe.data.units import spelled
 
 RATES_HZ = (4.0, 30_000.0)
 """Sample rates at which motion is logged."""
@@ -22,9 +24,13 @@ _NICE = (1, 1.2, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 7.5, 8)
 
 
 def time_unit(t: np.ndarray, said: str) -> str:
-    """Unit of a time column: as said, else the one that gives a rate at which motion is logged."""
-    if said in (*SECONDS, "datetime"):
-        return said
+    """Unit of a time column: as said, else the one that gives a rate at which motion is logged.
+
+    "" where it counts something else, such as ticks, or no unit gives such a rate.
+    """
+    known = said if said == "datetime" else spelled(said, tuple(SECONDS))
+    if said and known in (*SECONDS, "datetime", ""):
+        return known
     steps = np.diff(t[np.isfinite(t)])
     step = float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
     if step <= 0.0:
@@ -48,10 +54,10 @@ def likely_unit(si: str, values: np.ndarray) -> str:
 
 def interval_of(name: str, value: float) -> float:
     """Sampling interval, s, that a number beside the samples gives (``Ts``, ``fs``), else 0."""
-    plain = name.lower().replace("_", "")
+    plain = re.sub(r"[\W_]|hz$", "", name.lower())
     if value > 0.0 and plain in ("ts", "dt", "tsample", "sampletime", "samplingtime"):
         return value
-    if value > 0.0 and plain in ("fs", "samplerate", "samplingrate", "fsample"):
+    if value > 0.0 and re.fullmatch("fs(ample)?|sampl(e|ing)(rate|freq|frequency)", plain):
         return 1.0 / value
     return 0.0
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean
-from bampipe.data.readers import read_trial
+from bampipe.data.recording import read_recording
 from bampipe.data.session import SECONDS, Session, TrialEntry, inside
 from bampipe.errors import InputError
 from bampipe.files import digest_file
@@ -55,15 +55,9 @@ def read_sound_trial(
     Raises:
         InputError: the trial is to be set aside, with the reason.
     """
-    path = inside(session.root, entry.file, where=entry.file)
     clock = session.clock
-    raw = read_trial(
-        path,
-        session.columns,
-        name=entry.file,
-        largest_bytes=largest_bytes,
-        datetimes={clock.column: clock.format} if clock.datetime else {},
-        dialect=session.dialect,
+    raw = read_recording(
+        session.root, entry, session.columns, clock, session.dialect, largest_bytes
     )
     if clock.nanoseconds:
         columns = dict(raw.columns)

@@ -3,32 +3,48 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from bampipe.data.readers import EXTENSIONS, columns_of, read_trial
+from bampipe.data.looks import describe, find_roles
+from bampipe.data.parts import are_axes, join_parts
+from bampipe.data.readers import EXTENSIONS, TEXTS, RawTrial, columns_of, read_trial
 from bampipe.data.readers.trial import Dialect
-from bampipe.data.units import RecordedUnit, unit
+from bampipe.data.recording import read_recording, starts_of
+from bampipe.data.session import Clock, TrialEntry
+from bampipe.data.session.channels import CLOCK_UNITS
+from bampipe.data.session.places import lexically_inside
+from bampipe.data.units import RecordedUnit, spelled, unit
 from bampipe.errors import InputError
 
 MOST_FILES = 500
+_SMALL = 1 << 16
+"""Bytes below which a text may be no log but a line of results."""
+_MOST_SCANNED = 1 << 30
+"""Bytes of text in which other recordings are looked for; reading them takes some seconds."""
+_WHOLE = 2
+"""Of logs that hold both a motion and what drives it."""
+_RISES = 0.95
+"""Share of samples at which a clock rises, if what else it does is an accident."""
+_GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
+"""Words in the name of a column that say less of it than the name of its file."""
 _WORDS = {
-    "time": "t time timestamp stamp zeit clock seconds sec secs nanosec nsec nsecs nanoseconds"
-    " millis micros milliseconds microseconds",
+    "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
+    " nanoseconds millis micros milliseconds microseconds",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
     " wanted con ctrl",
     "brake": "brake bremse",
     "acceleration": "acc accel acceleration qdd ddq beschleunigung",
     "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate",
-    "force": "force f fx fy fz torque tau trq kraft moment loadcell wrench effort",
+    "force": "force forc f fx fy fz torque tau trq kraft moment drehmoment loadcell wrench effort"
+    " eff",
     "current": "current curr cur i iq amp amps ampere strom spulenstrom coil",
     "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung",
-    "position": "pos position angle theta phi psi q enc encoder disp displacement x stroke winkel"
-    " weg lage hub joint deflection yaw pitch extension carriage counts",
+    "position": "pos position ang angle theta phi psi q enc encoder disp displacement dist x stroke"
+    " winkel weg lage hub joint deflection yaw pitch extension carriage counts",
 }
 REFERENCE_WORDS = frozenset(_WORDS["reference"].split())
 """Words for what a controller asks for rather than what was measured."""
@@ -66,6 +82,7 @@ class SurveyedColumn:
             or "".
         unit: unit by the file, else by the name, "" where neither says.
         values: (T,) of the first log.
+        by_looks: whether its name says nothing and its role is what it looks like.
     """
 
     name: str
@@ -73,6 +90,7 @@ class SurveyedColumn:
     role: str
     unit: str
     values: np.ndarray
+    by_looks: bool = False
 
     @property
     def conversion(self) -> RecordedUnit | None:
@@ -97,16 +115,21 @@ class Survey:
     """The logs of a folder.
 
     Attributes:
-        files: paths relative to the folder, of the logs that have the same columns.
+        trials: the recordings that have the same columns, of one file or of several.
         columns: what they hold, from the first of them.
-        remarks: what was found out about the layout of the first.
+        remarks: what was guessed about them, a sentence each.
         passed: other files, and why each is left out.
     """
 
-    files: tuple[str, ...]
+    trials: tuple[TrialEntry, ...]
     columns: tuple[SurveyedColumn, ...]
     remarks: tuple[str, ...]
     passed: tuple[tuple[str, str], ...]
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Paths relative to the folder, the first of each recording."""
+        return tuple(dict.fromkeys(trial.file for trial in self.trials))
 
     def of(self, *roles: str) -> list[SurveyedColumn]:
         """The columns with one of these roles."""
@@ -123,6 +146,29 @@ def survey(folder: Path, names: Sequence[str] = ()) -> Survey:
     Raises:
         InputError: no such folder, no log in it, too many, or none that can be read.
     """
+    logs = _Logs(folder, Dialect(names=tuple(names)))
+    logs.look_through(_paths(folder))
+    trials, common = logs.choose()
+    read: tuple[SurveyedColumn, ...] = ()
+    sound = []
+    for trial in trials:
+        try:
+            if not read:
+                several = logs.recordings(trial)
+                read = logs.read(several[0], common)
+            else:
+                logs.compare(trial, common)
+                several = logs.recordings(trial)
+            sound += several
+        except InputError as error:
+            logs.passed.append((trial.file, str(error)))
+    if not read:
+        raise logs.fault()
+    columns, guessed = _by_looks(_with_commands(list(read)), folder)
+    return Survey(tuple(sound), columns, (*logs.remarks, *guessed), tuple(logs.passed))
+
+
+def _paths(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise InputError("no such folder", where=str(folder))
     paths = sorted(
@@ -140,65 +186,264 @@ def survey(folder: Path, names: Sequence[str] = ()) -> Survey:
         )
     if len(paths) > MOST_FILES:
         raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
-    found: dict[str, dict[str, str]] = {}
-    dialect = Dialect(names=tuple(names))
-    passed = []
-    for path in paths:
-        name = path.relative_to(folder).as_posix()
-        try:
-            found[name] = columns_of(path, name=name, dialect=dialect)
-        except InputError as error:
-            passed.append((name, str(error)))
-    if not found:
-        raise InputError("no log that can be read", where=str(folder), remedy=passed[0][1])
-    common = Counter(tuple(sorted(columns)) for columns in found.values()).most_common(1)[0][0]
-    _refuse_parted(folder, found, common)
-    files = [name for name, columns in found.items() if set(common) <= set(columns)]
-    passed += [(name, "has other columns") for name in found if name not in files]
-    columns, remarks = _columns(folder / files[0], files[0], found[files[0]], common, dialect)
-    return Survey(tuple(files), columns, remarks, tuple(passed))
+    return paths
 
 
-def _refuse_parted(
-    folder: Path, found: Mapping[str, Mapping[str, str]], common: tuple[str, ...]
-) -> None:
-    """Refuse logs that have their positions in one file and what drives them in another.
+@dataclass
+class _Logs:
+    """The files of a folder while it is found out which are logs, and which belong together.
 
-    Raises:
-        InputError: they are so.
+    Attributes:
+        found: columns and their units, by file; passed, remarks: see `Survey`.
     """
-    roles = {
-        name: {_role(*column) for column in columns.items()} for name, columns in found.items()
-    }
-    first = next(name for name, columns in found.items() if set(common) <= set(columns))
-    for here, there in (({"position"}, set(DRIVERS)), (set(DRIVERS), {"position"})):
-        if here & roles[first] and not (there | {"reference"}) & roles[first]:
-            other = next((name for name, other in roles.items() if there & other), "")
-            if other:
+
+    folder: Path
+    dialect: Dialect
+    found: dict[str, dict[str, str]] = field(default_factory=dict)
+    passed: list[tuple[str, str]] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    first: str = ""
+    scanned: int = 0
+
+    def look_through(self, paths: Sequence[Path]) -> None:
+        """Find the columns of every file; what is no log is left out, with the reason."""
+        for path in paths:
+            name = path.relative_to(self.folder).as_posix()
+            try:
+                lexically_inside(name, where="")
+                columns = columns_of(path, name=name, dialect=self.dialect)
+                if not columns:
+                    raise InputError("no column of numbers in it")
+                small = path.stat().st_size < _SMALL and path.suffix.lower() in TEXTS
+                if small and len(self._read_one(name, columns, _first(columns))) < 2:
+                    raise InputError("one row of numbers is no log")
+                self.found[name] = columns
+            except InputError as error:
+                self.passed.append((name, str(error)))
+        if not self.found:
+            raise self.fault()
+
+    def _read_one(self, name: str, columns: Mapping[str, str], column: str) -> RawTrial:
+        datetimes = {column: ""} if columns[column] == "datetime" else {}
+        return read_trial(
+            self.folder / name, [column], name=name, datetimes=datetimes, dialect=self.dialect
+        )
+
+    def fault(self) -> InputError:
+        """That no log can be read, with the reason of the first."""
+        why = self.passed[0][1]
+        remedy = why if self.passed[0][0] in why else ": ".join(self.passed[0])
+        return InputError("no log that can be read", where=str(self.folder), remedy=remedy)
+
+    def choose(self) -> tuple[list[TrialEntry], list[str]]:
+        """The recordings to take, and the columns that all have.
+
+        Logs with the same columns that hold a position and what drives it come before files that
+        are parts of one recording; of several, those with the most bytes.
+        """
+        common = max(map(frozenset, self.found.values()), key=self._worth)
+        names = [name for name, columns in self.found.items() if common <= set(columns)]
+        whole = self._worth(common)[0] == _WHOLE
+        axes = len(names) > 1 and are_axes(names)
+        if not whole or axes:
+            pool = {n: self.found[n] for n in names} if axes and whole else self.found
+            trials, reasons = join_parts(self.folder, pool, _role, self.dialect)
+            shared = [set(self._labels(trial)) for trial in trials]
+            best = max(
+                shared, key=lambda labels: (shared.count(labels), len(labels)), default=set()
+            )
+            trials = [trial for trial, has in zip(trials, shared, strict=True) if best <= has]
+            if trials and (axes or self._completeness(self._labels(trials[0])) == _WHOLE):
+                self._leave_out([p for t in trials for p in (t.file, *(x.file for x in t.parts))])
+                self.remarks += [_describe_join(trials)]
+                return trials, [c for c in self._labels(trials[0]) if c in best]
+            if not whole:
+                self._refuse_parted(names[0], reasons)
+        self._leave_out(names)
+        stated = self.found[names[0]]
+        return [TrialEntry(file=n, kind="free") for n in names], [c for c in stated if c in common]
+
+    def _leave_out(self, names: Sequence[str]) -> None:
+        why = "has other columns: it needs a session of its own"
+        self.passed += [(name, why) for name in self.found if name not in names]
+
+    def _worth(self, columns: frozenset[str]) -> tuple[int, int, int]:
+        """How well files with these columns would do as logs: what they hold, and how much."""
+        names = [name for name, other in self.found.items() if columns <= set(other)]
+        stated = {column: self.found[names[0]][column] for column in columns}
+        sizes = sum((self.folder / name).stat().st_size for name in names)
+        return self._completeness(stated), sizes, len(columns)
+
+    @staticmethod
+    def _completeness(stated: Mapping[str, str]) -> int:
+        roles = [_role(*column) for column in stated.items()]
+        moves, driven = {"position", "velocity"}, {*DRIVERS, "reference"}
+        if moves & set(roles) and driven & set(roles):
+            return _WHOLE
+        return int(roles.count("") > 1)
+
+    def _labels(self, trial: TrialEntry) -> dict[str, str]:
+        """Names and units of the columns of a recording; of a time that all share only one."""
+        labels: dict[str, str] = {}
+        for name, file in ((trial.part, trial.file), *((p.name, p.file) for p in trial.parts)):
+            for column, stated in self.found[file].items():
+                timed = any(_role(label, unit) == "time" for label, unit in labels.items())
+                if file != trial.file and timed and _role(column, stated) == "time":
+                    continue
+                labels[f"{name}:{column}" if name else column] = stated
+        return labels
+
+    def _refuse_parted(self, first: str, reasons: Sequence[str]) -> None:
+        """Refuse logs that have their positions in one file and what drives them in another.
+
+        Raises:
+            InputError: they are so.
+        """
+        roles = {n: {_role(*column) for column in c.items()} for n, c in self.found.items()}
+        for here, there in (({"position"}, set(DRIVERS)), (set(DRIVERS), {"position"})):
+            if here & roles[first] and not (there | {"reference"}) & roles[first]:
+                other = next((name for name, other in roles.items() if there & other), "")
+                if other:
+                    why = next((f": {reason}" for reason in reasons if other in reason), "")
+                    raise InputError(
+                        f"positions and drives are in different files, such as {first} and {other}"
+                        f"{why}",
+                        where=str(self.folder),
+                        remedy="put the columns of one recording side by side in one file, the time"
+                        " once, and leave the parts out of this folder; or name the parts of each"
+                        " recording under [[trials.parts]] of a session.toml",
+                    )
+
+    def read(self, trial: TrialEntry, wanted: Sequence[str]) -> tuple[SurveyedColumn, ...]:
+        """The columns of one recording."""
+        labels = self._labels(trial)
+        times = [column for column in wanted if _role(column, labels[column]) == "time"]
+        moments = [column for column in times if labels[column] == "datetime"]
+        dropped = [c for c in wanted if labels[c] == "datetime" and c not in moments[:1]]
+        # A reader of several topics takes the first column for the time.
+        ordered = sorted((c for c in wanted if c not in dropped), key=lambda c: c not in times)
+        clock = Clock(unit="samples")
+        if times:
+            column = (moments or times)[0]
+            said = "datetime" if moments else spelled(labels[column], CLOCK_UNITS)
+            clock = Clock(column=column, unit=next((u for u in CLOCK_UNITS if u == said), "s"))
+        raw = read_recording(self.folder, trial, ordered, clock, self.dialect)
+        sound = _complete_rows(raw.columns, clock.column)
+        self.first = trial.file
+        if not trial.parts and not trial.file.lower().endswith(TEXTS):
+            self.remarks += raw.remarks
+        found = []
+        for column in ordered:
+            said = raw.units.get(column, labels[column])
+            role = _role(column, said)
+            unit = _unit(column, said, role)
+            found.append(SurveyedColumn(column, said, role, unit, raw.columns[column][sound]))
+        return tuple(found)
+
+    def compare(self, trial: TrialEntry, wanted: Sequence[str]) -> None:
+        """Raise InputError where a log states another unit than the first that was read."""
+        for column in wanted:
+            here, there = self.found[trial.file].get(column), self.found[self.first].get(column)
+            known, other = unit(here or ""), unit(there or "")
+            if here and there and known and other and known != other:
                 raise InputError(
-                    f"positions and drives are in different files, such as {first} and {other}",
-                    where=str(folder),
-                    remedy="put the columns of one recording side by side in one file, the time"
-                    " once, and leave the parts out of this folder",
+                    f"gives {column} in {here}, {self.first} in {there}",
+                    remedy="export both in one unit, or put it into a session of its own",
                 )
 
+    def recordings(self, trial: TrialEntry) -> list[TrialEntry]:
+        """The recordings that one text file holds; others are taken as they are.
 
-def _columns(
-    path: Path, name: str, stated: dict[str, str], common: tuple[str, ...], dialect: Dialect
-) -> tuple[tuple[SurveyedColumn, ...], tuple[str, ...]]:
-    wanted = [column for column in stated if column in common]
-    datetimes = {column: "" for column in wanted if stated[column] == "datetime"}
-    # A reader of several topics takes the first column for the time.
-    wanted.sort(key=lambda column: _role(column, stated[column]) != "time")
-    raw = read_trial(path, wanted, name=name, datetimes=datetimes, dialect=dialect)
-    found = []
-    for column in wanted:
-        said = raw.units.get(column, stated[column])
-        role = _role(column, said)
-        found.append(
-            SurveyedColumn(column, said, role, _unit(column, said, role), raw.columns[column])
+        Raises:
+            InputError: it cannot be read.
+        """
+        path = self.folder / trial.file
+        self.scanned += path.stat().st_size
+        if trial.parts or path.suffix.lower() not in TEXTS or self.scanned > _MOST_SCANNED:
+            return [trial]
+        columns = self.found[trial.file]
+        times = [c for c, u in columns.items() if _role(c, u) == "time" and u != "datetime"]
+        column = (times or [_first(columns)])[0]
+        raw = self._read_one(trial.file, columns, column)
+        starts = starts_of(raw, column if times else "")
+        if len(starts) == 1:
+            return [trial]
+        rows = ", ".join(str(raw.rows[at]) for at in starts[1:4])
+        self.remarks.append(
+            f"{trial.file} holds {len(starts)} recordings, which begin again at row {rows}"
+            + (", ..." if len(starts) > 4 else "")
         )
-    return _with_commands(found), raw.remarks
+        return [
+            TrialEntry(file=trial.file, kind="free", recording=n) for n, _ in enumerate(starts, 1)
+        ]
+
+
+def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
+    """Rows (T,) in which no column lacks a number, those columns apart that mostly lack one.
+
+    Of a clock that nearly always increases, only rows in which it does.
+    """
+    known = [np.isfinite(values) for values in columns.values()]
+    if clock in columns:
+        t = np.nan_to_num(columns[clock], nan=-np.inf)
+        rises = np.concatenate([[True], t[1:] > np.maximum.accumulate(t)[:-1]])
+        known += [rises] if rises.mean() > _RISES else []
+    kept = [mask for mask in known if 2 * mask.sum() > len(mask)]
+    complete = np.logical_and.reduce(kept) if kept else np.ones(len(known[0]), dtype=bool)
+    return complete if 2 * complete.sum() > len(complete) else np.ones_like(complete)
+
+
+def _first(columns: Mapping[str, str]) -> str:
+    return next(iter(columns))
+
+
+def _describe_join(trials: Sequence[TrialEntry]) -> str:
+    """What was joined, as of the first recording."""
+    first = trials[0]
+    how = {
+        "rows": "row by row",
+        "time": "by their times",
+        "start": "by their times, as if started together",
+    }
+    ways = dict.fromkeys(how[part.join] for part in first.parts)
+    names = [first.file, *(part.file for part in first.parts)]
+    listed = f"{', '.join(names[:-1])} and {names[-1]}"
+    return f"{listed} are taken as one recording, joined {' and '.join(ways)}"
+
+
+def _by_looks(
+    columns: tuple[SurveyedColumn, ...], folder: Path
+) -> tuple[tuple[SurveyedColumn, ...], list[str]]:
+    """Columns whose names say nothing with the roles that they look like, and that in words.
+
+    Raises:
+        InputError: no column has a name, and none looks like a position.
+    """
+    unnamed = [c for c in columns if not c.role and not c.is_constant]
+    if any(c.role in ("position", "velocity") for c in columns) or not unnamed:
+        return columns, []
+    times = [c.values for c in columns if c.role == "time" and not c.is_constant]
+    roles = find_roles({c.name: c.values for c in unnamed}, times[0] if times else None)
+    if "position" not in roles.values():
+        if len(unnamed) < len(columns) or not all(_is_numbered(c.name) for c in columns):
+            return columns, []
+        listed = ", ".join(describe(c.name, c.values) for c in columns[:12])
+        raise InputError(
+            "the columns have no names, and none shows itself as a position by its derivative",
+            where=str(folder),
+            remedy=f"name them in order: bampipe init FOLDER --names time,position,...; {listed}",
+        )
+    said = ", ".join(f"{name} a {role}" for name, role in roles.items())
+    guessed = f"by what columns without names look like, {said}".replace(
+        "a force", "what drives the motion"
+    ).replace("a acc", "an acc")
+    return tuple(
+        replace(c, role=roles[c.name], by_looks=True) if c.name in roles else c for c in columns
+    ), [guessed]
+
+
+def _is_numbered(name: str) -> bool:
+    return re.fullmatch(r"(.*:)?column_\d+", name) is not None
 
 
 def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:
@@ -233,10 +478,21 @@ def words(name: str) -> list[str]:
     return [part.lower() for part in parts if part]
 
 
+def _singular(said: Sequence[str]) -> set[str]:
+    """Words, and those in the plural without their s."""
+    return {*said, *(word.removesuffix("s") for word in said if len(word) > 3)}
+
+
 def _role(name: str, stated: str) -> str:
+    """What a column is, by its unit and its name, and by the part of a recording it is in."""
+    part, colon, bare = name.partition(":")
+    if colon and not part.startswith("/"):
+        alone = _role(bare, stated)
+        vague = set(words(bare)) <= _GENERAL or not alone
+        return (vague and _role(part, "")) or alone
     if stated == "datetime" or name.strip().lower() in _UNIT_WORDS["time"]:
         return "time"
-    said = set(words(name))
+    said = _singular(words(name))
     first = [role for role in ("reference", "brake") if said & set(_WORDS[role].split())]
     if first:
         return first[0]
@@ -245,7 +501,10 @@ def _role(name: str, stated: str) -> str:
         return _BY_UNIT[known.si]
     if said & _PLAIN_POSITIONS and said & _PRESENT:
         said -= _PRESENT  # the position that is current, and no current
-    named = next((role for role, text in _WORDS.items() if said & set(text.split())), "")
+    roles = [role for role, text in _WORDS.items() if said & set(text.split())]
+    if len(roles) > 1 and max(map(len, said)) == 1:
+        return ""  # x_F: letters that stand for several quantities
+    named = next(iter(roles), "")
     return named or _BY_SUFFIX.get(re.split(r"[_\W]+", name)[-1], "")
 
 

@@ -18,92 +18,130 @@ class RecordedUnit:
 
 
 _TURN = 2 * math.pi
+_GRAVITY = 9.80665
 _POUND = 4.4482216152605
-_BASE: dict[str, RecordedUnit] = {
-    "s": RecordedUnit("s"),
-    "min": RecordedUnit("s", 60.0),
-    "m": RecordedUnit("m"),
-    "rad": RecordedUnit("rad"),
-    "deg": RecordedUnit("rad", math.pi / 180),
-    "rev": RecordedUnit("rad", _TURN),
-    "rad/s": RecordedUnit("rad/s"),
-    "deg/s": RecordedUnit("rad/s", math.pi / 180),
-    "rev/s": RecordedUnit("rad/s", _TURN),
-    "rev/min": RecordedUnit("rad/s", _TURN / 60),
-    "m/s": RecordedUnit("m/s"),
-    "m/min": RecordedUnit("m/s", 1 / 60),
-    "m/s2": RecordedUnit("m/s2"),
-    "rad/s2": RecordedUnit("rad/s2"),
-    "deg/s2": RecordedUnit("rad/s2", math.pi / 180),
-    "N": RecordedUnit("N"),
-    "N.m": RecordedUnit("N.m"),
-    "N.cm": RecordedUnit("N.m", 1e-2),
-    "N.mm": RecordedUnit("N.m", 1e-3),
-    "kgf": RecordedUnit("N", 9.80665),
-    "lbf": RecordedUnit("N", _POUND),
-    "lbf.ft": RecordedUnit("N.m", _POUND * 0.3048),
-    "lbf.in": RecordedUnit("N.m", _POUND * 0.0254),
-    "in": RecordedUnit("m", 0.0254),
-    "ft": RecordedUnit("m", 0.3048),
-    "in/s": RecordedUnit("m/s", 0.0254),
-    "A": RecordedUnit("A"),
-    "V": RecordedUnit("V"),
-    "W": RecordedUnit("W"),
-    "Hz": RecordedUnit("Hz"),
-    "Pa": RecordedUnit("Pa"),
-    "bar": RecordedUnit("Pa", 1e5),
-    "T": RecordedUnit("T"),
-    "K": RecordedUnit("K"),
-    "degC": RecordedUnit("K", 1.0, 273.15),
-    "kg": RecordedUnit("kg"),
-    "g": RecordedUnit("kg", 1e-3),
-    "%": RecordedUnit("", 1e-2),
-    "": RecordedUnit(""),
-}
-_PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
-_PREFIXED = ("s", "m", "rad", "N", "N.m", "A", "V", "W", "Hz", "Pa", "m/s", "T", "m/s2")
-_SPELLINGS = {
-    "sec": "s", "second": "s", "seconds": "s", "msec": "ms", "usec": "us", "hz": "Hz",
-    "degree": "deg", "degrees": "deg", "°": "deg", "°/s": "deg/s", "deg/sec": "deg/s",
-    "rads": "rad", "radian": "rad", "radians": "rad", "rad/sec": "rad/s", "rpm": "rev/min",
-    "r/min": "rev/min", "1/min": "rev/min", "rps": "rev/s", "turn": "rev", "turns": "rev",
-    "nm": "nm", "n": "N", "volt": "V", "volts": "V", "v": "V", "amp": "A", "amps": "A",
-    "ampere": "A", "a": "A", "newton": "N", "meter": "m", "meters": "m", "metre": "m",
-    "lb": "lbf", "lbs": "lbf", "°c": "degC", "c": "degC", "degc": "degC", "percent": "%",
-    "pct": "%", "-": "", "1": "", "none": "", "inch": "in", "kgf": "kgf",
+_FACTORS: dict[str, tuple[str, float]] = {
+    **{si: (si, 1.0) for si in ("s", "m", "rad", "N", "A", "V", "W", "Hz", "Pa", "T", "K", "kg")},
+    "min": ("s", 60.0), "h": ("s", 3600.0), "g": ("kg", 1e-3), "%": ("", 1e-2),
+    "deg": ("rad", math.pi / 180), "rev": ("rad", _TURN), "arcmin": ("rad", math.pi / 10_800),
+    "arcsec": ("rad", math.pi / 648_000), "in": ("m", 0.0254), "ft": ("m", 0.3048),
+    "kgf": ("N", _GRAVITY), "gf": ("N", 1e-3 * _GRAVITY), "lbf": ("N", _POUND),
+    "ozf": ("N", _POUND / 16), "kip": ("N", 1e3 * _POUND), "bar": ("Pa", 1e5),
+    "psi": ("Pa", _POUND / 0.0254**2),
 }  # fmt: skip
-_STEPS = re.compile(r"(?P<number>\d+\.?\d*|\.\d+)\.?(?P<unit>[^\W\d_].*|%|°.*)")
-_SQUEEZED = {"Nm": "N.m", "Ncm": "N.cm", "Nmm": "N.mm", "mNm": "mN.m", "kNm": "kN.m"}
+"""Units that others are put together from, with their SI unit."""
+_ORDER = ("kg", "N", "W", "Pa", "V", "A", "T", "K", "Hz", "rad", "m", "s")
+"""In which SI units stand in a product."""
+_LOGGED = frozenset(["", *_ORDER, "N.m", "rad/s", "rad/s2", "m/s", "m/s2"])
+"""SI units of what is logged."""
+_PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
+_PREFIXED = frozenset(["s", "m", "rad", "deg", "N", "A", "V", "W", "Hz", "Pa", "T", "g", "bar"])
+_WHOLE = {
+    "1/min": "rev/min", "-": "", "1": "",
+    "none": "", "ozin": "ozf.in", "kgcm": "kgf.cm", "inlb": "lbf.in", "lbin": "lbf.in",
+    "ftlb": "lbf.ft", "lbft": "lbf.ft",
+}  # fmt: skip
+_RATES = {"rpm": "rev/min", "r/min": "rev/min", "rps": "rev/s", "dps": "deg/s"}
+_SPELLINGS = {
+    "rot": "rev", "turn": "rev", "degree": "deg", "°": "deg",
+    "º": "deg", "radian": "rad", "revolution": "rev", "rotation": "rev", "second": "s",
+    "sec": "s", "minute": "min", "millisecond": "ms", "microsecond": "us", "nanosecond": "ns",
+    "milli": "ms", "micro": "us", "nano": "ns", "msec": "ms", "usec": "us", "nsec": "ns",
+    "volt": "V", "v": "V", "amp": "A", "ampere": "A", "a": "A", "n": "N", "newton": "N",
+    "newtonmeter": "Nm", "kn": "kN", "milliamp": "mA", "meter": "m", "metre": "m",
+    "millimeter": "mm", "millimetre": "mm", "centimeter": "cm", "inch": "in", "inche": "in",
+    "foot": "ft", "feet": "ft", "lb": "lbf", "pound": "lbf", "oz": "ozf", "hz": "Hz",
+    "percent": "%", "pct": "%",
+}  # fmt: skip
+"""Of single factors; those in the plural are found without their s."""
+_CELSIUS = frozenset(["degc", "°c", "c", "celsius"])
+_TOKEN = re.compile(
+    r"(?P<number>(?<![^\W_])\d+(?:\.\d+)?(?:[eE]-?\d+)?|\.\d+)"
+    r"|(?P<over>\s*(?:/|\bper\b)\s*)"
+    r"|(?P<word>[^\W\d_]+|%|[°º][A-Za-z]?)(?:(?:\^|\*\*)?(?P<power>-[1-4]|[2-4])(?![\d.]))?"
+    r"|\s*[*·⋅.\s-]\s*"
+)  # fmt: skip
 
 
 def spelled(text: str, among: Sequence[str]) -> str:
-    """The one of ``among`` that means the same unit as ``text``, "" where there is none."""
+    """The one of ``among`` that means the same unit as ``text``, else the text without brackets.
+
+    "" where the unit is not known.
+    """
     known = unit(text)
     if text in among or known is None:
         return text if text in among else ""
-    return next((other for other in among if unit(other) == known), "")
+    bare = text.strip().strip("[]()").strip()
+    return next((other for other in among if unit(other) == known), bare)
 
 
 def unit(text: str) -> RecordedUnit | None:
     """What ``text`` stands for, None where that is not known.
 
-    ``Nm``, ``N*m``, ``N·m`` and ``N.m`` are the same, ``mA``, ``kN`` and the like are put together
-    from their prefix; ``13.5mA`` is a reading in steps of 13.5 mA. ``nm`` is a nanometre, not a
-    torque.
+    It is a product of factors with powers, in any of the usual spellings: ``Nm``, ``N*m``,
+    ``N·m`` and ``N-m`` are the same, ``mA``, ``kN`` and the like are put together from their
+    prefix, ``13.5mA`` is a reading in steps of 13.5 mA. ``nm`` is a nanometre, not a torque; a
+    mass times a length is a torque.
     """
-    plain = text.strip().strip("[]()").strip()
-    plain = re.sub(r"\s*[*·⋅ ]\s*", ".", plain)
-    plain = plain.replace("µ", "u").replace("μ", "u").replace("²", "2").replace("^", "")
-    plain = plain.replace("s**2", "s2")
-    for spelling in (plain, _SQUEEZED.get(plain, ""), _SPELLINGS.get(plain.lower(), "")):
-        if spelling in _BASE and (spelling or plain in ("", "-", "1", "none")):
-            return _BASE[spelling]
-        prefix, rest = spelling[:1], spelling[1:]
-        if prefix in _PREFIXES and rest in _PREFIXED:
-            base = _BASE[rest]
-            return RecordedUnit(base.si, base.scale * _PREFIXES[prefix])
-    if steps := _STEPS.fullmatch(plain):
-        one, count = unit(steps["unit"]), float(steps["number"])
-        if one is not None and one.offset == 0.0 and count > 0.0:
-            return RecordedUnit(one.si, count * one.scale)
+    plain = text.strip().strip("[]()").strip().replace("µ", "u").replace("μ", "u")
+    plain = plain.replace("²", "2").replace("³", "3").replace("⁻", "-").replace("¹", "1")
+    plain = _WHOLE.get(plain.lower().replace("-", "").replace(".", "") or plain, plain)
+    plain = re.sub(
+        r"(?i)(?<![a-z])(rpm|r/min|rps|dps)(?![a-z])", lambda rate: _RATES[rate[0].lower()], plain
+    )
+    if len(plain) == 1 and plain.isupper() and plain not in (*_ORDER, "C"):
+        return None  # (R) and (S) are sides and names
+    if plain.lower() in _CELSIUS:
+        return RecordedUnit("K", 1.0, 273.15)
+    scale, at, sign = 1.0, 0, 1
+    factors: list[tuple[str, float, int]] = []
+    while at < len(plain):
+        token = _TOKEN.match(plain, at)
+        if token is None:
+            return None
+        at = token.end()
+        if token["number"]:
+            scale *= float(token["number"]) ** sign
+        if token["word"]:
+            found = _factor(token["word"])
+            if found is None:
+                return None
+            power = sign * int(token["power"] or 1)
+            factors += [(*each, power) for each in found]
+        sign = -1 if token["over"] else 1
+    return _product(scale, factors)
+
+
+def _factor(word: str) -> list[tuple[str, float]] | None:
+    """SI unit and scale of one factor, or of two written without anything between them."""
+    pair = re.fullmatch(r"(.*N)(m|cm|mm)", word)
+    if pair:
+        parts = [_factor(each) for each in pair.groups()]
+        return [found for part in parts if part for found in part] if all(parts) else None
+    low = word.lower()
+    singular = low.removesuffix("s") if len(low) > 2 else low
+    for spelling in dict.fromkeys((word, _SPELLINGS.get(word, ""), low, singular)):
+        known = _SPELLINGS.get(spelling, spelling)
+        if known in _FACTORS:
+            return [_FACTORS[known]]
+        if known[:1] in _PREFIXES and known[1:] in _PREFIXED:
+            si, scale = _FACTORS[known[1:]]
+            return [(si, scale * _PREFIXES[known[0]])]
     return None
+
+
+def _product(scale: float, factors: list[tuple[str, float, int]]) -> RecordedUnit | None:
+    """The unit that so many factors make, with what they are multiplied by."""
+    powers = dict.fromkeys(_ORDER, 0)
+    if {(si, power) for si, _, power in factors} == {("kg", 1), ("m", 1)}:
+        scale *= _GRAVITY  # the weight of the mass
+        factors = [("N" if si == "kg" else si, size, power) for si, size, power in factors]
+    for si, size, power in factors:
+        scale *= size**power
+        if si:
+            powers[si] += power
+    above = ".".join(f"{si}{n if n > 1 else ''}" for si, n in powers.items() if n > 0)
+    below = "".join(f"/{si}{-n if n < -1 else ''}" for si, n in powers.items() if n < 0)
+    if scale <= 0.0 or above + below not in _LOGGED or not (factors or scale == 1.0):
+        return None
+    return RecordedUnit(above + below, scale)

@@ -79,54 +79,80 @@ def weigh_sets(search: Search, pool: Pool, given: Sequence[str], seed: int) -> W
     own = [e for e in search.p.absence if e not in given]
     near = sorted((c, k) for c, k in pool.values() if c < none + _NEAR and k)[:_MOST]
     absent = [((f"-{e}", ()),) for e in own]
-    listed: list[tuple[tuple[Key, ...], int | None, float, Array]] = []
-    for keys in dict.fromkeys([(), *(k for _, k in near), *absent]):
-        if np.isfinite(search.cost(keys)):
-            listed.append((keys, None, none - search.cost(keys), _by_block(search, keys, None)))
-    functions: list[Unknown | None] = []
-    for axis in range(len(search.p.y)):
+    named = [
+        _Listed(keys, None, none - search.cost(keys), _by_block(search, keys, None))
+        for keys in dict.fromkeys([(), *(k for _, k in near), *absent])
+        if np.isfinite(search.cost(keys))
+    ]
+    sets = _share(search, named, given, seed)
+    effects = _by_effect(sets)
+    unknown, functions = np.zeros(len(search.p.y)), []
+    for axis in range(len(unknown)):
         columns = spline_columns(evidence, axis)
         here = weigh_unknown(search, axis, columns)
         functions.append(here)
         if here is None or here.size < search.criteria.size or here.cost > none + _NEAR:
             continue
-        for keys, found in _beside_unknown(search, axis, columns, here, own):
-            cost = found.cost - search.log_prior
-            listed.append((keys, axis, none - cost, _by_block(search, keys, found)))
-    total = np.array([gain for _, _, gain, _ in listed])
-    blocks = np.array([by for _, _, _, by in listed])
-    rng = np.random.default_rng([seed, blocks.shape[1]])
-    counts = rng.multinomial(
-        blocks.shape[1], np.full(blocks.shape[1], 1.0 / blocks.shape[1]), _DRAWS
-    )
-    scores = (counts - 1.0) @ blocks.T + total
-    shares = softmax(scores, axis=1).mean(axis=0)
+        beside = [
+            _Listed(
+                keys, axis, none - found.cost + search.log_prior, _by_block(search, keys, found)
+            )
+            for keys, found in _beside_unknown(search, axis, columns, here, own)
+        ]
+        # What one axis lacks is independent of what another one does.
+        with_unknown = _share(search, [*named, *beside], given, seed)
+        here_too = _by_effect(with_unknown)
+        unknown[axis] = sum(s.probability for s in with_unknown if s.unknown is not None)
+        for effect in own:
+            if axis in touched_axes(search, effect):
+                effects[effect] = min(effects[effect], here_too.get(effect, 0.0))
+        if unknown[axis] == unknown.max():
+            sets = with_unknown
+    drops = {one.keys[0][0][1:]: -one.gain for one in named if one.keys in absent}
+    return Weighed(sets, effects, unknown, tuple(functions), drops)
+
+
+@dataclass(frozen=True)
+class _Listed:
+    """A set with its log evidence over that of the most probable one, whole and by block of time."""
+
+    keys: tuple[Key, ...]
+    unknown: int | None
+    gain: float
+    by_block: Array
+
+
+def _share(
+    search: Search, listed: Sequence[_Listed], given: Sequence[str], seed: int
+) -> tuple[WeighedSet, ...]:
+    """Probabilities of sets, the most probable first."""
+    total, blocks = np.array([s.gain for s in listed]), np.array([s.by_block for s in listed])
+    count = blocks.shape[1]
+    rng = np.random.default_rng([seed, count])
+    drawn = rng.multinomial(count, np.full(count, 1.0 / count), _DRAWS)
+    shares = softmax((drawn - 1.0) @ blocks.T + total, axis=1).mean(axis=0)
     sets = [
-        WeighedSet(keys, _effects(search, keys, given), axis, float(gain), float(share))
-        for (keys, axis, gain, _), share in zip(listed, shares, strict=True)
+        WeighedSet(s.keys, _effects(search, s.keys, given), s.unknown, s.gain, float(share))
+        for s, share in zip(listed, shares, strict=True)
     ]
-    effects: dict[str, float] = {}
-    unknown = np.zeros(len(functions))
+    return tuple(sorted(sets, key=lambda s: -s.probability))
+
+
+def _by_effect(sets: Sequence[WeighedSet]) -> dict[str, float]:
+    found: dict[str, float] = {}
     for one in sets:
         for effect in one.effects:
-            effects[effect] = effects.get(effect, 0.0) + one.probability
-        if one.unknown is not None:
-            unknown[one.unknown] += one.probability
-    first, *others = sets
-    drops = {
-        keys[0][0][1:]: -gain for keys, axis, gain, _ in listed if axis is None and keys in absent
-    }
-    ranked = (first, *sorted(others, key=lambda s: -s.probability))
-    return Weighed(ranked, effects, unknown, tuple(functions), drops)
+            found[effect] = found.get(effect, 0.0) + one.probability
+    return found
 
 
 def _beside_unknown(
     search: Search, axis: int, columns: Sequence[Array], here: Unknown, own: Sequence[str]
 ) -> list[tuple[tuple[Key, ...], Unknown]]:
-    """Sets beside an unknown function: the effects that it does not replace, and less each of them.
+    """Sets beside an unknown function, and less each of their effects.
 
-    An effect whose place an unknown function can take but for less than a size that matters is one
-    that resembles what is missing.
+    Effects that explain less than the function does beyond them may be mere resemblances of what is
+    missing: those whose place it takes, but for less than a size that matters, are left out.
     """
     p, size = search.p, search.criteria.size
     root = p.likelihood.root[axis]
@@ -143,7 +169,9 @@ def _beside_unknown(
         return float(np.sqrt(np.mean(moved**2))) < size * force
 
     beside = [e for e in own if axis in touched_axes(search, e)]
-    gone_all = [e for e in beside if replaces(e)]
+    none, bare = search.cost(()), search.cost(tuple((f"-{e}", ()) for e in sorted(beside)))
+    resembles = none - here.cost > bare - none
+    gone_all = [e for e in beside if resembles and replaces(e)]
     sets = [gone_all, *([*gone_all, e] for e in beside if e not in gone_all)]
     return [(tuple((f"-{e}", ()) for e in sorted(one)), without(one)) for one in sets]
 

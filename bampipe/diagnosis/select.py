@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
 from bampipe.diagnosis.probability import Weighed, weigh_sets
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.search import Pool, Search, added, gone, names
+from bampipe.diagnosis.search import Pool, Search, Solution, added, gone, names
 from bampipe.diagnosis.session import (
     Fit,
     Session,
@@ -36,6 +36,8 @@ _MINOR = 0.05
 linearised far from the truth, a model leaves more than that."""
 _WORTH = 0.5
 """Fall of the cost, nats, that makes another set worth fitting."""
+_TRIED = 4
+"""Most sets that are fitted in a round until one is better."""
 _DEEP = 3
 """Effects added at once beside a set that has been fitted."""
 
@@ -153,27 +155,51 @@ def select_effects(
             room = session.criteria.most_effects - len(current.recipe.effects) + len(recipe.effects)
             pool = _explore(search, room, deep=room if number == 0 else min(_DEEP, room))
             moved = None
-            for cost, keys in sorted(pool.values()):
+            last = number == _MOST_ROUNDS - 1
+            better = [(c, k) for c, k in sorted(pool.values()) if c < none - _WORTH]
+            for _, keys in [] if last else better[:_TRIED]:
                 wider = change_set(current.recipe, keys)
-                if cost > none - _WORTH or frozenset(wider.effects) in tried:
+                if frozenset(wider.effects) in tried:
                     continue
                 tried.add(frozenset(wider.effects))
                 progress(0.15 + 0.1 * number, f"fitting {', '.join(names(keys))}")
                 moved = session.try_fit(wider, start_of(search, keys, wider))
-                if moved is not None:
+                if moved is not None and is_better(current, moved, search.solve(keys)):
                     break
+                moved = None
             if moved is None:
+                # What promised more by its linear problem did not keep that when it was fitted.
+                pool = {n: (c, k) for n, (c, k) in pool.items() if c >= none - _WORTH}
                 progress(0.9, "holding the model against chance")
                 replays = range(session.criteria.replicates)
                 chance = tuple(search.of_replay(k).largest_gain()[0] for k in replays)
                 weighed = weigh_sets(search, pool, recipe.effects, session.seed)
                 return Selection(
                     initial, current, weighed, chance, search.largest_gain(), gains,
-                    tuple(steps), room <= 0,
+                    tuple(steps), last or room <= 0,
                 )  # fmt: skip
         current = moved
         steps.append(current)
-    raise RuntimeError("the search did not settle")
+    raise AssertionError("the last round returns")
+
+
+def is_better(before: Fit, after: Fit, promised: Solution) -> bool:
+    """Whether a fitted set is more probable, by the weights of the model without it.
+
+    Args:
+        before, after: the model without and with it; promised: its linear problem solved.
+    """
+    if any(len(a) != len(b) for a, b in zip(before.problem.y, after.problem.y, strict=True)):
+        return True
+    gained = 0.0
+    for axis, root in enumerate(before.likelihood.root):
+        if len(root):
+            squares = [
+                float(np.sum((fit.rows_beyond_bias[axis] * root) ** 2)) for fit in (before, after)
+            ]
+            ratio = max(squares[1], 1e-300) / max(squares[0], 1e-300)
+            gained -= 0.5 * before.problem.independent[axis] * float(np.log(ratio))
+    return gained + float(promised.volume.sum()) - promised.penalty > _WORTH
 
 
 def _explore(search: Search, room: int, deep: int) -> Pool:

@@ -127,15 +127,21 @@ class Session:
         extra = [effect_from(e) for e in recipe.extra]
         return list_candidates(recipe.model().device, (*recipe.effects, *without), extra)
 
-    def linearise(self, recipe: Recipe, p: Array, like: Evidence | None = None) -> Evidence:
-        """The model of ``recipe`` at parameters ``p``, (n_p,), on the trials that choose a model."""
+    def linearise(
+        self, recipe: Recipe, p: Array, like: Evidence | None = None, judged: bool = False
+    ) -> Evidence:
+        """The model of ``recipe`` at parameters ``p``, (n_p,), on the trials that choose a model.
+
+        Or, where asked for, on those by which it is ``judged``.
+        """
         t = self.trials
         found = gather_evidence(
             system_of(recipe), t.motions, t.band, p, t.folds,
             most_iterations=0, timing=t.timing,
             like=like,
         )  # fmt: skip
-        kept = [k for k, group in enumerate(t.folds.groups) if group != HELD_OUT]
+        chosen = t.folds.judged if judged else [g != HELD_OUT for g in t.folds.groups]
+        kept = [k for k, counts in enumerate(chosen) if counts]
         return found if len(kept) == len(t.motions) else found.subset(kept)
 
     def replay(self, evidence: Evidence, p: Array, count: int, first: int = 0) -> list[list[Array]]:
@@ -223,6 +229,20 @@ class Session:
                 break
         return evidence, problem
 
+    def judge(self, recipe: Recipe, p: Array) -> Fit:
+        """A model with given parameters, held against replays of it, on all trials that are judged.
+
+        Raises:
+            Runaway: the simulated motion grows without bounds.
+        """
+        evidence, c = self.linearise(recipe, p, judged=True), self.criteria
+        samples = lay_out_samples(evidence, c.block_s)
+        replays = self.replay(evidence, p, c.replicates)
+        stopping = self.replay_stopping(recipe, evidence)
+        noise = describe_noise(replays, stopping, evidence, samples)
+        likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
+        return Fit(recipe, evidence, likelihood, likelihood.pose(evidence))
+
     def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
         """Fit a model with noise that is the same for all samples of an axis: nothing is replayed."""
         evidence = self.linearise(recipe, start)
@@ -288,10 +308,23 @@ class Fit:
         return NoiseFloor.of_errors(np.array(rms).T)
 
     @cached_property
-    def rmse_beyond_bias(self) -> Array:
-        """Root mean square of what is left once the bias is taken off, by axis, (n_q,), N.m or N."""
+    def stopping_rms(self) -> Array:
+        """Of the bias, what friction that stops the machine leaves, by axis, (n_q,), N.m or N."""
+        n_q = len(self.likelihood.samples)
+        factors = (self.problem.to_parameters @ self.solved.base)[-n_q:]
+        pairs = zip(self.likelihood.noise.stopping, factors, strict=True)
+        return np.array([rms(factor * c) for c, factor in pairs])
+
+    @cached_property
+    def rows_beyond_bias(self) -> tuple[Array, ...]:
+        """What is left once the bias is taken off, by axis, each (n,), N.m or N."""
         rows = zip(self.problem.y, self.problem.base, self.likelihood.root, strict=True)
-        return np.array([rms((y + x @ self.solved.base) / root) for y, x, root in rows])
+        return tuple((y + x @ self.solved.base) / root for y, x, root in rows)
+
+    @property
+    def rmse_beyond_bias(self) -> Array:
+        """Its root mean square, (n_q,)."""
+        return np.array([rms(rows) for rows in self.rows_beyond_bias])
 
     @cached_property
     def held_out_rmse(self) -> Array:

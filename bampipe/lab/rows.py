@@ -39,7 +39,7 @@ class SessionRows:
     tables: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
 
     def add(self, table: str, **columns: object) -> None:
-        """Add a row to ``table``."""
+        """Add a row to ``table``, which keeps those of ``columns`` that it has."""
         self.tables.setdefault(table, []).append({**self.key, **columns})
 
 
@@ -74,10 +74,8 @@ def of_run(root: Path) -> SessionRows:
             rows.add(
                 "stiffness",
                 axis=axis,
-                unit=entry.unit,
-                bandwidth_hz=entry.bandwidth_hz,
-                n_cycles=entry.n_cycles,
-                **_interval("stiffness", entry.stiffness, entry.sd),
+                **entry.model_dump(),
+                **_interval(entry.stiffness, entry.sd),
             )
     _session(root, rows, session, made)
     return rows
@@ -100,48 +98,23 @@ def _model(
                 model=model,
                 parameter=name,
                 axis=axis,
-                unit=found.unit,
-                at_bound=found.at_bound,
                 method=identified.method,
-                **_interval("estimate", found.estimate, found.sd),
+                **found.model_dump(),
+                **_interval(found.estimate, found.sd),
             )
     if run.exists(ValidateResult.file(model)):
         for axis, error in run.read(ValidateResult, model).axes.items():
-            floor = error.noise_floor
-            rows.add(
-                "errors",
-                model=model,
-                axis=axis,
-                held_out_rmse=error.held_out_rmse,
-                noise_floor=floor,
-                error_over_floor=error.held_out_rmse / floor if floor else None,
-                standing=error.standing,
-                unit=error.unit,
-                rmse=error.rmse,
-                rmse_without_friction=error.rmse_without_friction,
-                fit_percent=error.fit_percent,
-            )
+            over = error.held_out_rmse / error.noise_floor if error.noise_floor else None
+            rows.add("errors", model=model, axis=axis, error_over_floor=over, **error.model_dump())
     if run.exists(DiagnoseResult.file(model)):
         diagnosis = run.read(DiagnoseResult, model)
         for axis, said in diagnosis.axes.items():
-            rows.add(
-                "verdicts",
-                model=model,
-                axis=axis,
-                verdict=said.verdict,
-                effects=list(said.effects),
-                named=phrases.missing(diagnosis, axis),
-                likely=said.likely,
-                probabilities=[said.probabilities[name] for name in said.likely],
-                unknown=said.unknown,
-                unit=said.unit,
-                sentence=said.sentence,
-                explained=said.explained,
-                explainable_share=said.explainable_share,
-                rmse_before=said.rmse_before,
-                rmse_after=said.rmse_after,
-                noise_floor=said.noise_floor,
-            )
+            plain = said.model_dump(mode="json") | {
+                "named": phrases.missing(diagnosis, axis),
+                "likely": said.likely,
+                "probabilities": [said.probabilities[name] for name in said.likely],
+            }
+            rows.add("verdicts", model=model, axis=axis, **plain)
     return nis
 
 
@@ -186,7 +159,6 @@ def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _interval(name: str, value: float, sd: float) -> dict[str, float]:
-    """Return an estimate, its standard deviation and its 95 % interval."""
-    half = NORMAL_95 * sd
-    return {name: value, "sd": sd, "lower": value - half, "upper": value + half}
+def _interval(value: float, sd: float) -> dict[str, float]:
+    """Return the 95 % interval of an estimate."""
+    return {"lower": value - NORMAL_95 * sd, "upper": value + NORMAL_95 * sd}

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bampipe.data.survey import DRIVERS, survey
+from bampipe.data.survey import survey
 from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.proposal.clock import clock_of
@@ -71,7 +71,7 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
             remedy=f"it is left alone; to run it: bampipe run {folder}",
         )
     found = survey(folder, names)
-    notes = Notes()
+    notes = Notes(check=list(found.remarks))
     chosen = find_device(folder, found, device)
     clock = clock_of(found, notes)
     match = Matcher(found, clock.t, set(clock.columns))
@@ -90,11 +90,6 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
         match.turned, match.gears = columns.turned, columns.gears
         match.counting = columns.counting
         _check_robot(chosen, columns, notes)
-    if len(found.files) > 1 and not found.of(*DRIVERS, "reference", ""):
-        notes.check.append(
-            f"no column is a drive: if {found.files[0]} and {found.files[1]} are one recording, put"
-            " them side by side in one file, each column with a name of its own"
-        )
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
     lines = [
@@ -111,7 +106,9 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
         device=chosen.text,
         fill_in=notes.fill_in,
         check=notes.check,
-        passed=[f"{name}: {reason.removeprefix(f'{name}: ')}" for name, reason in found.passed],
+        passed=[
+            f"{name}: {reason.removeprefix(name).lstrip(':, ')}" for name, reason in found.passed
+        ],
     )
 
 

@@ -79,6 +79,9 @@ def _encoder(
         if how:
             return table + notes.guess(f"{column.name} {how}")
         return table + ("" if column.stated else notes.guess(f"{column.name} in {column.unit}"))
+    if column.by_looks:
+        note = notes.ask(f"the unit of {column.name}, which looks like the position of {axis.name}")
+        return entry(column.name, UNKNOWN, velocity) + note
     by_size = guesses.likely_unit(axis.unit, column.values)
     likely, why = (by_size, ", by its size") if by_size else (axis.unit, "")
     counted, how = _counting(axis, likely, match)

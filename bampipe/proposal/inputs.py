@@ -97,6 +97,9 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             + notes.ask(f"calibration_n_per_v, {device.force_unit} for one of {names}"),
             f"zero_v = {row}" + notes.guess(f"{names} is 0 without force"),
         ]
+    if any(column.by_looks for column in columns):
+        note = notes.ask(f"the unit of {names}, which looks like what drives the motion")
+        return [f'unit = "{UNKNOWN}"{note}']
     note = notes.guess(f"{names} is a force in {device.force_unit}{why}; volts need a gain")
     return [f'unit = "{device.force_unit}"{note}']
 

@@ -14,7 +14,20 @@ _TAKEN = frozenset(
         *("enc", "encoder", "pos", "position", "angle", "counts", "ticks", "displacement", "disp"),
         *("stroke", "present", "actual", "act", "measured", "meas", "current", "state", "value"),
         *("deg", "degree", "degrees", "rad", "radian", "radians", "vel", "velocity", "speed"),
-        *("header", "feedback", "percent", "rec", "log", "data", "mot", "motor"),
+        *(
+            "header",
+            "feedback",
+            "column",
+            "ang",
+            "motion",
+            "dist",
+            "percent",
+            "rec",
+            "log",
+            "data",
+            "mot",
+            "motor",
+        ),
     ]
 )
 _FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "torque", "tau"}

@@ -24,19 +24,29 @@ def trials_tables(
         match: the logs and their time.
         notes: where guesses and what is left open are noted.
     """
-    files = match.found.files
+    trials = match.found.trials
     cuts: list[float] = []
-    if len(files) == 1 and axes:
+    if len(trials) == 1 and axes:
         cuts = guesses.stretches(match.t, next(iter(axes.values())).values)
     lines = []
     if cuts:
         note = notes.guess("one record, cut at rests, so that each part can be held out")
         lines.append(note.strip())
-    for file in files:
+    for trial in trials:
         for start_s, end_s in pairwise([None, *cuts, None]):
-            lines += ["[[trials]]", f"file = {quoted(file)}", *_kind(file, device, notes)]
+            lines += ["[[trials]]", f"file = {quoted(trial.file)}"]
+            lines += _kind(trial.file, device, notes)
+            lines += [f"recording = {trial.recording}"] if trial.recording else []
             lines += [f"start_s = {start_s}"] if start_s is not None else []
             lines += [f"end_s = {end_s}"] if end_s is not None else []
+            lines += [f"part = {quoted(trial.part)}"] if trial.part else []
+            for part in trial.parts:
+                if not any(name.startswith(f"{part.name}:") for name in match.used):
+                    continue
+                lines += ["", "[[trials.parts]]"]
+                given = ("file", "name", "join", "time", "time_unit")
+                told = {key: getattr(part, key) for key in given}
+                lines += [f"{key} = {quoted(value)}" for key, value in told.items() if value]
             lines.append("")
     return lines
 

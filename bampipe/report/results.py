@@ -13,6 +13,7 @@ import pandas as pd
 from bampipe.declarations.model import read_model_file
 from bampipe.errors import InputError, MissingResultError
 from bampipe.files import read_json_table, read_toml
+from bampipe.report.document import Paragraph, Section
 from bampipe.results.compare import CompareResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.record import Result
@@ -196,6 +197,10 @@ class Results:
             return self.require_model(self.detail_model)
         compared = self.read(CompareResult)
         return compared.best if compared and compared.best in self.models else "base"
+
+    def not_done(self, title: str, said: str, stage: str) -> Section:
+        """Return the section of what a stage would do, with the command that does it."""
+        return Section(title, (Paragraph(f"{said}: `bampipe {stage} {self.root.name}` does it."),))
 
     @property
     def diagnose(self) -> str:

@@ -57,6 +57,17 @@ def scale(values: Iterable[float], base: str) -> tuple[float, str]:
     return 1.0 / size, letter + unit(base)
 
 
+def scaled(value: float | None, base: str, digits: int = 2, sd: float | None = None) -> str:
+    """Return a value with the unit that suits it; with ``sd`` rounded by that; a dash for none."""
+    if value is None:
+        return "–"
+    factor, shown = scale([value], base) if base != "J" else (1e3, "mJ")
+    number = (
+        significant(factor * value, digits) if sd is None else with_sd(factor * value, factor * sd)
+    )
+    return f"{number} {shown}"
+
+
 def plain(value: float, decimals: int, power: int = 0) -> str:
     """Return ``value`` with so many decimals, a true minus sign and that power of ten taken out."""
     text = f"{value / 10.0**power:.{decimals}f}"

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
@@ -57,7 +56,7 @@ class Config:
 
     Attributes:
         model: which model version to draft for.
-        replicates: replays of the model, from which the null distribution comes.
+        replicates: replays of the model, which are recombined to the null distribution.
         significance: chance of a formula where nothing is missing.
         jobs: worker processes; 0 means one for each processor, eight at most.
         seed: of the noise in the replays.
@@ -112,9 +111,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         drafted: dict[str, DraftedEffect] = {}
         if _beats_named_effects(one, diagnosis.axes[axis]):
             for term in one.terms:
-                file = f"models/{config.model}/drafts/{term.name}.toml"
+                file = f"models/{config.model}/drafts/{term.form.name}.toml"
                 write_text(out / file, write_toml(declare(term, source)))
-                drafted[term.canonical] = _effect(term, file)
+                drafted[term.form.canonical] = _effect(term, file)
         rows = [row for row in diagnosis.ranking if row.axis == axis]
         entries[axis] = _axis(axis, one, drafted, diagnosis.axes[axis], rows)
         effects |= drafted
@@ -209,7 +208,7 @@ def _axis(
         chance=found.chance,
         options=tuple(
             DraftOption(
-                effects=tuple(name for _, name in option.terms),
+                effects=tuple(form.name for form in option.terms),
                 constants=option.constants,
                 held_out_rmse=option.held_out_rmse,
                 log_evidence=option.log_evidence,

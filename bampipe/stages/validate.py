@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import groupby
 from pathlib import Path
 
@@ -16,6 +15,8 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.session import Session
 from bampipe.errors import InputError
 from bampipe.identification.drift import find_drift
 from bampipe.identification.free_run import free_runs
@@ -27,7 +28,7 @@ from bampipe.results.checks import find_failed_checks
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.rounding import significant
-from bampipe.results.standing import AT_FLOOR, standing
+from bampipe.results.standing import standing
 from bampipe.results.validate import (
     AxisError,
     ForceError,
@@ -45,6 +46,7 @@ from bampipe.trials.comparison import (
     published_rmse,
     rms,
 )
+from bampipe.trials.draw import draw_trials
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import (
     MeasuredTrials,
@@ -53,16 +55,7 @@ from bampipe.trials.measured import (
     trial_of_block,
 )
 from bampipe.trials.motion import Motion
-from bampipe.trials.noise_floor import (
-    PROBE_WIDTH,
-    STILL_WIDTH,
-    NoiseFloor,
-    find_noise_floor,
-    floor_replays,
-    force_noise_through_offset,
-    parameters_to_replay,
-    standing_still_matters,
-)
+from bampipe.trials.noise_floor import NoiseFloor, floor_replays
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
 
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
@@ -132,8 +125,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         recipe = read_recipe(run, config.model, model)
         floor, said = _noise_floor(evidence, trials, p, recipe, config, progress)
         notes += said
-        if floor is not None:
-            notes += _noise_through_play(evidence, trials, floor)
     free: FreeRun | None = None
     if config.free_run:
         progress(0.8, "free runs")
@@ -171,71 +162,38 @@ def _noise_floor(
     progress: Progress,
 ) -> tuple[NoiseFloor | None, list[str]]:
     """The floor, None where the fitted model cannot be simulated, and what to say of it."""
+    progress(0.4, "noise floor")
     count = config.repeats or floor_replays(trials.motions)
-
-    def report(done: int) -> None:
-        progress(0.4 + 0.4 * done / count, "noise floor")
-
-    report(0)
+    chosen = _choose_trials(evidence)
+    drawn = replace(
+        trials,
+        motions=[trials.motions[k] for k in chosen],
+        folds=trials.folds.subset(chosen),
+    )
+    session = Session(drawn, Criteria(replicates=count), seed=config.seed)
     try:
-        replayed = parameters_to_replay(evidence, trials.sensors, trials.kinematics, p)
-        floor = find_noise_floor(
-            evidence, replayed, trials.sensors, trials.kinematics, config.seed, count, report
-        )
+        found = session.judge(recipe, p)
     except InputError as error:
         return None, [f"No noise floor: simulating the fitted model failed ({error})."]
-    if not floor.is_exceeded(evidence.held_out_rmse):
-        return floor, []
-    return _with_still_replays(evidence, trials, replayed, floor, recipe, config.seed)
+    notes = []
+    for i, axis in enumerate(evidence.system.coordinates):
+        stops, level = found.stopping_rms[i], found.noise_floor.level[i]
+        if stops > 0.5 * level:
+            unit = evidence.system.torque_units[i]
+            notes.append(
+                f"{axis}: of the noise floor of {significant(level)} {unit}, {significant(stops)}"
+                " are of friction that stops the machine where it turns, between two samples."
+            )
+    return found.noise_floor, notes
 
 
-def _noise_through_play(evidence: Evidence, trials: MeasuredTrials, floor: NoiseFloor) -> list[str]:
-    """Say where most of a floor is what noise of the forces does by moving the mechanism."""
-    system = evidence.system
-    noise = force_noise_through_offset(evidence, trials.sensors)
-    named = ", ".join(
-        f"`{item.name}`" for item in system.model.effects if item.effect.kind == "measurement"
-    )
-    return [
-        f"{system.coordinates[i]}: of the noise floor of {significant(floor.level[i])}"
-        f" {system.torque_units[i]}, {significant(np.sqrt(noise[i]))} are noise of the force, which"
-        f" moves the mechanism by {named}. A quieter force sensor lets more be seen."
-        for i in np.flatnonzero(noise > 0.5 * floor.level**2)
-    ]
+def _choose_trials(evidence: Evidence) -> list[int]:
+    """Numbers of the trials that are replayed for the floor, in order.
 
-
-def _with_still_replays(
-    evidence: Evidence,
-    trials: MeasuredTrials,
-    p: Array,
-    floor: NoiseFloor,
-    recipe: Recipe,
-    seed: int,
-) -> tuple[NoiseFloor, list[str]]:
-    """The floor of a machine that creeps or stands still where it turns round, and what to say."""
-
-    def narrow(width: float) -> System:
-        return compile_model(recipe.with_sign_widths(width).model())
-
-    sensors, kinematics = trials.sensors, trials.kinematics
-    try:
-        probe = partial(narrow, PROBE_WIDTH)
-        if not standing_still_matters(evidence, probe, sensors, kinematics, floor):
-            return floor, []
-        still = find_noise_floor(
-            evidence, p, sensors, kinematics, seed, floor.replays, replayed=narrow(STILL_WIDTH)
-        )
-    except InputError:
-        return floor, []
-    either, system = floor.raised(still, evidence.held_out_rmse), evidence.system
-    raised = np.flatnonzero(either.level > AT_FLOOR * floor.level)
-    return either, [
-        f"{system.coordinates[i]}: replays that stand still where the motion turns round leave"
-        f" {significant(still.level[i])} {system.torque_units[i]}, those that creep as `sign_width`"
-        f" says {significant(floor.level[i])}: the noise floor is {significant(either.level[i])}."
-        " A smaller `sign_width` in the device file lets more be seen."
-        for i in raised
-    ]
+    Where the session holds trials out, these are few, and all are needed to judge by.
+    """
+    everything = list(range(len(evidence.motions)))
+    return draw_trials(evidence.sizes) if all(evidence.folds.judged) else everything
 
 
 def _run_freely(

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from bampipe.errors import InputError
 from bampipe.physics import System
 from bampipe.results.validate import AxisError
-from bampipe.trials.evidence import Evidence
+from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.noise_floor import replay_evidence
-from bampipe.trials.replay import UNLIKE, StandIn
+from bampipe.trials.replay import UNLIKE, StandIn, replay_motions
 from bampipe.trials.residuals import ModelOnTrial
 
 Array = NDArray[np.float64]
@@ -137,10 +136,10 @@ def expected_published_ratio(
     nothing = np.ones(len(evidence.system.coordinates))
     published = StandIn(evidence.system, p, evidence.motions, trials.sensors.rate_hz)
     try:
-        again = replay_evidence(
-            published, evidence.system, evidence.p, trials.sensors, trials.kinematics,
-            evidence.band, evidence.folds, (seed, _EXPECTED_SEED),
-        )  # fmt: skip
+        replays = replay_motions(
+            published, trials.sensors, trials.kinematics, (seed, _EXPECTED_SEED), alone=True
+        )
+        again = gather_evidence(evidence.system, replays, evidence.band, evidence.p, evidence.folds)
     except InputError:
         return nothing
     if np.any(again.held_out_rmse > UNLIKE * evidence.held_out_rmse):

@@ -57,6 +57,10 @@ WRITTEN = {
     "other lines above": PREAMBLE + table(";", ","),
     "header in a remark": "# " + table(" "),
     "MATLAB remark": "% made by hand\n" + table("\t"),
+    "lines that end in semicolons": "%log\n%t,x,n\n%[#],[deg],[1]\n"
+    + table(header="", row=lambda c: ",".join(c) + ";").removeprefix("\n"),
+    "header with commas above blanks": "% t, x, n\n" + table(" ", header=""),
+    "chatter": table().replace("\n0.200,", "\nLogging to: LD0029.CSV\n\n[INFO]: t, x, n!\n0.200,"),
     "unit row": table().replace("t,x,n\n", "t,x,n\ns,deg,1\n"),
     "unit row in brackets": table(";", ",").replace("t;x;n\n", "t;x;n\n[s];[mm];[-]\n"),
     "unit row, blanks": table("\t").replace("t\tx\tn\n", "t\tx\tn\ns\tN.m\t\n"),
@@ -212,3 +216,66 @@ def test_what_means_no_reading_can_be_said(tmp_path):
     text = table().replace("0.010,0.0300", "0.010,ovf").replace("0.020,0.0600", "0.020,n/a")
     trial = read(tmp_path, text, dialect=Dialect(missing=("ovf",)))
     assert np.isnan(trial.columns["x"][1:3]).all() and np.isfinite(trial.columns["x"][3:]).all()
+
+
+def test_the_first_rows_may_lack_cells(tmp_path):
+    """What is logged before all sensors have answered is no header."""
+    rows = "2026-05-04T09:30:00.{:03}Z,{},{}"
+    lines = [
+        "timestamp,pos (1),pos (2)",
+        "2026-05-04T09:29:59.990Z,,",
+        "2026-05-04T09:29:59.995Z,,",
+    ]
+    lines += [rows.format(10 * k, k, 2 * k) for k in range(30)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(lines) + "\n")
+    assert columns_of(path) == {"timestamp": "datetime", "pos (1)": "", "pos (2)": ""}
+    trial = read_trial(path, ("timestamp", "pos (2)"), datetimes={"timestamp": ""})
+    np.testing.assert_array_equal(trial.columns["pos (2)"][:4], [np.nan, np.nan, 0.0, 2.0])
+    assert trial.columns["timestamp"][2] == pytest.approx(0.01) and trial.first_row == 2
+
+
+def test_columns_without_a_header_have_numbers(tmp_path):
+    trial = read(tmp_path, table("\t", header="").lstrip(), ("column_1", "column_2", "column_3"))
+    check(trial, ("column_1", "column_2", "column_3"))
+    with pytest.raises(InputError, match="without names, the columns are column_1 to column_3"):
+        read(tmp_path, table("\t", header="").lstrip())
+
+
+def test_recordings_and_chatter_are_found_with_their_rows(tmp_path):
+    text = table() + "Logging to: B.CSV\n" + table()
+    trial = read(tmp_path, text)
+    assert len(trial) == 80 and trial.begun == (40,)
+    assert trial.notes == ("row 42 is text and no sample: left out",)
+    np.testing.assert_array_equal(trial.rows[[0, 39, 40, 79]], [2, 41, 44, 83])
+    second = trial.between(40, 80)
+    check(second)
+    assert second.first_row == 44 and second.begun == ()
+    with pytest.raises(InputError, match="50 lines hold text and no sample, and there are more"):
+        read(tmp_path, table() + "oops\n0,1,2\n" * 60)
+    with pytest.raises(InputError, match=r"row 42: 2 cells, where the header has 3; the line is"):
+        read(tmp_path, table() + "1.0,2.0\n" + "0.4,1.0,2\n")
+
+
+def test_joints_of_rostopic_echo_have_their_names(tmp_path):
+    """`rostopic echo -p`: the names of the joints stand in columns of their own."""
+    head = "%time,field.header.frame_id,field.name0,field.name1,field.position0,field.position1"
+    rows = [f"{1700000000000000000 + 10**7 * k},base,elbow,wrist,{X[k]},{N[k]}" for k in range(40)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join([head, *rows]) + "\n")
+    names = ("time", "field.position[elbow]", "field.position[wrist]")
+    assert tuple(columns_of(path)) == names
+    trial = read_trial(path, names)
+    np.testing.assert_allclose(np.diff(trial.columns["time"]), 1e7, atol=300.0)
+    np.testing.assert_array_equal(trial.columns["field.position[wrist]"], N)
+
+
+@pytest.mark.parametrize(("said", "angle"), [("inDegrees=yes\n", "deg"), ("inDegrees=no\n", "rad")])
+def test_motion_files_of_opensim_say_their_angles(tmp_path, said: str, angle: str):
+    head = f"knee\nversion=1\nnRows=40\nnColumns=4\n{said}endheader\n"
+    names = ("time", "knee_angle_r", "knee_angle_r_speed", "pelvis_tx", "knee_moment")
+    rows = ["\t".join(f"{v:.4f}" for v in (t, x, x, x, x)) for t, x in zip(T, X, strict=True)]
+    path = tmp_path / "a.mot"
+    path.write_text(head + "\t".join(names) + "\n" + "\n".join(rows) + "\n")
+    units = ("s", angle, f"{angle}/s", "", "")
+    assert columns_of(path) == dict(zip(names, units, strict=True))

@@ -328,19 +328,94 @@ def test_ros_refused(tmp_path):
     refused(path, (state,))
 
 
-def test_mcap_of_json(tmp_path):
+def write_json_mcap(path: Path, messages: list[tuple[float, dict]]) -> Path:
+    """An MCAP file of JSON messages at times in s."""
     writer_module = pytest.importorskip("mcap.writer")
-    path = tmp_path / "a.mcap"
     with path.open("wb") as stream:
         writer = writer_module.Writer(stream)
         writer.start()
         schema = writer.register_schema("state", "jsonschema", b'{"type": "object"}')
         channel = writer.register_channel("/state", "json", schema)
-        for n, q in enumerate(Q):
-            moment = STARTED + 10_000_000 * n
-            data = json.dumps({"q": [q], "ok": True}).encode()
-            writer.add_message(channel, moment, data, moment)
+        for t, message in messages:
+            moment = STARTED + round(1e9 * t)
+            writer.add_message(channel, moment, json.dumps(message).encode(), moment)
         writer.finish()
+    return path
+
+
+def test_two_publishers_on_a_topic_are_told_apart(tmp_path):
+    true, false = [], []
+    for t, q in zip(T, Q, strict=True):
+        both = {"position": [q, 2 * q], "velocity": [], "effort": [3 * q, 4 * q]}
+        true.append((t, {"name": ["elbow", "wrist"], **both}))
+        zeros = {"position": [0.0, 0.0], "velocity": [], "effort": []}
+        false.append((t + 0.003, {"name": ["wrist", "elbow"], **zeros}))
+        false.append((t + 0.004, {"name": ["grip"], "position": [t], "velocity": [], "effort": []}))
+    path = write_json_mcap(tmp_path / "a.mcap", sorted([*true, *false[:60]], key=lambda m: m[0]))
+    names = ("/state:@time", "/state:position[elbow]", "/state:effort[wrist]")
+    trial = read_trial(path, names)
+    np.testing.assert_allclose(trial.columns[names[0]], T, atol=1e-9)
+    np.testing.assert_allclose(trial.columns[names[1]], Q)
+    np.testing.assert_allclose(trial.columns[names[2]], 4 * Q)
+    (said,) = trial.remarks
+    assert "3 kinds of messages on /state" in said and "60 of 110 with other names" in said
+    assert "/state:position[grip]" in columns_of(path)
+    more = read_trial(path, (*names, "/state:position[grip]"))  # at the times of the others
+    inner = slice(1, 29)
+    np.testing.assert_allclose(more.columns["/state:position[grip]"][inner], T[inner], atol=0.005)
+
+
+def test_many_samples_in_a_message(tmp_path):
+    """A message a second, with all samples since the one before."""
+    t, rate = np.arange(1000) / 100.0, 100
+    q = np.sin(t)
+    messages = []
+    for k in range(0, 1000, rate):
+        rows = [{"q": x, "i": 2 * x} for x in q[k : k + rate]]
+        dim = [{"size": rate}, {"size": 2}]
+        flat = np.column_stack([q, -q])[k : k + rate].ravel().tolist()
+        message = {"samples": rows, "t": t[k : k + rate].tolist(), "data": flat, "ok": 1}
+        messages.append((float(t[k]), {**message, "layout": {"dim": dim}}))
+    path = write_json_mcap(tmp_path / "a.mcap", messages)
+    names = ("samples[:].q", "samples[:].i", "t[:]", "data[0::2]", "data[1::2]", "ok")
+    assert set(columns_of(path)) >= {f"/state:{name}" for name in names}
+    for clock in ("/state:@time", "/state:t[:]"):
+        trial = read_trial(path, (clock, *(f"/state:{name}" for name in names if name != clock)))
+        np.testing.assert_allclose(trial.columns[clock], t, atol=1e-9)
+        np.testing.assert_allclose(trial.columns["/state:samples[:].i"], 2 * q)
+        np.testing.assert_allclose(trial.columns["/state:data[1::2]"], -q)
+        np.testing.assert_array_equal(trial.columns["/state:ok"], 1.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "names"),
+    [
+        (
+            {"data": np.column_stack([T, Q, F]).tolist(), "dt": 0.01},
+            ("data[0]", "data[1]", "data[2]"),
+        ),
+        (
+            {"columns": ["t", "q", "f"], "data": np.column_stack([T, Q, F]).tolist(), "dt": 0.01},
+            ("t", "q", "f"),
+        ),
+        ({"t": T.tolist(), "arm": {"q": Q.tolist(), "f": F.tolist()}, "gains": [1, 2], "dt": 0.01},
+         ("t", "arm.q", "arm.f")),
+    ],
+)  # fmt: skip
+def test_json_of_arrays(tmp_path, content, names):
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(content))
+    assert tuple(columns_of(path)) == (*names, "dt")
+    trial = read_trial(path, (*names, "dt"))
+    for name, values in zip(names, (T, Q, F), strict=True):
+        np.testing.assert_array_equal(trial.columns[name], values)
+    np.testing.assert_array_equal(trial.columns["dt"], 0.01)
+    assert "no column 'x'" in refused(path, ("x",))
+
+
+def test_mcap_of_json(tmp_path):
+    messages = [(0.01 * n, {"q": [q], "ok": True}) for n, q in enumerate(Q)]
+    path = write_json_mcap(tmp_path / "a.mcap", messages)
     trial = read_trial(path, ("/state:@time", "/state:q[0]", "/state:ok"))
     np.testing.assert_allclose(trial.columns["/state:@time"], T, atol=1e-12)
     np.testing.assert_array_equal(trial.columns["/state:q[0]"], Q)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bampipe.discover.chance import system_of
+from bampipe.diagnosis.session import system_of
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import registry

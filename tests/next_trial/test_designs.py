@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from discover.sessions import BAND, KINEMATICS, SENSORS, bam
 
-from bampipe.discover.chance import system_of
-from bampipe.estimate.low_pass import Band
+from bampipe.diagnosis.session import system_of
 from bampipe.next_trial.choice import Tried, find_best_of_each, rank_designs
-from bampipe.next_trial.discrimination import Contest, Rival, Sums
+from bampipe.next_trial.discrimination import Contest, Rival, chance_of_confusion
 from bampipe.next_trial.forecast import Forecast
 from bampipe.next_trial.motion import (
     HASTY,
@@ -34,7 +33,6 @@ from bampipe.next_trial.primitives import (
     vary_surroundings,
 )
 from bampipe.next_trial.reasons import explain_proposal, find_shown
-from bampipe.next_trial.sensitivity import beyond_timing
 from bampipe.next_trial.words import describe
 from bampipe.physics import Model, compile_model, registry
 from bampipe.results.forecast import compare_forecast, read_forecasts
@@ -481,7 +479,11 @@ def test_what_shows_at_no_size_that_a_machine_has_is_out_of_sight():
 
     blindness = SimpleNamespace(
         found=[seen(3.0), seen(7.0), seen(1e5)],
-        contest=SimpleNamespace(system=SimpleNamespace(coordinates=("yaw",))),
+        contest=SimpleNamespace(
+            fit=SimpleNamespace(
+                evidence=SimpleNamespace(system=SimpleNamespace(coordinates=("yaw",)))
+            )
+        ),
         factors_with=lambda motions: np.array([1.0, 1.0, 99.0]),
     )
     near, far = _sensitivity(blindness, SimpleNamespace(usual=(None,))).values()
@@ -499,19 +501,6 @@ def test_what_the_trial_would_show_is_named_first():
     reasons = explain_proposal("sensitivity", "", made_proposal(0.1), table, (), ())
     assert reasons.why.startswith("These trials would not have shown drag:x below 3 N, far:2")
     assert reasons.expected.startswith("It would show drag:x from 1 N on")
-
-
-def test_rivals_that_the_trials_would_tell_apart_are_left_to_no_trial():
-    distinguishable = ["drag:joint", "sag:joint"]
-    best = made_proposal(0.1).model_copy(update={"confusion": ()})
-    why = explain_proposal("precision", "", best, {}, (), (), distinguishable=distinguishable).why
-    assert why.startswith("The diagnosis leaves drag:joint and sag:joint open, and no trial")
-    assert "below 1 %" in why
-    pair = made_proposal(0.0).confusion[0].model_copy(update={"before": 0.001})
-    asked = best.model_copy(update={"confusion": (pair,)})
-    reasons = explain_proposal("decision", "", asked, {}, (), ())
-    assert "would tell them apart" in reasons.why
-    assert reasons.expected == "No trial decides that."
 
 
 def test_where_nothing_decides_it_is_said_what_was_not_tried():
@@ -608,7 +597,7 @@ def test_a_plan_is_not_stalled_by_an_uncertainty_that_was_small_by_luck():
     )  # fmt: skip
     design = Primitive({0: Stroke(-0.5, 0.5, 1.0, 1.0)}, np.zeros(1), 20.0)
     forecast = SimpleNamespace(
-        precision=known, contest=None, at_hand=None, added_by=lambda tried: list(tried.usual)
+        precision=known, contest=None, added_by=lambda tried: list(tried.usual)
     )
     tried = Tried(design, 1.0, (information, information))
     goal = Goal(np.array([0.2, 0.004, 0.004, 0.004, 0.004]), 0.05)
@@ -702,43 +691,49 @@ def test_what_a_trial_was_to_show_is_held_against_the_diagnosis_that_knows_it(
     identified = SimpleNamespace(
         trials=("t1", "t2", "t3"), parameters={"mass": SimpleNamespace(sd=0.005)}
     )
-    diagnosed = SimpleNamespace(trials=weighed, selected=selected, groups={})
+    diagnosed = SimpleNamespace(trials=weighed, selected=selected, axes={})
     first, second = compare_forecast(proposed, identified, diagnosed)
     assert "was forecast with trials t2 and t3, ± 0.005 came" in first
     assert second == f"it was to show drag:x from 0.9 N on; {said}"
 
 
-def contest_of(odds: list[float], floor: float = 1.0) -> Contest:
-    rivals = tuple(Rival(None, np.zeros(0), share) for share in odds)
-    return Contest(None, np.zeros(0), rivals, Band(100.0, (8.0,)), np.array([floor]))
-
-
 def test_pairs_weigh_by_the_product_of_their_odds():
-    weights = contest_of([0.6, 0.3, 0.1]).weights()
+    rivals = tuple(Rival((), (), share) for share in (0.6, 0.3, 0.1))
+    weights = Contest(None, None, np.ones(1), rivals).weights()
     assert weights[0, 1] == pytest.approx(0.18 / 0.27)
     assert sum(weights.values()) == pytest.approx(1.0)
 
 
-def test_confusion_falls_with_what_the_wrong_one_leaves():
-    contest = contest_of([0.5, 0.5])
-    sums = Sums(np.zeros((1, 1, 1)), np.array([1000.0]))
-    nothing, chances = np.array([2000.0]), []
-    for left in (0.0, 10.0, 100.0, 1000.0):
-        distance, chance = contest._compare(sums, nothing, np.array([left]))
-        assert distance == pytest.approx(
-            0.5 * 1000.0 * contest.band.independent_share[0] * np.log1p(left / 1000.0)
-        )
-        chances.append(chance)
-    assert chances[0] == 0.5
+def test_confusion_is_that_of_a_choice_by_the_odds_that_further_trials_leave():
+    assert chance_of_confusion(0.6, 0.2, 0.0) == pytest.approx(0.25)
+    rng, gained = np.random.default_rng(0), 2.0
+    scatter = rng.normal(gained, np.sqrt(2.0 * gained), 200_000)
+    # Wrong where the ratio by the trials falls short of what was believed beforehand.
+    wrong = 0.75 * np.mean(scatter < -np.log(3.0)) + 0.25 * np.mean(scatter < np.log(3.0))
+    assert chance_of_confusion(0.6, 0.2, gained) == pytest.approx(wrong, abs=0.003)
+    chances = [chance_of_confusion(0.2, 0.6, nats) for nats in (0.1, 1.0, 10.0, 30.0)]
     assert chances == sorted(chances, reverse=True)
-    assert chances[-1] < 0.01
+    assert chances[-1] < 1e-3
 
 
-def test_what_the_timing_imitates_up_to_its_limit_shows_beyond_it():
-    """A pure delay shows by what is beyond the limit; one that no timing imitates, as it is."""
-    assert beyond_timing(1e9, 0.1, 2.0) == pytest.approx(2.1)
-    assert beyond_timing(3.0, 0.5, 0.0) == pytest.approx(0.5)
-    assert beyond_timing(3.0, 0.5, 3.0) == pytest.approx(3.0)
-    part = beyond_timing(3.0, 0.5, 1.0)
-    whole, rest = 1.0 / 3.0**2, 1.0 / 0.5**2 - 1.0 / 3.0**2
-    assert part**2 * whole + (part - 1.0) ** 2 * rest == pytest.approx(1.0)
+@pytest.mark.parametrize(
+    ("selected", "undecided", "said"),
+    [
+        (("a:x", "b:x"), (), "it is a:x + b:x"),
+        (("a:x",), (), "it is a:x"),
+        ((), (), "neither is found"),
+        (("a:x", "b:x"), ("a:x", "b:x"), "still do not distinguish them"),
+    ],
+)
+def test_sets_that_were_to_be_told_apart_are_held_against_the_diagnosis(selected, undecided, said):
+    pair = made_proposal(0.02).confusion[0].model_copy(update={"between": ("a:x", "a:x + b:x")})
+    proposed = NextResult(
+        model="base", purpose="decision", trials=("t1",), sentence="Move yaw.", why="",
+        expected="", proposals=(made_proposal(0.02).model_copy(update={"confusion": (pair,)}),),
+    )  # fmt: skip
+    identified = SimpleNamespace(trials=("t1", "t2"), parameters={})
+    axis = SimpleNamespace(verdict="undecided", probabilities=dict.fromkeys(undecided, 0.5))
+    diagnosed = SimpleNamespace(trials=("t2",), selected=selected, axes={"x": axis})
+    (line,) = compare_forecast(proposed, identified, diagnosed)
+    assert line.startswith("a:x or a:x + b:x: a chance of 2 % was forecast of confusing them; ")
+    assert line.endswith(f"{said}.")

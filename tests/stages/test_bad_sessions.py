@@ -264,7 +264,7 @@ REFUSED: dict[str, tuple[Damage, str]] = {
         "no encoder for axis 'pitch'",
     ),
     "axis in the wrong unit": (put("encoders.yaw.unit", "mm"), "brakes.unit: found"),
-    "unknown unit": (put("encoders.yaw.unit", "radian"), "did you mean 'rad'"),
+    "unknown unit": (put("encoders.yaw.unit", "radain"), "did you mean 'rad'"),
     "zero counts_per_unit": (put("encoders.yaw.counts_per_unit", 0), "counts_per_unit: found 0"),
     "counts_per_unit is text": (
         put("encoders.yaw.counts_per_unit", "many"),

@@ -206,7 +206,7 @@ def test_a_recorded_velocity_checks_the_position(tmp_path, velocity, said):
         ({"time": 'column = "t [s]"\nunit = "samples"'}, "time.column: given although unit"),
         ({"time": 'unit = "s"'}, "time: 'column' is missing"),
         ({"time": 'column = "t [s]"\nunit = "s"\nformat = "%S"'}, 'only for unit = "datetime"'),
-        ({"encoder": 'column = "q [deg]", unit = "degree"'}, 'expected "rad" or "deg"'),
+        ({"encoder": 'column = "q [deg]", unit = "counts"'}, "expected a unit of rad, m, rad"),
     ],
 )
 def test_units_that_contradict_the_file_are_refused(tmp_path, change, said):
@@ -237,6 +237,12 @@ def test_the_layout_that_a_session_declares(tmp_path):
         ("degC", "K", 1.0), ("-", "", 1.0), ("%", "", 0.01), ("m/s²", "m/s2", 1.0),
         ("nm", "m", 1e-9), ("MN", "N", 1e6), ("lbf", "N", 4.4482216152605),
         ("13.5mA", "A", 0.0135), ("[2.69 mA]", "A", 2.69e-3), ("0.5 deg", "rad", np.pi / 360),
+        ("Ncm", "N.m", 0.01), ("turns/s", "rad/s", 2 * np.pi), ("in", "m", 0.0254),
+        ("lb", "N", 4.4482216152605), ("kip", "N", 4448.2216152605), ("0.1%", "", 1e-3),
+        ("N-m", "N.m", 1.0), ("Newton meters", "N.m", 1.0), ("kg.cm", "N.m", 0.0980665),
+        ("oz-in", "N.m", 7.0615518e-3), ("ft-lb", "N.m", 1.3558179), ("rad s^-1", "rad/s", 1.0),
+        ("degrees per second", "rad/s", np.pi / 180), ("m·s⁻²", "m/s2", 1.0),
+        ("0.229rpm", "rad/s", 0.229 * np.pi / 30), ("deg/10", "rad", np.pi / 1800),
     ],
 )  # fmt: skip
 def test_units_of_logs(text, si, scale):
@@ -247,7 +253,20 @@ def test_units_of_logs(text, si, scale):
 
 @pytest.mark.parametrize(
     "text",
-    ["counts", "ticks", "furlong", "N.m.s/rad", "q", "m m m", "2", "1/s", "0 mA", "3e", "20 degC"],
+    [
+        "counts",
+        "ticks",
+        "furlong",
+        "N.m.s/rad",
+        "q",
+        "m m m",
+        "2",
+        "1/s",
+        "0 mA",
+        "3e",
+        "20 degC",
+        "m1",
+    ],
 )
 def test_units_that_are_not_known(text):
     assert unit(text) is None

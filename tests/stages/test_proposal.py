@@ -408,36 +408,40 @@ def test_why_a_time_is_no_clock_is_said(tmp_path):
     assert re.search(r"stamp does not change at \d+ of \d+ steps", line)
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ("header", "found 't', expected a number; the header once more: several recordings in one"),
-        ("time", "row 1002, column 't': time starts again once; several recordings in one file?"),
-        ("still", "is sound; a.csv and 1 more: declared free, but never moves"),
-    ],
-)
-def test_what_is_wrong_with_a_log_is_said_in_one_line(tmp_path, command: Command, change, said):
-    t = 0.01 * np.arange(2000)
-    rows = [f"{a:.2f},{np.sin(a):.6f},{np.cos(a):.4f}" for a in t]
-    if change == "header":
-        rows.insert(1000, "t,angle_rad,torque_nm")
-    elif change == "time":
-        rows = rows[:1000] + rows[:1000]
-    else:
-        rows = [
-            f"{a:.2f},{1e-5 * (k % (3 + k // 1200)):.6f},{np.cos(a):.4f}" for k, a in enumerate(t)
-        ]
+def test_what_is_wrong_with_a_log_is_said_in_one_line(tmp_path, command: Command):
+    rows = [
+        f"{0.01 * k:.2f},{1e-5 * (k % (3 + k // 1200)):.6f},{np.cos(0.01 * k):.4f}"
+        for k in range(2000)
+    ]
     (tmp_path / "a.csv").write_text("t,angle_rad,torque_nm\n" + "\n".join(rows) + "\n")
-    code, _, err = command("init", tmp_path)
-    if code == 0:
-        text = (tmp_path / "session.toml").read_text().partition("[[trials]]")[0]
-        trials = "".join(
-            f'[[trials]]\nfile = "a.csv"\nkind = "free"\n{cut}\n'
-            for cut in ("end_s = 9.0", "start_s = 9.0")
-        )
-        (tmp_path / "session.toml").write_text(text + trials)
-        code, _, err = command("ingest", tmp_path, "--quiet")
+    assert command("init", tmp_path)[0] == 0
+    code, _, err = command("ingest", tmp_path, "--quiet")
+    said = "is sound; a.csv and 3 more: declared free, but never moves"
     assert code == 2 and said in err and len(err.splitlines()) == 1, err
+
+
+@pytest.mark.parametrize("header", [["Logging to: B.CSV", "t,angle_rad,torque_nm"], []])
+def test_each_recording_of_a_file_is_a_trial(tmp_path, command: Command, header: list[str]):
+    t = 0.01 * np.arange(1000)
+    first, second = (
+        [f"{a:.2f},{np.sin(w * a):.6f},{np.cos(a):.4f}" for a in t] for w in (1.0, 1.5)
+    )
+    lines = ["t,angle_rad,torque_nm", *first, *header, *second]
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "b.csv").write_text("\n".join(["t,angle_rad,torque_nm", *first[:400]]) + "\n")
+    session, proposal = proposed(tmp_path)
+    assert [trial.get("recording") for trial in session["trials"]] == [1, 2, None]
+    begins = 1002 + len(header)
+    assert f"a.csv holds 2 recordings, which begin again at row {begins}" in proposal.check
+    for trial, rate in (("a", 1.0), ("a_2", 1.5), ("b", 1.0)):
+        found = samples(tmp_path, tmp_path / "out", trial)
+        np.testing.assert_allclose(found["t"], t[: len(found)], atol=1e-9)
+        np.testing.assert_allclose(found["q_joint"], np.sin(rate * t[: len(found)]), atol=1e-6)
+    text = re.sub("recording = .*", "", (tmp_path / "session.toml").read_text())
+    (tmp_path / "session.toml").write_text(text)
+    code, out, err = command("ingest", tmp_path)
+    assert code in (0, 2) and f"row {begins}: " in out + err
+    assert "2 recordings in one file; give each a [[trials]] entry with recording = 1" in out + err
 
 
 def test_a_rate_at_which_no_motion_is_logged_is_doubted(tmp_path):
@@ -492,26 +496,78 @@ def test_a_position_whose_drive_is_not_there_is_not_driven_by_another_position(t
     assert "pos_deg[1]" not in str(session["force"])
 
 
-@pytest.mark.parametrize("alone", ["q", "tau"])
-def test_a_recording_in_parts_is_to_be_put_together(tmp_path, command: Command, alone: str):
+def test_the_files_of_one_recording_are_joined(tmp_path):
+    """One quantity a file, as matrices without names; rows that one file has more are left out."""
+    log = joint_log(3)
+    for k in (1, 2):
+        rows = np.column_stack([np.deg2rad(log["joint_angle"]), log["joint_velocity"]])
+        np.savetxt(tmp_path / f"excit_ang_{k}.txt", rows[k:], "%.8f")
+        np.savetxt(tmp_path / f"excit_torque_{k}.txt", log["motor_current"][k:-2, None], "%.6f")
+    (tmp_path / "results.txt").write_text("RMSE 0.12\n")
+    (tmp_path / "one.txt").write_text("1.0 2.0 3.0\n")
+    (tmp_path / "empty.csv").write_text("")
+    session, proposal = proposed(tmp_path)
+    assert session["force"]["columns"] == ["torque:column_1"]
+    assert session["encoders"]["joint"]["column"] == "ang:column_1"
+    parts = [trial["parts"] for trial in session["trials"]]
+    assert parts == [
+        [{"file": f"excit_torque_{k}.txt", "name": "torque", "join": "rows"}] for k in (1, 2)
+    ]
+    assert [line.partition(":")[0] for line in proposal.passed] == [
+        "empty.csv", "one.txt", "results.txt"
+    ]  # fmt: skip
+    assert "excit_ang_1.txt and excit_torque_1.txt are taken as one recording, joined row" in str(
+        proposal.check
+    )
+    text = (tmp_path / "session.toml").read_text().replace('"?"', "100")
+    (tmp_path / "session.toml").write_text(text)
+    found = samples(tmp_path, tmp_path / "out", "excit_ang_1")
+    force = next(found[name] for name in found if name.startswith("force_"))
+    np.testing.assert_allclose(force, log["motor_current"][1:-2], atol=1e-6)
+
+
+@pytest.mark.parametrize("shift", [0.0, 2.5, 500.0])
+def test_motion_and_force_with_clocks_of_their_own_are_joined(tmp_path, shift: float):
+    """Clocks that overlap are one; those that do not are taken as started together, and it said."""
+    t, u = np.arange(0.0, 20.0, 0.01), np.arange(0.0, 20.0, 0.004)
+    motion, force = np.sin(2.0 * t), np.cos(2.0 * (u + (shift if shift < 20 else 0.0)))
+    write_table(tmp_path / "motion.csv", {"t": t, "angle_rad": motion})
+    write_table(tmp_path / "force.csv", {"stamp_ms": 1e3 * (u + shift), "Fz": force})
+    session, proposal = proposed(tmp_path)
+    (part,) = session["trials"][0]["parts"]
+    way = "start" if shift > 20 else "time"
+    assert part | {"file": "force.csv", "join": way, "time": "stamp_ms", "time_unit": "ms"} == part
+    assert ("as if started together" in str(proposal.check)) == (way == "start")
+    out = tmp_path / "out"
+    ingest.execute(RunFolder(out), out, ingest.Config(session=str(tmp_path)), silent)
+    found = read_parquet(out / "ingest/samples.parquet")
+    (name,) = (column for column in found if column.startswith("force_"))
+    stamps = t[round(shift / 0.01) if shift < 20 else 0 :][: len(found)]
+    first = found["trial_id"] == found["trial_id"][0]
+    count = min(500, int(first.sum()))
+    np.testing.assert_allclose(found[name][first][:count], np.cos(2.0 * stamps[:count]), atol=2e-5)
+
+
+def test_one_joint_a_file_is_one_recording(tmp_path):
     table = two_joints({})
-    for what in ("q", "tau"):
-        part = {name: v for name, v in table.items() if name.startswith((what, "time"))}
-        write_table(tmp_path / f"{'a' if what == alone else 'b'}.csv", part)
+    for k in (1, 2):
+        one = {"time": table["time [s]"], "q": table[f"q{k}"], "tau": table[f"tau{k}"]}
+        write_table(tmp_path / f"joint{k}.csv", one)
+    session, _ = proposed(tmp_path)
+    assert session["encoders"]["joint"]["column"] == "joint1:q"
+    assert session["force"]["columns"] == ["joint1:tau"]
+    (part,) = session["trials"][0].get("parts", [{}]) or [{}]
+    assert part.get("name") in (None, "joint2")
+
+
+def test_parts_that_no_clock_joins_are_refused(tmp_path, command: Command):
+    table = two_joints({})
+    write_table(tmp_path / "q.csv", {"q1": table["q1"]})
+    write_table(tmp_path / "tau.csv", {"tau1": table["tau1"][::3]})
     code, _, errors = command("init", str(tmp_path))
     assert code == 2 and errors.count("\n") == 1
-    assert "positions and drives are in different files, such as a.csv and b.csv" in errors
-    assert "side by side in one file" in errors
-
-
-def test_two_files_of_the_same_names_may_be_one_recording(tmp_path):
-    table = two_joints({})
-    for name in ("positions", "torques"):
-        write_table(tmp_path / f"{name}.csv", {"time [s]": table["time [s]"], "joint": table["q1"]})
-    _, proposal = proposed(tmp_path)
-    assert any(
-        "no column is a drive: if positions.csv and torques.csv" in x for x in proposal.check
-    )
+    assert "positions and drives are in different files, such as q.csv and tau.csv" in errors
+    assert "and no clock in common" in errors and "[[trials.parts]]" in errors
 
 
 def labelled(names: str, **scales: float) -> dict[str, np.ndarray]:
@@ -573,8 +629,10 @@ def test_a_torque_in_per_cent_asks_for_its_gain(tmp_path):
 def test_names_can_be_given_to_a_log_without_a_header(tmp_path, command: Command):
     table = np.column_stack(list(labelled("t,q,dq,u").values()))
     np.savetxt(tmp_path / "a.csv", table, "%.6f", ",")
-    code, _, errors = command("init", str(tmp_path))
-    assert code == 2 and "to bampipe init as --names time,position,..." in errors
+    session = tomllib.loads(propose(tmp_path).session)
+    assert session["time"]["column"] == "column_1"  # by what they look like
+    assert session["encoders"]["joint"]["column"] == "column_2"
+    assert "column_2, which looks like the position" in str(propose(tmp_path).fill_in)
     code, _, errors = command("init", str(tmp_path), "--names", "t,q_rad,dq,current_A")
     assert code == 0, errors
     session = tomllib.loads((tmp_path / "session.toml").read_text())

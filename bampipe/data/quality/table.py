@@ -82,8 +82,7 @@ class TrialTable:
         self.entry = entry
         self.limits = limits
         self.clock = session.clock.column
-        length = len(raw.columns[self.clock])
-        self.rows = np.arange(raw.first_row, raw.first_row + length, dtype=np.int64)
+        self.rows = raw.rows
         self.repairs = list(raw.notes)
         self.notes = list(raw.remarks)
         self.dead: list[DeadStretch] = []

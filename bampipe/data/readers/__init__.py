@@ -23,6 +23,7 @@ from bampipe.errors import InputError
 __all__ = [
     "EXTENSIONS",
     "LARGEST_BYTES",
+    "TEXTS",
     "Dialect",
     "RawTrial",
     "Wanted",
@@ -30,8 +31,10 @@ __all__ = [
     "read_trial",
 ]
 
+TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto")
+"""File extensions of tables as text."""
 _READERS: dict[str, ModuleType] = {
-    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat", ".asc", ".log"), text),
+    **dict.fromkeys(TEXTS, text),
     ".parquet": parquet,
     ".mat": mat,
     **dict.fromkeys((".h5", ".hdf5", ".hdf"), hdf5),
@@ -85,7 +88,7 @@ def read_trial(
     wanted = Wanted(tuple(columns), datetimes or {}, dialect or Dialect(), largest_bytes)
     with _memory_named(name):
         trial: RawTrial = reader.read(path, wanted, name)
-    if len(trial.columns[columns[0]]) == 0:
+    if columns and len(trial) == 0:
         raise InputError("a header but no samples", where=name)
     return trial
 

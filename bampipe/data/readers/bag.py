@@ -6,6 +6,11 @@ A column is ``/topic:field``, where the field is a path in the message:
 ``/topic:@time`` is when the message was recorded, ``/topic:header.stamp`` when it was stamped; both
 are returned in s since the first. The topic of the time column gives the samples; columns of other
 topics are interpolated linearly at its times.
+
+``/log:q[:]`` are all items of a list one after the other, for messages that hold many samples;
+``/log:t[:]`` their times, if there are any, else they are spread evenly over the time to the next
+message. Several nodes may publish on a topic: messages with other names, or with other lists left
+empty, are a stream of their own, and a column is taken from that with most of what is wanted.
 """
 
 from __future__ import annotations
@@ -14,7 +19,7 @@ import json
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +27,22 @@ import numpy as np
 
 from bampipe.data.readers import moments
 from bampipe.data.readers.extras import need
-from bampipe.data.readers.nested import MISSING, as_number, find, leaves
-from bampipe.data.readers.trial import LARGEST_BYTES, RawTrial, Wanted, check_columns, check_size
+from bampipe.data.readers.nested import MISSING, as_number, find, items, leaves, names_in, spread
+from bampipe.data.readers.trial import (
+    LARGEST_BYTES,
+    RawTrial,
+    Wanted,
+    check_columns,
+    check_size,
+    interpolated,
+)
 from bampipe.data.readers.unpacking import check_mcap, check_ros1
 from bampipe.errors import InputError
 
 RECORDED = "@time"
 STAMP = "header.stamp"
+_LISTS = ("position", "velocity", "effort")
+"""Of a message with names of joints: what may be empty."""
 _FILLER = "structure_needs_at_least_one_member"
 """What rosbags puts into a type without fields; ROS 1 messages do not have it."""
 
@@ -53,17 +67,51 @@ class Field:
         """Whether it says when the message was recorded or stamped."""
         return self.path in (RECORDED, STAMP)
 
-    def number(self, message: Any, where: str) -> float:
-        """The number in a message; NaN where it is null.
+    @property
+    def is_spread(self) -> bool:
+        """Whether every message has many samples of it."""
+        return "[:]" in self.path or "::" in self.path
 
-        Raises:
-            InputError: it is not there, or is no number.
-        """
-        value = find(message, self.path)
-        if value is MISSING:
-            near = ", ".join(path for path in _numbers_in(message) if path != STAMP)
-            raise InputError(f"no field '{self.path}'", where=where, remedy=f"it has {near:.200}")
-        return as_number(value, where)
+
+@dataclass
+class _Stream:
+    """The messages of one kind on a topic.
+
+    Attributes:
+        topic: name of the topic; kind: the names in the messages, and which lists are empty.
+        recorded, stamped: times of the messages, ns.
+        cells: numbers by column, for the columns that these messages have.
+        counts: samples in each message.
+    """
+
+    topic: str
+    kind: tuple[Any, ...]
+    recorded: list[int] = field(default_factory=list)
+    stamped: list[int | None] = field(default_factory=list)
+    cells: dict[str, list[float]] = field(default_factory=dict)
+    counts: list[int] = field(default_factory=list)
+
+    def add(self, moment: int, message: Any, name: str) -> None:
+        self.recorded.append(moment)
+        self.stamped.append(_stamp(message))
+        found = {column: items(message, column.partition(":")[2]) for column in self.cells}
+        count = max(map(len, found.values()), default=1)
+        for column, values in found.items():
+            where = f"{name}, column '{column}', message {len(self.recorded)}"
+            if any(value is MISSING for value in values) or len(values) not in (1, count):
+                raise InputError("no such field in this message, or a shorter list", where=where)
+            numbers = [as_number(value, where) for value in values]
+            self.cells[column] += numbers * count if len(numbers) < count else numbers
+        self.counts.append(count)
+
+    def spread(self, times: np.ndarray) -> np.ndarray:
+        """Times of all samples, ns, by those of the messages (T,)."""
+        counts = np.array(self.counts)
+        if len(counts) < 2 or counts.max() == 1:
+            return np.repeat(times, counts)
+        step = float(np.median(np.diff(times))) / float(np.median(counts))
+        within = np.concatenate([np.arange(count) for count in counts])
+        return np.repeat(times, counts) + np.rint(step * within).astype(np.int64)
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
@@ -74,63 +122,129 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
             not a number.
     """
     fields = {column: _field(column, name) for column in wanted.columns}
-    topics = tuple(dict.fromkeys(field.topic for field in fields.values()))
-    recorded: dict[str, list[int]] = {topic: [] for topic in topics}
-    stamped: dict[str, list[int | None]] = {topic: [] for topic in topics}
-    cells: dict[str, list[float]] = {column: [] for column in wanted.columns}
-    messages = _messages(path, topics, wanted.largest_bytes, name)
-    for number, (topic, moment, message) in enumerate(messages, 1):
-        check_size(number, wanted, name)
-        recorded[topic].append(moment)
-        stamped[topic].append(_stamp(message))
-        for column, field in fields.items():
-            if field.topic == topic and not field.is_time:
-                where = f"{name}, column '{column}', message {len(recorded[topic])}"
-                cells[column].append(field.number(message, where))
-    clock = fields[wanted.columns[0]]
-    if not clock.is_time:
+    clock_column, clock = next(iter(fields.items()))
+    streams = _read_streams(path, fields, wanted, name)
+    if not (clock.is_time or clock.is_spread):
         raise InputError(
             "is no time",
-            where=f"{name}, column '{wanted.columns[0]}'",
+            where=f"{name}, column '{clock_column}'",
             remedy=f"give {clock.topic}:{RECORDED} or {clock.topic}:{STAMP} under [time]",
         )
+    of = _chosen(streams, fields, name)
+    # The stream of most columns on the topic of the time gives the samples.
+    here = [of[c] for c, f in fields.items() if f.topic == clock.topic and not f.is_time]
+    alike = [stream for stream in streams if stream.topic == clock.topic]
+    leading = max(here or alike, key=lambda s: (here.count(s), len(s.recorded)))
+    of |= {column: leading for column, field in fields.items() if field.is_time}
+    used = list({id(stream): stream for stream in of.values()}.values())
     times = {
-        topic: _times(clock, recorded[topic], stamped[topic], topic == clock.topic, name)
-        for topic in topics
+        id(s): s.spread(_times(clock, s.recorded, s.stamped, s is leading, name)) for s in used
     }
-    base = times[clock.topic]
-    values, remarks = {}, []
-    for column, field in fields.items():
-        if field.is_time:
+    base = times[id(leading)]
+    values = {}
+    for column, each in fields.items():
+        stream = of[column]
+        if each.is_time:
             values[column] = moments.seconds(base)
-        elif field.topic == clock.topic:
-            values[column] = np.array(cells[column], dtype=np.float64)
+        elif stream is leading:
+            values[column] = np.array(stream.cells[column], dtype=np.float64)
         else:
-            values[column] = _interpolated(base, times[field.topic], cells[column])
-    for topic in topics:
-        if topic != clock.topic:
-            gap = float(np.max(np.diff(times[topic]), initial=0)) / moments.NANOSECONDS
+            at, since = ((x - base[0]) / moments.NANOSECONDS for x in (base, times[id(stream)]))
+            cells = np.array(stream.cells[column], dtype=np.float64)
+            values[column] = interpolated(at, since, cells)
+    remarks = [_left_out(topic, streams, used) for topic in {s.topic for s in used}]
+    for stream in used:
+        if stream is not leading:
+            gap = float(np.max(np.diff(times[id(stream)]), initial=0)) / moments.NANOSECONDS
             remarks.append(
-                f"{topic} interpolated linearly at the times of {clock.topic}"
+                f"{stream.topic} interpolated linearly at the times of {clock.topic}"
                 f" (at most {gap:.3g} s between its messages)"
             )
-    return RawTrial(values, first_row=1, remarks=tuple(remarks))
+    return RawTrial(values, first_row=1, remarks=tuple(filter(None, remarks)))
+
+
+def _read_streams(
+    path: Path, fields: Mapping[str, Field], wanted: Wanted, name: str
+) -> list[_Stream]:
+    """The messages by topic and kind, with the fields that each kind has."""
+    topics = tuple(dict.fromkeys(field.topic for field in fields.values()))
+    streams: dict[tuple[Any, ...], _Stream] = {}
+    samples, near = 0, ""
+    for topic, moment, message in _messages(path, topics, wanted.largest_bytes, name):
+        kind = _kind(message)
+        stream = streams.get((topic, kind))
+        if stream is None:
+            stream = streams[topic, kind] = _Stream(topic, kind)
+            asked = [c for c, f in fields.items() if f.topic == topic and not f.is_time]
+            present = [c for c in asked if _holds(message, fields[c].path)]
+            stream.cells = {column: [] for column in present}
+            near = near or ", ".join(path for path in _numbers_in(message) if path != STAMP)
+        stream.add(moment, message, name)
+        samples += stream.counts[-1]
+        check_size(samples, wanted, name)
+    for column, each in fields.items():
+        if not each.is_time and all(column not in s.cells for s in streams.values()):
+            raise InputError(
+                f"no field '{each.path}'",
+                where=f"{name}, column '{column}'",
+                remedy=f"it has {near:.200}",
+            )
+    return list(streams.values())
+
+
+def _holds(message: Any, path: str) -> bool:
+    found = items(message, path)
+    return bool(found) and found[0] is not MISSING
+
+
+def _kind(message: Any) -> tuple[Any, ...]:
+    """What tells the messages of one publisher from those of another: names and empty lists."""
+    names = names_in(message)
+    lists = {key: find(message, key) for key in _LISTS} if names else {}
+    empty = (key for key, found in lists.items() if found is MISSING or len(found) == 0)
+    return (*sorted(names), "", *empty)
+
+
+def _chosen(streams: list[_Stream], fields: Mapping[str, Field], name: str) -> dict[str, _Stream]:
+    """The stream that each column is taken from: that which has most of the columns, then most
+    messages.
+    """
+    ranked = sorted(streams, key=lambda s: (-len(s.cells), -len(s.recorded)))
+    return {
+        column: next(stream for stream in ranked if column in stream.cells)
+        for column, field in fields.items()
+        if not field.is_time
+    }
+
+
+def _left_out(topic: str, streams: list[_Stream], used: list[_Stream]) -> str:
+    """What to say of the messages on a topic that are not used."""
+    here = [stream for stream in streams if stream.topic == topic]
+    unused = [stream for stream in here if not any(stream is other for other in used)]
+    count, total = (sum(len(s.recorded) for s in part) for part in (unused, here))
+    if not count:
+        return ""
+    return (
+        f"{len(here)} kinds of messages on {topic}, as of several publishers: {count} of {total}"
+        f" with other names or empty lists are left out"
+    )
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names of the numbers in the first message of each topic; times have the unit s.
+    """Names of the numbers in the first message of each kind; times have the unit s.
 
     Raises:
         InputError: as :func:`read`.
     """
     found: dict[str, str] = {}
-    seen: set[str] = set()
+    seen: set[tuple[Any, ...]] = set()
     for topic, _, message in _messages(path, (), LARGEST_BYTES, name):
-        if topic in seen:
+        key = (topic, _kind(message))
+        if key in seen:
             continue
-        seen.add(topic)
+        seen.add(key)
         found[f"{topic}:{RECORDED}"] = "s"
-        for leaf in _numbers_in(message):
+        for leaf in [*_numbers_in(message), *spread(message)]:
             found[f"{topic}:{leaf}"] = "s" if leaf == STAMP else ""
     return found
 
@@ -170,7 +284,7 @@ def _times(
 ) -> np.ndarray:
     """Times of a topic's messages, ns, by the clock that the time column names if it has that."""
     known = [moment for moment in stamped if moment is not None]
-    if clock.path == RECORDED or (not leads and len(known) < len(stamped)):
+    if clock.path != STAMP or (not leads and len(known) < len(stamped)):
         return np.array(recorded, dtype=np.int64)
     if len(known) < len(stamped):
         raise InputError(
@@ -179,15 +293,6 @@ def _times(
             remedy=f"give {clock.topic}:{RECORDED} under [time]",
         )
     return np.array(known, dtype=np.int64)
-
-
-def _interpolated(base: np.ndarray, times: np.ndarray, cells: list[float]) -> np.ndarray:
-    """Values at the times ``base``, NaN before the first and after the last."""
-    order = np.argsort(times, kind="stable")
-    since = (times[order] - base[0]) / moments.NANOSECONDS
-    at = (base - base[0]) / moments.NANOSECONDS
-    values = np.array(cells, dtype=np.float64)[order]
-    return np.asarray(np.interp(at, since, values, left=np.nan, right=np.nan))
 
 
 def _messages(

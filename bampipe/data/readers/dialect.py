@@ -11,7 +11,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import Dialect, check_columns
@@ -27,9 +27,14 @@ _POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
 _COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+\Z")
 _GROUPED = re.compile(r"[-+]?(\d{1,3}(,\d{3})+\.\d*|\d{1,3}(\.\d{3})+,\d*)\Z")
-_UNIT = re.compile(r"[\[(]?\s*(?=.*[A-Za-z%°Ωµμ1\-])[A-Za-z0-9%°Ωµμ./*^²³· _\-]{0,16}\s*[\])]?\Z")
+_UNIT = re.compile(r"[\[(]?\s*(?=.*[A-Za-z%°Ωµμ#1\-])[A-Za-z0-9%°Ωµμ#./*^²³· _\-]{0,16}\s*[\])]?\Z")
 _NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
 _REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?")
+_MOTION = re.compile(r"(?i)\binDegrees\s*=\s*yes\b")
+_NO_ANGLE = re.compile(
+    r"(?i)force|moment|torque|power|activation|excitation|fiber|length|[_.][tpv][xyz]\Z|\Atime\Z"
+)
+_NUMBERED = "column_"
 _SEARCHED = 200
 _TRIED = 400
 
@@ -46,6 +51,8 @@ class TableLayout:
         start: bytes before that line.
         remarks: what is unlike a plain table with commas, a sentence each.
         units: units that the header or a line below it gives, by column.
+        ended: whether every line ends with a semicolon that separates nothing.
+        title: the line that is the header, "" where there is none.
     """
 
     delimiter: str
@@ -55,6 +62,22 @@ class TableLayout:
     start: int
     remarks: tuple[str, ...] = ()
     units: dict[str, str] = field(default_factory=dict)
+    ended: bool = False
+    title: str = ""
+
+    def cells(self, text: str) -> list[str]:
+        """The cells of one line."""
+        return cells(text.removesuffix(";") if self.ended else text, self.delimiter)
+
+    def is_header(self, text: str) -> bool:
+        """Whether a line among the samples is the header once more."""
+        return bool(self.title) and self.cells(text) == self.cells(self.title)
+
+    def is_chatter(self, text: str) -> bool:
+        """Whether a line among the samples is text without a number in any cell."""
+        row = [cell for cell in self.cells(text) if cell not in NULLS]
+        plain = not any(_is_number(cell, self.decimal) or is_moment(cell) for cell in row)
+        return plain and any(map(str.isalpha, text)) and text.isprintable()
 
 
 @dataclass(frozen=True)
@@ -86,10 +109,13 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     lines = _lines(head, name)
     if not any(line.text.strip() for line in lines):
         raise InputError("the file holds no text", where=name)
+    ended = _end_in_semicolons(lines)
+    if ended:
+        lines = [replace(line, text=line.text.removesuffix(";")) for line in lines]
     delimiters: list[str] = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
     index, delimiter, header = _header(lines, columns, dialect, delimiters, name)
     body = lines[index + 1 :]
-    units = _units_in(header)
+    units = _units_in(header) | _units_of_motion([line.text for line in lines[:index]], header)
     remarks = []
     if delimiter != "," and not dialect.delimiter:
         remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")
@@ -98,12 +124,18 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
         remarks.append(f"{above} lines above the header passed over")
     passed = index
     for line in body:
-        row = cells(line.text, delimiter)
-        if line.text.strip() and not _is_remark(line.text):
-            if _is_unit_row(row, header, columns) and not dialect.names:
-                units |= {h: _bare(u) for h, u in zip(header, row, strict=False) if _bare(u)}
-                remarks.append(f"row {line.number} gives units")
-                passed += 1
+        remark = _is_remark(line.text)
+        row = cells(_REMARK.sub("", line.text, count=1) if remark else line.text, delimiter)
+        if (
+            _is_unit_row(row, header, columns)
+            and not dialect.names
+            and not (remark and not _are_units(row))
+        ):
+            units |= {h: _bare(u) for h, u in zip(header, row, strict=False) if _bare(u)}
+            remarks.append(f"row {line.number} gives units")
+            passed += 1
+            break
+        if line.text.strip() and not remark:
             break
         passed += 1
     body = lines[passed + 1 :]
@@ -113,7 +145,10 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
         remarks.append("decimal commas")
     start = lines[passed].end if passed >= 0 else _mark(head)
     number = lines[passed].number + 1 if passed >= 0 else 1
-    return TableLayout(delimiter, decimal, tuple(header), number, start, tuple(remarks), units)
+    title = lines[index].text if index >= 0 and not dialect.names else ""
+    return TableLayout(
+        delimiter, decimal, tuple(header), number, start, tuple(remarks), units, ended, title
+    )
 
 
 def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
@@ -129,7 +164,7 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
         if line.number < layout.first_line or not line.text.strip():
             continue
         rows += 1
-        row = cells(line.text, layout.delimiter)
+        row = layout.cells(line.text)
         numbers.update(n for n, cell in enumerate(row) if _is_number(cell, layout.decimal))
         moments.update(n for n, cell in enumerate(row) if is_moment(cell))
     return {
@@ -190,30 +225,69 @@ def _header(
             row = _names(line.text, delimiter, lines[index + 1 :])
             if set(columns) <= set(row):
                 check_columns(row, columns, f"{name}, row {line.number}")
-                return index, delimiter, row
+                first, below = _guess(lines[index + 1 :], delimiters)[0]
+                rows = lines[index + 1 + first :]  # may be separated otherwise than the header
+                fits = len(row) > 1 and rows and len(cells(rows[0].text, below)) == len(row)
+                return index, below if fits else delimiter, row
     guesses = _guess(lines, delimiters)
     found = [(_above(lines, first, delimiter), delimiter) for first, delimiter in guesses]
     index, delimiter = next((each for each in found if each[0] >= 0), (-1, ""))
     if index < 0:
-        shown = ",".join(columns) or "time,position,..."
+        first, delimiter = guesses[0]
+        row = [f"{_NUMBERED}{n}" for n, _ in enumerate(cells(lines[first].text, delimiter), 1)]
+        if set(columns) <= set(row):
+            above = [n for n, line in enumerate(lines[:first]) if line.text.strip()]
+            return (above[-1] if above else -1), delimiter, row
         raise InputError(
             "no header: the first line holds numbers",
             where=f"{name}, row {lines[0].number}",
-            remedy=f"add a line {shown}, or give names under [csv], to bampipe init as --names"
-            f" {shown}",
+            remedy=f"add a line {','.join(columns)}, or give names under [csv]; without names, the"
+            f" columns are {row[0]} to {row[-1]}",
         )
+    width = len(cells(lines[guesses[0][0]].text, delimiter)) if guesses[0][0] < len(lines) else 0
     row = _names(lines[index].text, delimiter, lines[index + 1 :])
+    if len(row) not in (width, width - 1):  # the header is written otherwise than the samples
+        row = next(iter(_otherwise(lines[index].text, width)), row)
     check_columns(row, columns, f"{name}, row {lines[index].number}")
     return index, delimiter, row
+
+
+def _otherwise(text: str, width: int) -> list[list[str]]:
+    """The names in a header of ``width`` cells, by each delimiter that separates so many."""
+    split = [cells(_REMARK.sub("", text, count=1), delimiter) for delimiter in DELIMITERS]
+    return [row for row in split if len(row) == width > 1]
 
 
 def _names(text: str, delimiter: str, below: list[_Line]) -> list[str]:
     """Names in a header, which may be written as a remark: ``# t x`` has two names or three."""
     plain, bare = (cells(t, delimiter) for t in (text, _REMARK.sub("", text, count=1)))
-    if len(plain) == len(bare):
-        return bare if _is_remark(text) and plain[0].strip("#%/") else plain
     rows = [line.text for line in below if line.text.strip() and not _is_remark(line.text)]
-    return plain if rows and len(cells(rows[0], delimiter)) == len(plain) else bare
+    if len(plain) == len(bare):
+        row = bare if _is_remark(text) and plain[0].strip("#%/") else plain
+    else:
+        row = plain if rows and len(cells(rows[0], delimiter)) == len(plain) else bare
+    if delimiter == " ":
+        row = [name.rstrip(",;") or name for name in row]
+    return _named_items(row, [cells(text, delimiter) for text in rows[:_SEARCHED]])
+
+
+def _named_items(header: list[str], rows: list[list[str]]) -> list[str]:
+    """The header with ``field.effort[elbow]`` for ``field.effort0`` beside a ``field.name0``.
+
+    So are messages with lists written by `rostopic echo -p`; the name has to be that of all rows.
+    """
+    of: dict[tuple[str, str], str] = {}
+    for at, column in enumerate(header):
+        match = re.fullmatch(r"(.*)name(\d+)", column)
+        said = {row[at].strip('"') for row in rows if at < len(row)}
+        if match and len(said) == 1 and not _POINT.match(name := said.pop()) and name:
+            of[match[1], match[2]] = name
+    named = []
+    for column in header:
+        match = re.fullmatch(r"(.*?)(\w*?[A-Za-z_])(\d+)", column) if of else None
+        item = of.get((match[1], match[3])) if match and match[2] != "name" else None
+        named.append(f"{match[1]}{match[2]}[{item}]" if match and item else column)
+    return named
 
 
 def _guess(lines: list[_Line], delimiters: list[str]) -> list[tuple[int, str]]:
@@ -238,8 +312,25 @@ def _guess(lines: list[_Line], delimiters: list[str]) -> list[tuple[int, str]]:
             if len(row) == width and _number_cells(row, delimiter) > 0.5 * width:
                 first = index
                 break
+        # What was logged before all sensors had answered are samples with empty cells.
+        while 0 < first < len(lines) and _is_sparse(cells(lines[first - 1].text, delimiter), width):
+            first -= 1
         found.append((first, delimiter))
     return found
+
+
+def _is_sparse(row: list[str], width: int) -> bool:
+    """Whether a line is a sample in which cells are empty: numbers and moments, nothing else."""
+    return len(row) == width > 1 and all(
+        cell in NULLS or _POINT.match(cell) or _COMMA.match(cell) or is_moment(cell) for cell in row
+    )
+
+
+def _end_in_semicolons(lines: list[_Line]) -> bool:
+    """Whether lines end with a semicolon, and have other delimiters in them."""
+    tried = [line.text for line in lines[-_TRIED:] if line.text.strip()]
+    ended = [text for text in tried if text.endswith(";") and text.count(";") == 1]
+    return 2 * len(ended) > len(tried) and all(re.search(r"[,\t |]", text) for text in ended)
 
 
 def _number_cells(row: list[str], delimiter: str) -> int:
@@ -255,6 +346,9 @@ def _above(lines: list[_Line], first: int, delimiter: str) -> int:
     width = len(cells(lines[first].text, delimiter))
     above = [n for n in range(first) if lines[n].text.strip()]
     rows = {n: cells(_REMARK.sub("", lines[n].text, count=1), delimiter) for n in above[-4:]}
+    for n, row in rows.items():
+        if not width - 1 <= len(row) <= width:
+            rows[n] = next(iter(_otherwise(lines[n].text, width)), row)
     fitting = [n for n, row in rows.items() if width - 1 <= len(row) <= width]
     if len(fitting) > 1 and _are_units(rows[fitting[-1]]) and len(rows[fitting[-2]]) == width:
         return fitting[-2]
@@ -346,15 +440,33 @@ def _are_units(row: list[str]) -> bool:
 
 
 def _units_in(header: list[str]) -> dict[str, str]:
-    """Units in names such as ``force [N]``; a number, as in ``q[0]`` and ``q[1]``, is an index."""
+    """Units in names such as ``force [N]``; a number, as in ``q[0]`` or ``pos (1)``, is an index.
+
+    Beside units of other columns, ``[1]`` is one, unless the name comes with other numbers too.
+    """
     matches = {name: match for name in header if (match := _NAME_WITH_UNIT.match(name))}
     numbered = Counter(m["name"] for m in matches.values() if m["unit"].isdigit())
+    others = any(not match["unit"].isdigit() for match in matches.values())
     return {
         name: match["unit"]
         for name, match in matches.items()
         if match["name"]
-        and not (match["unit"].isdigit() and (match["unit"] != "1" or numbered[match["name"]] > 1))
+        and not (
+            match["unit"].isdigit()
+            and (match["unit"] != "1" or not others or numbered[match["name"]] > 1)
+        )
     }
+
+
+def _units_of_motion(above: list[str], header: list[str]) -> dict[str, str]:
+    """Units of the angles and speeds in a motion file of OpenSim, by its preamble ``above``."""
+    if not any(text.strip().lower() == "endheader" for text in above):
+        return {}
+    angle = "deg" if any(map(_MOTION.search, above)) else "rad"
+    units = {name: angle for name in header if not _NO_ANGLE.search(name)}
+    units |= {name: f"{angle}/s" for name in units if re.search(r"(?i)speed|velocit|_u\Z", name)}
+    units |= {name: f"{angle}/s2" for name in units if re.search(r"(?i)acc", name)}
+    return units | {name: "s" for name in header if name.lower() == "time"}
 
 
 def _bare(unit: str) -> str:

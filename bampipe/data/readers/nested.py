@@ -18,6 +18,9 @@ MISSING = object()
 
 _MOST_ITEMS = 64
 _DEEPEST = 6
+_SPREAD = re.compile(
+    r"(?P<list>[^\[\]]+)\[(?::|(?P<start>\d+)::(?P<step>[1-9]\d*))\](?:\.(?P<inner>.+))?"
+)
 
 
 def find(value: Any, path: str) -> Any:
@@ -37,6 +40,50 @@ def find(value: Any, path: str) -> Any:
     return value
 
 
+def items(value: Any, path: str) -> list[Any]:
+    """What stands at ``path`` in every item of a list: ``q[:]``, ``samples[:].q``, ``data[1::3]``.
+
+    The last is every third item from the second on, as of rows of three numbers.
+    """
+    match = _SPREAD.fullmatch(path)
+    if match is None:
+        return [find(value, path)]
+    found = find(value, match["list"])
+    if not isinstance(found, list | tuple | np.ndarray):
+        return []
+    chosen = found[int(match["start"] or 0) :: int(match["step"] or 1)]
+    return [find(item, match["inner"]) for item in chosen] if match["inner"] else list(chosen)
+
+
+def spread(value: Any, path: str = "") -> Iterator[str]:
+    """Paths of the numbers in the items of long lists, for `items`."""
+    for key in _keys(value):
+        part, inner = _part(value, key), f"{path}.{key}" if path else key
+        if isinstance(part, list | tuple | np.ndarray):
+            if len(part) <= _MOST_ITEMS:
+                continue
+            if _is_number(part[0]):
+                width = _width(value, len(part))
+                ends = [f"[{k}::{width}]" for k in range(width)] if width > 1 else ["[:]"]
+                yield from (inner + end for end in ends)
+            else:
+                numbers = (leaf for leaf, item in leaves(part[0]) if _is_number(item))
+                yield from (f"{inner}[:].{leaf}" for leaf in numbers)
+        elif path.count(".") < _DEEPEST:
+            yield from spread(part, inner)
+
+
+def _width(parent: Any, count: int) -> int:
+    """Numbers in a row of an array that is written row by row, by the dimensions beside it."""
+    sizes = [find(parent, f"layout.dim[{k}].size") for k in range(2)]
+    fits = all(isinstance(size, int | np.integer) for size in sizes)
+    return int(sizes[1]) if fits and sizes[0] * sizes[1] == count and sizes[1] <= _MOST_ITEMS else 1
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number)
+
+
 def leaves(value: Any, path: str = "", parent: Any = None) -> Iterator[tuple[str, Any]]:
     """Paths of the numbers and texts in ``value``, and these; long lists are left out."""
     if path.count(".") + path.count("[") > _DEEPEST:
@@ -53,11 +100,17 @@ def leaves(value: Any, path: str = "", parent: Any = None) -> Iterator[tuple[str
         yield path, value
 
 
+def names_in(message: Any) -> tuple[str, ...]:
+    """The list ``name`` of a message, where it is one of texts; else nothing."""
+    names = _part(message, "name")
+    listed = isinstance(names, list | tuple) and all(isinstance(name, str) for name in names)
+    return tuple(names) if listed else ()
+
+
 def _names_beside(parent: Any, values: Any) -> list[str]:
     """Names of the items of ``values``, from a list ``name`` of as many texts; [] without one."""
-    names = _part(parent, "name")
-    fits = isinstance(names, list | tuple) and names is not values and len(names) == len(values)
-    return list(names) if fits and all(isinstance(name, str) for name in names) else []
+    names = names_in(parent)
+    return list(names) if len(names) == len(values) and list(names) != list(values) else []
 
 
 def _keys(value: Any) -> list[str]:

@@ -1,19 +1,22 @@
-"""JSON: samples that are objects with named values, in a list or one a line.
+"""JSON: samples that are objects with named values, in a list or one a line; or arrays.
 
 A value inside another is named by its path: ``state.q[0]`` is the first item of ``q`` in ``state``.
+Arrays are columns, those of rows a column each, as in MATLAB files: ``data[0]``; where a list of
+as many names stands beside them, they have these.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from bampipe.data.readers import moments
+from bampipe.data.readers.arrays import pick, recorded, split_index
 from bampipe.data.readers.nested import MISSING, as_number, find, leaves
-from bampipe.data.readers.trial import LARGEST_BYTES, RawTrial, Wanted, check_columns
+from bampipe.data.readers.trial import LARGEST_BYTES, RawTrial, Wanted, aligned, check_columns
 from bampipe.errors import InputError
 
 _COSTS = {b"{": 184, b"[": 96, b",": 40, b"\n": 16}
@@ -29,6 +32,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         InputError: not JSON, no such list, a column missing or not of numbers.
     """
     samples, constants, notes = _samples(path, wanted.largest_bytes, name)
+    if isinstance(samples, dict):
+        return _from_arrays(samples, constants, wanted, notes, name)
     first = _first(samples, name)
     fixed = {column for column in wanted.columns if find(first, column) is MISSING}
     for column in fixed - set(constants):
@@ -62,6 +67,11 @@ def columns(path: Path, name: str) -> dict[str, str]:
         InputError: as :func:`read`.
     """
     samples, constants, _ = _samples(path, LARGEST_BYTES, name)
+    if isinstance(samples, dict):
+        shapes = {column: values.shape for column, values in samples.items()}
+        moment = {column for column, values in samples.items() if values.dtype == object}
+        kept = {column: "datetime" if column in moment else "" for column in recorded(shapes)}
+        return kept | dict.fromkeys(constants, "")
     found = {}
     for column, cell in leaves(_first(samples, name)):
         if isinstance(cell, int | float):
@@ -77,10 +87,69 @@ def _first(samples: list[object], name: str) -> dict[str, object]:
     return samples[0]
 
 
+def _from_arrays(
+    arrays: Mapping[str, np.ndarray],
+    constants: Mapping[str, object],
+    wanted: Wanted,
+    notes: tuple[str, ...],
+    name: str,
+) -> RawTrial:
+    """The wanted columns of arrays."""
+    values = {}
+    for column in wanted.columns:
+        where = f"{name}, '{column}'"
+        if column in constants:
+            values[column] = np.array([as_number(constants[column], where)])
+            continue
+        label, index = split_index(column, arrays)
+        check_columns([*arrays, *constants], [label], name)
+        if column in wanted.datetimes:
+            stamps = moments.nanoseconds(arrays[label].tolist(), wanted.datetimes[column], where)
+            values[column] = moments.seconds(stamps)
+        elif arrays[label].dtype == object:
+            raise InputError("found text, expected numbers", where=where)
+        else:
+            values[column] = pick(arrays[label], index, where)
+    return RawTrial(aligned(values, name, "array"), first_row=1, notes=notes)
+
+
+def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
+    """Arrays (T,) or (T, k) of numbers, or (T,) of moments, in a parsed text, by their paths."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            names = [
+                other for other in value.values() if isinstance(other, list) and _are_names(other)
+            ]
+            inner = f"{path}.{key}" if path else str(key)
+            for label, array in _arrays(item, inner):
+                width = array.shape[-1] if array.ndim == 2 else 0
+                called = next((n for n in names if len(n) == width), None)
+                if label == inner and called:
+                    yield from zip(called, array.T, strict=True)
+                else:
+                    yield label, array
+    elif isinstance(value, list) and len(value) > 1:
+        if isinstance(value[0], str):
+            if moments.is_moment(value[0]) and all(isinstance(x, str | None) for x in value):
+                yield path, np.array(value, dtype=object)
+            return
+        try:
+            array = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError):  # ragged, or with other things in it
+            return
+        if array.ndim <= 2 and array.size:
+            yield path or "data", array
+
+
+def _are_names(values: list[object]) -> bool:
+    texts = [value for value in values if isinstance(value, str) and value]
+    return bool(texts) and len(set(texts)) == len(values)
+
+
 def _samples(
     path: Path, largest_bytes: int, name: str
-) -> tuple[list[object], Mapping[str, object], tuple[str, ...]]:
-    """Samples of a file, the numbers beside them, and what was left out."""
+) -> tuple[list[object] | dict[str, np.ndarray], Mapping[str, object], tuple[str, ...]]:
+    """Samples of a file, or its arrays; the numbers beside them, and what was left out."""
     size = 3 * path.stat().st_size
     if size <= largest_bytes:
         data = path.read_bytes()
@@ -109,8 +178,14 @@ def _samples(
             if text.endswith("\n"):
                 raise
             notes = ("last line is cut off: 1 row dropped",)
+        content: object = samples
     else:
-        samples, constants = _list_of_samples(_parsed(text, name), name)
+        content = _parsed(text, name)
+    lists = _lists_of_samples(content)
+    if not lists and (arrays := dict(_arrays(content))):
+        return arrays, _numbers(content), notes
+    if path.suffix.lower() not in (".jsonl", ".ndjson"):
+        samples, constants = _list_of_samples(content, lists, name), _numbers(content)
     if not samples:
         raise InputError("a header but no samples", where=name)
     return samples, constants, notes
@@ -126,24 +201,36 @@ def _parsed(text: str, where: str) -> object:
         ) from error
 
 
-def _list_of_samples(content: object, name: str) -> tuple[list[object], dict[str, object]]:
-    """Samples of a parsed file, and the numbers beside them."""
-    if isinstance(content, list):
-        return content, {}
-    content = content if isinstance(content, dict) else {}
-    lists = {
-        key: value
-        for key, value in content.items()
+def _lists_of_samples(content: object) -> dict[str, list[object]]:
+    """Lists of objects with named values, by their key; "" for the whole content."""
+    items = content.items() if isinstance(content, dict) else [("", content)]
+    return {
+        str(key): value
+        for key, value in items
         if isinstance(value, list) and value and isinstance(value[0], dict)
     }
+
+
+def _numbers(content: object) -> dict[str, object]:
+    """The numbers beside the samples of a parsed file."""
+    items = content.items() if isinstance(content, dict) else ()
+    return {str(key): value for key, value in items if isinstance(value, int | float)}
+
+
+def _list_of_samples(content: object, lists: Mapping[str, list[object]], name: str) -> list[object]:
+    """Samples of a parsed file.
+
+    Raises:
+        InputError: no list can be them, or several.
+    """
+    if isinstance(content, list):
+        return content
     if len(lists) != 1:
         raise InputError(
             f"{len(lists)} lists of samples: {', '.join(lists)}"
             if lists
-            else "no list of samples, that is of objects with named values",
+            else "no list of samples, that is of objects with named values, and no array",
             where=name,
+            remedy="leave one list in the file, or export the log as CSV",
         )
-    constants: dict[str, object] = {
-        key: value for key, value in content.items() if isinstance(value, int | float)
-    }
-    return next(iter(lists.values())), constants
+    return next(iter(lists.values()))

@@ -10,6 +10,7 @@ import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -25,6 +26,8 @@ from bampipe.errors import InputError
 from bampipe.files import temporary_space
 
 BLOCK = 1 << 20
+_MOST_CHATTER = 50
+"""Lines of text among the samples, messages of a logger, that are left out."""
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _WESTERN = "cp1252"
 _TAKEN_AS = "not UTF-8: names and units are taken as Windows-1252"
@@ -33,17 +36,18 @@ _TAKEN_AS = "not UTF-8: names and units are taken as Windows-1252"
 class _Stretch:
     """A binary file of which only the bytes from ``start`` to ``end`` are seen."""
 
-    def __init__(self, stream: BinaryIO, start: int, end: int) -> None:
+    def __init__(self, stream: BinaryIO, start: int, end: int, ended: bool = False) -> None:
         stream.seek(start)
         self._stream = stream
         self._left = max(end - start, 0)
+        self._ended = ended
         self.closed = False
 
     def read(self, size: int = -1) -> bytes:
         size = self._left if size < 0 else min(size, self._left)
         data = self._stream.read(size)
         self._left -= len(data)
-        return data
+        return data.replace(b";", b" ") if self._ended else data
 
     def readable(self) -> bool:
         return True
@@ -83,11 +87,21 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     with opened(path, wanted.dialect, name) as (stream, said):
         layout = _layout(stream, wanted, name)
         end, notes = _sound_end(stream, layout)
-        values, rows = _read_samples(stream, layout, end, wanted, name)
-    if rows == 0:
+        samples = _Samples(wanted)
+        _read_samples(stream, layout, end, samples, name)
+    if samples.rows == 0:
         raise InputError("a header but no samples", where=name)
     units = {column: layout.units[column] for column in wanted.columns if column in layout.units}
-    return RawTrial(values, layout.first_line, notes, (*said, *layout.remarks), units)
+    return RawTrial(
+        samples.values(),
+        layout.first_line,
+        (*notes, *samples.notes),
+        (*said, *layout.remarks),
+        units,
+        tuple(samples.resumed),
+        tuple(samples.begun),
+        samples.since,
+    )
 
 
 def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, str]:
@@ -180,55 +194,116 @@ def _layout(stream: BinaryIO, wanted: Wanted, name: str) -> TableLayout:
     return dialects.find_layout(_head(stream, name), wanted.columns, wanted.dialect, name)
 
 
+@dataclass
+class _Samples:
+    """What has been read of a file: the wanted columns in parts, and how many rows.
+
+    Attributes: see :class:`RawTrial`.
+    """
+
+    wanted: Wanted
+    parts: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    rows: int = 0
+    notes: list[str] = field(default_factory=list)
+    resumed: list[tuple[int, int]] = field(default_factory=list)
+    begun: list[int] = field(default_factory=list)
+    since: dict[str, int] = field(default_factory=dict)
+
+    def add(self, batch: pa.RecordBatch, first_line: int, name: str) -> None:
+        for column in self.wanted.columns:
+            cells = batch.column(column)
+            if column in self.wanted.datetimes:
+                form = self.wanted.datetimes[column]
+                where = f"{name}, column '{column}'"
+                part = moments.nanoseconds(cells.to_pylist(), form, where, first_line)
+            else:
+                part = np.array(cells.to_numpy(zero_copy_only=False), dtype=np.float64)
+            self.parts.setdefault(column, []).append(part)
+        self.rows += batch.num_rows
+        check_size(self.rows, self.wanted, name)
+
+    def cut(self, rows: int, parts: int) -> None:
+        """Forget all but the first ``rows``, which the first ``parts`` hold."""
+        self.rows = rows
+        for held in self.parts.values():
+            del held[parts:]
+
+    def values(self) -> dict[str, np.ndarray]:
+        values = joined({column: self.parts[column] for column in self.wanted.columns})
+        self.parts.clear()
+        for column in self.wanted.datetimes:
+            known = values[column][values[column] != np.iinfo(np.int64).min]
+            self.since |= {column: int(known[0])} if len(known) else {}
+            values[column] = moments.seconds(values[column])
+        return values
+
+
 def _read_samples(
-    stream: BinaryIO, layout: TableLayout, end: int, wanted: Wanted, name: str
-) -> tuple[dict[str, np.ndarray], int]:
-    """The wanted columns of the samples before byte ``end``, and how many samples there are."""
+    stream: BinaryIO, layout: TableLayout, end: int, samples: _Samples, name: str
+) -> None:
+    """Read the samples before byte ``end``, past lines of text that hold none.
+
+    Raises:
+        InputError: a row is damaged, or too many lines are text.
+    """
+    while True:
+        rows, parts = samples.rows, max(map(len, samples.parts.values()), default=0)
+        try:
+            _read_stretch(stream, layout, end, samples, name)
+            return
+        except pa.ArrowInvalid as error:
+            if "Empty CSV file" in str(error):
+                return
+            line = _faulty_line(stream, str(error), layout)
+            again = line is not None and layout.is_header(line.text)
+            if line is None or not (again or layout.is_chatter(line.text)):
+                raise _fault(str(error), layout, line, name) from error
+            samples.cut(rows, parts)
+            try:
+                _read_stretch(stream, layout, line.start, samples, name)
+            except pa.ArrowInvalid as empty:
+                if "Empty CSV file" not in str(empty):
+                    raise _fault(str(empty), layout, None, name) from empty
+            if again:
+                samples.begun += [samples.rows] if samples.rows else []
+            elif len(samples.notes) == _MOST_CHATTER:
+                raise InputError(
+                    f"{_MOST_CHATTER} lines hold text and no sample, and there are more",
+                    where=f"{name}, row {line.number}",
+                    remedy="take them out, or log them to another file",
+                ) from error
+            else:
+                samples.notes.append(f"row {line.number} is text and no sample: left out")
+            samples.resumed.append((samples.rows, line.number + 1))
+            layout = replace(layout, start=line.end, first_line=line.number + 1)
+
+
+def _read_stretch(
+    stream: BinaryIO, layout: TableLayout, end: int, samples: _Samples, name: str
+) -> None:
+    wanted = samples.wanted
     kinds = {c: pa.string() if c in wanted.datetimes else pa.float64() for c in wanted.columns}
-    header = layout.header
-    parts: dict[str, list[np.ndarray]] = {column: [] for column in wanted.columns}
-    rows = 0
     seen = _SingleBlanks if layout.delimiter == " " else _Stretch
-    source = pa.PythonFile(seen(stream, layout.start, end), mode="r")
-    try:
-        reader = pa_csv.open_csv(
-            source,
-            read_options=pa_csv.ReadOptions(
-                use_threads=False,
-                block_size=BLOCK,
-                # Names that are not wanted may be repeated or empty: a number stands for them.
-                column_names=[c if c in kinds else f"\0{n}" for n, c in enumerate(header)],
-            ),
-            parse_options=pa_csv.ParseOptions(delimiter=layout.delimiter),
-            convert_options=pa_csv.ConvertOptions(
-                column_types=kinds,
-                include_columns=list(kinds),
-                null_values=[*NULLS, *wanted.dialect.missing],
-                strings_can_be_null=True,
-                decimal_point=layout.decimal,
-            ),
-        )
-        for batch in reader:
-            for column in wanted.columns:
-                cells = batch.column(column)
-                if column in wanted.datetimes:
-                    form = wanted.datetimes[column]
-                    where = f"{name}, column '{column}'"
-                    first = layout.first_line + rows
-                    parts[column].append(moments.nanoseconds(cells.to_pylist(), form, where, first))
-                    continue
-                values = cells.to_numpy(zero_copy_only=False)
-                parts[column].append(np.array(values, dtype=np.float64))
-            rows += batch.num_rows
-            check_size(rows, wanted, name)
-    except pa.ArrowInvalid as error:
-        if "Empty CSV file" in str(error):
-            return {}, 0
-        raise _fault(stream, str(error), layout, name) from error
-    values = joined(parts)
-    for column in wanted.datetimes:
-        values[column] = moments.seconds(values[column])
-    return values, rows
+    before = samples.rows
+    reader = pa_csv.open_csv(
+        pa.PythonFile(seen(stream, layout.start, end, layout.ended), mode="r"),
+        read_options=pa_csv.ReadOptions(
+            use_threads=False,
+            block_size=BLOCK,
+            # Names that are not wanted may be repeated or empty: a number stands for them.
+            column_names=[c if c in kinds else f"\0{n}" for n, c in enumerate(layout.header)],
+        ),
+        parse_options=pa_csv.ParseOptions(delimiter=layout.delimiter),
+        convert_options=pa_csv.ConvertOptions(
+            column_types=kinds,
+            include_columns=list(kinds),
+            null_values=[*NULLS, *wanted.dialect.missing],
+            strings_can_be_null=True,
+            decimal_point=layout.decimal,
+        ),
+    )
+    for batch in reader:
+        samples.add(batch, layout.first_line + samples.rows - before, name)
 
 
 def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, ...]]:
@@ -260,19 +335,50 @@ def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, .
 
 
 def _split(line: bytes, layout: TableLayout) -> list[bytes]:
+    line = line.rstrip(b";") if layout.ended else line
     return line.split() if layout.delimiter == " " else line.split(layout.delimiter.encode())
 
 
-def _fault(stream: BinaryIO, message: str, layout: TableLayout, name: str) -> InputError:
+@dataclass(frozen=True)
+class _FaultyLine:
+    """A line at which reading stopped: its number, its bytes in the file and its text."""
+
+    number: int
+    start: int
+    end: int
+    text: str
+
+
+_TORN = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+): (.*?)(?: \.\.\.)?$", re.DOTALL)
+_CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*invalid value '(.*)'", re.DOTALL)
+
+
+def _faulty_line(stream: BinaryIO, message: str, layout: TableLayout) -> _FaultyLine | None:
+    """The line that Arrow complains about, which does not count blank lines; None for none."""
+    found = _TORN.search(message) or _CELL.search(message)
+    row = int(found[1] if found.re is _TORN else found[2] or 0) if found else 0
+    if row == 0:
+        return None
+    stream.seek(layout.start)
+    at, full = layout.start, 0
+    for number, line in enumerate(stream, layout.first_line):
+        full += bool(line.strip(b"\r\n"))
+        if full == row:
+            text = line.decode("utf-8", "replace").strip("\r\n")
+            return _FaultyLine(number, at, at + len(line), text)
+        at += len(line)
+    return None
+
+
+def _fault(message: str, layout: TableLayout, line: _FaultyLine | None, name: str) -> InputError:
     """The plain form of what Arrow says about a text file."""
-    torn = re.search(
-        r"Row #(\d+): Expected (\d+) columns, got (\d+): (.*?)(?: \.\.\.)?$", message, re.DOTALL
-    )
+    at = f", row {line.number}" if line is not None else ""
+    torn = _TORN.search(message)
     if torn:
-        row, expected, actual, text = int(torn[1]), int(torn[2]), int(torn[3]), torn[4]
+        expected, actual, text = int(torn[2]), int(torn[3]), torn[4]
         commas = actual > expected and re.fullmatch(r'[\s"0-9,+-]*', text)
         clock = re.search(r"\d+:\d\d:\d\d,\d+", text) if layout.delimiter == "," else None
-        remedy = "the line is damaged"
+        remedy = "the line is damaged: take it out of the file"
         if commas:
             remedy = (
                 "decimal commas? export with semicolons between columns, or points as decimal sign"
@@ -284,27 +390,20 @@ def _fault(stream: BinaryIO, message: str, layout: TableLayout, name: str) -> In
             )
         return InputError(
             f"{actual} cells, where the header has {expected}",
-            where=f"{name}, row {_line(stream, layout, row)}",
+            where=f"{name}{at}",
             remedy=remedy,
         )
-    cell = re.search(
-        r"In CSV column #(\d+): (?:Row #(\d+): )?.*invalid value '(.*)'", message, re.DOTALL
-    )
+    cell = _CELL.search(message)
     if cell is None:
         what = "a line is far too long" if "straddl" in message else message
         return InputError(what, where=name)
-    column, row_number, value = layout.header[int(cell[1])], cell[2], cell[3]
+    column, value = layout.header[int(cell[1])], cell[3]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
     other = "," if layout.decimal == "." else "."
     sign = re.fullmatch(rf"\s*[-+]?\d+{re.escape(other)}\d+\s*", value)
-    at = f", row {_line(stream, layout, int(row_number))}" if row_number else ""
     remedy = ""
     if sign:
         remedy = f"export with one decimal sign; '{layout.decimal}' was taken from the first rows"
-    elif value.strip().strip('"') == column:
-        remedy = (
-            "the header once more: several recordings in one file? put each into one of its own"
-        )
     elif moments.is_moment(value):
         remedy = 'is it the time? then say unit = "datetime" under [time]'
     elif shown == value and re.fullmatch(r"[^\d\"\\]+", value.strip()):
@@ -316,14 +415,3 @@ def _fault(stream: BinaryIO, message: str, layout: TableLayout, name: str) -> In
         where=f"{name}{at}, column '{column}'",
         remedy=remedy,
     )
-
-
-def _line(stream: BinaryIO, layout: TableLayout, row: int) -> int:
-    """Line of the file that holds Arrow's row ``row``: Arrow does not count blank lines."""
-    stream.seek(layout.start)
-    full = 0
-    for number, line in enumerate(stream, layout.first_line):
-        full += bool(line.strip(b"\r\n"))
-        if full == row:
-            return number
-    return layout.first_line + row

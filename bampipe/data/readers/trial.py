@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -62,6 +62,9 @@ class RawTrial:
         notes: what was left out, one sentence each.
         remarks: what was found out about the file, one sentence each.
         units: units that the file itself gives to its columns.
+        resumed: after lines that hold no sample, the sample that follows and its row.
+        begun: samples before which the header stands once more, as of another recording.
+        since: of columns of dates and times, where known, their first moment, ns since 1970.
     """
 
     columns: dict[str, np.ndarray]
@@ -69,6 +72,30 @@ class RawTrial:
     notes: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    resumed: tuple[tuple[int, int], ...] = ()
+    begun: tuple[int, ...] = ()
+    since: Mapping[str, int] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Row in the file of every sample, (T,) int64."""
+        rows = np.arange(self.first_row, self.first_row + len(self), dtype=np.int64)
+        for sample, row in self.resumed:
+            rows[sample:] += row - rows[sample] if sample < len(rows) else 0
+        return rows
+
+    def between(self, start: int, stop: int) -> RawTrial:
+        """The samples from ``start`` to before ``stop``."""
+        return replace(
+            self,
+            columns={name: values[start:stop] for name, values in self.columns.items()},
+            first_row=int(self.rows[start]),
+            resumed=tuple((at - start, row) for at, row in self.resumed if start < at < stop),
+            begun=tuple(at - start for at in self.begun if start < at < stop),
+        )
 
 
 def check_size(rows: int, wanted: Wanted, name: str) -> None:
@@ -103,7 +130,7 @@ def check_columns(found: Sequence[str], wanted: Sequence[str], name: str) -> Non
 
 
 def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np.ndarray]:
-    """The columns, all as long as the first; a single number is a column that does not change.
+    """The columns, all of one length; a single number is a column that does not change.
 
     Args:
         values: (T,) or (1,) a column.
@@ -113,7 +140,7 @@ def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np
     Raises:
         InputError: a column is of another length.
     """
-    first = next(iter(values))
+    first = max(values, key=lambda column: len(values[column]) > 1)
     count = len(values[first])
     for column, value in values.items():
         if len(value) not in (1, count):
@@ -122,6 +149,18 @@ def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np
                 where=f"{name}, {what} '{column}'",
             )
     return {c: np.repeat(v, count) if len(v) == 1 < count else v for c, v in values.items()}
+
+
+def interpolated(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (T,) at ``at`` (N,), NaN before the first time (T,) and after the last.
+
+    Missing values are bridged; times need not be in order.
+    """
+    known = np.flatnonzero(np.isfinite(times) & np.isfinite(values))
+    if len(known) == 0:
+        return np.full(len(at), np.nan)
+    order = known[np.argsort(times[known], kind="stable")]
+    return np.asarray(np.interp(at, times[order], values[order], left=np.nan, right=np.nan))
 
 
 def joined(parts: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:

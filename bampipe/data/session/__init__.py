@@ -5,14 +5,16 @@ Everything that can be known from the session file alone is checked here, and a 
 is wrong with one trial's file is the reader's and the quality rules' business.
 """
 
-from bampipe.data.session.channels import SECONDS, Channel, Encoder
-from bampipe.data.session.file import Session, TrialEntry, read_session, session_from
+from bampipe.data.session.channels import SECONDS, Channel, Clock, Encoder
+from bampipe.data.session.file import Part, Session, TrialEntry, read_session, session_from
 from bampipe.data.session.places import inside
 
 __all__ = [
     "SECONDS",
     "Channel",
+    "Clock",
     "Encoder",
+    "Part",
     "Session",
     "TrialEntry",
     "inside",

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -29,6 +29,8 @@ from bampipe.schema import (
 LARGEST_CONDITION = 1e8
 """A calibration matrix with a larger condition number counts as singular."""
 
+TimeUnit = Literal["ns", "us", "ms", "s", "datetime"]
+CLOCK_UNITS: tuple[TimeUnit, ...] = get_args(TimeUnit)
 SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
 _FORCE_SUFFIXES = ("_nm", "_v", "_n")
 
@@ -73,11 +75,24 @@ def _unit(text: str) -> units.RecordedUnit:
     return found
 
 
+def _unit_of(*si: str) -> AfterValidator:
+    """Of a field that holds a unit of one of the SI units ``si``; of volts, V alone."""
+
+    def checked(text: str) -> str:
+        found = units.unit(text)
+        if found is None or found.si not in si or (found.si == "V" and text != "V"):
+            listed = f"{', '.join(si[:-1])} or {si[-1]}"
+            raise fault(f'found "{text}", expected a unit of {listed}{did_you_mean(text, si)}')
+        return text
+
+    return AfterValidator(checked)
+
+
 class Clock(Declaration):
     """The time column."""
 
     column: str = Field(default="", description="Its name; left out where samples are counted")
-    unit: Literal["ns", "us", "ms", "s", "datetime", "samples"] = Field(
+    unit: TimeUnit | Literal["samples"] = Field(
         description="datetime: dates and times; samples: no column, one sample each"
         " 1/sample_rate_hz"
     )
@@ -139,13 +154,11 @@ class Encoder(NamedDeclaration):
         " negative where it turns the other way round",
     )
     zero: Number = Field(default=0.0, alias="zero_counts", description="Raw reading at position 0")
-    stated_unit: Literal[
-        "rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in",
-        "rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s",
-    ] = Field(
+    stated_unit: Annotated[str, _unit_of("rad", "m", "rad/s", "m/s")] = Field(
         alias="unit",
-        description="A unit of velocity where no position was recorded: it is integrated",
-    )  # fmt: skip
+        description="Such as deg, mm or 0.088deg; a unit of velocity where no position was"
+        " recorded: it is integrated",
+    )
     scale_sd: Uncertainty = Field(
         default=0.0, description="Standard uncertainty of its scale, as a share: 0.001 for 0.1 %"
     )
@@ -256,10 +269,9 @@ class Force(Declaration):
         " force_<component>; fewer than columns where the calibration joins several, one row a"
         " component",
     )
-    raw_unit: Literal[
-        "V", "N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "lbf.in",
-        "lbf.ft",
-    ] = Field(alias="unit", description="Of the columns; only V needs a calibration")  # fmt: skip
+    raw_unit: Annotated[str, _unit_of("N", "N.m", "V")] = Field(
+        alias="unit", description="Of the columns, such as kN or mN.m; only V needs a calibration"
+    )
     frame: str = Field(default="", description="In which the components are given: free text")
     calibration_n_per_v: (
         Annotated[Several[Annotated[Several[Number], Field(min_length=1)]], Field(min_length=1)]

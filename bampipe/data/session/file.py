@@ -23,6 +23,7 @@ from bampipe.data.session.channels import (
     Clock,
     Encoder,
     Force,
+    TimeUnit,
 )
 from bampipe.data.session.places import inside, is_device_path, lexically_inside
 from bampipe.errors import InputError, did_you_mean
@@ -64,11 +65,46 @@ def _moment(value: Any) -> Any:
     return value
 
 
+LogPath = Annotated[
+    Text,
+    AfterValidator(checked_by(_inside)),
+    Field(description="Path relative to the session folder"),
+]
+
+
+class Part(Declaration):
+    """One ``[[trials.parts]]`` entry: another file of the same recording."""
+
+    file: LogPath
+    name: ChannelName = Field(
+        description="What its columns are called by: force:Fx is Fx of the part force"
+    )
+    join: Literal["rows", "time", "start"] = Field(
+        default="rows",
+        description="rows: sample by sample; time: between its samples, by its time column, which"
+        " is on the clock of the trial's file; start: the same, both counted from their first"
+        " sample",
+    )
+    time: str = Field(default="", description="Its time column, if not called as that of the file")
+    time_unit: TimeUnit | Literal[""] = Field(
+        default="", description="Unit of its time column, if not that of the file"
+    )
+
+
 class TrialEntry(NamedDeclaration):
     """One ``[[trials]]`` entry."""
 
-    file: Annotated[Text, AfterValidator(checked_by(_inside))] = Field(
-        description="Path relative to the session folder"
+    file: LogPath
+    part: str = Field(
+        default="", description="Where parts have columns of the same names, a name for this file"
+    )
+    parts: Several[Part] = Field(
+        default=(), description="Other files of the same recording, one entry each"
+    )
+    recording: Annotated[int, Field(ge=1)] | None = Field(
+        default=None,
+        description="Which recording, where the file holds several: each begins with the header, or"
+        " where time starts again",
     )
     kind: Literal["free", "locked", "viscous"] = Field(
         description="free: moved at will; locked: a brake holds one axis; viscous: in a field"
@@ -97,8 +133,9 @@ class TrialEntry(NamedDeclaration):
         return self.name
 
     def overlaps(self, other: TrialEntry) -> bool:
-        """Whether the stretches of two trials of one record have samples in common."""
-        return self.start_s < other.end_s and other.start_s < self.end_s
+        """Whether the stretches of two trials of one file have samples in common."""
+        apart = self.recording != other.recording and None not in (self.recording, other.recording)
+        return not apart and self.start_s < other.end_s and other.start_s < self.end_s
 
     def cross_faults(self) -> Iterator[InputError]:
         for key, value, only in (
@@ -111,6 +148,11 @@ class TrialEntry(NamedDeclaration):
                 yield InputError(
                     f'given for a "{self.kind}" trial', where=key, remedy=f'only for "{only}"'
                 )
+        named = Counter(part.name for part in self.parts)
+        named.update([self.part] if self.part else [])
+        for name, times in named.items():
+            if times > 1:
+                yield InputError(f"{times} parts are called '{name}'", where="parts")
         if not self.start_s < self.end_s:
             yield InputError(
                 f"found {self.end_s:g}, expected more than start_s = {self.start_s:g}",

@@ -86,26 +86,27 @@ class FormDictionary:
 
     def key(self, name: str, searched: Mapping[str, float]) -> Key:
         """A form at given values of its searched constants."""
-        found = []
-        for constant, (low, high, _) in self.candidates[name].limits().items():
-            value = float(np.clip(searched[constant], low, high))
-            by_ratio = low > 0.0 and self._by_ratio(name, constant)
-            ends = np.log([low, value, high]) if by_ratio else np.array([low, value, high])
-            found.append(float((ends[1] - ends[0]) / (ends[2] - ends[0])))
-        return name, tuple(found)
+        shape = []
+        for constant, low, high, by_ratio in self._ranges(name):
+            ends = [low, float(np.clip(searched[constant], low, high)), high]
+            at = np.log(ends) if by_ratio else ends
+            shape.append(float((at[1] - at[0]) / (at[2] - at[0])))
+        return name, tuple(shape)
 
     def values(self, key: Key) -> dict[str, float]:
         """The searched constants of a form at one shape."""
-        name, found = key[0], {}
-        for u, (constant, (low, high, _)) in zip(
-            key[1], self.candidates[name].limits().items(), strict=True
-        ):
-            by_ratio = low > 0.0 and self._by_ratio(name, constant)
-            found[constant] = low * (high / low) ** u if by_ratio else low + u * (high - low)
-        return {constant: float(value) for constant, value in found.items()}
+        return {
+            constant: float(low * (high / low) ** u if by_ratio else low + u * (high - low))
+            for u, (constant, low, high, by_ratio) in zip(key[1], self._ranges(key[0]), strict=True)
+        }
 
-    def _by_ratio(self, name: str, constant: str) -> bool:
-        return self.candidates[name].shape.searched[constant] in ("length", "time", "wavenumber")
+    def _ranges(self, name: str) -> list[tuple[str, float, float, bool]]:
+        """Searched constants with the ends of their ranges, and whether to step by ratios."""
+        form = self.candidates[name]
+        by_ratio = {
+            n: k in ("length", "time", "wavenumber") for n, k in form.shape.searched.items()
+        }
+        return [(n, low, high, by_ratio[n]) for n, (low, high, _) in form.limits().items()]
 
     def bounds(self, name: str) -> list[tuple[float, float]]:
         """Of each strength of a form: a file states none."""
@@ -114,14 +115,15 @@ class FormDictionary:
     def spreads(self, name: str) -> list[float]:
         """Standard deviation of each strength before any data: of what drives the axis."""
         form = self.candidates[name]
-        size = self._rms[form.coordinate.words if form.factor == READING else _LOAD]
+        size = self._sizes[form.coordinate.words if form.factor == READING else _LOAD]
         return [max(size, 1e-300)] * len(form.shape.strengths)
 
     def make(self, key: Key) -> Atom | None:
         """Columns of a form at one shape; None where it does nothing in these trials."""
         form, searched = self.candidates[key[0]], self.values(key)
         constants = form.constants_at(searched, 1.0 / self._rate_hz)
-        axes = self._axes(form)
+        # An error of a reading acts wherever the force does.
+        axes = range(len(self.samples)) if form.factor == READING else [self.axis]
         rows: dict[int, list[Array]] = {axis: [] for axis in axes}
         slopes: dict[int, list[Array]] = {axis: [] for axis in axes}
         for i, (_, kept) in enumerate(self._sampling):
@@ -187,6 +189,13 @@ class FormDictionary:
             found.append((slice(first, None, every), (kept - first) // every))
         return found
 
+    @cached_property
+    def _sizes(self) -> dict[str, float]:
+        """Root mean square of each signal."""
+        return {
+            n: float(np.sqrt(np.mean(np.concatenate(s) ** 2))) for n, s in self._signals.items()
+        }
+
     @property
     def _rate_hz(self) -> float:
         return float(self.evidence.band.rate_hz / self._sampling[0][0].step)
@@ -234,27 +243,20 @@ class FormDictionary:
             found.append(np.asarray(e.system.input_map(motion.q[rows], u, e.p)))
         return found
 
-    def _component(self, form: Form) -> int:
-        return self.evidence.system.model.device.forces.index(form.coordinate.channel)
-
-    def _axes(self, form: Form) -> list[int]:
-        """The axes that a form acts on: an error of a reading acts on all that the force does."""
-        return list(range(len(self.samples))) if form.factor == READING else [self.axis]
-
     def _lever(self, form: Form, axis: int, trial: int) -> Array:
         """What the shape of a form is multiplied by on an axis, (T, 1)."""
         if form.factor == READING:
-            return -self._pulls[trial][:, axis, self._component(form)][:, None]
+            component = self.evidence.system.model.device.forces.index(form.coordinate.channel)
+            return -self._pulls[trial][:, axis, [component]]
         return np.ones((1, 1)) if form.factor == FORCE else self._signals[form.factor][trial]
 
     def _by_forces(self, form: Form, trial: int, kept: NDArray[np.int64]) -> Array:
         """Slope of what a form follows by the measured forces, (K, n_forces, 1)."""
-        pulls = self._pulls[trial][kept]
+        forces = self.evidence.system.model.device.forces
         if form.factor == READING:
-            return np.asarray(np.eye(pulls.shape[2])[[self._component(form)]][:, :, None])
-        return np.asarray(pulls[:, self.axis] * np.sign(self._of(_APPLIED, trial)[kept]))[
-            :, :, None
-        ]
+            return np.array([[[float(f == form.coordinate.channel)] for f in forces]])
+        pulls, applied = self._pulls[trial][kept, self.axis], self._signals[_APPLIED][trial][kept]
+        return np.asarray(pulls * np.sign(applied))[:, :, None]
 
     @cached_property
     def spans(self) -> dict[str, Span]:
@@ -277,13 +279,6 @@ class FormDictionary:
         """Time between samples and of a trial, s."""
         trials = [motion.t for motion in self.evidence.motions]
         return Span(float(np.median(np.diff(trials[0]))), max(float(np.ptp(t)) for t in trials))
-
-    @cached_property
-    def _rms(self) -> dict[str, float]:
-        return {
-            name: float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
-            for name, parts in self._signals.items()
-        }
 
     def _points(self, form: Form) -> list[dict[str, float]]:
         """Values of the searched constants of a form to try."""

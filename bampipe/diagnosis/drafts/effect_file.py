@@ -35,7 +35,7 @@ def declare(term: Term, source: str) -> dict[str, Any]:
             interval = f"{round_with_sd(term.values[name], 1.96 * term.sd[name])} {entry['unit']}"
             entries[name]["description"] += f"; drafted as {interval}".rstrip()
             entries[name] |= _numbers(term, name, entry)
-    return term.form.declaration(source, term.name, entries)
+    return term.form.declaration(source, entries)
 
 
 def _numbers(term: Term, name: str, entry: Mapping[str, Any]) -> dict[str, float]:

@@ -66,19 +66,12 @@ _CURVED: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
     for factor in (FORCE, FRICTION)
 }
 """Where a curve may be put in place of a formula."""
-_SEES = {
-    FORCE: "the same in both directions of motion",
-    FRICTION: "opposite in the two directions of motion",
-    DAMPING: "in proportion to velocity",
-    INERTIA: "in proportion to acceleration",
-    READING: "as an error of what the force is read to be",
-}
-_ACTS = {
-    FORCE: "A force on the axis",
-    FRICTION: "Friction on the axis",
-    DAMPING: "Damping on the axis",
-    INERTIA: "Inertia on the axis",
-    READING: "An error of the sensor",
+_ACTS_AND_SHOWS = {
+    FORCE: ("A force on the axis", "the same in both directions of motion"),
+    FRICTION: ("Friction on the axis", "opposite in the two directions of motion"),
+    DAMPING: ("Damping on the axis", "in proportion to velocity"),
+    INERTIA: ("Inertia on the axis", "in proportion to acceleration"),
+    READING: ("An error of the sensor", "as an error of what the force is read to be"),
 }
 
 
@@ -92,6 +85,7 @@ class Form:
         span: of the coordinate in the trials; times: time between samples and of a trial, s.
         scale: of the factor: the highest speed or acceleration of the axis; 1 for others.
         beside: other quantities that it follows, ``x2``, ``x3`` in its shape, and their spans.
+        prefix: of its name, where a model has two terms of one form.
     """
 
     axis: Axis
@@ -103,6 +97,7 @@ class Form:
     times: Span
     scale: float
     beside: tuple[tuple[Quantity, Span], ...] = ()
+    prefix: str = ""
 
     @property
     def quantities(self) -> tuple[tuple[Quantity, Span], ...]:
@@ -113,8 +108,8 @@ class Form:
     def name(self) -> str:
         """Name of the effect: ``bump_by_position``, ``slope_by_extension_position_on_yaw``."""
         if self.factor == READING:
-            return f"{self.shape.name}_of_reading"
-        head = "" if self.factor == FORCE else f"{self.factor}_"
+            return f"{self.prefix}{self.shape.name}_of_reading"
+        head = self.prefix + ("" if self.factor == FORCE else f"{self.factor}_")
         tail = "" if self.is_own else f"_on_{self.axis.name}"
         by = "" if self.beside else f"_by_{self.coordinate.name}"
         return f"{head}{self.shape.name}{by}{tail}"
@@ -143,14 +138,10 @@ class Form:
         return self.coordinate.unit if self.factor == READING else self.axis.torque_unit
 
     @property
-    def lever(self) -> str:
-        """Name of the signal that its shape is multiplied by."""
-        return f"{READING} {self.target}" if self.factor == READING else self.factor
-
-    @property
-    def constants(self) -> int:
-        """How many numbers are estimated."""
-        return len(self.shape.strengths) + len(self.shape.searched)
+    def parameters(self) -> dict[str, str]:
+        """Names in a model of what is estimated, strengths first, by their short names."""
+        head = self.canonical.replace(":", ".")
+        return {n: f"{head}.{n}" for n in (*self.shape.strengths, *self.shape.searched)}
 
     @property
     def expression(self) -> str:
@@ -178,12 +169,12 @@ class Form:
     @property
     def summary(self) -> str:
         """What it is, in one sentence."""
-        return f"{_ACTS[self.factor]} that {self._words}"
+        return f"{_ACTS_AND_SHOWS[self.factor][0]} that {self._words}"
 
     @property
     def looks_like(self) -> str:
         """How it shows in a residual."""
-        seen = "" if self.beside else f", {_SEES[self.factor]}"
+        seen = "" if self.beside else f", {_ACTS_AND_SHOWS[self.factor][1]}"
         return f"residual that {self._words}{seen}"
 
     def fixed(self) -> dict[str, tuple[float, str]]:
@@ -246,14 +237,9 @@ class Form:
         return found
 
     def declaration(
-        self, source: str, name: str = "", entries: Mapping[str, Mapping[str, Any]] | None = None
+        self, source: str, entries: Mapping[str, Mapping[str, Any]] | None = None
     ) -> dict[str, Any]:
-        """The effect file.
-
-        Args:
-            source: where it comes from; name: of the effect, that of the form where empty.
-            entries: its parameters; `entries` of the form where left out.
-        """
+        """The effect file; source: where it comes from; entries: its parameters, else `entries`."""
         parameters: dict[str, Any] = {}
         for key, entry in (entries or self.entries()).items():
             numbers = {k: value for k, value in entry.items() if k != "description"}
@@ -269,7 +255,7 @@ class Form:
             acts["torque"] = {self.axis.name: self.expression}
         return {
             "schema": "bampipe.effect/1",
-            "name": name or self.name,
+            "name": self.name,
             "summary": self.summary,
             "scope": self._scope,
             "looks_like": self.looks_like,

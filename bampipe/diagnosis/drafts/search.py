@@ -51,13 +51,12 @@ class Term:
     """A form with its numbers.
 
     Attributes:
-        form: what it is; name: of its effect, which differs where two terms have one form.
+        form: what it is.
         values: of its constants, by name, as fitted with the model.
         covariance: of them, in that order.
     """
 
     form: Form
-    name: str
     values: dict[str, float]
     covariance: Array
 
@@ -66,11 +65,6 @@ class Term:
         """Standard deviations of the constants."""
         spread = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return dict(zip(self.values, map(float, spread), strict=True))
-
-    @property
-    def canonical(self) -> str:
-        """Its name as a model has it."""
-        return _canonical(self.form, self.name)
 
     def curve(self, count: int = 121) -> tuple[Array, Array, Array]:
         """Coordinate, torque and its standard deviation along the range travelled, (count,) each.
@@ -103,13 +97,13 @@ class Option:
     """A model with some terms, fitted.
 
     Attributes:
-        terms: forms and the names of their effects.
+        terms: their forms.
         held_out_rmse: on the axis, N.m or N.
         log_evidence: over the model as given, nats.
         recipe: the model; p: its parameters, (n_p,).
     """
 
-    terms: tuple[tuple[Form, str], ...]
+    terms: tuple[Form, ...]
     held_out_rmse: float
     log_evidence: float
     recipe: Recipe
@@ -118,7 +112,7 @@ class Option:
     @property
     def constants(self) -> int:
         """How many numbers its terms have."""
-        return sum(form.constants for form, _ in self.terms)
+        return sum(len(form.parameters) for form in self.terms)
 
 
 @dataclass(frozen=True)
@@ -334,17 +328,18 @@ class _AxisSearch:
         terms, tasks = [], []
         for key in keys:
             form, solution = search.forms.candidates[key[0]], search.solve((key,))
-            taken = [name for _, name in current.terms]
-            name = form.name if form.name not in taken else f"other_{form.name}"
+            if form.name in [one.name for one in current.terms]:
+                form = replace(form, prefix="other_")
             wider = replace(
                 current.recipe,
-                effects=(*current.recipe.effects, _canonical(form, name)),
-                extra=(*current.recipe.extra, form.declaration(self.source, name)),
+                effects=(*current.recipe.effects, form.canonical),
+                extra=(*current.recipe.extra, form.declaration(self.source)),
             )
             strengths = dict(zip(form.shape.strengths, solution.strengths[0], strict=True))
             values = search.forms.values(key) | strengths
-            start = _start(search, wider, _prefix(form, name), values, solution.base)
-            terms.append((*current.terms, (form, name)))
+            known = {form.parameters[name]: value for name, value in values.items()}
+            start = _start(search, wider, known, solution.base)
+            terms.append((*current.terms, form))
             tasks.append((wider, start))
         jobs = min(self.session.jobs, len(tasks))
         with workers((self, search.fit.likelihood.noise), jobs) as spread:
@@ -400,30 +395,20 @@ def _best(options: Sequence[Option]) -> Option:
     return max((options[0], *lower), key=lambda o: o.log_evidence)
 
 
-def _canonical(form: Form, name: str) -> str:
-    return name + form.canonical.removeprefix(form.name)
-
-
-def _prefix(form: Form, name: str) -> str:
-    return f"{name}.{form.target}" if form.target else name
-
-
 def _cost(fit: Fit) -> float:
     """Negative log likelihood of a fit with what is known of its parameters, nats."""
     e: Evidence = fit.evidence
     return fit.problem.solve().cost + 0.5 * float(e.precision @ e.known**2)
 
 
-def _start(
-    search: FormSearch, wider: Recipe, prefix: str, values: dict[str, float], base: Array
-) -> Array:
+def _start(search: FormSearch, wider: Recipe, values: dict[str, float], base: Array) -> Array:
     """Parameters of a model with a form from the solution of its linear problem, (n_p,)."""
     e = search.fit.evidence
     known = {q.name: float(v) for q, v in zip(e.system.parameters, e.p, strict=True)}
     change = search.p.to_parameters @ base
     for place, number in enumerate(e.free):
         known[e.system.parameters[number].name] += float(change[place])
-    known |= {f"{prefix}.{name}": value for name, value in values.items()}
+    known |= values
     parameters: Sequence[Any] = system_of(wider).parameters
     start = np.array([known.get(q.name, q.prior) for q in parameters])
     bounds = [q.lower for q in parameters], [q.upper for q in parameters]
@@ -438,10 +423,8 @@ def _terms(fit: Fit, option: Option) -> tuple[Term, ...]:
     covariance = p.to_parameters @ np.linalg.pinv(normal, hermitian=True) @ p.to_parameters.T
     place = {e.system.parameters[i].name: k for k, i in enumerate(e.free)}
     found = []
-    for form, name in option.terms:
-        short = [*form.shape.strengths, *form.shape.searched]
-        full = [f"{_prefix(form, name)}.{constant}" for constant in short]
-        rows = [place[f] for f in full]
-        values = {c: float(e.p[e.system.index(f)]) for c, f in zip(short, full, strict=True)}
-        found.append(Term(form, name, values, covariance[np.ix_(rows, rows)]))
+    for form in option.terms:
+        rows = [place[name] for name in form.parameters.values()]
+        values = {c: float(e.p[e.system.index(n)]) for c, n in form.parameters.items()}
+        found.append(Term(form, values, covariance[np.ix_(rows, rows)]))
     return tuple(found)

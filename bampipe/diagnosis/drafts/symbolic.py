@@ -63,7 +63,7 @@ def breed(forms: FormDictionary, problem: Problem) -> None:
     for text in _breed_expressions(-problem.y[axis] / root, unweighted, x):
         for parts in _choices(_read(text, len(known))):
             form, numbers = write_form(forms, known, parts)
-            if form.constants <= _MOST_CONSTANTS:
+            if len(form.parameters) <= _MOST_CONSTANTS:
                 found.setdefault(form.expression, (form, numbers))
     for number, (form, numbers) in enumerate(found.values(), 1):
         forms.candidates[f"{form.name} {number}"] = form

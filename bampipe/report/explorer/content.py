@@ -214,18 +214,10 @@ def _maps(results: Results) -> list[Content]:
         diagnosis = results.read(DiagnoseResult, model)
         for axis, maps in (diagnosis.maps if diagnosis else {}).items():
             for variable, drawn in maps.items():
+                plain = drawn.model_dump(mode="json", include={"center", "mean", "low", "high"})
+                about = {"unit": wording.unit(drawn.unit), "share": drawn.variance_share}
                 found.append(
-                    {
-                        "model": number,
-                        "axis": axis,
-                        "variable": variable,
-                        "unit": wording.unit(drawn.unit),
-                        "share": drawn.variance_share,
-                        "center": list(drawn.center),
-                        "mean": list(drawn.mean),
-                        "low": list(drawn.low),
-                        "high": list(drawn.high),
-                    }
+                    {"model": number, "axis": axis, "variable": variable, **about, **plain}
                 )
     return found
 
@@ -268,7 +260,7 @@ def _parameters(results: Results) -> list[Content]:
                 "name": name,
                 "unit": wording.unit(unit),
                 "values": [
-                    {"estimate": v.estimate, "sd": v.sd, "at_bound": v.at_bound} if v else None
+                    v.model_dump(include={"estimate", "sd", "at_bound"}) if v else None
                     for v in values
                 ],
             }

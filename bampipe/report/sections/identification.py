@@ -36,10 +36,7 @@ def section(results: Results) -> Section:
     """Return the section."""
     identified = results.read(IdentifyResult)
     if identified is None:
-        command = f"`bampipe identify {results.root.name}`"
-        return Section(
-            TITLE, (Paragraph(f"No parameters have been identified: {command} does it."),)
-        )
+        return results.not_done(TITLE, "No parameters have been identified", "identify")
     blocks: list[Block] = [_parameters(results, identified)]
     if identified.base_parameters:
         blocks.append(_base_parameters(identified.base_parameters))
@@ -223,8 +220,8 @@ def _bounds(results: Results, bounds: Mapping[str, StateBound]) -> Table:
     rows = [
         (
             axis,
-            *((_scaled(bounds[axis].position, results.unit(axis)),) if positions else ()),
-            _scaled(bounds[axis].velocity, results.rate_unit(axis)),
+            *((wording.scaled(bounds[axis].position, results.unit(axis)),) if positions else ()),
+            wording.scaled(bounds[axis].velocity, results.rate_unit(axis)),
         )
         for axis in verdicts.ordered(results, bounds)
     ]
@@ -234,13 +231,6 @@ def _bounds(results: Results, bounds: Mapping[str, StateBound]) -> Table:
         tuple(rows),
         "lrr" if positions else "lr",
     )
-
-
-def _scaled(value: float | None, unit: str) -> str:
-    if value is None:
-        return "–"
-    factor, shown = wording.scale([value], unit)
-    return f"{wording.significant(factor * value, 2)} {shown}"
 
 
 def _groups(

@@ -22,10 +22,7 @@ def section(results: Results) -> Section | None:
     if found is None:
         if not (results.trials["kind"] == "locked").any():
             return None
-        command = f"`bampipe stiffness {results.root.name}`"
-        return Section(
-            TITLE, (Paragraph(f"The locked trials have not been used: {command} does it."),)
-        )
+        return results.not_done(TITLE, "The locked trials have not been used", "stiffness")
     axes, notes = found.axes, found.notes
     if not axes and not found.gears:
         return Section(TITLE, (Paragraph(" ".join(notes) or "There are no locked trials."),))
@@ -44,15 +41,13 @@ def _table(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:
     poses: dict[str, str] = {}
     for axis in verdicts.ordered(results, axes):
         entry = axes[axis]
-        factor, unit = wording.scale([entry.stiffness], entry.unit)
-        value = wording.with_sd(factor * entry.stiffness, factor * entry.sd)
         rows.append(
             (
                 axis,
-                f"{value} {unit}",
+                wording.scaled(entry.stiffness, entry.unit, sd=entry.sd),
                 str(entry.n_cycles),
-                _scaled(entry.loop_width, entry.loop_width_unit),
-                _scaled(entry.energy_per_cycle, entry.energy_unit),
+                wording.scaled(entry.loop_width, entry.loop_width_unit, 3),
+                wording.scaled(entry.energy_per_cycle, entry.energy_unit, 3),
                 wording.significant(entry.bandwidth_rad_s),
                 wording.significant(entry.bandwidth_hz),
             )
@@ -88,14 +83,11 @@ def _gears(results: Results, gears: Mapping[str, GearStiffness]) -> Table:
     rows = []
     for axis in verdicts.ordered(results, gears):
         gear = gears[axis]
-        stiffness = "not seen"
+        stiffness, play = "not seen", "not crossed"
         if gear.stiffness is not None and gear.sd is not None:
-            factor, unit = wording.scale([gear.stiffness], gear.unit)
-            stiffness = f"{wording.with_sd(factor * gear.stiffness, factor * gear.sd)} {unit}"
-        play = "not crossed"
+            stiffness = wording.scaled(gear.stiffness, gear.unit, sd=gear.sd)
         if gear.play is not None and gear.play_sd is not None:
-            factor, unit = wording.scale([abs(gear.play)], gear.play_unit)
-            play = f"{wording.with_sd(factor * gear.play, factor * gear.play_sd)} {unit}"
+            play = wording.scaled(gear.play, gear.play_unit, sd=gear.play_sd)
         late = wording.with_sd(1e3 * gear.late_s, 1e3 * gear.late_sd)
         explained = f"{100.0 * gear.explained:.0f} %"
         rows.append((axis, stiffness, play, explained, f"{late} ms", gear.side))
@@ -118,11 +110,6 @@ def _pose(results: Results, entry: AxisStiffness) -> str:
         f"{axis} {pose[axis]:.3g} {results.unit(axis)}" for axis in verdicts.ordered(results, pose)
     ]
     return f"{wording.words(name)} ({', '.join(parts)})" if parts else wording.words(name)
-
-
-def _scaled(value: float, unit: str) -> str:
-    factor, shown = wording.scale([value], unit) if unit != "J" else (1e3, "mJ")
-    return f"{wording.significant(factor * value)} {shown}"
 
 
 def _loops(results: Results, axes: Mapping[str, AxisStiffness], loops: pd.DataFrame) -> Figure:

@@ -188,10 +188,7 @@ def _percent(entry: AxisError | None) -> str:
 
 
 def _stiffness(entry: AxisStiffness | None) -> str:
-    if entry is None:
-        return "–"
-    factor, unit = wording.scale([entry.stiffness], entry.unit)
-    return f"{wording.with_sd(factor * entry.stiffness, factor * entry.sd)} {unit}"
+    return "–" if entry is None else wording.scaled(entry.stiffness, entry.unit, sd=entry.sd)
 
 
 def _near_zero(results: Results, parameters: Mapping[str, ParameterEstimate]) -> str:

@@ -156,11 +156,11 @@ def _filter(results: Results, filtered: FilterResult) -> list[Block]:
         rows.append(
             (
                 axis,
-                _scaled(entry.resolution, entry.unit),
+                wording.scaled(entry.resolution, entry.unit),
                 wording.significant(entry.bandwidth_hz),
-                _scaled(entry.position_sd, entry.unit),
-                _scaled(entry.velocity_sd, f"{entry.unit}/s"),
-                _scaled(entry.acceleration_sd, f"{entry.unit}/s2"),
+                wording.scaled(entry.position_sd, entry.unit),
+                wording.scaled(entry.velocity_sd, f"{entry.unit}/s"),
+                wording.scaled(entry.acceleration_sd, f"{entry.unit}/s2"),
             )
         )
     method = filtered.method
@@ -207,8 +207,3 @@ def _filter(results: Results, filtered: FilterResult) -> list[Block]:
             )
         )
     return blocks
-
-
-def _scaled(value: float, unit: str) -> str:
-    factor, shown = wording.scale([value], unit)
-    return f"{wording.significant(factor * value, 2)} {shown}"

@@ -23,9 +23,8 @@ def section(results: Results) -> Section:
     """Return the section."""
     validated = results.read(ValidateResult)
     if validated is None:
-        command = f"`bampipe validate {results.root.name}`"
-        text = f"Predicted and measured force have not been compared: {command} does it."
-        return Section(TITLE, (Paragraph(text),))
+        said = "Predicted and measured force have not been compared"
+        return results.not_done(TITLE, said, "validate")
     blocks: list[Block] = [_by_axis(results, validated)]
     if validated.trials:
         blocks.append(_by_trial(results, validated))

@@ -22,10 +22,7 @@ def section(results: Results) -> Section | None:
     if found is None:
         if not (results.trials["kind"] == "viscous").any():
             return None
-        command = f"`bampipe viscous {results.root.name}`"
-        return Section(
-            TITLE, (Paragraph(f"The viscous trials have not been used: {command} does it."),)
-        )
+        return results.not_done(TITLE, "The viscous trials have not been used", "viscous")
     directions = found.directions
     if not directions:
         return None

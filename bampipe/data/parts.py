@@ -1,0 +1,212 @@
+"""Which files of a folder are parts of one recording, by their names, lengths and clocks."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal, cast
+
+import numpy as np
+
+from bampipe.data import guesses
+from bampipe.data.readers import RawTrial, read_trial
+from bampipe.data.readers.moments import NANOSECONDS
+from bampipe.data.readers.trial import Dialect
+from bampipe.data.recording import MOST_APART
+from bampipe.data.session import SECONDS, Part, TrialEntry
+from bampipe.data.session.channels import TimeUnit
+from bampipe.errors import InputError
+
+Columns = Mapping[str, str]
+_AXIS = re.compile(r"(?i)(?<![a-z])(joint|axis|link|servo|motor|dof|j)[ _-]?(\d+)(?!\d)")
+_LONGEST = 40
+"""Letters in the name of a part."""
+_SAME_STAMP = 0.6
+"""Of a step: how far stamps of two clocks of the same samples may be apart."""
+_OVERLAP = 0.5
+"""Share of the shorter part that both must have in common on one clock."""
+_SAME_LENGTH = 0.2
+"""Share by which lengths may differ of parts whose clocks are taken to start together."""
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """Files alike: with the same columns, and the same quantities or axes in their names."""
+
+    columns: frozenset[str]
+    said: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FileClock:
+    """The time of one file.
+
+    Attributes:
+        samples: how many it has.
+        column: name of the time column, "" where there is none.
+        unit: of the time column.
+        t: (T,) s; start: its first stamp, s, on a clock that files may share.
+    """
+
+    samples: int
+    column: str = ""
+    unit: str = ""
+    t: np.ndarray | None = None
+    start: float = 0.0
+
+
+def join_parts(
+    folder: Path,
+    found: Mapping[str, Columns],
+    role: Callable[[str, str], str],
+    dialect: Dialect,
+) -> tuple[list[TrialEntry], list[str]]:
+    """Put together the files that are one recording.
+
+    Args:
+        folder: of the logs.
+        found: columns and their units by file.
+        role: of a column by its name and unit, see `bampipe.data.survey`.
+        dialect: of text files.
+
+    Returns:
+        The recordings, none where no files belong together, and for each file that seems to but
+        does not fit, a sentence why.
+    """
+    if len(found) < 2:
+        return [], []
+    kinds = {name: _kind(name, columns, role) for name, columns in found.items()}
+    own = {kind: _common(n for n in found if kinds[n] == kind) for kind in set(kinds.values())}
+    shared = frozenset.intersection(*own.values())
+    groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    for name, kind in kinds.items():
+        words = (w for w in _words(name) if w not in kind.said and w not in own[kind])
+        groups[tuple(words)].append(name)
+    trials, reasons = [], []
+
+    @cache
+    def clock(name: str) -> FileClock:
+        return _read_clock(folder, name, found[name], role, dialect)
+
+    for names in groups.values():
+        if len({kinds[name] for name in names}) != len(names) or len(names) < 2:
+            continue
+        called: dict[str, str] = {}
+        for n in names:
+            name = _called(_words(n), own[kinds[n]] - shared, kinds[n].said)
+            called[n] = f"{name}_{len(called)}" if name in called.values() else name
+        roles = {n: {role(f"{called[n]}:{c}", u) for c, u in found[n].items()} for n in names}
+        main = max(names, key=lambda n: ("position" in roles[n], -names.index(n)))
+        parts, alike = [], set()
+        for other in names:
+            if other == main:
+                continue
+            try:
+                parts.append(_part(main, other, called[other], clock(main), clock(other)))
+            except InputError as error:
+                reasons.append(str(error))
+                continue
+            alike |= set(found[other]) & set(found[main]) - {clock(main).column}
+        if parts:
+            named = called[main] if alike else ""
+            trials.append(TrialEntry(file=main, kind="free", part=named, parts=tuple(parts)))
+    return trials, reasons
+
+
+def are_axes(names: Sequence[str]) -> bool:
+    """Whether the names of files differ by an axis, as ``joint1.csv`` and ``joint2.csv`` do."""
+    bare = {_AXIS.sub("", name) for name in names}
+    return len(bare) < len(names) and all(_AXIS.search(name) for name in names)
+
+
+def _kind(name: str, columns: Columns, role: Callable[[str, str], str]) -> _Kind:
+    words = _words(Path(name).name)
+    said = tuple(w for w in words if _AXIS.fullmatch(w) or role(w, "") not in ("", "time"))
+    return _Kind(frozenset(columns), said)
+
+
+def _words(name: str) -> list[str]:
+    """Words and numbers of a path without its extension; an axis with its number is one."""
+    parts = re.findall(
+        r"(?:joint|axis|link|servo|motor|dof|j)\d+|[A-Z]?[a-z]+|[A-Z]+|\d+",
+        _AXIS.sub(lambda axis: f" {axis[1].lower()}{axis[2]} ", name.rpartition(".")[0]),
+    )
+    return [part.lower() for part in parts]
+
+
+def _common(names: Iterable[str]) -> frozenset[str]:
+    """Words that all of these names have; numbers, if there are several, tell trials apart."""
+    return frozenset.intersection(*(frozenset(_words(name)) for name in names))
+
+
+def _called(words: Sequence[str], own: frozenset[str], said: Sequence[str]) -> str:
+    """Name of a part: what its kind of file has in its name and other kinds have not."""
+    name = "_".join(dict.fromkeys(w for w in words if w in own or w in said))
+    return name[:_LONGEST] if re.match("[a-z]", name) else f"part_{name}".rstrip("_")[:_LONGEST]
+
+
+def _part(main: str, other: str, called: str, first: FileClock, second: FileClock) -> Part:
+    """How ``other`` is joined to ``main``.
+
+    Raises:
+        InputError: neither length nor clock says how.
+    """
+    counts = sorted((first.samples, second.samples))
+    rows = counts[1] - counts[0] <= max(1, MOST_APART * counts[1])
+    join: Literal["rows", "time", "start", ""] = "rows" if rows else ""
+    if first.t is not None and second.t is not None:
+        same = rows and _same_stamps(first.t, second.t)
+        ends = (first.start + first.t[-1], second.start + second.t[-1])
+        overlap = min(ends) - max(first.start, second.start)
+        spans = sorted((float(first.t[-1]), float(second.t[-1])))
+        if not same:
+            alike = spans[0] >= (1.0 - _SAME_LENGTH) * spans[1]
+            join = "time" if overlap >= _OVERLAP * spans[0] else "start" if alike else ""
+    if not join:
+        raise InputError(
+            f"{second.samples} samples, where {main} has {first.samples}, and no clock in common",
+            where=other,
+            remedy="are they one recording? export them at one rate, or each with its time",
+        )
+    timed = join != "rows"
+    return Part(
+        file=other,
+        name=called,
+        join=join,
+        time=second.column if timed and second.column != first.column else "",
+        time_unit=cast(TimeUnit, second.unit) if timed and second.unit != first.unit else "",
+    )
+
+
+def _same_stamps(t: np.ndarray, u: np.ndarray) -> bool:
+    length = min(len(t), len(u))
+    step = float(np.median(np.diff(t)))
+    return bool(np.max(np.abs(t[:length] - u[:length])) <= _SAME_STAMP * step)
+
+
+def _read_clock(
+    folder: Path,
+    name: str,
+    columns: Columns,
+    role: Callable[[str, str], str],
+    dialect: Dialect,
+) -> FileClock:
+    times = [column for column, unit in columns.items() if role(column, unit) == "time"]
+    datetimes = {column: "" for column in times if columns[column] == "datetime"}
+    wanted = times or list(columns)[:1]
+    raw: RawTrial = read_trial(
+        folder / name, wanted, name=name, datetimes=datetimes, dialect=dialect
+    )
+    for column in times:
+        stamps = raw.columns[column]
+        known = stamps[np.isfinite(stamps)]
+        if len(known) > 1 and float(np.mean(np.diff(known) > 0)) > 0.9 and len(known) == len(raw):
+            unit = guesses.time_unit(stamps, columns[column])
+            tick = SECONDS.get(unit, 1.0)
+            start = raw.since.get(column, 0) / NANOSECONDS or float(known[0]) * tick
+            return FileClock(len(raw), column, unit, (stamps - known[0]) * tick, start)
+    return FileClock(len(raw))

@@ -1,0 +1,201 @@
+"""One recording: a log, one of several in a file, or several files joined."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bampipe.data.readers import LARGEST_BYTES, Dialect, RawTrial, read_trial
+from bampipe.data.readers.moments import NANOSECONDS
+from bampipe.data.readers.trial import interpolated
+from bampipe.data.session import SECONDS, Clock, Part, TrialEntry, inside
+from bampipe.errors import InputError
+
+MOST_APART = 0.01
+"""Share of samples that one part may have more than another to be joined row by row."""
+_LEAST = 20
+"""Samples of a recording: time that falls sooner has not started again."""
+_BACK = 0.02
+"""Of the time that has passed: how close to its beginning a clock that starts again comes."""
+
+
+def read_recording(
+    root: Path,
+    entry: TrialEntry,
+    columns: Sequence[str],
+    clock: Clock,
+    dialect: Dialect | None = None,
+    largest_bytes: int = LARGEST_BYTES,
+) -> RawTrial:
+    """Read the columns of one trial, those of its parts at the samples of its file.
+
+    Args:
+        root: the session folder.
+        entry: which files, and how they are joined.
+        columns: names; of a part's columns ``part:column``.
+        clock: the time column.
+        dialect: of text files.
+        largest_bytes: what one file may take in memory.
+
+    Raises:
+        InputError: as :func:`read_trial`; files that do not belong together, or a file that holds
+            several recordings where ``entry`` does not say which.
+    """
+    places = {column: _place(column, entry) for column in columns}
+    own_time = _place(clock.column, entry)[1]
+
+    def read(name: str, file: str, time: str, unit: str) -> RawTrial:
+        wanted = dict.fromkeys([time, *(bare for part, bare in places.values() if part == name)])
+        wanted.pop("", None)
+        raw = read_trial(
+            inside(root, file, where=file),
+            list(wanted),
+            name=file,
+            largest_bytes=largest_bytes,
+            datetimes={time: clock.format} if unit == "datetime" and time else {},
+            dialect=dialect,
+        )
+        called = {bare: column for column, (part, bare) in places.items() if part == name}
+        return replace(
+            raw,
+            columns={called.get(bare, bare): values for bare, values in raw.columns.items()},
+            units={called[bare]: unit for bare, unit in raw.units.items() if bare in called},
+            since={called.get(bare, bare): first for bare, first in raw.since.items()},
+        )
+
+    timed = any(part.join != "rows" for part in entry.parts)
+    in_own = places.get(clock.column, ("", ""))[0] == ""
+    raw = read("", entry.file, own_time if clock.column and (timed or in_own) else "", clock.unit)
+    for part in entry.parts:
+        if all(name != part.name for name, _ in places.values()):
+            continue
+        time = (part.time or own_time) if part.join != "rows" else ""
+        unit = part.time_unit or clock.unit
+        if part.join == "rows" and places.get(clock.column, ("", ""))[0] == part.name:
+            time = places[clock.column][1]
+        other = read(part.name, part.file, time, unit)
+        kept = [column for column, (name, _) in places.items() if name == part.name]
+        if part.join == "rows":
+            raw = _by_rows(raw, other, entry, part, kept)
+        else:
+            ticks = SECONDS.get(clock.unit, 1.0), SECONDS.get(unit, 1.0)
+            raw = _by_time(raw, other, entry.file, part, kept, (clock.column, time), ticks)
+    raw = replace(raw, columns={column: raw.columns[column] for column in columns})
+    return _one_of(raw, entry, clock)
+
+
+def starts_of(raw: RawTrial, clock: str) -> list[int]:
+    """Samples at which the recordings in a file begin: with the header, or time starts again."""
+    starts = {0, *raw.begun}
+    t = raw.columns.get(clock)
+    if t is not None:
+        begin = 0
+        for at in np.flatnonzero(np.diff(t) < 0.0) + 1:
+            begin = max([start for start in starts if start <= at], default=begin)
+            passed = t[at - 1] - t[begin]
+            turned = -np.diff(t[at - 1 : at + 1])[0] > 0.9 * 2.0**32  # a counter, not a clock
+            goes_on = len(t) - at >= _LEAST and bool(np.all(np.diff(t[at : at + _LEAST]) > 0.0))
+            back = abs(t[at] - t[begin]) <= _BACK * passed
+            if at - begin >= _LEAST and back and goes_on and not turned:
+                starts.add(int(at))
+    return sorted(starts)
+
+
+def _place(column: str, entry: TrialEntry) -> tuple[str, str]:
+    """The part that a column belongs to, "" for the trial's file, and its name there."""
+    name, colon, bare = column.partition(":")
+    if colon and name == entry.part:
+        return "", bare
+    if colon and any(name == part.name for part in entry.parts):
+        return name, bare
+    return "", column
+
+
+def _by_rows(
+    raw: RawTrial, other: RawTrial, entry: TrialEntry, part: Part, kept: Sequence[str]
+) -> RawTrial:
+    """The columns side by side, sample by sample."""
+    if not raw.columns:
+        return other
+    counts = len(raw), len(other)
+    least, most = min(counts), max(counts)
+    if most - least > max(1, MOST_APART * most):
+        raise InputError(
+            f"{counts[1]} samples, where {entry.file} has {counts[0]}",
+            where=part.file,
+            remedy='files of different rates are joined by their times: join = "time" or "start"',
+        )
+    remarks = [f"{part.file} joined to {entry.file} row by row"]
+    if most > least:
+        longer = entry.file if counts[0] == most else part.file
+        remarks[0] += f"; the last {most - least} of {longer} left out"
+    columns = {name: values[:least] for name, values in raw.columns.items()}
+    columns |= {name: other.columns[name][:least] for name in kept}
+    return replace(
+        raw,
+        columns=columns,
+        units={**raw.units, **other.units},
+        notes=(*raw.notes, *other.notes),
+        remarks=(*raw.remarks, *remarks),
+    )
+
+
+def _by_time(
+    raw: RawTrial,
+    other: RawTrial,
+    file: str,
+    part: Part,
+    kept: Sequence[str],
+    times: tuple[str, str],
+    ticks: tuple[float, float],
+) -> RawTrial:
+    """The columns of the part between its samples, at the times of the others."""
+    t, u = raw.columns[times[0]], other.columns[times[1]]
+    t_0, u_0 = (float(x[np.isfinite(x)][:1].sum()) for x in (t, u))
+    at, stamps = (t - t_0) * ticks[0], (u - u_0) * ticks[1]
+    if part.join == "time":
+        moments = other.since.get(times[1], 0) - raw.since.get(times[0], 0)
+        stamps += u_0 * ticks[1] - t_0 * ticks[0] + moments / NANOSECONDS
+    span = min(np.nanmax(at), np.nanmax(stamps)) - max(np.nanmin(at), np.nanmin(stamps))
+    if not span > 0.0:
+        raise InputError(
+            f"no time in common with {file}: it starts {np.nanmin(stamps):.4g} s after that",
+            where=part.file,
+            remedy='join = "start" where both clocks count from the same moment',
+        )
+    columns = dict(raw.columns)
+    columns |= {name: interpolated(at, stamps, other.columns[name]) for name in kept}
+    said = f"{part.file} interpolated linearly at the times of {file}"
+    within = np.flatnonzero((at >= np.nanmin(stamps)) & (at <= np.nanmax(stamps)))
+    joined = replace(
+        raw,
+        columns=columns,
+        units={**raw.units, **other.units},
+        notes=(*raw.notes, *other.notes),
+        remarks=(*raw.remarks, f"{said} (at most {np.nanmax(np.diff(stamps)):.3g} s apart)"),
+    )
+    return joined.between(int(within[0]), int(within[-1]) + 1)
+
+
+def _one_of(raw: RawTrial, entry: TrialEntry, clock: Clock) -> RawTrial:
+    """The recording of the file that the trial is."""
+    starts = starts_of(raw, clock.column)
+    count = len(starts)
+    if entry.recording is None and count == 1:
+        return raw
+    if entry.recording is None or entry.recording > count:
+        at = starts[min(1, count - 1)]
+        what = "the header stands again" if at in raw.begun else "time starts again"
+        raise InputError(
+            f"{what}: {count} recordings in one file" if count > 1 else "one recording only",
+            where=f"{entry.file}, row {raw.rows[at]}",
+            remedy="give each a [[trials]] entry with recording = 1, 2, ..."
+            if count > 1
+            else "leave recording out",
+        )
+    said = f"recording {entry.recording} of {count} in the file"
+    part = raw.between(*[*starts, len(raw)][entry.recording - 1 : entry.recording + 1])
+    return replace(part, remarks=(*raw.remarks, said))

@@ -1,0 +1,136 @@
+"""Next and its table judge as the diagnosis does: by its search, its record and its criteria."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from discover.sessions import TRUTH, bam, made
+from scipy.special import logit
+
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.dictionary import Dictionary, Key
+from bampipe.diagnosis.search import Search
+from bampipe.diagnosis.session import Fit, Session, candidates_of
+from bampipe.next_trial.sensitivity import find_blindness, find_needed
+from bampipe.next_trial.suggestion import find_ambiguity, make_contest, suggest_trial
+from bampipe.trials.folds import Folds
+from bampipe.trials.measured import MeasuredTrials
+
+NAMES = ("quadratic_drag:yaw", "return_spring:pitch", "force_bias:z", "shear_thinning:yaw")
+CRITERIA = Criteria()
+
+
+@pytest.fixture(scope="module")
+def session() -> Session:
+    return Session(made(bam(), {}, trials=3, seconds=6.0), CRITERIA)
+
+
+@pytest.fixture(scope="module")
+def fit(session) -> Fit:
+    return session.fit(bam(), np.array(list(TRUTH.values())))
+
+
+def search_beside(fit: Fit, scale, residual) -> Search:
+    """The search of a diagnosis over `NAMES` alone, on a residual in place of the measured one."""
+    candidates = {item.name: item for item in candidates_of(fit.recipe, NAMES)}
+    dictionary = Dictionary(fit.evidence, fit.likelihood.samples, candidates, scale)
+    problem = fit.likelihood.pose(fit.evidence, residual)
+    return Search(problem, dictionary, dictionary.make_all, CRITERIA, {})
+
+
+def key_of(dictionary: Dictionary, name: str, values) -> Key:
+    """The key of a candidate whose shapes are nearest to given values."""
+    item, shape = dictionary.candidates[name], []
+    shares = np.linspace(0.0, 1.0, 401)
+    for limits, place in zip(dictionary.ranges[name], item.searched_indices, strict=True):
+        at = np.array([limits.value_at(limits.within(share)) for share in shares])
+        shape.append(float(shares[np.argmin(np.abs(at - values[place]))]))
+    return name, tuple(shape)
+
+
+def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_it(session, fit):
+    blindness = find_blindness(session, fit)
+    found = {one.rival.name: one for one in blindness.found}
+    assert blindness.needed == find_needed(CRITERIA, len(session.candidate_names(fit.recipe)))
+    noise, scale = fit.likelihood.noise, blindness.contest.scale
+    plain = search_beside(fit, machine_scale(fit), noise.bias)
+    enough = float(logit(CRITERIA.probability)) + blindness.needed + plain.log_prior
+    enough -= find_needed(CRITERIA, 1)
+    for name in NAMES:
+        one = found[name]
+        values = one.rival.values[0]
+        key = key_of(plain.dictionary, name, values)
+        atom = plain.dictionary.make(key)
+        strength = values[list(one.item.linear_indices)] * one.factor
+        shares = []
+        for share in (0.5, 1.3):
+            is_found = []
+            for replay in range(CRITERIA.replicates):
+                residual = [
+                    bias
+                    + np.sqrt(scale[axis]) * (noise.residuals[axis][replay] - bias)
+                    - share * (atom.columns[axis] @ strength if axis in atom.columns else 0.0)
+                    for axis, bias in enumerate(noise.bias)
+                ]
+                search = search_beside(fit, plain.dictionary.scale, residual)
+                search.ensure([key])
+                is_found.append(search.cost(()) - search.cost((key,)) > enough)
+            shares.append(np.mean(is_found))
+        assert shares[0] <= 0.1, name
+        assert shares[1] >= 0.9, name
+
+
+def machine_scale(fit: Fit):
+    from bampipe.diagnosis.ranges import MachineScale
+
+    return MachineScale.of_trials(fit.evidence)
+
+
+def made_diagnosis(sets, verdict="undecided") -> SimpleNamespace:
+    return SimpleNamespace(
+        axes={"yaw": SimpleNamespace(verdict=verdict)},
+        sets=tuple(SimpleNamespace(effects=e, probability=p) for e, p in sets),
+    )
+
+
+def test_rivals_are_the_effects_in_which_the_most_probable_sets_differ():
+    sets = [(("lag", "a"), 0.5), (("lag", "b", "c"), 0.3), (("lag",), 0.15), (("lag", "d"), 0.05)]
+    asked = find_ambiguity(made_diagnosis(sets), CRITERIA)
+    assert asked.common == ("lag",)
+    total = 0.95
+    expected = {("a",): 0.5 / total, ("b", "c"): 0.3 / total, (): 0.15 / total}
+    assert asked.odds == pytest.approx(expected)
+    assert find_ambiguity(made_diagnosis(sets, "missing"), CRITERIA) is None
+    assert find_ambiguity(made_diagnosis([(("a",), 0.95), ((), 0.05)]), CRITERIA) is None
+    # The same effects, once with one of the model's own taken away, are no question for a trial.
+    assert find_ambiguity(made_diagnosis([(("a",), 0.5), (("a",), 0.45)]), CRITERIA) is None
+
+
+def test_a_trial_is_suggested_that_tells_apart_what_small_motion_does_not():
+    values = {"quadratic_drag.yaw.coefficient": 0.6}
+    recipe = bam(["quadratic_drag:yaw"])
+    trials = made(recipe, values, trials=2, seconds=6.0)
+    session = Session(trials, CRITERIA)
+    final = session.fit(recipe, np.array([*TRUTH.values(), 0.6]))
+    asked = made_diagnosis([(("quadratic_drag:yaw",), 0.6), (("shear_thinning:yaw",), 0.4)])
+    contest = make_contest(session, final, find_ambiguity(asked, CRITERIA))
+    assert [rival.name for rival in contest.rivals] == ["quadratic_drag:yaw", "shear_thinning:yaw"]
+    assert contest.confusions(contest.now) == {(0, 1): pytest.approx(0.4)}
+    # Twice the trials at hand leave twice the distance: nothing else is in a likelihood.
+    twice = contest.contrasts(contest.at_hand.scaled(2.0))[0, 1].distance
+    assert twice == pytest.approx(2.0 * contest.now[0, 1].distance, rel=0.05)
+    found = suggest_trial(session, final, asked)
+    assert found is not None
+    assert found.axis == "yaw"
+    assert found.design.startswith("Move yaw")
+    assert found.confusion < 0.1 < found.confusion_now == pytest.approx(0.4)
+    assert "fall from 40 % to" in found.sentence
+    assert suggest_trial(session, final, made_diagnosis([(("quadratic_drag:yaw",), 1.0)])) is None
+
+
+def test_effects_are_weighed_by_trials_with_brakes_on_too_but_by_none_held_out():
+    names = ("t01", "t02", "t03")
+    folds = Folds.of_trials(names, held_out=("t02",), fitted=("t01",))
+    assert MeasuredTrials(names, None, None, None, folds).weighed == ["t01", "t03"]
