@@ -4,9 +4,9 @@
     python benchmarks/calibration.py --runs runs.tsv --out scores.jsonl
     python benchmarks/calibration.py --from benchmarks/results/calibration.jsonl --probability 0.8
 
-Sessions come from simulators that share no code with bampipe (benchmarks/independent): a machine, a
-day, up to five effects and their strengths are drawn from the seed. ``--runs`` diagnoses run folders
-that exist instead: a table with the columns ``id``, ``run``, ``effects``, ``outside``. One line of
+Sessions come from simulators that share no code with bampipe (benchmarks/independent): the seed
+draws a machine, a day, up to five effects and their strengths. ``--runs`` diagnoses run folders
+that exist instead: a table with the columns ``id``, ``run``, ``effects``, ``outside``. A line of
 JSON a session holds the raw scores and the truth; ``--from`` makes the tables from such lines in a
 second, with other criteria where they are given.
 """
@@ -22,6 +22,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -193,7 +194,7 @@ def _reliability(scores: Iterable[Scores], criteria: Criteria) -> list[str]:
     """Of the effects given each tenth of probability, how many are there."""
     stated = [(p, e in s.effects) for s in scores for e, p in s.probabilities(criteria).items()]
     lines = ["| stated probability | effects | mean stated | there | wrong |", "|-|-|-|-|-|"]
-    for low, high in zip(TENTHS[:-1], TENTHS[1:], strict=True):
+    for low, high in pairwise(TENTHS):
         here = [(p, t) for p, t in stated if low <= p < high or (high == 1.0 and p == 1.0)]
         if here:
             true = sum(t for _, t in here)
