@@ -7,7 +7,7 @@
 Each session of an independent simulator hides nothing or one effect of its own. The bare device is
 fitted by least squares with several widths, times that of the device file; printed is by how much
 the log of the error on trials left out falls. `identify` takes a narrower width on a test bench
-where an eighth lowers it by `WORTH` of `bampipe.discover.sign_width`.
+where an eighth lowers it by `WORTH` of `bampipe.diagnosis.sign_width`.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from independent.sensors import GOOD, HARD, Conditions
 import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model_file import load_model, read_recipe
-from bampipe.discover.chance import system_of
-from bampipe.discover.sign_width import score_width
+from bampipe.diagnosis.session import system_of
+from bampipe.diagnosis.sign_width import fit_width
 from bampipe.trials.measured import read_measured_trials
 
 WIDTHS = (1.0 / 3.0, 1.0 / 8.0, 1.0 / 32.0)
@@ -50,11 +50,11 @@ def find_drops(machine: str, seed: int, effect: str, conditions: Conditions) -> 
         run = RunFolder(Path(session.root))
         recipe = read_recipe(run, "base", load_model(run, "base", as_declared=True))
         trials = read_measured_trials(run, system_of(recipe), every_input=True)
-        declared = score_width(trials, recipe, 1.0)
-        count = declared.independent_samples
+        declared = fit_width(trials, recipe, 1.0)
+        count, error = declared.problem.independent, declared.held_out_rmse
         return [
-            float(count @ np.log(declared.base_error / one.base_error) / count.sum())
-            for one in (score_width(trials, recipe, width) for width in WIDTHS)
+            float(count @ np.log(error / one.held_out_rmse) / count.sum())
+            for one in (fit_width(trials, recipe, width) for width in WIDTHS)
         ]
 
 

@@ -46,7 +46,9 @@ def main() -> None:
     rows = [
         (cumulative, f"{Path(file).stem}.{name}", calls)
         for (file, _, name), (_, calls, _, cumulative, _) in entries
-        if "/bampipe/discover/" in file and cumulative > SHARE * total and "<" not in name
+        if any(f"/bampipe/{room}/" in file for room in ("diagnosis", "trials"))
+        and cumulative > SHARE * total
+        and "<" not in name
     ]
     for cumulative, name, calls in sorted(rows, reverse=True):
         print(f"| `{name}` | {calls} | {cumulative:.1f} | {100 * cumulative / total:.0f} % |")

@@ -122,8 +122,12 @@ def run(folder: Path, diagnose: bool) -> Outcome:
             for trial, stretches in opened.read(FilterResult).disturbances.items()
             for one in stretches
         ),
-        opened.read(DiagnoseResult, "base").headline if diagnose else "",
+        _verdicts(opened.read(DiagnoseResult, "base")) if diagnose else "",
     )
+
+
+def _verdicts(found: DiagnoseResult) -> str:
+    return "; ".join(f"{axis}: {words}" for axis, words in found.verdicts_in_words.items())
 
 
 def compare(machine: str, effect: str, seed: int, diagnose: bool) -> list[str]:

@@ -14,21 +14,15 @@ import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from bampipe.data.run_folder import RunFolder
-from bampipe.discover.chance import Recipe
-from bampipe.discover.diagnosis import diagnose
-from bampipe.discover.settings import Settings
-from bampipe.physics import Model, compile_model, registry
+import bampipe
+from bampipe.diagnosis.criteria import Criteria
 from bampipe.progress import silent
 from bampipe.simulator import session as simulate
-from bampipe.stages import filter as filter_stage
-from bampipe.stages import ingest
-from bampipe.trials.measured import read_measured_trials
 
 SINGLES = (
     "stribeck:yaw", "stribeck:pitch", "stribeck:extension", "presliding:yaw", "presliding:pitch",
@@ -47,6 +41,12 @@ SINGLES = (
     "friction_by_pose:yaw-extension", "encoder_scale:yaw", "encoder_scale:extension", "brake_lag",
     "brake_residual_torque:yaw",
 )  # fmt: skip
+PIPELINE = """schema = "bampipe.pipeline/1"
+name = "hidden"
+stages = ["ingest", "filter", "identify"]
+[settings.identify]
+method = "least-squares"
+"""
 PLANTS = Path(__file__).parent / "plants"
 OTHER_FORMS = {
     "stribeck_exponential:yaw": "stribeck:yaw",
@@ -129,28 +129,20 @@ def run_case(case: Case) -> Outcome:
             locked_trials=False, effect_files=tuple(str(f) for f in sorted(PLANTS.glob("*.toml"))),
         )  # fmt: skip
         simulate.simulate_session(root / "session", config, silent)
-        for part in ("ingest", "filter"):
-            (root / "run" / part).mkdir(parents=True)
-        run = RunFolder(root / "run")
-        ingest.execute(run, run.root, ingest.Config(session=str(root / "session")), silent)
-        filter_stage.execute(run, run.root, filter_stage.Config(), silent)
-        device = registry.device("bam")
-        system = compile_model(Model(device))
-        begun = time.perf_counter()
-        trials = read_measured_trials(run, system, every_input=True)
-        found = diagnose(
-            replace(trials, motions=tuple(trials.motions)),
-            Recipe(device.declaration, (), ()),
-            system.prior,
-            Settings(replicates=case.replicates, jobs=1, seed=case.seed),
+        (root / "hidden.toml").write_text(PIPELINE)
+        run = bampipe.run_session(
+            root / "session", runs=root / "runs", pipeline=str(root / "hidden.toml")
         )
+        begun = time.perf_counter()
+        found = bampipe.diagnose(run, "base", replicates=case.replicates, jobs=1, seed=case.seed)
         seconds = time.perf_counter() - begun
+    ranked, axes = {row["effect"]: row for row in found["ranking"]}, found["axes"].values()
     return Outcome(
-        case.effects, case.strength, case.seed, found.selected,
-        tuple(found.groups.get(n, ()) for n in found.selected),
-        tuple(a.verdict for a in found.axes),
-        tuple(r.effect for r in found.ranking[:5]),
-        tuple(round(a.rmse_after / a.noise_floor, 3) for a in found.axes), seconds,
+        case.effects, case.strength, case.seed, tuple(found["selected"]),
+        tuple(tuple(ranked[n]["indistinguishable_from"]) for n in found["selected"]),
+        tuple(a["verdict"] for a in axes),
+        tuple(ranked)[:5],
+        tuple(round(a["rmse_after"] / (a["noise_floor"] or np.nan), 3) for a in axes), seconds,
     )  # fmt: skip
 
 
@@ -193,7 +185,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--nothing", type=int, default=10, help="sessions with nothing hidden")
     parser.add_argument("--pairs", action="store_true", help="two effects at once too")
     parser.add_argument("--plants", action="store_true", help="other forms, and effects outside")
-    parser.add_argument("--replicates", type=int, default=10, help="replays for the chance level")
+    parser.add_argument("--replicates", type=int, default=Criteria.replicates)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="write the outcomes as JSON")
     options = parser.parse_args(arguments)

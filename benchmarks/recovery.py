@@ -32,6 +32,7 @@ from pydantic import TypeAdapter
 import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model_file import load_model
+from bampipe.diagnosis.criteria import Criteria
 from bampipe.files import write_text
 from bampipe.progress import silent
 from bampipe.results.identify import IdentifyResult
@@ -137,8 +138,9 @@ class Outcome:
     Attributes:
         case: the session.
         hidden, outside: effects hidden that the library has, and that it has not.
-        named: effects found, in order; groups: what each was said to be like.
-        verdicts: of the last diagnosis, by axis.
+        named: effects found, in order; probabilities: of each, by the diagnosis that named it; none
+            where it was followed to its end; groups: what each was said to be like.
+        verdicts: of the last diagnosis, by axis; remains: whether more is missing than it names.
         over_floor: held-out error over noise floor with what was found, by axis.
         parameters: those that have a truth, where the set is right.
         seconds: of the diagnosis, or of the whole loop, or of the identification.
@@ -149,8 +151,10 @@ class Outcome:
     hidden: tuple[str, ...] = ()
     outside: tuple[str, ...] = ()
     named: tuple[str, ...] = ()
+    probabilities: tuple[float, ...] = ()
     groups: tuple[tuple[str, ...], ...] = ()
     verdicts: tuple[str, ...] = ()
+    remains: bool = False
     over_floor: tuple[float, ...] = ()
     parameters: tuple[Found, ...] = ()
     seconds: float = 0.0
@@ -177,7 +181,7 @@ class Outcome:
     @property
     def unknown(self) -> bool:
         """Something was said to be missing that the library has no name for."""
-        return "unknown_effect" in self.verdicts
+        return self.remains or "unknown_effect" in self.verdicts
 
     def line(self) -> str:
         """One line of the log."""
@@ -192,8 +196,11 @@ class Outcome:
             )
             said += "".join(f" | {r:.2f}" for r in self.over_floor)
         else:
-            alike = [f"{n} (or {', '.join(g)})" if g else n for n, g in
-                     zip(self.named, self.groups, strict=True)]  # fmt: skip
+            chances = self.probabilities or (None,) * len(self.named)
+            alike = [
+                n + (f" {p:.2f}" if p is not None else "") + (f" (or {', '.join(g)})" if g else "")
+                for n, p, g in zip(self.named, chances, self.groups, strict=True)
+            ]
             ratios = ", ".join(f"{r:.2f}" for r in self.over_floor)
             said = f"{' + '.join(alike) or '-'} | {', '.join(self.verdicts)} | {ratios}"
         hidden = " + ".join(self.case.effects) or "nothing"
@@ -226,7 +233,7 @@ def _search(case: Case, root: Path, truth: dict[str, Any]) -> Outcome:
     diagnosis = bampipe.diagnose(run, replicates=case.replicates, jobs=1, seed=case.seed)
     seconds = time.perf_counter() - begun
     axes = diagnosis["axes"].values()
-    groups = diagnosis["groups"] if not case.auto else {}
+    ranked = {} if case.auto else {row["effect"]: row for row in diagnosis["ranking"]}
     named = named if case.auto else tuple(diagnosis["selected"])
     parameters: tuple[Found, ...] = ()
     if set(named) == set(case.effects) and case.auto:
@@ -236,9 +243,11 @@ def _search(case: Case, root: Path, truth: dict[str, Any]) -> Outcome:
         tuple(truth["effects"]),
         tuple(truth["outside"]),
         named,
-        tuple(tuple(groups.get(n, ())) for n in named),
+        tuple(round(ranked[n]["probability"], 3) for n in named if ranked),
+        tuple(tuple(ranked[n]["indistinguishable_from"]) if ranked else () for n in named),
         tuple(a["verdict"] for a in axes),
-        tuple(round(a["rmse_after"] / a["noise_floor"], 3) for a in axes),
+        any(a["remains"] for a in axes),
+        tuple(round(a["rmse_after"] / (a["noise_floor"] or np.nan), 3) for a in axes),
         parameters,
         seconds=seconds,
     )
@@ -433,7 +442,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--trials", type=int, help="trials a session, in place of the usual")
     parser.add_argument("--seconds", type=float, help="length of each")
-    parser.add_argument("--replicates", type=int, default=10)
+    parser.add_argument("--replicates", type=int, default=Criteria.replicates)
     parser.add_argument(
         "--given", nargs="*", metavar="METHOD", help="give the model the hidden effects (auto)"
     )
