@@ -6,9 +6,10 @@
 
 Sessions come from simulators that share no code with bampipe (benchmarks/independent): the seed
 draws a machine, a day, up to five effects and their strengths. ``--runs`` diagnoses run folders
-that exist instead: a table with the columns ``id``, ``run``, ``effects``, ``outside``. A line of
-JSON a session holds the raw scores and the truth; ``--from`` makes the tables from such lines in a
-second, with other criteria where they are given.
+that exist instead: a table, tab-separated, with the columns ``id``, ``run``, ``effects`` (such as
+``stribeck:yaw=0.5+base_tilt``) and ``outside``. A line of JSON a session holds the raw scores and
+the truth; ``--from`` makes the tables from such lines in a second, with other criteria where they
+are given.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import shutil
 import sys
 import tempfile
 import time
@@ -159,10 +161,12 @@ def record_and_diagnose(seed: int, clean: bool) -> Scores:
 
 
 def diagnose_row(row: Mapping[str, str]) -> Scores:
-    """Diagnose a run folder of a table; strengths that it does not state are 1."""
-    effects = {e: 1.0 for e in (row["effects"] or "").split("+") if e}
+    """Diagnose a copy of a run folder of a table; strengths that it does not state are 1."""
+    hidden = [e.partition("=") for e in (row["effects"] or "").split("+") if e]
     outside = [e for e in (row.get("outside") or "").split("+") if e]
-    return diagnose(row["id"], Path(row["run"]), {"effects": effects, "outside": outside})
+    truth = {"effects": {e: float(s or 1.0) for e, _, s in hidden}, "outside": outside}
+    with tempfile.TemporaryDirectory() as folder:
+        return diagnose(row["id"], shutil.copytree(row["run"], Path(folder) / "run"), truth)
 
 
 def write_tables(scores: Sequence[Scores], criteria: Criteria) -> str:
