@@ -24,7 +24,6 @@ HEAVY = (
     "pyarrow",
     "pydantic",
     "scipy",
-    "sklearn",
     "sympy",
 )
 
@@ -41,9 +40,8 @@ LAWS = {
         "compiled generated_code errors model_functions schema",
     ),
     "estimate": law("numpy scipy numba llvmlite filterpy", "compiled errors model_functions"),
-    "discover": law(
-        "numpy scipy sklearn joblib threadpoolctl numba pyoperon",
-        "errors lists physics estimate results trials workers",
+    "diagnosis": law(
+        "numpy scipy numba pyoperon", "errors lists physics estimate results trials workers"
     ),
     "results": law("pydantic", "errors files lists schema"),
     "data": law("numpy scipy pandas pyarrow h5py pydantic", "errors lists schema files results"),
@@ -51,10 +49,10 @@ LAWS = {
     "setup": law("numpy", "errors lists results physics estimate trials"),
     "identification": law(
         "numpy scipy pandas pyarrow numba pydantic",
-        "schema errors lists results progress physics estimate data trials discover",
+        "schema errors lists results progress physics estimate data trials diagnosis",
     ),
     "next_trial": law(
-        "numpy scipy", "errors lists results physics estimate trials identification discover"
+        "numpy scipy", "errors lists results physics estimate trials identification diagnosis"
     ),
     "declarations": law(
         "numpy pydantic", "errors files lists schema stages.base results physics data"
@@ -71,7 +69,7 @@ LAWS = {
     "stages": law(
         "numpy scipy pandas pyarrow numba pydantic",
         "errors files schema results progress physics estimate data declarations trials "
-        "identification setup discover next_trial report",
+        "identification setup diagnosis next_trial report",
     ),
     "report": law(
         "numpy matplotlib typst pandas pyarrow bampipe", "declarations errors lists files results"
@@ -86,7 +84,7 @@ LAWS = {
     ),
     "cli": law(
         "typer rich bampipe",
-        "progress api errors files results run lab stages physics discover data declarations "
+        "progress api errors files results run lab stages physics diagnosis data declarations "
         "monitor proposal simulator",
     ),
 }

@@ -13,7 +13,7 @@ class Criteria:
         probability: from which an effect is called missing, and below one minus which it is not
             mentioned.
         size: least share of the applied force of an axis, root mean square, that an effect must add
-            beyond what the other parameters could take over: a load cell is no more linear than that.
+            beyond what the other parameters could take over: no load cell is more linear.
         significance: chance of a false alarm in a session where nothing is missing, by replicates.
         replicates: replays of a fitted model, as in a parametric bootstrap.
         expected_effects: how many effects a model is expected to lack: the prior of each is this

@@ -114,7 +114,7 @@ def weigh_sets(search: Search, pool: Pool, given: Sequence[str], seed: int) -> W
 
 @dataclass(frozen=True)
 class _Listed:
-    """A set with its log evidence over that of the most probable one, whole and by block of time."""
+    """A set with its log evidence over that of the most probable one, by block of time, too."""
 
     keys: tuple[Key, ...]
     unknown: int | None

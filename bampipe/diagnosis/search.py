@@ -1,7 +1,7 @@
-"""The search over sets of effects: each set is weighed whole, its shapes refined, its bounds held.
+"""The search over sets of effects, each weighed whole, its shapes refined, its bounds held.
 
-The cost of a set is its negative log evidence: half of n log s^2 on each axis, with s^2 what the set
-leaves in units of the noise; the logarithm of what it takes off the measured quantity, so that
+The cost of a set is its negative log evidence: half of n log s^2 on each axis, with s^2 what the
+set leaves in units of the noise; the logarithm of what it takes off the measured quantity, so that
 nothing is explained by making both sides of the equation small; and by the priors of its parameters
 (Laplace) and of the set itself.
 """
@@ -25,7 +25,7 @@ _STEP = 0.02
 """Of a shape's range: the step of its slope."""
 _FARTHEST = 0.2
 _LEAST_SLOPE = 0.2
-"""Geometric mean of what a set leaves of the slope by the force; below, the equation has no scale."""
+"""Geometric mean of what a set leaves of the slope by the force; below, nothing has a scale."""
 
 _BESIDE, _PROMISING, _SWAPPED = 24, 8, 5
 """Candidates weighed exactly beside a set that grows, beside one that lost a member, and of those
@@ -386,12 +386,16 @@ class Search:
         """Cost of a set with each candidate added, best first, of those that promise most."""
         if not np.isfinite(self.cost(keys)):
             return []
+        # Close to those of this set: most weights are found in two passes from there.
+        self._weight = self.solve(keys).weight
         gains, have = self.gains(keys), {name.removeprefix("-") for name, _ in keys}
         tried: dict[str, int] = {}
         best: dict[str, tuple[float, Key]] = {}
         for k in np.argsort(-gains):
             key = self.places[k]
             name = key[0]
+            if not gains[k] > 0.0:
+                break
             if (
                 name in have
                 or tried.get(name, 0) >= shapes

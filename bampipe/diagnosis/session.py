@@ -165,11 +165,14 @@ class Session:
         """Residual of a model on a replay without noise whose friction truly stops it, by trial.
 
         How abruptly a machine stops no log says. Zero where the motion is given, and where such a
-        replay runs away.
+        replay runs away. A robot is held on its path by controllers: there friction that stops a
+        joint differs from one that creeps by the width of its sign alone.
         """
         t, nothing = self.trials, [np.zeros_like(r) for r in evidence.residual]
         if keep_motion(evidence.fitted):
             return nothing
+        if evidence.system.model.device.robot is not None:
+            return _narrower_friction(evidence)
         none = np.zeros(len(evidence.system.coordinates))
         exact = replace(
             t.sensors, resolution=none, reading_sd=none, force_sd=np.zeros_like(t.sensors.force_sd)
@@ -244,7 +247,7 @@ class Session:
         return Fit(recipe, evidence, likelihood, likelihood.pose(evidence))
 
     def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
-        """Fit a model with noise that is the same for all samples of an axis: nothing is replayed."""
+        """Fit a model with noise that is the same for all samples of an axis, without replays."""
         evidence = self.linearise(recipe, start)
         samples = lay_out_samples(evidence, self.criteria.block_s)
         nothing = [np.zeros_like(r) for r in evidence.residual]
@@ -289,7 +292,7 @@ class Fit:
 
     @cached_property
     def bias(self) -> tuple[Array, ...]:
-        """The bias of filters and of friction that stops, with its fitted factors, by axis, (n,)."""
+        """The bias of filters and of friction that stops, as fitted, by axis, each (n,)."""
         noise, n_q = self.likelihood.noise, len(self.likelihood.samples)
         factors = (self.problem.to_parameters @ self.solved.base)[-2 * n_q :]
         pairs = zip(noise.bias, noise.stopping, factors[:n_q], factors[n_q:], strict=True)
@@ -367,6 +370,19 @@ def _residuals_of_replay(seed: tuple[int, ...]) -> list[Array]:
     trials, evidence, stand_in = shared()
     replays = replay_motions(stand_in, trials.sensors, trials.kinematics, seed, alone=True)
     return residuals_of(evidence, replays)
+
+
+def _narrower_friction(evidence: Evidence) -> list[Array]:
+    """What Coulomb friction leaves whose sign is narrower than the model's, by trial, (K, n_q)."""
+    e, coordinates = evidence, evidence.system.model.device.coordinates
+    known = dict(zip((q.name for q in e.system.parameters), e.p.tolist(), strict=True))
+    dry = np.array([abs(known.get(f"coulomb.{c.name}", 0.0)) for c in coordinates])
+    width = np.array([c.sign_width for c in coordinates])
+    rows = [
+        dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width)) for m in e.motions
+    ]
+    thin = e.band.thin_trials(rows, range(len(coordinates)))
+    return [values * used for values, used in zip(thin, e.used, strict=True)]
 
 
 def residuals_of(evidence: Evidence, replays: Sequence[Motion]) -> list[Array]:

@@ -1,4 +1,4 @@
-"""Something that no effect of the library is: a smooth function of what an axis does, as a candidate.
+"""Something that no effect of the library is: a smooth function of what an axis does.
 
 Linear splines in position, speed, load and time since the last reversal, and in the position of the
 other axes, even and odd in the direction of motion, with a normal prior: a Gaussian process of few

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.diagnosis.probability import chance_of, touched_axes
+from bampipe.diagnosis.probability import chance_of
 from bampipe.diagnosis.select import Selection
 from bampipe.diagnosis.session import Fit, Session, candidates_of, rms
 from bampipe.results.diagnose import (
@@ -131,7 +131,7 @@ _BEYOND_MODELS = 3.0
 
 
 def _exceeds_any_model(fit: Fit, axis: int) -> bool:
-    """Whether an axis leaves more than sensors, filters and the discrepancy of any model explain."""
+    """Whether an axis leaves more than sensors, filters and any model's discrepancy explain."""
     solved = fit.solved
     return bool(np.sqrt(solved.left[axis] / fit.problem.count[axis]) > _BEYOND_MODELS)
 

@@ -160,25 +160,29 @@ class Contest:
         )  # fmt: skip
         samples = lay_out_samples(seen, c.block_s)
         speed = [np.abs(motion.qd[e.band.thinned_rows(len(motion.t))])]
-        bias, variance = [], []
+        bias, variance, classes = [], [], []
         for axis, here in enumerate(samples):
             # One replay is its bias with the noise of one.
             bias.append(take_samples(seen.residual, here, axis))
-            known = self._variance_by_speed[axis]
-            variance.append(np.interp(take_samples(speed, here, axis), *known))
+            speeds, variances, numbers = self._noise_by_speed[axis]
+            at = np.searchsorted(speeds[:-1], take_samples(speed, here, axis))
+            variance.append(variances[at])
+            classes.append(numbers[at])
         nothing = tuple(np.zeros_like(b) for b in bias)
-        noise = Noise(tuple(bias), tuple(variance), nothing, ())
+        noise = Noise(tuple(bias), tuple(variance), nothing, (), tuple(classes))
         return seen, Likelihood.of(seen, samples, noise, c.bias_error, c.discrepancy)
 
     @cached_property
-    def _variance_by_speed(self) -> list[tuple[Array, Array]]:
+    def _noise_by_speed(self) -> list[tuple[Array, Array, NDArray[np.int64]]]:
+        """By axis: speeds at hand in order, the variance of replays there, and their classes."""
         e, likelihood, found = self.fit.evidence, self.fit.likelihood, []
         speeds = [np.abs(m.qd[e.band.thinned_rows(len(m.t))]) for m in e.motions]
         for axis, here in enumerate(likelihood.samples):
-            speed, variance = take_samples(speeds, here, axis), likelihood.noise.variance[axis]
+            speed, noise = take_samples(speeds, here, axis), likelihood.noise
             order = np.argsort(speed)
             # An axis that never moves has none, and counts for nothing.
-            found.append((speed[order], variance[order]) if speed.size else (_ZERO, _ZERO))
+            known = speed[order], noise.variance[axis][order], noise.speed[axis][order]
+            found.append(known if speed.size else (_ZERO, _ZERO, np.zeros(1, dtype=np.int64)))
         return found
 
     def _sums_of(self, evidence: Evidence, likelihood: Likelihood) -> Sums:

@@ -86,7 +86,7 @@ class Config:
         confusion: what it is to bring every chance of confusing two effects below.
         seed: of how people differ, and of sensor noise.
         jobs: worker processes; 0 means one for each processor.
-        criteria: what a diagnosis asks of an effect; as in `diagnose`.
+        criteria: the numbers by which a diagnosis decides; those of `diagnose`.
     """
 
     model: str = "base"

@@ -1,15 +1,16 @@
 """The likelihood of what was measured, given a model: the one by which everything is judged.
 
-Of the samples of an axis that count, in the words of docs/method:
+Of the samples of an axis that count, in the words of docs/method_residual:
 
-    y = f(motion; theta) + beta b + gamma c + e,   var e ~ s^2 (v(z) + tau^2 (b^2 + g^2 c^2) + (delta F)^2)
+    y = f(motion; theta) + beta b + gamma c + e
+    var e ~ s^2 (v(z) + tau^2 (b^2 + g^2 c^2) + (delta F)^2), with the tails of Student's t
 
 y is what the fitted model leaves, low-passed; b the mean of replays of the model (what filters do
-to its residual where friction turns, which the measurement shares); c the residual of a replay whose
-friction truly stops the machine where it turns, g a first guess of its factor; v what single replays leave around b, by speed; F
-the applied force; s a scale of each axis, which is found with the rest. Parameters have their priors
-and bounds; so have the nuisance parameters: the factors beta and gamma of each axis, and the time by
-which inputs were sampled late.
+to its residual where friction turns, which the measurement shares); c the residual of a replay
+whose friction truly stops the machine where it turns, and g a first guess of its factor; v what
+single replays leave around b, by speed; F the applied force; s a scale of each axis, which is found
+with the rest. Parameters have their priors and bounds; so have the nuisance parameters: the factors
+beta and gamma of each axis, and the time by which inputs were sampled late.
 """
 
 from __future__ import annotations
@@ -181,7 +182,7 @@ class Likelihood:
         bias_error: float,
         discrepancy: float,
     ) -> Likelihood:
-        """Weight samples by the noise of replays, the error of their bias, and that of any model."""
+        """Weight samples by the noise of replays, the error of their bias and any model's."""
         e, system = evidence, evidence.system
         axes = range(len(samples))
         applied = e.band.thin_trials([fitted.applied for fitted in e.fitted], axes)
@@ -306,7 +307,7 @@ def _pose(
         columns[:, n + axis] = -bias[axis]
         columns[:, n + n_q + axis] = -likelihood.noise.stopping[axis]
         full.append(columns * likelihood.root[axis][:, None])
-    # A number that lies evenly between two bounds has a standard deviation of 0.29 of their distance.
+    # What lies evenly between two bounds has a standard deviation of 0.29 of their distance.
     of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
     n_timing, none = len(of_timing), np.zeros(n_q)
     precision = np.concatenate([evidence.precision, of_timing, none + 1.0, none + 1.0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from independent_runs import record_trials
 
-from bampipe.discover.chance import system_of
+from bampipe.diagnosis.session import system_of
 from bampipe.identification import drift
 from bampipe.identification.drift import HORIZONS_S, find_drift
 from bampipe.physics import Model, compile_model, registry

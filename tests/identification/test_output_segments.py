@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from discover.sessions import bam, made
+from diagnosis.sessions import bam, made
 
-from bampipe.discover.chance import system_of
+from bampipe.diagnosis.session import system_of
 from bampipe.estimate.unscented import Trial
 from bampipe.identification.output_estimate import cut_segments
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from discover.sessions import BAND, KINEMATICS, SENSORS, bam
+from diagnosis.sessions import BAND, KINEMATICS, SENSORS, bam
 
 from bampipe.diagnosis.session import system_of
 from bampipe.next_trial.choice import Tried, find_best_of_each, rank_designs

@@ -246,30 +246,25 @@ class Form:
             # The unit of an axis' own motion is that of its kind.
             held = {self.axis.kind: numbers} if self.is_own else numbers
             parameters[key] = {"description": entry["description"], **held}
+        scope = "axis" if self.is_own else "device"
         acts: dict[str, Any] = {"kind": "torque", "torque": self.expression}
         if self.factor == INERTIA:
             acts = {"kind": "energy", "kinetic": self.expression}
         elif self.factor == READING:
-            acts = {"kind": "input", "input": self.expression}
+            scope, acts = "force_component", {"kind": "input", "input": self.expression}
         elif not self.is_own:
             acts["torque"] = {self.axis.name: self.expression}
         return {
             "schema": "bampipe.effect/1",
             "name": self.name,
             "summary": self.summary,
-            "scope": self._scope,
+            "scope": scope,
             "looks_like": self.looks_like,
             "source": source,
             **acts,
             "parameters": parameters,
             **self._states(),
         }
-
-    @property
-    def _scope(self) -> str:
-        if self.factor == READING:
-            return "force_component"
-        return "axis" if self.is_own else "device"
 
     def _states(self) -> dict[str, Any]:
         unit: dict[str, Any] = {"unit": self.coordinate.unit}

@@ -24,7 +24,7 @@ from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.session import Fit, Session, shared, system_of, workers
 from bampipe.physics.recipe import Recipe
 from bampipe.results.draft import ChanceOfDraft
-from bampipe.trials.evidence import Evidence, gather_evidence
+from bampipe.trials.evidence import gather_evidence
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
@@ -76,13 +76,8 @@ class Term:
         others = [np.full((count, 1), span.high) for _, span in self.form.beside]
         x = np.hstack([x, *others])
         values = np.array(list(self.values.values()))
-        middle = self._at(x, values)
-        slopes = []
-        for k in range(len(values)):
-            moved, step = values.copy(), 1e-4 * max(abs(values[k]), 1e-9)
-            moved[k] += step
-            slopes.append((self._at(x, moved) - middle) / step)
-        slope = np.array(slopes)
+        middle, steps = self._at(x, values), np.diag(1e-4 * np.maximum(np.abs(values), 1e-9))
+        slope = np.array([(self._at(x, values + s) - middle) / s.sum() for s in steps])
         variance = np.einsum("kt,kl,lt->t", slope, self.covariance, slope)
         return x[:, 0], middle, np.sqrt(np.maximum(variance, 0.0))
 
@@ -258,34 +253,30 @@ class _AxisSearch:
 
     def run(self, recipe: Recipe, start: Array, progress: Progress) -> FoundDraft:
         """Add terms to a model as long as one beats chance and lowers the held-out error."""
-        fit = bare = self.session.fit(recipe, start)
-        given = chosen = Option((), self.held_out(bare), 0.0, recipe, bare.evidence.p)
-        options, chances, left = [given], [], True
+        bare = self.session.fit(recipe, start)
+        given = Option((), self.held_out(bare), 0.0, recipe, bare.evidence.p)
+        options, chances, stand = [given], [], (bare, given)
         for number in range(MOST_TERMS):
             progress(0.05 + 0.4 * number, "holding every form against the residual")
-            search = self._open(fit)
+            search, before = self._open(stand[0]), stand[1]
             progress(0.15 + 0.4 * number, "searching replays for as good a formula")
             chances.append(weigh_chance(self.session, search))
             if chances[-1].p_value > self.session.criteria.significance:
                 break
             progress(0.3 + 0.4 * number, "fitting the best forms with the model")
-            tried = self._fit_forms(search, chosen)
+            tried = self._fit_forms(search, before)
             options += tried
-            best = _best((chosen, *tried))
-            if best is chosen:
+            stand = self._take(stand, tried)
+            if stand[1] is before or not self._leaves_much(*stand):
                 break
-            fit, chosen = self._fit(best), best
-            left = self._leaves_much(fit, chosen)
-            if not left:
-                break
-        wanted = left and chances[0].p_value <= self.session.criteria.significance
-        wanted = wanted and not self.curves
+        wanted = not self.curves and chances[0].p_value <= self.session.criteria.significance
+        wanted = wanted and self._leaves_much(*stand)
         if wanted and symbolic.is_available():
             progress(0.85, "symbolic regression")
-            bred = self._fit_forms(self._breed(bare), given)
-            options += bred
-            if (best := _best((chosen, *bred))) is not chosen:
-                fit, chosen = self._fit(best), best
+            tried = self._fit_forms(self._open(bare, bred=True), given)
+            options += tried
+            stand = self._take(stand, tried)
+        fit, chosen = stand
         chosen = replace(chosen, held_out_rmse=self.held_out(fit), p=fit.evidence.p)
         options = [chosen if o.terms == chosen.terms else o for o in options]
         return FoundDraft(
@@ -293,21 +284,24 @@ class _AxisSearch:
             chosen, wanted and not symbolic.is_available(),
         )  # fmt: skip
 
-    def _open(self, fit: Fit) -> FormSearch:
+    def _open(self, fit: Fit, bred: bool = False) -> FormSearch:
+        """A search over the forms of the grammar, or over formulas that are bred."""
         forms = FormDictionary(fit.evidence, fit.likelihood.samples, self.axis)
-        left = fit.problem.y[self.axis] / fit.likelihood.root[self.axis] if self.curves else None
-        forms.add_grammar(self.curves, left)
+        if bred:
+            symbolic.breed(forms, fit.problem)
+        else:
+            left = fit.problem.y[self.axis] / fit.likelihood.root[self.axis]
+            forms.add_grammar(self.curves, left if self.curves else None)
         return FormSearch(self.session, fit, forms)
 
-    def _breed(self, fit: Fit) -> FormSearch:
-        """A search over formulas in several quantities."""
-        forms = FormDictionary(fit.evidence, fit.likelihood.samples, self.axis)
-        symbolic.breed(forms, fit.problem)
-        return FormSearch(self.session, fit, forms)
-
-    def _fit(self, option: Option) -> Fit:
-        """The model of an option with noise by replays of itself."""
-        return self.session.fit(option.recipe, option.p)
+    def _take(self, stand: tuple[Fit, Option], tried: Sequence[Option]) -> tuple[Fit, Option]:
+        """The most probable of models that lower the held-out error, fitted; else ``stand``."""
+        chosen = stand[1]
+        lower = [o for o in tried if o.held_out_rmse < chosen.held_out_rmse]
+        best = max((chosen, *lower), key=lambda option: option.log_evidence)
+        if best is chosen:
+            return stand
+        return self.session.fit(best.recipe, best.p), best
 
     def _floor(self, fit: Fit) -> float:
         replays = fit.likelihood.noise.residuals[self.axis]
@@ -389,15 +383,9 @@ def weigh_chance(session: Session, search: FormSearch) -> ChanceOfDraft:
     return ChanceOfDraft(gain=gain, gains=tuple(gains), p_value=p_value)
 
 
-def _best(options: Sequence[Option]) -> Option:
-    """The most probable of some models that lower the held-out error of the first; else that."""
-    lower = [o for o in options[1:] if o.held_out_rmse < options[0].held_out_rmse]
-    return max((options[0], *lower), key=lambda o: o.log_evidence)
-
-
 def _cost(fit: Fit) -> float:
     """Negative log likelihood of a fit with what is known of its parameters, nats."""
-    e: Evidence = fit.evidence
+    e = fit.evidence
     return fit.problem.solve().cost + 0.5 * float(e.precision @ e.known**2)
 
 

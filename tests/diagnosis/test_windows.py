@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bampipe.discover.shape import _size
+from bampipe.diagnosis.shape import _size
 from bampipe.stages.diagnose import _map_variables
 
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from independent_runs import device_of, record_trials
 
-from bampipe.discover.candidates import (
+from bampipe.diagnosis.candidates import (
     build_candidate_model,
     compile_candidate,
     list_candidates,
 )
-from bampipe.discover.chance import fit_trials, system_of
-from bampipe.discover.columns import added_residual
-from bampipe.discover.growth import collapses
-from bampipe.discover.polish import FittedSet
-from bampipe.discover.scorer import Scorer
-from bampipe.discover.settings import Settings
-from bampipe.discover.start import search_start
+from bampipe.diagnosis.session import system_of
+from bampipe.diagnosis.columns import added_residual
+from bampipe.diagnosis.growth import collapses
+from bampipe.diagnosis.polish import FittedSet
+from bampipe.diagnosis.scorer import Scorer
+from bampipe.diagnosis.settings import Settings
+from bampipe.diagnosis.start import search_start
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.residuals import residual_and_memory

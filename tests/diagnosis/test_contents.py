@@ -9,10 +9,10 @@ import pytest
 from sessions import BAND, KINEMATICS, SENSORS, folds, made
 
 from bampipe.discover import chance
-from bampipe.discover.growth import _keeps_the_floor
-from bampipe.discover.scorer import Scorer
-from bampipe.discover.settings import Settings
-from bampipe.discover.shape import worst_windows
+from bampipe.diagnosis.growth import _keeps_the_floor
+from bampipe.diagnosis.scorer import Scorer
+from bampipe.diagnosis.settings import Settings
+from bampipe.diagnosis.shape import worst_windows
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
 from bampipe.results.standing import standing

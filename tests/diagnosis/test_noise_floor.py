@@ -12,7 +12,7 @@ import pytest
 from independent_runs import record_trials
 from sessions import SENSORS, bam, made
 
-from bampipe.discover.chance import fit_trials, system_of
+from bampipe.diagnosis.session import system_of
 from bampipe.estimate.least_squares import fit
 from bampipe.physics import Model, compile_model
 from bampipe.trials import draw, noise_floor, replay

@@ -8,7 +8,7 @@ from physics.small_arm import ARM
 from scipy.signal import butter, sosfiltfilt
 from sessions import BAND, KINEMATICS, RATE, TRUTH, bam, folds, made
 
-from bampipe.discover.chance import system_of
+from bampipe.diagnosis.session import system_of
 from bampipe.estimate.least_squares import residual_and_slopes, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, compile_model
