@@ -68,7 +68,7 @@ def diagnose(name: str, run: bampipe.Run | Path, truth: Mapping[str, Any]) -> Sc
         sets=[{k: v for k, v in s.items() if v is not None} for s in found["sets"]],
         drops={
             row["effect"]: (round(row["score"], 2), row["p_value"])
-            for row in found["ranking"] if row["effect"] in found["sets"][0]["effects"]
+            for row in found["ranking"] if row["effect"] in found["selected"]
         },
         chance=[round(v, 2) for v in found["chance"]["largest"]],
         beside=round(found["chance"]["measured"], 2),

@@ -26,7 +26,7 @@ class Scores:
         id: of the session; effects: hidden, of the library, by their strength; outside: not of it.
         effects_found: probability of each effect of any probable set.
         sets: effects, axis of something unknown, log evidence (nats) and probability of each.
-        drops: log evidence lost without each effect of the most probable set, nats, with p-values.
+        drops: log evidence lost without each effect that is selected, nats, with p-values.
         chance: largest gain of any candidate on each replay of the final model, nats.
         beside: the same on the measured trials.
         unknown: probability of something unknown, by axis.
