@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 @dataclass(frozen=True)
 class Criteria:
-    """What it takes for an effect to be called missing; each with its study in docs/validation.
+    """What it takes for an effect to be called missing; each described in docs/method_selection.
 
     Attributes:
         probability: from which an effect is called missing, and below one minus which it is not

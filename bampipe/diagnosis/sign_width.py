@@ -26,7 +26,7 @@ Friction that rises as the speed falls, where the model lacks it, can make a thi
 likelier on a machine that does yield over all of it, but not an eighth."""
 _NARROWER = (1.0 / 3.0, _STOPS, 1.0 / 32.0)
 WORTH = 0.03
-"""Least drop of the log error for a narrower width; see docs/benchmarks_thresholds.md."""
+"""Least drop of the log error for a narrower width: `benchmarks/chosen_sign_width.py`."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from bampipe.results.identify import Independence, InnovationTests, Whiteness
 _LAGS_S = (0.0, 0.25, 0.5)
 """Lags at which inputs are taken."""
 WHITE_SHARE = 0.2
-"""Share predictable from the past below which a channel counts as white: docs/identification."""
+"""Share predictable from the past below which a channel counts as white."""
 INPUT_SHARE = 0.05
 """Share predictable from the inputs below which a channel counts as independent of them."""
 _SIGNIFICANT = 0.01

@@ -35,7 +35,7 @@ _SOUND = 1.2
 _SCATTERED = 1.3
 """Standard deviations of the filter over those of least squares, from which on least squares are
 published. In eight of 46 identifications of a joint they were: there the filter's true errors were
-1.6 to 32 times those of least squares (docs/identification.md)."""
+1.6 to 32 times those of least squares."""
 _UNSURE = 3.0
 """The same with what the width of the smoothed sign leaves open."""
 _BIASED = 0.5

@@ -13,14 +13,13 @@ Standing = Literal["at_floor", "above_floor", "floor_implausible", "floor_missin
 AT_FLOOR = 1.2
 """Error over floor up to which a model leaves no more than its sensors do. No replay is perfect:
 clean axes stand at up to 1.08 floors, at up to 1.16 where friction truly stops the arm; the weakest
-effects that are found start at 1.18 (docs/benchmarks_thresholds.md)."""
+effects that were found stood at 1.18."""
 FLOOR_SDS = 3.0
-"""Standard deviations of the floor over replays that are allowed for. No axis of 39 sessions stands
-otherwise with 1.9 to 3.0 (benchmarks/margins.py)."""
+"""Standard deviations of the floor over replays that are allowed for. No axis of 39 sessions stood
+otherwise with 1.9 to 3.0."""
 IMPLAUSIBLE = 0.7
 """Error over floor below which the floor is wrong: sensors noisier than the data, or a replay that
-does not resemble the machine. No axis of 39 sessions stands otherwise with 0.55 to 0.88
-(benchmarks/margins.py)."""
+does not resemble the machine. No axis of 39 sessions stood otherwise with 0.55 to 0.88."""
 
 FLOOR_WRONG = ("floor_implausible", "floor_missing")
 """Standings in which an error cannot be judged."""

@@ -59,7 +59,7 @@ Fraction = Annotated[float, Field(gt=0, lt=1)]
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config:
-    """Settings of the stage; what each number decides is in docs/method.md.
+    """Settings of the stage; what each number decides is in docs/method_selection.md.
 
     Attributes:
         model: which model version to diagnose.

@@ -1,0 +1,162 @@
+"""Scores of diagnoses of sessions whose truth is known, and tables of them under any criteria."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+from bampipe.diagnosis.criteria import Criteria
+
+TENTHS = np.linspace(0.0, 1.0, 11)
+BEGIN, END = "<!-- printed by benchmarks/calibration.py -->", "<!-- end -->"
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What a diagnosis of one session computed, and the truth.
+
+    Attributes:
+        id: of the session; effects: hidden, of the library, by their strength; outside: not of it.
+        effects_found: probability of each effect of any probable set.
+        sets: effects, axis of something unknown, log evidence (nats) and probability of each.
+        drops: log evidence lost without each effect that is selected, nats, with p-values.
+        chance: largest gain of any candidate on each replay of the final model, nats.
+        beside: the same on the measured trials.
+        unknown: probability of something unknown, by axis.
+        over_floor: held-out error over the noise floor, by axis.
+        exceeds: axes that leave more than any model may, whatever that probability.
+        no_verdict: axes without a verdict; seconds: of the diagnosis; failure: why there is none.
+    """
+
+    id: str
+    effects: Mapping[str, float]
+    outside: Sequence[str]
+    effects_found: Mapping[str, float] = field(default_factory=dict)
+    sets: Sequence[Mapping[str, Any]] = ()
+    drops: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    chance: Sequence[float] = ()
+    beside: float = 0.0
+    unknown: Mapping[str, float] = field(default_factory=dict)
+    over_floor: Mapping[str, float] = field(default_factory=dict)
+    exceeds: Sequence[str] = ()
+    no_verdict: Sequence[str] = ()
+    seconds: float = 0.0
+    failure: str = ""
+
+    def probabilities(self, criteria: Criteria) -> dict[str, float]:
+        """Of each effect of any probable set; no surer than chance allows."""
+        doubtful = {e: p for e, (_, p) in self.drops.items() if p > criteria.significance}
+        return {e: min(p, 1.0 - doubtful.get(e, 0.0)) for e, p in self.effects_found.items()}
+
+    def finds_unknown(self, criteria: Criteria) -> bool:
+        """Whether something is said to be missing that no effect of the library is."""
+        sure = max(self.unknown.values(), default=0.0) >= criteria.probability
+        return sure or bool(self.exceeds)
+
+
+def write_tables(scores: Sequence[Scores], criteria: Criteria) -> str:
+    """Reliability, alarms and sets at the given criteria, as Markdown."""
+    done = [s for s in scores if not s.failure]
+    clean = [s for s in done if not s.effects and not s.outside]
+    hidden = [s for s in done if s.effects and not s.outside]
+    outside = [s for s in done if s.outside]
+    lines = [
+        f"{len(done)} sessions, {len(scores) - len(done)} refused; probability"
+        f" {criteria.probability:g}, significance {criteria.significance:g}",
+        "",
+        *_reliability([*hidden, *outside], criteria),
+        "",
+        *_alarms(clean, criteria),
+        *_sets(hidden, criteria),
+    ]
+    if outside:
+        lines.append(
+            f"Of {len(outside)} sessions with an effect outside the library, something unknown is"
+            f" said to be missing in {sum(s.finds_unknown(criteria) for s in outside)}."
+        )
+    seconds = [s.seconds for s in done] or [np.nan]
+    lines.append(f"A diagnosis took {np.median(seconds):.1f} s, at most {max(seconds):.1f} s.")
+    return "\n".join(lines)
+
+
+def _reliability(scores: Iterable[Scores], criteria: Criteria) -> list[str]:
+    """Of the effects given each tenth of probability, how many are there."""
+    stated = [(p, e in s.effects) for s in scores for e, p in s.probabilities(criteria).items()]
+    lines = ["| stated probability | effects | mean stated | there | wrong |", "|-|-|-|-|-|"]
+    for low, high in pairwise(TENTHS):
+        here = [(p, t) for p, t in stated if low <= p < high or (high == 1.0 and p == 1.0)]
+        if here:
+            true = sum(t for _, t in here)
+            lines.append(
+                f"| {low:.1f} to {high:.1f} | {len(here)} | {np.mean([p for p, _ in here]):.3f} |"
+                f" {true / len(here):.3f} | {len(here) - true} |"
+            )
+    return lines
+
+
+def _alarms(clean: Sequence[Scores], criteria: Criteria) -> list[str]:
+    """Sessions where nothing is missing of which something else is said."""
+    if not clean:
+        return []
+    least = 1.0 - criteria.probability
+    named = [max(s.probabilities(criteria).values(), default=0.0) for s in clean]
+    sure = sum(
+        p >= criteria.probability or s.finds_unknown(criteria)
+        for p, s in zip(named, clean, strict=True)
+    )
+    unsure = sum(
+        least <= max(p, *s.unknown.values()) < criteria.probability
+        for p, s in zip(named, clean, strict=True)
+    )
+    bound = float(beta.ppf(0.95, sure + 1, len(clean) - sure)) if sure < len(clean) else 1.0
+    return [
+        f"Of {len(clean)} clean sessions, {sure} are said to lack something (at most"
+        f" {100 * bound:.1f} % at 95 % confidence), {unsure} are left undecided, and"
+        f" {sum(bool(s.no_verdict) for s in clean)} have an axis without a verdict."
+    ]
+
+
+def _sets(hidden: Sequence[Scores], criteria: Criteria) -> list[str]:
+    """Whole sets and single effects, where all that is hidden is of the library."""
+    if not hidden:
+        return []
+    first = [set(s.sets[0]["effects"]) == set(s.effects) for s in hidden]
+    among = [any(set(o["effects"]) == set(s.effects) and o["probability"] >= 0.1 for o in s.sets)
+             for s in hidden]  # fmt: skip
+    lines = [
+        f"Of {len(hidden)} sessions with effects of the library alone, the most probable set is the"
+        f" hidden one in {sum(first)}, and a set of probability 0.1 or more is in {sum(among)}."
+    ]
+    for low, high in ((0.1, 0.2), (0.2, 0.5), (0.5, 1.01)):
+        chances = [s.probabilities(criteria).get(e, 0.0) for s in hidden
+                   for e, strength in s.effects.items() if low <= strength < high]  # fmt: skip
+        if chances:
+            found = sum(p >= criteria.probability for p in chances)
+            open_still = sum(1 - criteria.probability <= p < criteria.probability for p in chances)
+            lines.append(
+                f"At strengths {low:g} to {min(high, 1.0):g}, {found} of {len(chances)} effects are"
+                f" called missing, and {open_still} more are undecided."
+            )
+    return lines
+
+
+def read_scores(path: Path) -> Iterator[Scores]:
+    """The scores of a file, a line each."""
+    for line in path.read_text(encoding="utf-8").splitlines():
+        yield Scores(**json.loads(line))
+
+
+def write_page(path: Path, tables: str) -> None:
+    """Put the tables in the place that a page marks for them."""
+    before, _, rest = path.read_text(encoding="utf-8").partition(BEGIN)
+    after = rest.partition(END)[2]
+    if not after:
+        raise SystemExit(f"{path} has no place for the tables: {BEGIN} ... {END}")
+    path.write_text(f"{before}{BEGIN}\n\n{tables}\n\n{END}{after}", encoding="utf-8")
