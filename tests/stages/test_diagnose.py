@@ -1,12 +1,17 @@
-"""What the stage is asked to leave out."""
+"""The stage diagnose: what it writes, and what it is asked to leave out."""
 
 from __future__ import annotations
 
-import pytest
+import json
 
+import pytest
+from independent_runs import record_run
+
+import bampipe
 from bampipe.errors import InputError
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
+from bampipe.results.diagnose import DiagnoseResult
 from bampipe.stages.diagnose import _require_known
 
 
@@ -15,3 +20,41 @@ def test_what_is_no_effect_cannot_be_left_out() -> None:
     _require_known(("backlash:carriage",), recipe)
     with pytest.raises(InputError, match="no effect of this device, did you mean 'backlash:"):
         _require_known(("backlsh:carriage",), recipe)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> bampipe.Run:
+    """A run of a joint with thinning grease, identified and validated."""
+    return record_run(tmp_path_factory.mktemp("joint"), "joint", 41, "shear_thinning:joint")[0]
+
+
+def written(run: bampipe.Run, jobs: int, seed: int = 0) -> bytes:
+    """The file that the diagnosis writes."""
+    path = run.root / DiagnoseResult.file("base")
+    path.unlink(missing_ok=True)
+    bampipe.diagnose(run, "base", jobs=jobs, seed=seed)
+    return path.read_bytes()
+
+
+def test_the_file_is_the_same_byte_for_byte_with_one_process_or_two(run: bampipe.Run) -> None:
+    one = written(run, jobs=1)
+    assert one == written(run, jobs=2)
+    assert one != written(run, jobs=1, seed=1)
+
+
+def test_what_other_programs_read_is_there_and_true(run: bampipe.Run) -> None:
+    found = json.loads(written(run, jobs=1))
+    axis = found["axes"]["joint"]
+    assert axis["verdict"] == "missing" and axis["effects"] == ["shear_thinning:joint"]
+    assert 0.9 < axis["explainable_share"] <= 1.0 and axis["remains"] is False
+    assert axis["rmse_after"] < 0.5 * axis["rmse_before"]
+    assert found["selected"] == ["shear_thinning:joint"] and found["suggested_trial"] is None
+    first, *others = found["ranking"]
+    assert first["effect"] == "shear_thinning:joint" and first["probability"] > 0.9
+    assert first["p_value"] < 0.01 and first["indistinguishable_from"] == []
+    assert first["held_out_rmse_after"] == axis["rmse_after"]
+    assert first["held_out_rmse_before"] > axis["rmse_after"]
+    assert all(row["probability"] < 0.1 for row in others)
+    assert sum(one["probability"] for one in found["sets"]) == pytest.approx(1.0, abs=0.01)
+    assert found["chance"]["p_value"] > 0.01
+    assert len(found["chance"]["largest"]) == found["chance"]["replicates"]

@@ -1,0 +1,158 @@
+"""What must not be taken for an effect, each on a session of a simulator that shares no code."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sessions import bam, diagnose_trials, take_timing_off
+
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.session import Session, system_of
+from bampipe.physics import registry
+
+
+def verdicts(found):
+    return [axis.verdict for axis in found.axes]
+
+
+def probabilities(found):
+    return {name: p for axis in found.axes for name, p in axis.probabilities.items()}
+
+
+def moved(trials, change):
+    """The trials with the channels that ``change`` gives for each motion and its number."""
+    motions = [m.with_channels(change(k, m)) for k, m in enumerate(trials.motions)]
+    return replace(trials, motions=tuple(motions))
+
+
+@pytest.mark.parametrize(
+    ("machine", "seed", "conditions"),
+    [
+        ("joint", 7, {"creep": True}),
+        ("axis", 58, {"creep": True}),
+        ("damper", 57, {}),
+        ("wrist", 56, {}),
+        ("bam", 6, {}),
+        ("bam", 6, {"coarse": 8.0}),  # play would make of counts what the model lacks
+        ("axis", 58, {"creep": False}),  # it truly stops: no Stribeck friction, no compliance
+        ("joint", 5, {}),
+    ],
+)
+def test_nothing_is_missing_where_nothing_was_hidden(record, machine, seed, conditions):
+    selection, found = diagnose_trials(*record(machine, seed, **conditions))
+    assert {*verdicts(found)} == {"nothing_missing"}
+    assert selection.effects == found.selected == ()
+    assert found.chance.p_value > 0.01
+    for axis in found.axes:
+        assert 0.8 < axis.rmse_after / axis.noise_floor < 1.35
+
+
+@pytest.mark.parametrize("seconds", [0.3, 1.0])
+def test_one_event_decides_nothing(record, seconds):
+    """Somebody pushes the drive once, for less than a block of time."""
+    trials, recipe = record("joint", 7)
+
+    def pushed(k, motion):
+        force = motion.channels["current"]
+        push = 0.3 * force.std() * np.exp(-(((motion.t - 4.0) / (0.5 * seconds)) ** 2))
+        return {"current": force + (k == 1) * push}
+
+    _, found = diagnose_trials(moved(trials, pushed), recipe)
+    assert all(p < 0.9 for p in probabilities(found).values())
+    assert verdicts(found) != ["missing"]
+
+
+@pytest.mark.parametrize("seed", [8, 9, 10])
+def test_a_lag_gains_nothing_by_averaging_noise(record, seed):
+    trials, recipe = record("joint", 4)
+    rng = np.random.default_rng(seed)
+    sd = 0.5 * trials.motions[0].channels["current"].std()
+
+    def noisy(_, motion):
+        return {"current": motion.channels["current"] + sd * rng.normal(size=motion.t.size)}
+
+    sensors = replace(trials.sensors, force_sd=np.hypot(trials.sensors.force_sd, sd))
+    shaken = replace(moved(trials, noisy), sensors=sensors)
+    _, found = diagnose_trials(shaken, recipe)
+    named = probabilities(found)
+    assert not [n for n in named if n.partition(":")[0] in ("actuator_lag", "actuator_delay")]
+
+
+def test_a_trial_that_alone_holds_a_parameter_condemns_no_model(record):
+    """Its spring shows in one trial; without that nothing is known of it but what the file says."""
+    trials, recipe = record("joint", 7)
+    joint = replace(recipe, effects=("return_spring:joint",))
+    session = Session(trials, Criteria())
+    fit = session.fit(joint, session.fit_plainly(joint, system_of(joint).prior).evidence.p)
+    assert fit.held_out_rmse[0] < 1.3 * np.sqrt(
+        np.mean((fit.problem.y[0] / fit.likelihood.root[0]) ** 2)
+    )
+
+
+def test_inputs_that_are_read_half_a_sample_late_give_no_delay(record):
+    trials, recipe = record("joint", 5)
+    late_s = 0.4 / trials.band.rate_hz
+    late = [motion.with_input_timing(-late_s) for motion in trials.motions]
+    again = take_timing_off(replace(trials, motions=tuple(late), late_s=0.0), recipe)
+    assert again.late_s == pytest.approx(late_s, abs=3e-4)
+    for some in (again, replace(trials, motions=tuple(late))):
+        _, found = diagnose_trials(some, recipe)
+        assert not [n for n in probabilities(found) if "delay" in n or "lag" in n]
+
+
+def test_a_delay_that_is_there_is_named(record):
+    _, found = diagnose_trials(*record("joint", 5, "actuator_lag:current"))
+    assert found.selected == ("actuator_lag:current",)
+    assert verdicts(found) == ["missing"]
+
+
+TWIN = "other_thinning"
+
+
+def test_twins_are_undecided_and_their_probabilities_sum_to_one(record):
+    """An effect, and a file of a user's that says the same under another name."""
+    trials, recipe = record("joint", 41, "shear_thinning:joint")
+    declaration = dict(registry.effect("shear_thinning").declaration) | {"name": TWIN}
+    selection, found = diagnose_trials(trials, replace(recipe, extra=(declaration,)))
+    (axis,) = found.axes
+    pair = {n: axis.probabilities.get(n, 0.0) for n in ("shear_thinning:joint", f"{TWIN}:joint")}
+    assert axis.verdict == "undecided"
+    assert sum(pair.values()) == pytest.approx(1.0, abs=0.05)
+    assert min(pair.values()) > 0.3
+    (name,) = selection.effects
+    row = next(row for row in found.ranking if row.effect == name)
+    assert {name, *row.indistinguishable_from} == {*pair}
+
+
+@pytest.mark.parametrize(
+    ("machine", "seed", "effect", "axis"), [("bam", 12, "detent:yaw", 0)],
+)  # fmt: skip
+def test_what_no_effect_of_the_library_is_is_called_unknown(record, machine, seed, effect, axis):
+    _, found = diagnose_trials(*record(machine, seed, effect))
+    here = found.axes[axis]
+    assert here.verdict == "unknown_effect" and here.remains and here.unknown > 0.9
+    assert here.effects == found.selected == ()
+    assert {v for k, v in enumerate(verdicts(found)) if k != axis} <= {"nothing_missing"}
+
+
+@pytest.mark.parametrize(
+    ("criterion", "value"), [("size", 0.5), ("significance", 1e-9), ("probability", 1.0 - 1e-12)]
+)
+def test_the_numbers_that_decide_are_those_that_are_given(record, criterion, value):
+    """An effect of 10 % of the force is none of a size that matters to who asks for half of it."""
+    trials, recipe = record("joint", 41, "shear_thinning:joint")
+    _, usual = diagnose_trials(trials, recipe)
+    assert verdicts(usual) == ["missing"] and usual.selected == ("shear_thinning:joint",)
+    _, found = diagnose_trials(trials, recipe, **{criterion: value})
+    if criterion == "size":
+        assert found.selected == ()
+    assert verdicts(found) != ["missing"]
+
+
+def test_the_pose_of_an_arm_is_no_reason_to_doubt_it(record):
+    """A weight in the hand is the mass of the arm to any trial; neither is missing."""
+    trials, _ = record("bam", 6)
+    _, found = diagnose_trials(trials, bam(), only=("handle_payload", "force_gain:y"))
+    assert found.selected == ()
