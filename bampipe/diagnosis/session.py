@@ -30,6 +30,7 @@ from bampipe.trials.likelihood import (
     Problem,
     Solved,
     describe_noise,
+    dry_friction,
     lay_out_samples,
     solve_bounded,
     take_samples,
@@ -374,14 +375,12 @@ def _residuals_of_replay(seed: tuple[int, ...]) -> list[Array]:
 
 def _narrower_friction(evidence: Evidence) -> list[Array]:
     """What Coulomb friction leaves whose sign is narrower than the model's, by trial, (K, n_q)."""
-    e, coordinates = evidence, evidence.system.model.device.coordinates
-    known = dict(zip((q.name for q in e.system.parameters), e.p.tolist(), strict=True))
-    dry = np.array([abs(known.get(f"coulomb.{c.name}", 0.0)) for c in coordinates])
-    width = np.array([c.sign_width for c in coordinates])
+    e = evidence
+    dry, width = dry_friction(e)
     rows = [
         dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width)) for m in e.motions
     ]
-    thin = e.band.thin_trials(rows, range(len(coordinates)))
+    thin = e.band.thin_trials(rows, range(len(dry)))
     return [values * used for values, used in zip(thin, e.used, strict=True)]
 
 
