@@ -47,7 +47,7 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
     p_values = {e: chance_of(drop, selection.chance) for e, drop in weighed.drops.items()}
     # Of what chance gives as well, nothing is sure.
     probability = {
-        e: share if p_values.get(e, 0.0) <= c.significance else min(share, 1.0 - p_values[e])
+        e: min(share, 1.0) if p_values.get(e, 0.0) <= c.significance else min(share, 1.0 - p_values[e])
         for e, share in weighed.effects.items()
     }
     where = {e: effect_axes(initial, final, e) for e in probability}
@@ -57,7 +57,7 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
         here = {e: p for e, p in probability.items() if axis in where[e]}
         listed = {e: p for e, p in here.items() if p >= 1.0 - c.probability}
         listed = dict(sorted(listed.items(), key=lambda pair: -pair[1]))
-        unknown = float(weighed.unknown[axis])
+        unknown = min(float(weighed.unknown[axis]), 1.0)
         axes.append(_judge(session, selection, axis, name, listed, unknown))
     ranking = rank_effects(selection, probability, p_values)
     return Conclusion(

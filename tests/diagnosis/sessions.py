@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from bampipe.diagnosis.session import system_of
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.select import Selection, select_effects
+from bampipe.diagnosis.session import Session, system_of
+from bampipe.diagnosis.verdict import Conclusion, conclude
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import registry
@@ -61,6 +65,31 @@ def fit_trials(trials: MeasuredTrials, recipe: Recipe) -> Evidence:
     return gather_evidence(
         system, trials.motions, trials.band, system.prior, trials.folds, timing=trials.timing
     )
+
+
+def take_timing_off(trials: MeasuredTrials, recipe: Recipe) -> MeasuredTrials:
+    """The trials with the timing of their inputs as found by least squares, and open beside it."""
+    half = 0.5 / trials.band.rate_hz
+    timed = replace(trials, limit_s=half, timed=True)
+    fit = Session(timed, Criteria()).fit_plainly(recipe, system_of(recipe).prior)
+    change = fit.problem.to_parameters @ fit.solved.base
+    return timed.with_input_timing(float(change[len(fit.evidence.free)]))
+
+
+def diagnose_trials(
+    trials: MeasuredTrials, recipe: Recipe, only: Sequence[str] = (), **criteria: float
+) -> tuple[Selection, Conclusion]:
+    """Fit a model by least squares, as identification does, and diagnose it, in this process.
+
+    Args:
+        trials: of the session; recipe: the model.
+        only: effects that are weighed in place of all; criteria: other ones than the defaults.
+    """
+    session = Session(trials, Criteria(**criteria))
+    without = [n for n in session.candidate_names(recipe) if only and n not in only]
+    start = session.fit_plainly(recipe, system_of(recipe).prior).evidence.p
+    selection = select_effects(session, recipe, start, without)
+    return selection, conclude(session, selection)
 
 
 def made(

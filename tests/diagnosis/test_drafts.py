@@ -169,7 +169,7 @@ def test_a_formula_at_the_edge_of_chance_is_ranked_among_the_replays(clean):
     y = list(fit.problem.y)
     y[1] = y[1] + 5.0 * bump / np.linalg.norm(bump) * np.linalg.norm(y[1])
     assert len(y[1]) == len(form.rows)
-    assert search.on_replay(tuple(y)).largest_gain() > max(chance.gains)
+    assert search.on_replay(tuple(y)).gain_of_best_form() > max(chance.gains)
 
 
 @pytest.mark.long

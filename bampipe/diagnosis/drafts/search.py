@@ -24,6 +24,7 @@ from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.session import Fit, Session, shared, system_of, workers
 from bampipe.physics.recipe import Recipe
 from bampipe.results.draft import ChanceOfDraft
+from bampipe.results.standing import standing
 from bampipe.trials.evidence import gather_evidence
 
 Array = NDArray[np.float64]
@@ -156,7 +157,7 @@ class FormSearch(Search):
         other._weight = other.p.independent / np.maximum(other.yy, 1e-300)
         return other
 
-    def _volume(self, keys: Sequence[Key], strengths: Sequence[Array]) -> Array:
+    def _volume(self, keys: Sequence[Key], strengths: Sequence[Array]) -> Array | None:
         """As of effects, but that a form by the load or by a reading may have several strengths."""
         other, ones = copy.copy(self), [np.ones(1)] * len(keys)
         other.atoms = {
@@ -166,7 +167,7 @@ class FormSearch(Search):
         }
         return Search._volume(other, keys, ones)
 
-    def largest_gain(self) -> float:
+    def gain_of_best_form(self) -> float:
         """Log evidence that the best form on the grid adds, nats; 0 where none adds any."""
         best = self.best_beside((), _PROMISING, shapes=1)
         return max(self.cost(()) - best[0][0], 0.0) if best else 0.0
@@ -314,7 +315,7 @@ class _AxisSearch:
         return float(found.held_out_rmse[self.axis])
 
     def _leaves_much(self, fit: Fit, option: Option) -> bool:
-        return option.held_out_rmse >= self.session.criteria.above_floor * self._floor(fit)
+        return standing(option.held_out_rmse, self._floor(fit)) == "above_floor"
 
     def _fit_forms(self, search: FormSearch, current: Option) -> list[Option]:
         """The model with each of the best forms, all parameters fitted together."""
@@ -377,8 +378,8 @@ def weigh_chance(session: Session, search: FormSearch) -> ChanceOfDraft:
             * search.fit.likelihood.root[axis]
             for axis, s in enumerate(samples)
         )
-        gains.append(search.on_replay(y).largest_gain())
-    gain = search.largest_gain()
+        gains.append(search.on_replay(y).gain_of_best_form())
+    gain = search.gain_of_best_form()
     p_value = (1 + sum(g >= gain for g in gains)) / (1 + len(gains))
     return ChanceOfDraft(gain=gain, gains=tuple(gains), p_value=p_value)
 
