@@ -36,11 +36,6 @@ class Candidate:
     searched_indices: tuple[int, ...]
 
     @property
-    def n_constants(self) -> int:
-        """How many numbers it adds to the model."""
-        return sum(not q.fixed for q in self.parameters)
-
-    @property
     def replaces_motion(self) -> bool:
         """Whether all that it does is that the model sees another motion than was measured."""
         return self.system.model.effects[-1].effect.kind == "measurement"

@@ -52,7 +52,7 @@ class Atom:
     @property
     def width(self) -> int:
         """Number of its strengths."""
-        return next(iter(self.columns.values())).shape[1]
+        return int(next(iter(self.columns.values())).shape[1])
 
 
 @dataclass

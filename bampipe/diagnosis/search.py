@@ -153,11 +153,16 @@ class Search:
 
     # --- one set -------------------------------------------------------------------------------
 
-    def _products(self, key: Key) -> dict[int, tuple[Array, Array, Array]] | None:
+    def _atom(self, key: Key) -> Atom:
+        """The columns of a candidate that does something in these trials."""
+        atom = self.atoms[key]
+        assert atom is not None
+        return atom
+
+    def _products(self, key: Key) -> dict[int, tuple[Array, Array, Array]]:
         """By axis: weighted columns of an atom, their products with the base and with y."""
         if key not in self._with_base:
-            atom, p = self.atoms[key], self.p
-            assert atom is not None
+            atom, p = self._atom(key), self.p
             found = {}
             for axis, columns in atom.columns.items():
                 x = columns * p.likelihood.root[axis][:, None]
@@ -184,7 +189,7 @@ class Search:
         if any(self.atoms.get(key) is None for key in keys):
             return Solution(np.inf)
         parts = [self._products(key) for key in keys]
-        widths = [self.atoms[key].width for key in keys]
+        widths = [self._atom(key).width for key in keys]
         at = np.concatenate([[nb], nb + np.cumsum(widths)]).astype(int)
         n = int(at[-1])
         xx, xy = np.zeros((self.n_q, n, n)), np.zeros((self.n_q, n))
@@ -219,8 +224,8 @@ class Search:
             used = np.flatnonzero(~solved.held)
             inside = _schur(normal, nb)[np.ix_(used, used)]
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
-            place = np.repeat(np.arange(len(keys)), widths)[used]
-            sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, place)
+            member = np.repeat(np.arange(len(keys)), widths)[used]
+            sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)
             if min(sizes) < self.least_size:
                 return Solution(np.inf)
             spread = np.array([s for key in keys for s in self.dictionary.spreads(key[0])])
@@ -246,7 +251,7 @@ class Search:
         for k, (key, strength) in enumerate(zip(keys, strengths, strict=True)):
             at = np.flatnonzero(place == k)
             here = np.ix_(at, at)
-            alone = b[at] @ np.linalg.pinv(spread[here], hermitian=True) @ b[at]
+            alone = float(b[at] @ np.linalg.pinv(spread[here], hermitian=True) @ b[at])
             share = alone / max(float(b[at] @ own[here] @ b[at]), 1e-300)
             sizes.append(self._size(key, strength) * float(np.sqrt(max(share, 0.0))))
         return tuple(sizes)
@@ -254,9 +259,9 @@ class Search:
     def _size(self, key: Key, strength: Array) -> float:
         """What an effect adds over the applied force of an axis, root mean square, the largest."""
         if key not in self._squares:
-            self._squares[key] = {a: c.T @ c for a, c in self.atoms[key].columns.items()}
+            self._squares[key] = {a: c.T @ c for a, c in self._atom(key).columns.items()}
         return max(
-            float(np.sqrt(max(strength @ square @ strength, 0.0) / self.applied[axis]))
+            float(np.sqrt(max(float(strength @ square @ strength), 0.0) / self.applied[axis]))
             for axis, square in self._squares[key].items()
         )
 
@@ -274,8 +279,7 @@ class Search:
         found = [np.zeros(len(y)) for y in self.p.y]
         moved: dict[int, Array] = {}
         for key, b in zip(keys, strengths, strict=True):
-            atom = self.atoms[key]
-            assert atom is not None
+            atom = self._atom(key)
             found = [f + g if g else f for f, g in zip(found, atom.log_gain, strict=True)]
             for axis, slope in atom.slopes.items():
                 moved[axis] = moved.get(axis, 0.0) + float(b[0]) * slope
@@ -319,7 +323,7 @@ class Search:
         keys = added(tuple(sorted(keys)))
         weight = p.independent / np.maximum(known.scale * p.count, 1e-300)
         parts = [self._products(key) for key in keys]
-        widths = [self.atoms[key].width for key in keys]
+        widths = [self._atom(key).width for key in keys]
         at = np.concatenate([[nb], nb + np.cumsum(widths)]).astype(int)
         n = int(at[-1])
         normal = np.zeros((n, n))
@@ -475,7 +479,7 @@ class Search:
         p, nb = self.p, self.bb.shape[1]
         parts = [self._products(key) for key in keys]
         weight = p.independent / np.maximum(known.scale * p.count, 1e-300)
-        widths = [self.atoms[key].width for key in keys]
+        widths = [self._atom(key).width for key in keys]
         at = np.concatenate([[nb], nb + np.cumsum(widths)]).astype(int)
         n = int(at[-1]) + extra
         normal, right = np.zeros((n, n)), np.zeros(n)
@@ -552,7 +556,8 @@ class Search:
 
     def beam(self, most: int) -> Iterator[list[tuple[float, tuple[Key, ...]]]]:
         """Best sets of 1, 2, ... ``most`` effects: lists of cost and set, best first."""
-        wide, beam = self.criteria.beam, [(self.cost(()), ())]
+        wide, start = self.criteria.beam, tuple[Key, ...]()
+        beam = [(self.cost(start), start)]
         for _ in range(most):
             grown: Pool = {}
             for _, keys in beam:

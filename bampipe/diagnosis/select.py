@@ -250,6 +250,5 @@ def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
         }
     system = system_of(wider)
     start = np.array([known.get(q.name, q.prior) for q in system.parameters])
-    return np.clip(
-        start, [q.lower for q in system.parameters], [q.upper for q in system.parameters]
-    )
+    bounds = [q.lower for q in system.parameters], [q.upper for q in system.parameters]
+    return np.asarray(np.clip(start, *bounds))

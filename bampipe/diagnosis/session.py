@@ -308,7 +308,7 @@ class Fit:
         for of_replays, b, bias in zip(noise.residuals, noise.bias, self.bias, strict=True):
             rows = of_replays - b + bias
             rms.append(np.sqrt(np.mean(rows**2, axis=1)) if b.size else np.zeros(len(rows)))
-        return NoiseFloor.of_errors(np.array(rms).T)
+        return NoiseFloor.of_errors([*np.array(rms).T])
 
     @cached_property
     def stopping_rms(self) -> Array:

@@ -125,18 +125,6 @@ class NormalEquations:
             self.precision, self.known,
         )  # fmt: skip
 
-    def scaled(self, factor: Array) -> NormalEquations:
-        """The sums with every trial times its ``factor``, (K,)."""
-        by_axis = factor[:, None]
-        return NormalEquations(
-            self.xx * factor[:, None, None, None],
-            self.xy * factor[:, None, None],
-            self.yy * by_axis,
-            self.count * by_axis,
-            self.precision,
-            self.known,
-        )
-
     def solve(self, weight: Array, lower: Array, upper: Array) -> Array:
         """Weighted least squares over all trials within bounds, (P,); see `solve_bounded`.
 

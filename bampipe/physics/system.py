@@ -130,12 +130,6 @@ class System:
         return np.array([p.prior for p in self.parameters])
 
     @property
-    def remembers_force(self) -> bool:
-        """Whether the rate of an internal state depends on a measured force, as of a lag."""
-        used = self._memory_uses.get("u", ())
-        return any(self.inputs[i] in self.model.device.forces for i in used)
-
-    @property
     def undriven(self) -> tuple[str, ...]:
         """Coordinates that no measured force acts on, such as a pole that hangs on a cart."""
         n = len(self.coordinates)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,21 +69,12 @@ class Folds:
         """Whether there is one group only, so that the error is that of the fit."""
         return len(set(self.groups)) == 1
 
-    def among_fitted(self) -> Folds:
-        """The same without regard to the trials that the session holds out."""
-        return replace(self, judged=tuple(group != HELD_OUT for group in self.groups))
-
-    def with_all_fitted(self) -> Folds:
-        """The same with every trial fitted that the session does not hold out."""
-        return replace(self, fitted=tuple(group != HELD_OUT for group in self.groups))
-
     def solve(
         self,
         sums: NormalEquations,
         weight: Array,
         lower: Array,
         upper: Array,
-        own_weight: float = 0.0,
     ) -> tuple[Array, ...]:
         """Coefficients (P,) for each trial, fitted to the other groups.
 
@@ -93,18 +84,12 @@ class Folds:
         Args:
             sums: of all trials, linearised at the fit to the fitted ones.
             weight: of each axis, (n_q,); lower, upper: bounds of the coefficients, (P,).
-            own_weight: that a group keeps in its own fit; 0 leaves it out. A little of it keeps
-                coefficients that no other group determines from being extrapolated.
         """
         found: dict[int, Array] = {}
         for group in sorted(set(self.groups)):
             others = [k for k in self.fitted_trials if self.groups[k] != group]
             if others and not self.nothing_held_out:
-                own = [k for k in self.fitted_trials if self.groups[k] == group]
-                factor = np.isin(range(len(self.groups)), others) + own_weight * np.isin(
-                    range(len(self.groups)), own if group != HELD_OUT else []
-                )
-                found[group] = sums.scaled(factor).solve(weight, lower, upper)
+                found[group] = sums.subset(others).solve(weight, lower, upper)
             else:
                 found[group] = np.zeros(lower.size)
         return tuple(found[group] for group in self.groups)

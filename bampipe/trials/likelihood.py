@@ -108,7 +108,7 @@ class Noise:
         factor = np.linalg.lstsq(both, target, rcond=1e-6)[0][1] if len(y) else 0.0
         square = b**2 + (np.clip(factor, 0.0, _MOST_STOPPING) * c) ** 2
         count = np.maximum(np.bincount(at, minlength=_SPEEDS), 1)
-        return 0.5 * (square + (np.bincount(at, square, minlength=_SPEEDS) / count)[at])
+        return np.asarray(0.5 * (square + (np.bincount(at, square, minlength=_SPEEDS) / count)[at]))
 
     def without(self, replay: int) -> tuple[Array, ...]:
         """The bias by all replays but one."""

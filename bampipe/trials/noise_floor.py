@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.results.standing import standing
 from bampipe.trials.draw import ENOUGH_SAMPLES
 from bampipe.trials.motion import Motion, trial_sizes
 
@@ -40,11 +39,6 @@ class NoiseFloor:
         found = np.array(errors)
         level = np.median(found, axis=0)
         return cls(level, _SD_OF_DEVIATION * np.median(np.abs(found - level), axis=0), len(found))
-
-    def is_exceeded(self, error: Array) -> bool:
-        """Whether the error (n_q,) of some axis is above it."""
-        stands = map(standing, error.tolist(), self.level.tolist(), self.sd.tolist())
-        return "above_floor" in stands
 
 
 def floor_replays(motions: Sequence[Motion]) -> int:

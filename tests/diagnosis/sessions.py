@@ -12,6 +12,7 @@ from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
+from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import AxisFilter, Kinematics
 from bampipe.trials.measured import MeasuredTrials
@@ -52,6 +53,14 @@ def folds(count: int) -> Folds:
 def bam(effects: Sequence[str] = (), extra: Sequence[Mapping[str, Any]] = ()) -> Recipe:
     """The BAM with ``effects``."""
     return Recipe(registry.device("bam").declaration, tuple(effects), tuple(extra))
+
+
+def fit_trials(trials: MeasuredTrials, recipe: Recipe) -> Evidence:
+    """Least squares of the model of ``recipe`` on the measured trials, from its priors on."""
+    system = system_of(recipe)
+    return gather_evidence(
+        system, trials.motions, trials.band, system.prior, trials.folds, timing=trials.timing
+    )
 
 
 def made(

@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from sessions import BAND, KINEMATICS, SENSORS, folds, made
 
-from bampipe.discover import chance
-from bampipe.diagnosis.growth import _keeps_the_floor
-from bampipe.diagnosis.scorer import Scorer
-from bampipe.diagnosis.settings import Settings
+from bampipe.diagnosis.session import candidates_of, system_of
 from bampipe.diagnosis.shape import worst_windows
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
@@ -30,9 +27,9 @@ def bam_with_force(factor: float) -> Recipe:
 
 def column_size(recipe: Recipe, trials: MeasuredTrials) -> float:
     """Size of what a wrong gain of the force along the extension adds to its equation."""
-    system = chance.system_of(recipe)
+    system = system_of(recipe)
     evidence = gather_evidence(system, trials.motions, BAND, system.prior, trials.folds)
-    (item,) = chance.candidates_of(recipe, ["force_gain:z"])
+    (item,) = candidates_of(recipe, ["force_gain:z"])
     u = trials.motions[0].inputs(item.system.inputs)
     motion = trials.motions[0]
     p = np.append(evidence.p, 1.0)
@@ -47,19 +44,6 @@ def test_two_devices_of_one_name_have_their_own_candidates():
     thrice = column_size(bam_with_force(3.0), trials)
     assert thrice == pytest.approx(3.0 * once, rel=1e-9)
     assert column_size(bam_with_force(1.0), trials) == once
-
-
-def test_trials_are_held_no_longer_than_they_are_open(monkeypatch):
-    recipe = bam_with_force(1.0)
-    trials = made(recipe, {}, trials=2, seconds=4.0)
-    with chance.workers(trials, 1):
-        assert chance.open_trials() is trials
-    with pytest.raises(RuntimeError, match="no trials are open"):
-        chance.open_trials()
-    monkeypatch.setattr(chance, "_MOST_MODELS", 3)
-    for number in range(5):
-        chance.candidates_of(recipe, [f"force_gain:{'xyz'[number % 3]}", "force_bias:x"])
-        assert len(chance._candidates) <= 3
 
 
 @pytest.mark.parametrize(
@@ -78,27 +62,9 @@ def test_one_judgement_of_at_the_floor(error, floor, sd, expected):
     assert standing(error, floor, sd) == expected
 
 
-def test_an_effect_that_only_raises_the_floor_is_not_added():
-    trials = made(bam_with_force(1.0), {}, trials=2, seconds=4.0)
-    system = chance.system_of(bam_with_force(1.0))
-    evidence = gather_evidence(system, trials.motions, BAND, system.prior, folds(2))
-    error = Scorer(evidence).base_error
-
-    def replays(factor: float) -> list[chance.Replicate]:
-        none = np.zeros(0)
-        return [chance.Replicate(factor * error, factor * error, evidence.p, {}, none)] * 2
-
-    assert _keeps_the_floor(error, replays(1.0), error, replays(1.0), Settings())
-    assert not _keeps_the_floor(error, replays(100.0), error, replays(1.0), Settings())
-    assert _keeps_the_floor(error, replays(2.0), error, replays(1.9), Settings())
-    # A fifth of the noise is left: both sides of the equation were made small.
-    assert not _keeps_the_floor(error, replays(5.0), 8.0 * error, replays(5.0), Settings())
-    assert _keeps_the_floor(error, replays(5.0), error, replays(5.0), Settings())
-
-
 def test_every_axis_has_its_worst_window():
     trials = made(bam_with_force(1.0), {}, trials=2, seconds=4.0)
-    system = chance.system_of(bam_with_force(1.0))
+    system = system_of(bam_with_force(1.0))
     evidence = gather_evidence(system, trials.motions, BAND, system.prior, folds(2))
     found = worst_windows(evidence, count=1)
     assert sorted(window.axis for window in found) == sorted(system.coordinates)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from discover.sessions import TRUTH, bam, made
+from diagnosis.sessions import TRUTH, bam, made
 
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Dictionary, Key

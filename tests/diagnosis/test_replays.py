@@ -1,4 +1,4 @@
-"""The noise floor of long sessions, and what a replay needs."""
+"""Replays of a fitted model: what they need, what they share, and the bias that they show."""
 
 from __future__ import annotations
 
@@ -10,16 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 from independent_runs import record_trials
-from sessions import SENSORS, bam, made
 
 from bampipe.diagnosis.session import system_of
 from bampipe.estimate.least_squares import fit
 from bampipe.physics import Model, compile_model
-from bampipe.trials import draw, noise_floor, replay
+from bampipe.trials import draw, replay
 from bampipe.trials.bias import remove_bias
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.noise_floor import find_noise_floor, force_noise_through_offset
 from bampipe.trials.replay import StandIn, replay_motion
 from bampipe.trials.residuals import ModelOnTrial, problem_of
 
@@ -37,29 +35,6 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[MeasuredTrials, Ev
     )
     system = system_of(recipe)
     return trials, gather_evidence(system, trials.motions, trials.band, system.prior, trials.folds)
-
-
-def test_the_floor_of_a_long_session_comes_from_trials_drawn_from_it(
-    fitted, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trials, evidence = fitted
-    replayed: list[int] = []
-
-    def counted(*arguments: Any) -> Evidence:
-        replayed.append(len(arguments[0].motions))
-        return replay_evidence(*arguments)
-
-    replay_evidence = noise_floor.replay_evidence
-    monkeypatch.setattr(noise_floor, "replay_evidence", counted)
-    monkeypatch.setattr(draw, "LEAST_DRAWN", 2)
-    floors = []
-    for most in (10**6, 1400):
-        monkeypatch.setattr(draw, "ENOUGH_SAMPLES", most)
-        floors.append(
-            find_noise_floor(evidence, evidence.p, trials.sensors, trials.kinematics, 0, 3).level
-        )
-    assert replayed == [6, 6, 6, 4, 4, 4]
-    np.testing.assert_allclose(floors[1], floors[0], rtol=0.15)
 
 
 def test_the_bias_of_a_long_session_comes_with_what_the_trials_left_out_may_change(
@@ -150,26 +125,6 @@ def test_a_replay_leaves_out_the_moments_at_which_the_machine_stands_still(fitte
     np.testing.assert_array_equal(stored.left_out, replayed.left_out)
 
 
-def test_a_machine_that_stands_still_is_held_against_replays_that_do(tmp_path: Path) -> None:
-    """An axis at 1 kHz, whose friction stops it, and a device that lets it creep at 0.25 mm/s."""
-    trials, recipe, _ = record_trials(tmp_path, "axis", 88201, trials=2, seconds=8.0)
-    system = system_of(recipe)
-    evidence = gather_evidence(system, trials.motions, trials.band, system.prior, trials.folds)
-    narrow = system_of(recipe.with_sign_widths(noise_floor.STILL_WIDTH))
-    creeping, still = (
-        find_noise_floor(
-            evidence, evidence.p, trials.sensors, trials.kinematics, 0, 2, replayed=replayed
-        )
-        for replayed in (system, narrow)
-    )
-    error = evidence.held_out_rmse
-    assert creeping.is_exceeded(error)
-    assert not creeping.raised(still, error).is_exceeded(error)
-    # A machine may be in between, and is not above or below either then.
-    for far, level in ((3.0, still.level), (0.1, creeping.level), (0.9, 0.9 * still.level)):
-        np.testing.assert_array_equal(creeping.raised(still, far * still.level).level, level)
-
-
 @pytest.mark.parametrize("late", [0, 1.6, 3, -1.6, -3])
 def test_the_jumps_of_a_drive_that_acts_or_is_read_late_are_seen(late: float) -> None:
     """A joint that turns round under a controller that gives its motion, logged at another time."""
@@ -196,66 +151,6 @@ def test_the_jumps_of_a_drive_that_acts_or_is_read_late_are_seen(late: float) ->
     assert not replay._jumps(slow, built_up)
 
 
-@pytest.mark.parametrize(
-    ("robot", "kept", "stands", "error", "matters"),
-    [
-        ("arm", False, 1.5, 1.3, True),
-        ("arm", False, 1.1, 1.3, False),  # not clearly more
-        ("arm", False, 1.5, 4.0, False),  # next to nothing of what the model lacks
-        ("arm", True, 1.5, 1.3, False),
-        (None, True, 1.1, 4.0, True),  # machines of one axis are not probed
-    ],
-)
-def test_standing_still_matters_where_it_leaves_clearly_more(
-    robot, kept, stands, error, matters, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    left = {"creeps": 1.0, "stands": stands**2}
-    monkeypatch.setattr(noise_floor, "keep_motion", lambda fitted: kept)
-    monkeypatch.setattr(
-        noise_floor, "_mean_square_of_own_motion",
-        lambda evidence, moved, *_: np.array([left["creeps"], left[getattr(moved, "name", moved)]]),
-    )  # fmt: skip
-    system = SimpleNamespace(
-        name="creeps", model=SimpleNamespace(device=SimpleNamespace(robot=robot))
-    )
-    evidence = SimpleNamespace(
-        system=system, fitted=(), sizes=[100], motions=[None],
-        held_out_rmse=np.array([1.0, error]),
-    )  # fmt: skip
-    floor = noise_floor.NoiseFloor(np.ones(2), np.zeros(2), 1)
-    sensors = SimpleNamespace(rate_hz=100.0)
-    found = noise_floor.standing_still_matters(evidence, lambda: "stands", sensors, None, floor)
-    assert found is matters
-
-
-@pytest.mark.parametrize(
-    ("sizes", "probed"),
-    [
-        ([9000, 5000, 8000], [0, 1, 2]),  # the second, alone, may not turn round slowly once
-        ([40_000] * 4, [0, 1, 2, 3]),
-        ([20_000] * 10, [1, 4, 7]),
-        ([20_000] * 12, [2, 6, 10]),
-    ],
-)
-def test_standing_still_is_probed_on_trials_spread_over_a_session(
-    sizes, probed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen = []
-    monkeypatch.setattr(noise_floor, "keep_motion", lambda fitted: False)
-    monkeypatch.setattr(
-        noise_floor, "_mean_square_of_own_motion",
-        lambda evidence, moved, motions, *_: seen.append(motions) or np.ones(1),
-    )  # fmt: skip
-    system = SimpleNamespace(model=SimpleNamespace(device=SimpleNamespace(robot="arm")))
-    evidence = SimpleNamespace(
-        system=system, fitted=(), sizes=sizes, motions=list(range(len(sizes))),
-        held_out_rmse=np.ones(1),
-    )  # fmt: skip
-    floor = noise_floor.NoiseFloor(np.ones(1), np.zeros(1), 1)
-    noise_floor.standing_still_matters(evidence, lambda: system, None, None, floor)
-    assert seen == [probed, probed]
-
-
 @pytest.mark.parametrize("machine", ["axis", "joint"])
 def test_a_replay_of_a_late_motor_leaves_what_the_measurement_leaves(machine, tmp_path) -> None:
     """By another simulator; moved by time derivatives within the band, it was up to 27 % off."""
@@ -266,7 +161,7 @@ def test_a_replay_of_a_late_motor_leaves_what_the_measurement_leaves(machine, tm
     system = system_of(late)
     start = system.prior.copy()
     start[-1] = 0.005
-    p = fit_trials(trials, late, start).p
+    p = gather_evidence(system, trials.motions, trials.band, start, trials.folds).p
     stand_in = StandIn(system, p, trials.motions, trials.sensors.rate_hz)
     for number, measured in enumerate(trials.motions):
         rng = np.random.default_rng(1)
@@ -291,18 +186,3 @@ def test_how_late_a_force_acts_is_read_off_the_model(fitted, effect, late) -> No
     motion = motion.with_channels(derivatives | dict(motion.channels))
     found = replay._lateness(ModelOnTrial(system, p, [motion]), motion.inputs(system.inputs))
     np.testing.assert_allclose(found, [late], atol=1e-9)
-
-
-def test_most_of_the_floor_of_play_is_noise_of_the_force_through_it() -> None:
-    """Of the axis with play alone, and as much as it leaves: without play there is none."""
-    recipe = bam(["backlash:yaw"])
-    values = {"backlash.yaw.gap": 0.03, "backlash.yaw.closing": 1.4}
-    session = made(recipe, values, trials=3)
-    system = system_of(recipe)
-    start = np.array([values.get(item.name, item.prior) for item in system.parameters])
-    evidence = fit_trials(session, recipe, start)
-    share = force_noise_through_offset(evidence, SENSORS) / evidence.rmse() ** 2
-    assert 0.5 < share[0] < 1.1
-    assert share[1:].max() < 0.5
-    bare = fit_trials(session, bam(), system_of(bam()).prior)
-    assert not force_noise_through_offset(bare, SENSORS).any()
