@@ -311,13 +311,10 @@ class Fit:
             rms.append(np.sqrt(np.mean(rows**2, axis=1)) if b.size else np.zeros(len(rows)))
         return NoiseFloor.of_errors([*np.array(rms).T])
 
-    @cached_property
-    def stopping_rms(self) -> Array:
-        """Of the bias, what friction that stops the machine leaves, by axis, (n_q,), N.m or N."""
-        n_q = len(self.likelihood.samples)
-        factors = (self.problem.to_parameters @ self.solved.base)[-n_q:]
-        pairs = zip(self.likelihood.noise.stopping, factors, strict=True)
-        return np.array([rms(factor * c) for c, factor in pairs])
+    @property
+    def creeping_floor(self) -> Array:
+        """The error of replays that creep where they turn, as the device says, (n_q,), N.m or N."""
+        return np.array([rms(rows) for rows in self.likelihood.noise.residuals])
 
     @cached_property
     def rows_beyond_bias(self) -> tuple[Array, ...]:

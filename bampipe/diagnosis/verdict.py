@@ -47,7 +47,9 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
     p_values = {e: chance_of(drop, selection.chance) for e, drop in weighed.drops.items()}
     # Of what chance gives as well, nothing is sure.
     probability = {
-        e: min(share, 1.0) if p_values.get(e, 0.0) <= c.significance else min(share, 1.0 - p_values[e])
+        e: min(share, 1.0)
+        if p_values.get(e, 0.0) <= c.significance
+        else min(share, 1.0 - p_values[e])
         for e, share in weighed.effects.items()
     }
     where = {e: effect_axes(initial, final, e) for e in probability}
