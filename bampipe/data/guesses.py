@@ -6,17 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import oaconvolve
 
 from bampipe.data.angle_torque import AngleTorque, angle_torque, least_squares
 from bampipe.data.quality.clock import rate_of
 from bampipe.data.session import SECONDS
+from bampipe.data.smoothing import SmoothedMotion
 
 RATES_HZ = (4.0, 30_000.0)
 """Sample rates at which motion is logged."""
-
-_SMOOTHED_S = 0.06
-"""Length of the window over which motion and input are smoothed before they are compared, s."""
 
 _NICE = (1, 1.2, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 7.5, 8)
 
@@ -95,24 +92,12 @@ def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False
         t: (T,) s; q: (T,) position; column: (T,).
         angle: whether the position is an angle in rad, on which gravity may depend.
     """
-    step = float(np.median(np.diff(t)))
-    width = max(5, round(_SMOOTHED_S / step) | 1)
-    if len(t) < 4 * width + 20:
+    motion = SmoothedMotion.of(t, q)
+    if motion is None:
         return Driven(0.0)
-    window = np.hanning(width + 2)[1:-1] / np.hanning(width + 2).sum()
-
-    def smoothed(values: np.ndarray) -> np.ndarray:
-        return np.asarray(oaconvolve(values, window, "same"))
-
-    smooth = smoothed(q)
-    qd = np.gradient(smooth, step)
-    qdd = np.gradient(qd, step)
-    inner = slice(2 * width, -2 * width or None)
-    # Both sides alike: what one filter takes off the motion, it takes off the column too.
-    sides = [smoothed(qdd), smoothed(qd), smoothed(np.sign(qd)), np.ones_like(q)]
-    moving = np.column_stack(sides)[inner]
-    position = smoothed(smooth)[inner]
-    target = smoothed(smoothed(column))[inner]
+    moving = np.column_stack([motion.moving, np.ones_like(q)])[motion.inner]
+    position = motion.position[motion.inner]
+    target = motion.smooth(column)[motion.inner]
     spread = float(np.sum((target - target.mean()) ** 2)) if len(target) else 0.0
     if spread == 0.0:
         return Driven(0.0)

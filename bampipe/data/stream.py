@@ -71,10 +71,11 @@ class StreamLayout:
                 where=where,
                 remedy="log the position",
             )
-        wrapped = [channel.name for channel in session.channels if channel.wrap_bits]
-        if wrapped:
+        registers = [e.name for e in (*session.encoders, *session.channels) if e.sign_bit]
+        registers += [channel.name for channel in session.channels if channel.wrap_bits]
+        if registers:
             raise InputError(
-                f"channel {wrapped[0]} is a register that wraps, which a stream cannot undo",
+                f"{registers[0]} is a register that holds a sign, which a stream cannot undo",
                 where=where,
                 remedy="log it as a signed number",
             )

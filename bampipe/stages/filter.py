@@ -173,11 +173,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     setup = _inspect(system, out, session, names, free - held_out, bands, disturbances)
     setup.write(out)
     notes = [f"{name}: not used: {reason}" for name, reason in written.skipped.items()]
-    notes += [
-        f"{name}: {one.start_s:.1f} to {one.end_s:.1f} s left out: {one.reason}"
-        for name, stretches in disturbances.items()
-        for one in stretches
-    ]
+    for name, stretches in disturbances.items():
+        for reason in dict.fromkeys(one.reason for one in stretches):
+            of_it = [one for one in stretches if one.reason == reason]
+            where = f"{of_it[0].start_s:.1f} to {of_it[-1].end_s:.1f} s"
+            if len(of_it) > 1:
+                lasting = sum(one.end_s - one.start_s for one in of_it)
+                where = f"{len(of_it)} stretches, {lasting:.1f} s in all,"
+            notes.append(f"{name}: {where} left out: {reason}")
     return result.write(out) | {"setup": list(setup.lines), "notes": notes}
 
 

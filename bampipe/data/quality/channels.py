@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bampipe.data.quality.table import TrialTable, counted, in_rows, longest_run
-from bampipe.data.session import SECONDS, Channel, Session
+from bampipe.data.session import SECONDS, Channel, Encoder, Session
 from bampipe.data.session.channels import LARGEST_CONDITION
 from bampipe.data.units import unit
 from bampipe.errors import InputError
@@ -192,20 +192,22 @@ def part_readings(session: Session, si: dict[str, np.ndarray]) -> None:
         si[f"q_{axis}"] = values
 
 
-def to_signed(table: TrialTable, channel: Channel) -> None:
+def to_signed(table: TrialTable, register: Channel | Encoder) -> None:
     """Read the unsigned register of a signed number as what it stands for."""
-    if not channel.wrap_bits:
+    two, bit = getattr(register, "wrap_bits", None), register.sign_bit
+    if two is None and bit is None:
         return
-    period = 2.0**channel.wrap_bits
-    values = table.columns[channel.column]
+    period = 2.0**two if two is not None else 2.0 ** (bit + 1)
+    values = table.columns[register.column]
     beyond = (values < 0.0) | (values >= period)
     table.refuse(
         beyond,
         lambda at: f"found {values[at]:g}, expected 0 to {period - 1.0:.0f}",
-        column=channel.column,
-        remedy="a column that is signed already needs no wrap_bits",
+        column=register.column,
+        remedy="a column that is signed already needs no wrap_bits and no sign_bit",
     )
-    values[values >= 0.5 * period] -= period
+    negative = values >= 0.5 * period
+    values[negative] = values[negative] - period if bit is None else 0.5 * period - values[negative]
 
 
 def _refuse_wild(table: TrialTable, values: np.ndarray, words: str, column: str) -> None:
