@@ -28,6 +28,7 @@ from bampipe.proposal.encoders import encoders_table
 from bampipe.proposal.inputs import input_tables
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import Notes, quoted
+from bampipe.proposal.readings import fresh_readings, signed_readings
 from bampipe.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
 from bampipe.proposal.trials import trials_tables
 
@@ -70,11 +71,11 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
             where=str(folder),
             remedy=f"it is left alone; to run it: bampipe run {folder}",
         )
-    found = survey(folder, names)
     notes = Notes()
+    found, registers = signed_readings(fresh_readings(survey(folder, names), notes))
     chosen = find_device(folder, found, device)
     clock = clock_of(found, notes)
-    match = Matcher(found, clock.t, set(clock.columns))
+    match = Matcher(found, clock.t, set(clock.columns), registers)
     if chosen is None:
         chosen = new_device(folder, match, notes)
         positions = len([c for c in found.of("position") if not c.is_constant])

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 UNKNOWN = "?"
 """Stands for a column that could not be found."""
+COLUMNS = "see the headers of the logs, or who wrote the logger"
+"""Where the name of a column is looked up."""
 
 
 @dataclass
@@ -26,9 +28,9 @@ class Notes:
             self.check.append(text)
         return f"  # guess: {text}"
 
-    def ask(self, text: str) -> str:
-        """The comment that marks what a person must fill in."""
-        self.fill_in.append(text)
+    def ask(self, text: str, where: str) -> str:
+        """The comment that marks what a person must fill in, and where to look it up."""
+        self.fill_in.append(f"{text}: {where}")
         return f"  # fill in: {text}"
 
 

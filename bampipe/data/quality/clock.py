@@ -20,7 +20,7 @@ _SEAM = 3.0
 
 
 def keep_fresh_rows(table: TrialTable) -> None:
-    """Drop rows that repeat the positions of the row before: the logger is faster than its source."""
+    """Drop rows that repeat the positions before them: a logger is faster than its source."""
     encoders = table.session.encoders
     kept = find_fresh_rows([table.columns[encoder.column] for encoder in encoders])
     if kept is not None:

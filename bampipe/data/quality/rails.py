@@ -36,10 +36,9 @@ def find_rails(values: np.ndarray) -> dict[float, Flags]:
         (levels[-1], counts[-1], counts[-1 - _BESIDE : -1]),
         (levels[0], counts[0], counts[1 : 1 + _BESIDE]),
     ):
-        at_rail = values == rail
-        if len(beside) > 1 and pile > _TIMES_BESIDE * beside.max():
-            if longest_run(at_rail)[1] >= _LONGEST_RUN:
-                rails[float(rail)] = at_rail
+        at_rail, piled = values == rail, len(beside) > 1 and pile > _TIMES_BESIDE * beside.max()
+        if piled and longest_run(at_rail)[1] >= _LONGEST_RUN:
+            rails[float(rail)] = at_rail
     return rails
 
 

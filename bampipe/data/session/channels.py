@@ -68,8 +68,8 @@ SignBit = Annotated[
     Field(
         ge=1,
         le=62,
-        description="The column is a register whose bit of this number, from 0, stands for minus and"
-        " whose lower bits are the magnitude, as 15 of a Feetech servo's position",
+        description="The column is a register whose bit of this number, from 0, stands for minus"
+        " and whose lower bits are the magnitude, such as 15",
     ),
 ]
 Columns = Annotated[Distinct[Column], Field(min_length=1, description="Columns of the trial files")]
@@ -512,7 +512,12 @@ class Channel(NamedDeclaration):
     @property
     def raw_unit(self) -> str:
         """Unit of the column, "" where the session file rescales it."""
-        rescaled = {"stated_scale", "stated_offset", "wrap_bits", "sign_bit"} & self.model_fields_set
+        rescaled = {
+            "stated_scale",
+            "stated_offset",
+            "wrap_bits",
+            "sign_bit",
+        } & self.model_fields_set
         return "" if rescaled else self.stated_unit
 
     def cross_faults(self) -> Iterator[InputError]:
