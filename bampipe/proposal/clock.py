@@ -65,18 +65,21 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
     counter = not _COUNTERS.isdisjoint(words(column.name))
     kind = "" if counter else guesses.time_unit(stamps, column.unit)
     if not kind:
-        step = float(np.median(np.diff(stamps)))
-        note = notes.ask(
-            f"ticks_per_s, what {column.name} counts in a second, and sample_rate_hz, a"
-            f" {step:g}th of it",
-            "the clock of the timer or processor in its data sheet or firmware, or the last stamp"
-            " less the first over the seconds that the recording took",
-        )
-        lines = (named, 'unit = "ticks"', f"ticks_per_s = 0.0{note}")
+        if counter:
+            step = float(np.median(np.diff(stamps)))
+            note = notes.ask(
+                f"ticks_per_s, what {column.name} counts in a second, and sample_rate_hz, a"
+                f" {step:.3g}th of it",
+                "the clock of the timer or processor, in its data sheet or firmware; else what it"
+                " counted over the seconds that the recording took",
+            )
+            lines = (named, 'unit = "ticks"', f"ticks_per_s = 0.0{note}")
+        else:
+            note = notes.ask("the unit of time: no unit gives a likely rate", _OF_ROWS)
+            lines = (named, f'unit = "{UNKNOWN}"{note}')
+        rate = f'sample_rate_hz = "{UNKNOWN}"'
         samples = np.arange(len(stamps)) / _LIKELY_RATE_HZ
-        return ProposedClock(
-            samples, (column.name,), _table(*lines), f'sample_rate_hz = "{UNKNOWN}"'
-        )
+        return ProposedClock(samples, (column.name,), _table(*lines), rate)
     t = stamps * SECONDS.get(kind, 1.0)
     said = kind == "datetime" or spelled(column.unit, tuple(SECONDS)) == kind
     note = "" if said else notes.guess(f"time in {kind}, by the rate that it gives")

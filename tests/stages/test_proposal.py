@@ -31,6 +31,7 @@ from bampipe.physics import registry
 from bampipe.physics.units import check_device
 from bampipe.progress import silent
 from bampipe.proposal import propose, write_proposal
+from bampipe.proposal.notes import COLUMNS
 from bampipe.proposal.starter import starter_device
 from bampipe.proposal.starter_input import Drive
 from bampipe.stages import ingest
@@ -372,7 +373,8 @@ def test_a_clock_named_by_its_unit(tmp_path):
 def test_a_rate_that_nobody_knows_is_refused_until_it_is_given(tmp_path):
     write_stage_log(tmp_path / "a", "pos_mm", "load_cell_N")
     _, proposal = proposed(tmp_path / "a")
-    assert proposal.fill_in == ["sample_rate_hz, the true rate"]
+    (ask,) = proposal.fill_in
+    assert ask.startswith("sample_rate_hz, rows a second: ")
     with pytest.raises(InputError, match=r'sample_rate_hz: found "\?"'):
         read_session(tmp_path / "a")
 
@@ -391,7 +393,7 @@ def test_a_force_that_is_not_there_is_asked_for_where_it_is_read(tmp_path, comma
     header = "time [s],position [rad],current [A]"
     np.savetxt(tmp_path / "a.csv", table, fmt="%.6f", delimiter=",", header=header, comments="")
     session, proposal = proposed(tmp_path)
-    assert proposal.fill_in == ["the column of force_drive in N.m"]
+    assert proposal.fill_in == ["the column of force_drive in N.m: " + COLUMNS]
     assert session["force"] == {"columns": ["?"], "components": ["drive"], "unit": "N.m"}
     code, _, err = command("ingest", tmp_path)
     assert code == 2 and "fill in the name of the column" in err
@@ -567,7 +569,8 @@ def test_a_torque_in_per_cent_asks_for_its_gain(tmp_path):
     write_table(tmp_path / "a.csv", labelled("t,angle_deg,w,torque_percent", q=57.29578, u=20.0))
     session, proposal = proposed(tmp_path)
     assert session["force"]["unit"] == "V" and session["force"]["calibration_n_per_v"] == [[0.0]]
-    assert proposal.fill_in == ['calibration_n_per_v, N.m for one of "torque_percent"']
+    (ask,) = proposal.fill_in
+    assert ask.startswith('calibration_n_per_v, N.m for one of "torque_percent": ')
 
 
 def test_names_can_be_given_to_a_log_without_a_header(tmp_path, command: Command):
@@ -597,7 +600,8 @@ def test_a_load_in_a_register_is_no_force(tmp_path, beside: str, role: str):
     (drive,) = (c for c in session["channels"].values() if c["column"] == "load")
     assert drive["wrap_bits"] == 16 and drive["signed"]
     if beside:
-        assert proposal.fill_in == ["the scale of duty, 1 over full duty"]
+        (ask,) = proposal.fill_in
+        assert ask.startswith("the scale of duty, 1 over the reading of load at full duty")
     else:
         said = "a signed register of 16 bits: give its scale"
         assert any(said in line for line in proposal.check)

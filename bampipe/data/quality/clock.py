@@ -15,6 +15,8 @@ _GAP = 1.6
 _SMOOTHER = 0.8
 """Of the travel of the positions in the order of the file, in that of the stamps: below, rows were
 written late; above, the clock was set back."""
+_UNLIKELY_TWICE = 0.1
+"""Share of stamps that stand twice once rows are sorted, from which two recordings are mixed."""
 _SEAM = 3.0
 """Times the largest step of a position, over which it goes on where a clock was set back."""
 
@@ -119,16 +121,20 @@ def put_in_order(table: TrialTable) -> None:
             np.abs(np.diff(positions[:, which])).sum() for which in (np.r_[rows], place)
         )
         falls = start + np.flatnonzero(np.diff(t[rows]) < 0.0)
-        if as_stamped < _SMOOTHER * as_written:
+        # Two recordings one after the other fall once, and their stamps are the same.
+        late_rows = len(falls) > 1 and np.mean(np.diff(t[place]) == 0.0) < _UNLIKELY_TWICE
+        if late_rows and as_stamped < _SMOOTHER * as_written:
             order[rows] = place
             late += int(np.sum(place != np.arange(start, stop + 1)))
-        elif len(falls) == 1 and _goes_on(positions, int(falls[0])):
-            at = int(falls[0])
-            size = t[at] - t[at + 1] + float(np.median(np.diff(t)))
-            t[at + 1 :] += size
-            table.repairs.append(
-                f"the clock is set back by {size:.3g} s at row {table.rows[at + 1]}: bridged"
-            )
+        elif len(falls) == 1:
+            at, step = int(falls[0]), float(np.median(np.diff(t)))
+            size = t[at] - t[at + 1] + step
+            # After a lone stamp that is wrong, the clock is where it was.
+            if (stop - at) * step > 0.5 * size and _goes_on(positions, at):
+                t[at + 1 :] += size
+                table.repairs.append(
+                    f"the clock is set back by {size:.3g} s at row {table.rows[at + 1]}: bridged"
+                )
     if late:
         table.keep(order)
         table.repairs.append(f"{in_rows(late)} written out of order sorted by their time stamps")

@@ -17,6 +17,8 @@ _NEAR_ROLL = 5.0
 """Steps within which a stamp that rolled over goes on where the one before stopped."""
 _OF_ONE_LATTICE = 1e-3
 """Of the mean step: what may be a rounding of numbers in the file."""
+_UNEVEN = 0.05
+"""Share of the steps that rounding makes unlike the others, the least."""
 _LEAST_HELD = 0.15
 """Share of rows that are held, the least."""
 _REGULAR = 0.7
@@ -70,15 +72,19 @@ def spread_stamps(t: Array) -> tuple[Array, float]:
         or do not tell.
     """
     steps = np.diff(t)
-    step = float(t[-1] - t[0]) / max(len(steps), 1)
+    step = float(np.sum(steps)) / max(len(steps), 1)
     if len(t) < 8 or not step > 0.0 or steps.min() < 0.0:
+        return t, 0.0
+    # Where few steps are unlike the others, samples are lost or stand twice.
+    if np.mean(np.abs(steps - np.median(steps)) > COARSEST_STAMP * step) < _UNEVEN:
         return t, 0.0
     lengths = np.unique(np.concatenate([[0.0], steps]))
     gaps = np.diff(lengths)
     gaps = gaps[gaps > _OF_ONE_LATTICE * step]
     rounding = float(gaps.min()) if len(gaps) else 0.0
-    on_lattice = np.abs(steps / rounding - np.rint(steps / rounding)) < 0.1 if rounding else False
-    if rounding < COARSEST_STAMP * step or not np.all(on_lattice) or np.ptp(steps) < 0.5 * rounding:
+    if rounding < COARSEST_STAMP * step:
+        return t, 0.0
+    if np.any(np.abs(steps / rounding - np.rint(steps / rounding)) > 0.1):
         return t, 0.0
     rows = np.arange(len(t), dtype=np.float64)
     slope, start = np.polyfit(rows, t - t[0], 1)
