@@ -235,9 +235,9 @@ def find_register(values: np.ndarray) -> Register | None:
     if bit < _LEAST_SIGN_BIT or min(len(above), len(below)) < 3:
         return None
     leaps, steps = (np.abs(np.diff(v)) for v in (known, register.signed(known)))
-    # A gap below the bit that no reading crosses; or, of what fills it, a path that is smooth.
+    # A gap below the bit that no reading crosses; or, of what fills it, no leap.
     empty = max(above.max(), below.max()) < _SIGN_GAP * half
-    return register if empty or steps.sum() < 0.5 * leaps.sum() else None
+    return register if empty or steps.max() < 0.5 * leaps.max() else None
 
 
 def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:

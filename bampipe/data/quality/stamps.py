@@ -76,7 +76,8 @@ def spread_stamps(t: Array) -> tuple[Array, float]:
     if len(t) < 8 or not step > 0.0 or steps.min() < 0.0:
         return t, 0.0
     # Where few steps are unlike the others, samples are lost or stand twice.
-    if np.mean(np.abs(steps - np.median(steps)) > COARSEST_STAMP * step) < _UNEVEN:
+    usual = float(np.median(steps))
+    if usual > 0.0 and np.mean(np.abs(steps - usual) > COARSEST_STAMP * step) < _UNEVEN:
         return t, 0.0
     lengths = np.unique(np.concatenate([[0.0], steps]))
     gaps = np.diff(lengths)
