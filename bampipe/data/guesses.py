@@ -161,7 +161,7 @@ def find_turning(t: np.ndarray, q: np.ndarray, drive: np.ndarray) -> Turning | N
         return float(rest @ rest)
 
     # What an angle spans, by its logarithm: from half a radian to two turns.
-    tried = np.linspace(*np.log(_SPANS), 60)
+    tried = np.linspace(math.log(_SPANS[0]), math.log(_SPANS[1]), 60)
     costs = [left(x) for x in tried]
     best = int(np.argmin(costs))
     if best in (0, len(tried) - 1):

@@ -71,8 +71,8 @@ class StreamLayout:
                 where=where,
                 remedy="log the position",
             )
-        registers = [e.name for e in (*session.encoders, *session.channels) if e.sign_bit]
-        registers += [channel.name for channel in session.channels if channel.wrap_bits]
+        registers = [encoder.name for encoder in session.encoders if encoder.sign_bit]
+        registers += [c.name for c in session.channels if c.sign_bit or c.wrap_bits]
         if registers:
             raise InputError(
                 f"{registers[0]} is a register that holds a sign, which a stream cannot undo",

@@ -73,19 +73,18 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
                 "the clock of the timer or processor, in its data sheet or firmware; else what it"
                 " counted over the seconds that the recording took",
             )
-            lines = (named, 'unit = "ticks"', f"ticks_per_s = 0.0{note}")
+            table = _table(named, 'unit = "ticks"', f"ticks_per_s = 0.0{note}")
         else:
             note = notes.ask("the unit of time: no unit gives a likely rate", _OF_ROWS)
-            lines = (named, f'unit = "{UNKNOWN}"{note}')
+            table = _table(named, f'unit = "{UNKNOWN}"{note}')
         rate = f'sample_rate_hz = "{UNKNOWN}"'
         samples = np.arange(len(stamps)) / _LIKELY_RATE_HZ
-        return ProposedClock(samples, (column.name,), _table(*lines), rate)
+        return ProposedClock(samples, (column.name,), table, rate)
     t = stamps * SECONDS.get(kind, 1.0)
     said = kind == "datetime" or spelled(column.unit, tuple(SECONDS)) == kind
     note = "" if said else notes.guess(f"time in {kind}, by the rate that it gives")
-    lines = (named, f'unit = "{kind}"{note}')
     rate = _stamped_rate(guesses.sample_rate(t), notes)
-    return ProposedClock(t, (column.name,), _table(*lines), rate)
+    return ProposedClock(t, (column.name,), _table(named, f'unit = "{kind}"{note}'), rate)
 
 
 def _in_two_columns(seconds: SurveyedColumn, rest: SurveyedColumn, notes: Notes) -> ProposedClock:

@@ -58,7 +58,7 @@ def find_force_offsets(
     for number in range(len(motions)):
         one = stacked.get(number) or stacked_residual(problem, number, found.p)
         trials[number] = _Trial.of(system, motions[number], band, one, found.p[:-1], size)
-    own = sum(trials[k].without_offset for k in fitted)
+    own = np.sum([trials[k].without_offset for k in fitted], axis=0)
     step = np.linalg.lstsq(own[:-1, :-1], -own[:-1, -1], rcond=1e-9)[0]
     if not _still_told([trials[k] for k in fitted], own):
         return {}
@@ -115,7 +115,8 @@ class _Trial:
         parts = np.array_split(np.arange(target.size), _PARTS)
         each = [np.linalg.lstsq(self.map[k], target[k], rcond=1e-9)[0] for k in parts]
         error = np.std(each, axis=0, ddof=1) / np.sqrt(_PARTS)
-        return np.linalg.lstsq(self.map, target, rcond=1e-9)[0], np.maximum(error, 1e-300)
+        whole = np.linalg.lstsq(self.map, target, rcond=1e-9)[0]
+        return np.asarray(whole), np.maximum(error, 1e-300)
 
     def left(self, step: Array) -> float:
         """Sum of squares beside its offsets."""

@@ -195,9 +195,12 @@ def part_readings(session: Session, si: dict[str, np.ndarray]) -> None:
 def to_signed(table: TrialTable, register: Channel | Encoder) -> None:
     """Read the unsigned register of a signed number as what it stands for."""
     two, bit = getattr(register, "wrap_bits", None), register.sign_bit
-    if two is None and bit is None:
+    if bit is not None:
+        period = 2.0 ** (bit + 1)
+    elif two is not None:
+        period = 2.0**two
+    else:
         return
-    period = 2.0**two if two is not None else 2.0 ** (bit + 1)
     values = table.columns[register.column]
     beyond = (values < 0.0) | (values >= period)
     table.refuse(
