@@ -110,7 +110,7 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
     return ProposedSession(
         session="\n".join(lines) + "\n",
         device=chosen.text,
-        fill_in=notes.fill_in,
+        fill_in=notes.questions,
         check=notes.check,
         passed=[f"{name}: {reason.removeprefix(f'{name}: ')}" for name, reason in found.passed],
     )

@@ -235,8 +235,9 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     starter = starter_device(position.name, linear, drive, fit, weight, width)
     kind = "linear" if linear else "rotary"
     doubt = "" if linear or position.conversion is not None else _MAY_SLIDE
+    what = "torque" if role == "force" and not linear else role
     notes.check.append(
-        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}{doubt}; put in what you"
+        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {what}{doubt}; put in what you"
         " know of it"
     )
     for constant in starter.placeholders:

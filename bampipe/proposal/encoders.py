@@ -10,7 +10,7 @@ from bampipe.data.units import spelled, unit
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.proposal.matching import Matcher
-from bampipe.proposal.notes import COLUMNS, UNKNOWN, Notes, bare, entry, quoted
+from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
 from bampipe.proposal.positions import in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
@@ -27,7 +27,7 @@ def encoders_table(
     for axis in device.coordinates:
         column = measured_position(axis.name, len(device.coordinates), match, notes)
         if column is None:
-            note = notes.ask(f"the column of the position of {axis.name}", COLUMNS)
+            note = notes.ask_column(f"the position of {axis.name}", axis.unit)
             lines.append(f"{axis.name} = {entry(UNKNOWN, axis.unit)}{note}")
             continue
         axes[axis.name] = column

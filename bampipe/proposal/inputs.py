@@ -12,7 +12,7 @@ from bampipe.data.units import spelled, unit
 from bampipe.physics.device import Device
 from bampipe.proposal.device import ChosenDevice
 from bampipe.proposal.matching import Match, Matcher
-from bampipe.proposal.notes import COLUMNS, UNKNOWN, Notes, bare, entry, quoted
+from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
 
 _FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "V")
 _SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])
@@ -67,8 +67,7 @@ def _open_force_table(device: Device, notes: Notes) -> list[str]:
     which = " and ".join(device.forces)
     return [
         "[force]",
-        f"columns = [{unknown}]"
-        + notes.ask(f"the column of {which} in {device.force_unit}", COLUMNS),
+        f"columns = [{unknown}]" + notes.ask_column(which, device.force_unit),
         f"components = [{components}]",
         f'unit = "{device.force_unit}"',
         "",
@@ -83,7 +82,10 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
     names = ", ".join(quoted(column.name) for column in columns)
     if known is not None and known.si == device.force_unit and common:
         stated = all(column.stated for column in columns)
-        return [f'unit = "{common}"' + ("" if stated else notes.guess(f"force in {known.si}"))]
+        return [
+            f'unit = "{common}"'
+            + ("" if stated else notes.guess(f"{names} is a {_QUANTITY[known.si]} in {common}"))
+        ]
     needs_gain = any(_needs_gain(column) for column in columns)
     if common == "V" or needs_gain:
         row = f"[{', '.join(['0.0'] * len(columns))}]"
@@ -94,7 +96,7 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             "the sensor's certificate or the driver's manual, or hang a known weight on it",
         )
         if needs_gain:
-            volts = notes.guess(f"{names} is no force yet: as a voltage it gets a gain")
+            volts = notes.guess(f"{names} counts or is a share: like volts it gets a calibration")
             zero = notes.guess(f"{names} is 0 without force")
         else:
             volts = notes.guess("the force channels are volts, by their names")
@@ -151,8 +153,7 @@ def _channels_table(
     for name, si in wanted.items():
         column, why = given[name]
         if column is None:
-            note = notes.ask(f"the column of {name}" + (f" in {si}" if si else ""), COLUMNS)
-            lines.append(f"{name} = {entry(UNKNOWN, si)}{note}")
+            lines.append(f"{name} = {entry(UNKNOWN, si)}{notes.ask_column(name, si)}")
             continue
         match.used.add(column.name)
         lines.append(f"{name} = {_channel(name, si, column, why, match, notes)}")

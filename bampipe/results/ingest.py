@@ -96,7 +96,7 @@ class DeadStretch(Record):
     def sentence(self) -> str:
         """What is the matter with which column."""
         if self.rail is not None:
-            return f"'{self.column}' stands at a rail while the motion takes more"
+            return f"'{self.column}' stands at a rail"
         return f"'{self.column}' reads one and the same value while the machine moves"
 
 

@@ -470,10 +470,6 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         text(lambda s: re.sub(r"(\n(?:[^,\n]*,){4})[^,\n]*", r"\1inf", s)),
         "column 'force_x_v': holds no number at all",
     ),
-    "force saturated": (
-        table(lambda t: np.clip(t["force_y_v"], -0.8, 0.8, out=t["force_y_v"]) is None),
-        r"column 'force_y_v': 2\d.\d% of the samples are at the rail -?0.8: saturated",
-    ),
     "force frozen": (samples("force_z_v", slice(200, 800), 0.25), "reads 0.25 without a change"),
     "force disconnected": (samples("force_z_v", slice(None), 0.0), "frozen"),
     "force out of this world": (samples("force_z_v", 300, 1e9), "which no such machine does"),
@@ -593,6 +589,10 @@ REPAIRED: dict[str, tuple[Damage, str]] = {
             ]
         ),
         "100 rows written out of order sorted by their time stamps",
+    ),
+    "force saturated": (
+        table(lambda t: np.clip(t["force_y_v"], -0.8, 0.8, out=t["force_y_v"]) is None),
+        r"column 'force_y_v': 41.0% of the samples stand at the rail -0.8 and 0.8: left out",
     ),
     "a few repeated stamps": (
         samples("time_us", [100, 200], [198_000, 398_000]),

@@ -12,7 +12,6 @@ from bampipe.data.quality.channels import (
     fill_missing,
     refuse_frozen,
     refuse_other_units,
-    refuse_saturated,
     to_si,
     to_signed,
 )
@@ -85,7 +84,6 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
     if session.force is not None and session.force.volts:
         for column in session.force.columns:
             refuse_frozen(table, column)
-            refuse_saturated(table, column)
     note_dead_stretches(table)
     leave_out_rails(table)
     columns = to_si(table)

@@ -108,30 +108,6 @@ def refuse_frozen(table: TrialTable, column: str) -> None:
         )
 
 
-def refuse_saturated(table: TrialTable, column: str) -> None:
-    """Refuse a channel that piles up at its extreme: in runs, and far above the next level."""
-    values = table.columns[column]
-    levels, counts = np.unique(values, return_counts=True)
-    if len(levels) < 3:
-        return
-    for rail, pile, beside in (
-        (levels[-1], counts[-1], counts[-2]),
-        (levels[0], counts[0], counts[1]),
-    ):
-        share = pile / len(values)
-        if share <= table.limits.saturated_share or pile <= 5 * beside:
-            continue
-        start, length = longest_run(values == rail)
-        if length >= 5:
-            raise table.fault(
-                f"{share:.1%} of the samples are at the rail {rail:g}: saturated, more than"
-                f" {table.limits.saturated_share:.0%}",
-                column=column,
-                at=start,
-                remedy="lower the gain or the load",
-            )
-
-
 def to_si(table: TrialTable) -> dict[str, np.ndarray]:
     """Columns (T,) in SI units by name: q_<axis>, force_<component>, brake_<axis>, channels."""
     session, raw = table.session, table.columns

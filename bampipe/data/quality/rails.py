@@ -43,36 +43,52 @@ def find_rails(values: np.ndarray) -> dict[float, Flags]:
 
 
 def leave_out_rails(table: TrialTable) -> None:
-    """Leave out what an input reads at a rail, where the motion takes more than that.
+    """Leave out what an input reads at a rail.
 
     A command that stands at its limit is all that the machine gets; a reading that does tells
-    nothing. Which of the two it is, the motion says: regressed on it between the rails, the input
-    goes on beyond them or does not.
+    nothing. A sensor's volts are readings; of other inputs the motion says which of the two they
+    are: regressed on it between the rails, an input goes on beyond them or does not.
+
+    Raises:
+        InputError: a sensor of a locked trial, which is used as a whole, is at a rail for long.
     """
-    session = table.session
-    columns = [*(session.force.columns if session.force is not None else ())]
+    session, limits = table.session, table.limits
+    force = session.force
+    columns = [*(force.columns if force is not None else ())]
+    volts = columns if force is not None and force.volts and limits.saturated_share < 1.0 else []
     columns += [channel.column for channel in session.channels]
     motions = None
     for column in dict.fromkeys(columns):
         values = table.columns[column]
         rails = {rail: at for rail, at in find_rails(values).items() if rail != 0.0}
-        share = sum(at.mean() for at in rails.values())
-        if not _LEAST <= share <= _MOST or len(np.unique(values)) < _FEWEST_LEVELS:
-            continue
-        motions = motions if motions is not None else _motions(table)
+        share = float(sum(at.mean() for at in rails.values()))
         where = " and ".join(f"{rail:g}" for rail in sorted(rails))
-        said = f"column '{column}': {share:.1%} of the samples stand at the rail {where}"
-        clipped = _beyond(values, rails, motions)
-        if clipped is None:
-            table.notes.append(f"{said}; the motion does not tell whether it takes more: left in")
-        elif clipped:
-            table.repairs.append(f"{said}, where the motion takes up to {clipped:.3g}: left out")
-            for rail, at_rail in rails.items():
-                for start, stop in zip(*find_runs(at_rail), strict=True):
-                    first, last = float(table.t[start]), float(table.t[stop - 1])
-                    table.dead.append(
-                        DeadStretch(column=column, start_s=first, end_s=last, rail=rail)
-                    )
+        said = f"{share:.1%} of the samples stand at the rail {where}"
+        most = limits.saturated_share if table.entry.kind == "locked" else _MOST
+        if column in volts and share > most:
+            raise table.fault(
+                f"{said}: saturated, more than {most:.0%}",
+                column=column,
+                at=int(np.argmax(np.any(list(rails.values()), axis=0))),
+                remedy="lower the gain or the load",
+            )
+        in_steps = len(np.unique(values)) < _FEWEST_LEVELS and column not in volts
+        if not _LEAST <= share <= _MOST or in_steps:
+            continue
+        said = f"column '{column}': {said}"
+        if column not in volts:
+            motions = motions if motions is not None else _motions(table)
+            farthest = _beyond(values, rails, motions)
+            if not farthest:
+                if farthest is None:
+                    table.notes.append(f"{said}; the motion does not tell whether it takes more")
+                continue
+            said += f", where the motion takes up to {farthest:.3g}"
+        table.repairs.append(f"{said}: left out")
+        for rail, at_rail in rails.items():
+            for start, stop in zip(*find_runs(at_rail), strict=True):
+                first, last = float(table.t[start]), float(table.t[stop - 1])
+                table.dead.append(DeadStretch(column=column, start_s=first, end_s=last, rail=rail))
 
 
 def _motions(table: TrialTable) -> list[SmoothedMotion]:
