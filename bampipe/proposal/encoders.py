@@ -27,7 +27,7 @@ def encoders_table(
     for axis in device.coordinates:
         column = measured_position(axis.name, len(device.coordinates), match, notes)
         if column is None:
-            note = notes.ask_column(f"the position of {axis.name}", axis.unit)
+            note = notes.ask_column(axis.name, axis.unit, "position")
             lines.append(f"{axis.name} = {entry(UNKNOWN, axis.unit)}{note}")
             continue
         axes[axis.name] = column
