@@ -21,6 +21,8 @@ _SPANS, _STEP = (0.5, 4.0 * np.pi), 0.01
 _WEIGHT_LEAVES, _SURE_TURNING = 0.5, 0.03
 """Of what a straight line leaves of the drive, what a sine may leave, and the relative standard
 error up to which what a reading is worth is proposed."""
+_MOST_ROWS = 20_000
+"""Of which that is found."""
 _LEAST_SIGN_BIT, _SIGN_GAP = 7, 0.7
 """Lowest bit that is taken for a sign, and the largest magnitude, as a share of it, by which an
 empty range below the bit shows it."""
@@ -147,9 +149,9 @@ def find_turning(t: np.ndarray, q: np.ndarray, drive: np.ndarray) -> Turning | N
     motion = SmoothedMotion.of(t, q)
     if motion is None or np.ptp(q) == 0.0:
         return None
-    inner = motion.inner
-    moving = np.column_stack([motion.moving, np.ones_like(q)])[inner]
-    position, target = motion.position[inner], motion.smooth(drive)[inner]
+    rows = np.arange(len(q))[motion.inner][:: max(1, len(q) // _MOST_ROWS)]
+    moving = np.column_stack([motion.moving, np.ones_like(q)])[rows]
+    position, target = motion.position[rows], motion.smooth(drive)[rows]
     middle, span = float(np.median(position)), float(np.ptp(position))
 
     def fitted(x: float) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ whole trial. One offset for all trials leaves most of that, and it passes for we
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +27,10 @@ _PLAIN = 5.0
 """Median size of the offsets over their standard errors, the least."""
 _LEAVES = 0.7
 """Share of the mean squared error that offsets by trial leave, the most."""
-_STILL_TOLD = 0.1
-"""Share of what tells any parameter beside one offset for all that is left beside offsets by trial,
-the least: trials that each go one way, or each in a pose of their own, tell no offset."""
+_TOLD, _STILL_TOLD = 1e-3, 0.1
+"""Share of its slope beside one offset for all by which a parameter is told at all, and of that,
+what is left beside offsets by trial, the least: trials that each go one way, or each in a pose of
+their own, tell no offset."""
 
 
 def find_force_offsets(
@@ -53,22 +55,29 @@ def find_force_offsets(
     except (ValueError, InputError):
         return {}
     stacked = dict(zip(fitted, found.stacked, strict=True))
-    size = np.sqrt(_mean_square([s.residual for s in found.stacked], found.stacked))
-    trials = {}
-    for number in range(len(motions)):
-        one = stacked.get(number) or stacked_residual(problem, number, found.p)
-        trials[number] = _Trial.of(system, motions[number], band, one, found.p[:-1], size)
-    own = np.sum([trials[k].without_offset for k in fitted], axis=0)
-    step = np.linalg.lstsq(own[:-1, :-1], -own[:-1, -1], rcond=1e-9)[0]
-    if not _still_told([trials[k] for k in fitted], own):
+    size = _root_mean_square(found.stacked)
+    trials = [
+        _Trial.of(
+            system,
+            motion,
+            band,
+            stacked.get(number) or stacked_residual(problem, number, found.p),
+            found.p[:-1],
+            size,
+        )
+        for number, motion in enumerate(motions)
+    ]
+    seen = [trials[number] for number in fitted]
+    own = np.sum([one.own for one in seen], axis=0)
+    whole = np.sum([one.whole for one in seen], axis=0)
+    if not _still_told(seen, own, whole):
         return {}
-    offsets, errors = zip(*(trials[k].offset(step) for k in range(len(motions))), strict=True)
-    left = sum(trials[k].left(step) for k in fitted)
-    before = sum(float(trials[k].residual @ trials[k].residual) for k in fitted)
-    mean = np.mean([offsets[k] for k in fitted], axis=0)
-    plain = np.abs(np.array(offsets) - mean)[list(fitted)] / np.array(errors)[list(fitted)]
-    chosen = np.median(plain, axis=0) > _PLAIN
-    if left > _LEAVES * before or not chosen.any():
+    step = np.append(np.linalg.lstsq(own[:-1, :-1], -own[:-1, -1], rcond=1e-9)[0], 1.0)
+    offsets = np.array([one.offset @ step for one in trials])
+    mean = offsets[list(fitted)].mean(axis=0)
+    plain = np.abs(offsets - mean) / [one.error(step) for one in trials]
+    chosen = np.median(plain[list(fitted)], axis=0) > _PLAIN
+    if step @ own @ step > _LEAVES * whole[-1, -1] or not chosen.any():
         return {}
     forces = system.model.device.forces
     return {
@@ -81,19 +90,22 @@ def find_force_offsets(
     }
 
 
+@dataclass(frozen=True)
 class _Trial:
-    """One trial in units of the error of each axis, its rows one under another.
+    """What one trial says of its offsets, linear in a step of the free parameters and 1.
 
     Attributes:
-        residual: (N,); slope: (N, n_free); map: (N, n_force), what a force adds to the residual.
+        offset: (n_force, n_free + 1) that offsets are; parts: of each of its parts, the same.
+        whole: (n_free + 1, n_free + 1) sums of squares and products of slopes and residual, in
+            units of the error of each axis; own: the same beside its offsets.
+        common: (n_force, n_free + 1) and (n_force, n_force) what one offset for all needs of it.
     """
 
-    def __init__(self, residual: Array, slope: Array, map_: Array) -> None:
-        self.residual, self.slope, self.map = residual, slope, map_
-        both = np.column_stack([slope, residual])
-        self._of_both = np.linalg.lstsq(map_, both, rcond=1e-9)[0]
-        rest = both - map_ @ self._of_both
-        self.without_offset = rest.T @ rest
+    offset: Array
+    parts: Array
+    whole: Array
+    own: Array
+    common: tuple[Array, Array]
 
     @classmethod
     def of(
@@ -102,39 +114,41 @@ class _Trial:
         """From what `stacked_residual` gave."""
         rows = band.thinned_rows(motion.t.size)
         gains = system.input_map(motion.q[rows], motion.inputs(system.inputs)[rows], p)
-        weight = one.used / size
+        weight = (one.used / size)[:, :, None]
+        both = np.concatenate([one.slope, one.residual[:, :, None]], axis=2) * weight
+        both, forces = (x.reshape(-1, x.shape[2]) for x in (both, gains * weight))
+
+        def solve(rows: NDArray[np.int64] | slice) -> Array:
+            return np.asarray(np.linalg.lstsq(forces[rows], both[rows], rcond=1e-9)[0])
+
+        offset = solve(slice(None))
+        rest = both - forces @ offset
+        parts = [solve(rows) for rows in np.array_split(np.arange(len(both)), _PARTS)]
         return cls(
-            (one.residual * weight).reshape(-1),
-            (one.slope * weight[:, :, None]).reshape(-1, one.slope.shape[2]),
-            (gains * weight[:, :, None]).reshape(-1, gains.shape[2]),
+            offset,
+            np.array(parts),
+            both.T @ both,
+            rest.T @ rest,
+            (forces.T @ both, forces.T @ forces),
         )
 
-    def offset(self, step: Array) -> tuple[Array, Array]:
-        """Offsets of forces, (n_force,), with parameters moved by ``step``, and their errors."""
-        target = self.residual + self.slope @ step
-        parts = np.array_split(np.arange(target.size), _PARTS)
-        each = [np.linalg.lstsq(self.map[k], target[k], rcond=1e-9)[0] for k in parts]
-        error = np.std(each, axis=0, ddof=1) / np.sqrt(_PARTS)
-        whole = np.linalg.lstsq(self.map, target, rcond=1e-9)[0]
-        return np.asarray(whole), np.maximum(error, 1e-300)
-
-    def left(self, step: Array) -> float:
-        """Sum of squares beside its offsets."""
-        both = np.append(step, 1.0)
-        return float(both @ self.without_offset @ both)
+    def error(self, step: Array) -> Array:
+        """Standard errors of the offsets, (n_force,), by its parts."""
+        sd = np.std(self.parts @ step, axis=0, ddof=1) / np.sqrt(_PARTS)
+        return np.asarray(np.maximum(sd, np.finfo(float).tiny))
 
 
-def _still_told(trials: Sequence[_Trial], own: Array) -> bool:
+def _still_told(trials: Sequence[_Trial], own: Array, whole: Array) -> bool:
     """Whether offsets by trial leave what one offset for all leaves to tell the parameters."""
-    slopes = sum(np.sum(one.slope**2, axis=0) for one in trials)
-    across = sum(one.map.T @ one.slope for one in trials)
-    squared = sum(one.map.T @ one.map for one in trials)
-    common = slopes - np.sum(across * np.linalg.lstsq(squared, across, rcond=1e-9)[0], axis=0)
-    counts = common > 1e-3 * slopes
+    across = np.sum([one.common[0] for one in trials], axis=0)
+    squared = np.sum([one.common[1] for one in trials], axis=0)
+    common = np.diag(whole - across.T @ np.linalg.lstsq(squared, across, rcond=1e-9)[0])[:-1]
+    counts = common > _TOLD * np.diag(whole)[:-1]
     return bool(np.all(np.diag(own)[:-1][counts] > _STILL_TOLD * common[counts]))
 
 
-def _mean_square(residuals: Sequence[Array], stacked: Sequence[Stacked]) -> Array:
-    total = sum(np.sum(one**2, axis=0) for one in residuals)
-    count = sum(one.used.sum(axis=0) for one in stacked)
-    return np.asarray(np.maximum(total / np.maximum(count, 1), np.finfo(float).tiny))
+def _root_mean_square(stacked: Sequence[Stacked]) -> Array:
+    """Of the residuals of each axis, (n_q,)."""
+    total = np.sum([np.sum(one.residual**2, axis=0) for one in stacked], axis=0)
+    count = np.sum([one.used.sum(axis=0) for one in stacked], axis=0)
+    return np.asarray(np.sqrt(np.maximum(total / np.maximum(count, 1), np.finfo(float).tiny)))
