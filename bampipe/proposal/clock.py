@@ -69,7 +69,7 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
             step = float(np.median(np.diff(stamps)))
             note = notes.ask(
                 f"ticks_per_s, what {column.name} counts in a second, and sample_rate_hz, a"
-                f" {step:.3g}th of it",
+                f" {step:.6g}th of it",
                 "the clock of the timer or processor, in its data sheet or firmware; else what it"
                 " counted over the seconds that the recording took",
             )

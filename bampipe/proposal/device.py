@@ -25,13 +25,14 @@ from bampipe.proposal.gravity import MOST_TRAVEL, weight_of
 from bampipe.proposal.joints import chain_logged
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import Notes
-from bampipe.proposal.positions import in_counts, position_in_si, scale_to, slides
+from bampipe.proposal.positions import SLIDING, in_counts, position_in_si, scale_to, slides
 from bampipe.proposal.starter import starter_device
 from bampipe.proposal.starter_input import Drive
 
 DEVICE = "device.toml"
 _SCHEMA = "bampipe.device/1"
 _MAY_SLIDE = " (no unit says that it slides: if it does, bampipe init FOLDER --device slider)"
+_MAY_TURN = " (by a force in N alone: if it turns, call its column {0}_rad or {0}_deg)"
 _HEAD_BYTES = 4096
 """Of a file that cannot be read whole, in which its first element is looked for."""
 _SAME_DRIVE = 0.8
@@ -234,7 +235,9 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     weight, on_gravity = weight_of(position, fit, linear, found)
     starter = starter_device(position.name, linear, drive, fit, weight, width)
     kind = "linear" if linear else "rotary"
-    doubt = "" if linear or position.conversion is not None else _MAY_SLIDE
+    doubt = "" if position.conversion is not None else _MAY_SLIDE
+    if doubt and linear:
+        doubt = "" if set(words(position.name)) & SLIDING else _MAY_TURN.format(position.name)
     what = "torque" if role == "force" and not linear else role
     notes.check.append(
         f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {what}{doubt}; put in what you"

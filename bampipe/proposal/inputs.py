@@ -20,6 +20,8 @@ _FORCES = frozenset(["force", "kraft", "loadcell", "fx", "fy", "fz"])
 _TORQUES = frozenset(["torque", "tau", "trq", "moment", "effort", "drehmoment"])
 _QUANTITY = {"N": "force", "N.m": "torque", "A": "current", "V": "voltage"}
 _FEWEST_COUNTS = 100
+_MOST_VOLTS = 60.0
+"""Of a supply: servos count theirs in tenths."""
 _FULL_DUTY = 1.05
 """A duty cycle as a share goes to 1, and a little over by rounding."""
 
@@ -175,6 +177,8 @@ def _channel(
             return table
         return table + notes.guess(f"{column.name} is {name}{why}{_unscaled(si, column, register)}")
     likely = si if register else guesses.likely_unit(si, column.values) or si
+    if name == "supply" and column.is_integer and float(np.nanmedian(column.values)) > _MOST_VOLTS:
+        likely = "0.1V"
     if name == "duty" and not column.unit:
         most = float(np.nanmax(np.abs(column.values)))
         if most > 100.0:
@@ -187,8 +191,9 @@ def _channel(
         if most > _FULL_DUTY:
             likely = "%"
     where = f" in {likely}" if si else ""
+    doubt = "" if likely[:1].isdigit() else _unscaled(si, column, register)
     return entry(column.name, likely, fields) + notes.guess(
-        f"{column.name} is {name}{where}{why}{_unscaled(si, column, register)}"
+        f"{column.name} is {name}{where}{why}{doubt}"
     )
 
 

@@ -81,7 +81,9 @@ def leave_out_rails(table: TrialTable) -> None:
             farthest = _beyond(values, rails, motions)
             if not farthest:
                 if farthest is None:
-                    table.notes.append(f"{said}; the motion does not tell whether it takes more")
+                    table.notes.append(
+                        f"{said}; left in: the motion does not tell if it takes more"
+                    )
                 continue
             said += f", where the motion takes up to {farthest:.3g}"
         table.repairs.append(f"{said}: left out")
