@@ -28,6 +28,7 @@ from bampipe.proposal.encoders import encoders_table
 from bampipe.proposal.inputs import input_tables
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import Notes, quoted
+from bampipe.proposal.readings import fresh_readings, signed_readings
 from bampipe.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
 from bampipe.proposal.trials import trials_tables
 
@@ -72,9 +73,10 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
         )
     found = survey(folder, names)
     notes = Notes(check=list(found.remarks))
+    found, registers = signed_readings(fresh_readings(found, notes))
     chosen = find_device(folder, found, device)
     clock = clock_of(found, notes)
-    match = Matcher(found, clock.t, set(clock.columns))
+    match = Matcher(found, clock.t, set(clock.columns), registers)
     if chosen is None:
         chosen = new_device(folder, match, notes)
         positions = len([c for c in found.of("position") if not c.is_constant])
@@ -104,7 +106,7 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
     return ProposedSession(
         session="\n".join(lines) + "\n",
         device=chosen.text,
-        fill_in=notes.fill_in,
+        fill_in=notes.questions,
         check=notes.check,
         passed=[
             f"{name}: {reason.removeprefix(name).lstrip(':, ')}" for name, reason in found.passed
