@@ -22,11 +22,13 @@ from bampipe.proposal.device import (
     ChosenDevice,
     find_device,
     new_device,
+    with_gravity,
     with_motors,
 )
 from bampipe.proposal.encoders import encoders_table
 from bampipe.proposal.inputs import input_tables
 from bampipe.proposal.matching import Matcher
+from bampipe.proposal.mounting import Mounting
 from bampipe.proposal.notes import Notes, quoted
 from bampipe.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
 from bampipe.proposal.trials import trials_tables
@@ -88,7 +90,10 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
         chosen = _with_guessed_motors(folder, chosen, columns)
         match.joints, match.of_robot = columns.columns, several
         match.turned, match.gears = columns.turned, columns.gears
-        match.counting = columns.counting
+        if columns.mounting is not None:
+            chosen = _hung(folder, chosen, columns.mounting, notes)
+            joints = [c.name for c in chosen.device.coordinates]
+            match.counting = dict(zip(joints, columns.mounting.by_joint, strict=True))
         _check_robot(chosen, columns, notes)
     if len(found.files) > 1 and not found.of(*DRIVERS, "reference", ""):
         notes.check.append(
@@ -155,6 +160,21 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColum
         gears = {j: (1.0 / size, None) for j, size in zip(joints, sizes, strict=True)}
         return with_motors(folder, chosen, gears)
     return chosen
+
+
+def _hung(folder: Path, chosen: ChosenDevice, mounting: Mounting, notes: Notes) -> ChosenDevice:
+    """The robot under the gravity that the drawn bodies ask for, where that is not as stated."""
+    if not mounting.hangs:
+        return chosen
+    gravity = ", ".join(
+        f"{v:.4g}" for v in np.where(np.abs(mounting.gravity) < 1e-9, 0.0, mounting.gravity)
+    )
+    said = f"gravity = [{gravity}]"
+    notes.check.append(
+        f"{said} in the frame of the base, by weight and inertia as drawn: is the robot mounted so?"
+        + ("" if chosen.text else f" put that into [robot] of {chosen.name}")
+    )
+    return with_gravity(folder, chosen, said) if chosen.text else chosen
 
 
 def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> None:

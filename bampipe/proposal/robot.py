@@ -11,22 +11,27 @@ from numpy.typing import NDArray
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
-from bampipe.proposal.directions import Counting, find_counting
 from bampipe.proposal.drawing import (
     FEW_ROWS,
     MOST_ROWS,
+    Comparison,
     Drive,
     fits,
-    hold,
-    judge_along,
-    left_by,
     mean_left,
     motion_along,
     positions_of,
     range_of,
 )
-from bampipe.proposal.gears import BEYOND, DOUBTED, Gears, find_gears, known_gears
+from bampipe.proposal.gears import (
+    BEYOND,
+    DOUBTED,
+    Gears,
+    find_best_mounting,
+    find_gears,
+    known_gears,
+)
 from bampipe.proposal.joints import Group, pair_joints
+from bampipe.proposal.mounting import Mounting
 from bampipe.proposal.notes import Notes
 from bampipe.proposal.positions import scale_to
 
@@ -51,14 +56,13 @@ class RobotColumns:
         columns: by name of joint or input.
         drives: by name of input, where drawing and log can be compared.
         gears: by joint whose position is that of a motor, its turns for one of the joint.
-        counting: by joint, its direction against the drawing, 1 or -1, and the angle that is added
-            to its reading times that, rad.
+        mounting: of the joints and the base against the drawing; None where nothing tells.
     """
 
     columns: Mapping[str, SurveyedColumn]
     drives: Mapping[str, Drive]
     gears: Mapping[str, float] = field(default_factory=dict)
-    counting: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    mounting: Mounting | None = None
 
     @property
     def turned(self) -> frozenset[str]:
@@ -140,34 +144,16 @@ def find_robot_columns(
             columns |= dict(zip(_joints(device), other[0].columns, strict=True))
             columns |= dict(zip(device.forces, other[1].columns, strict=True))
             positions, drives = other
-    counting, judged = _counted(device, robot, positions, drives, t, judged)
+    turns = turns if turns is not None else np.ones(len(judged))
+    few, many = (
+        _compare(device, robot, positions, drives, t, turns, rows) for rows in (FEW_ROWS, MOST_ROWS)
+    )
+    mounting = None
+    if few is not None and many is not None:
+        mounting, judged = find_best_mounting(few, many)
     by_input = dict(zip(device.forces, judged, strict=True))
     notes.check += _sentences(device, columns, by_input)
-    return RobotColumns(
-        columns, by_input, counting=dict(zip(_joints(device), counting, strict=True))
-    )
-
-
-def _counted(
-    device: Device, robot: Robot, positions: Group, drives: Group, t: Array, judged: list[Drive]
-) -> tuple[list[tuple[float, float]], list[Drive]]:
-    """Direction and zero of each joint, and what they make of the drives, as `find_counting`."""
-    ratio = _turns(device, robot)
-    few, many = (
-        motion_along(positions_of(device, positions, t), t, rows) for rows in (FEW_ROWS, MOST_ROWS)
-    )
-    counting = Counting.as_drawn(len(device.coordinates))
-    if few is None or many is None or ratio is None:
-        return counting.by_joint, judged
-
-    if max(drive.left for drive in judged) < DOUBTED:
-        return counting.by_joint, judged
-    left = left_by(device, robot, few, drives, ratio)
-    counting = find_counting([c.unit == "rad" for c in device.coordinates], left)
-    if not counting.changed:
-        return counting.by_joint, judged
-    motion = many.counted(counting.direction, counting.zero)
-    return counting.by_joint, hold(device, robot, motion, drives, ratio)
+    return RobotColumns(columns, by_input, mounting=mounting)
 
 
 def _geared(
@@ -196,9 +182,7 @@ def _geared(
         f"drawing, drives' inertia and friction explain {explained:.1%} of the drives"
     )
     drives = dict(zip(device.forces, found.drives, strict=True))
-    return RobotColumns(
-        paired, drives, gears, dict(zip(joints, found.counting.by_joint, strict=True))
-    )
+    return RobotColumns(paired, drives, gears, found.mounting)
 
 
 def _in_si(device: Device, group: Group) -> Group:
@@ -265,7 +249,21 @@ def _judge(device: Device, robot: Robot, positions: Group, drives: Group, t: Arr
     ratio = _turns(device, robot)
     if ratio is None:
         return []
-    return judge_along(device, robot, positions_of(device, positions, t), drives, ratio, t)
+    compared = _compare(device, robot, positions, drives, t, ratio, MOST_ROWS)
+    return [] if compared is None else compared.hold(compared.drawn)
+
+
+def _compare(
+    device: Device,
+    robot: Robot,
+    positions: Group,
+    drives: Group,
+    t: Array,
+    ratio: Array,
+    rows: int,
+) -> Comparison | None:
+    motion = motion_along(positions_of(device, positions, t), t, rows)
+    return None if motion is None else Comparison(device, robot, drives, ratio, motion)
 
 
 def _turns(device: Device, robot: Robot) -> Array | None:
