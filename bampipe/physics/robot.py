@@ -13,7 +13,14 @@ from pydantic import Field
 
 from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.expression import Name
-from bampipe.physics.newton_euler import INERTIAL, Algebra, Link, Vector, columns
+from bampipe.physics.newton_euler import (
+    INERTIAL,
+    Algebra,
+    Link,
+    Vector,
+    columns,
+    joint_forces,
+)
 from bampipe.physics.parameter import Parameter
 from bampipe.schema import (
     ByName,
@@ -247,6 +254,19 @@ class Robot(Declaration):
         """
         a, b, c = (list(np.ascontiguousarray(x.T)) for x in (q, qd, qdd))
         return columns(Algebra.numbers(), self.links, a, b, c, gravity_vector(self))
+
+    def drawn_forces(self, q: Array, qd: Array, qdd: Array, gravity: Array) -> Array:
+        """Forces of the joints, (T, n), that the drawn bodies require along a motion.
+
+        Args:
+            q, qd, qdd: a motion, (T, n), rad or m and derivatives.
+            gravity: in the frame of the base, m/s2, (3,), or (3, T) where it differs.
+        """
+        bodies = [list(joint.inertial) for joint in self.joints]
+        a, b, c = (list(np.ascontiguousarray(part.T)) for part in (q, qd, qdd))
+        down = (gravity[0], gravity[1], gravity[2])
+        forces = joint_forces(Algebra.numbers(), self.links, bodies, a, b, c, down)
+        return np.column_stack([np.broadcast_to(force, len(q)) for force in forces])
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from bampipe.physics.device import Device
-from bampipe.physics.newton_euler import Algebra, joint_forces
 from bampipe.physics.robot import Robot
 from bampipe.proposal.joints import Group
 from bampipe.proposal.mounting import Mounting
@@ -131,7 +130,7 @@ class Comparison:
     drives: Group
     ratio: Array
     motion: JointMotion
-    _required: dict[bytes, list[Array]] = field(default_factory=dict, init=False)
+    _sums: dict[bytes, list[tuple[Array, ...]]] = field(default_factory=dict, init=False)
 
     @property
     def drawn(self) -> Mounting:
@@ -143,30 +142,20 @@ class Comparison:
         """Whether each joint turns."""
         return [c.unit == "rad" for c in self.device.coordinates]
 
-    def required(self, mounting: Mounting, bodies: Sequence[Array] | None = None) -> Array:
-        """Forces of the joints (K, n) by the drawn bodies, or by ten numbers each of others."""
-        key = mounting.direction.tobytes() + mounting.zero.tobytes()
-        parts = None if bodies is not None else self._required.get(key)
-        if parts is None:
-            moved = self.motion.scaled(mounting.direction)
-            still = np.zeros_like(moved.rate)
-            at = moved.position + mounting.zero
-            numbers = bodies or [joint.inertial for joint in self.robot.joints]
-            # Linear in gravity: without it, and what 1 m/s2 of it along each axis adds.
-            parts = [self._forces(numbers, at, moved.rate, moved.change, np.zeros(3))]
-            parts += [self._forces(numbers, at, still, still, axis) for axis in np.eye(3)]
-            if bodies is None:
-                self._required[key] = parts
-        return parts[0] + np.tensordot(mounting.gravity, parts[1:], 1)
+    def required(self, mounting: Mounting) -> Array:
+        """Drives (K, n) that the drawn bodies require."""
+        parts = self._required(mounting)
+        return np.asarray(parts[0] + np.tensordot(mounting.gravity, parts[1:], 1))
 
-    def _forces(
-        self, bodies: Sequence[Array], q: Array, qd: Array, qdd: Array, gravity: Array
-    ) -> Array:
-        forces = joint_forces(
-            Algebra.numbers(), self.robot.links, [list(body) for body in bodies],
-            list(q.T), list(qd.T), list(qdd.T), (gravity[0], gravity[1], gravity[2]),
-        )  # fmt: skip
-        return np.column_stack([np.broadcast_to(force, len(q)) for force in forces])
+    def _required(self, mounting: Mounting) -> Array:
+        """Drives (4, K, n) required without gravity, and by 1 m/s2 of it along each axis."""
+        moved = self.motion.scaled(mounting.direction)
+        still = np.zeros((3 * len(moved.rate), len(self.ratio)))
+        q = np.tile(moved.position + mounting.zero, (4, 1))
+        qd, qdd = (np.concatenate([part, still]) for part in (moved.rate, moved.change))
+        gravity = np.repeat(np.eye(4)[1:], len(moved.rate), axis=1)
+        parts = self.robot.drawn_forces(q, qd, qdd, gravity) / self.ratio
+        return parts.reshape(4, -1, len(self.ratio))
 
     def values(self, k: int) -> Array:
         """Drive ``k`` (K,), in the unit of the device."""
@@ -175,19 +164,24 @@ class Comparison:
         return np.asarray(found * scale_to(self.device.force_unit, column))
 
     @cached_property
-    def _losses(self) -> list[_Losses]:
+    def losses(self) -> list[Losses]:
+        """Of each drive, which a motor that turns the other way counts so."""
         motion, way = self.motion, np.sign(self.ratio)
         return [
-            _Losses.along(way[k] * motion.rate[:, k], way[k] * motion.change[:, k], self.values(k))
+            Losses.along(way[k] * motion.rate[:, k], way[k] * motion.change[:, k], self.values(k))
             for k in range(len(self.ratio))
         ]
 
     def hold(self, mounting: Mounting) -> list[Drive]:
         """How each drive goes with the drawing, the joints counted and the base mounted so."""
-        required = self.required(mounting) / self.ratio
+        key = mounting.direction.tobytes() + mounting.zero.tobytes()
+        if key not in self._sums:
+            parts = self._required(mounting)
+            self._sums[key] = [loss.sums(parts[:, :, k]) for k, loss in enumerate(self.losses)]
+        by_part = np.array([1.0, *mounting.gravity])
         return [
-            losses.beside(required[:, k], mounting.direction[k])
-            for k, losses in enumerate(self._losses)
+            loss.beside(sums, by_part, mounting.direction[k])
+            for k, (loss, sums) in enumerate(zip(self.losses, self._sums[key], strict=True))
         ]
 
     def misfit(self, mounting: Mounting) -> float:
@@ -198,7 +192,7 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class _Losses:
+class Losses:
     """What its own inertia, friction and an offset take of a drive (K,), and what they leave.
 
     Attributes:
@@ -217,7 +211,7 @@ class _Losses:
     known: bool
 
     @classmethod
-    def along(cls, rate: Array, change: Array, drive: Array) -> _Losses:
+    def along(cls, rate: Array, change: Array, drive: Array) -> Losses:
         """With the velocity and acceleration of the drive, (K,) each."""
         sign = np.tanh(rate / max(0.02 * float(np.abs(rate).max()), 1e-9))
         columns = np.column_stack([change, rate, sign, np.ones_like(rate)])
@@ -236,24 +230,36 @@ class _Losses:
             bool(held.all()),
         )
 
-    def beside(self, required: Array, direction: float) -> Drive:
-        """A regression of the drive on ``required``, (K,), too; of a joint counted that way."""
-        own = required - self.basis @ (self.basis.T @ required)
-        square = float(own @ own)
-        if not self.known or square <= 1e-18 * max(float(required @ required), 1e-300):
-            return Drive(0.0, np.inf, float(np.mean(self.drive**2)) / self.size, 0.0)
-        share = float(own @ self.drive) / square
-        mean_square = float(np.mean((self.drive - share * own) ** 2))
+    def sums(self, parts: Array) -> tuple[Array, ...]:
+        """Products of what is required, in ``parts`` (m, K), by which `beside` needs no samples."""
+        own = self.without(parts)
+        return own @ own.T, parts @ parts.T, own @ self.drive, parts @ self.power
+
+    def without(self, columns: Array) -> Array:
+        """What the losses leave of columns, (m, K)."""
+        return np.asarray(columns - (columns @ self.basis) @ self.basis.T)
+
+    def beside(self, sums: tuple[Array, ...], by_part: Array, direction: float) -> Drive:
+        """A regression of the drive on what is required too, the sum of ``by_part`` (m,) parts.
+
+        Of a joint that counts in ``direction``; ``sums``: of the parts.
+        """
+        square, whole = (float(by_part @ of @ by_part) for of in sums[:2])
+        along, power = (float(of @ by_part) for of in sums[2:])
+        left, count = float(self.drive @ self.drive), len(self.drive)
+        if not self.known or square <= 1e-18 * max(whole, 1e-300):
+            return Drive(0.0, np.inf, left / count / self.size, 0.0)
+        share = along / square
+        mean_square = max(left - share * along, 0.0) / count
         # Neighbouring samples err alike: about one in ten counts.
         variance = 10.0 * mean_square
-        dual = float(self.power @ required)
-        power_sd = np.sqrt(variance * (float(self.power @ self.power) + dual**2 / square))
-        power = direction * (self.taken - share * dual)
+        power_sd = np.sqrt(variance * (float(self.power @ self.power) + power**2 / square))
+        taken = direction * (self.taken - share * power)
         return Drive(
             share,
             float(np.sqrt(variance / square)),
             mean_square / self.size,
-            float(power / max(power_sd, 1e-300)),
+            float(taken / max(power_sd, 1e-300)),
         )
 
 

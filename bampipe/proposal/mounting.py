@@ -9,7 +9,7 @@ bodies explain the drives.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
@@ -19,15 +19,19 @@ from scipy.optimize import minimize
 Array = NDArray[np.float64]
 
 _TURNS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
-_DOWN = tuple(sign * axis for axis in np.eye(3) for sign in (1.0, -1.0))
-"""Directions of gravity in the frame of a base that stands, hangs or lies."""
+_DOWN = tuple(np.array(v) for v in product((-1.0, 0.0, 1.0), repeat=3) if any(v))
+"""Directions of gravity in the frame of a base that stands, hangs or lies, or half of two."""
 _WORTH = np.log(2.0)
 """What each change must gain of the sum over the joints of the logarithm of what is left."""
-_HANGING = 2.0
-"""Changes of joints that one of gravity must be worth: far more robots stand than hang."""
+_HANGING, _LEANING = 2.0, 4.0
+"""Changes of joints that another gravity must be worth, along an axis of the base and along none:
+far more robots stand than hang, and drawn bodies that are wrong tilt it a little."""
 _LEAST_TILT = np.radians(10.0)
 """Angle below which a gravity that explains more is put down to the drawing of the bodies."""
-_MOST_ROUNDS = 4
+_FIRST_TILT = 0.2
+"""Angle by which the search for one along no axis begins, rad."""
+_MOST_ROUNDS = 6
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,13 @@ class Mounting:
     def is_changed(self) -> bool:
         """Whether anything is not as it is drawn or stated."""
         return self.hangs or bool(self.changed)
+
+    @property
+    def changes(self) -> float:
+        """How many changes of joints all of it is as unlikely as."""
+        size = np.abs(self.gravity)
+        leans = size.max() < (1.0 - _ROUNDING) * np.linalg.norm(size)
+        return len(self.changed) + self.hangs * (_LEANING if leans else _HANGING)
 
     @property
     def by_joint(self) -> list[tuple[float, float]]:
@@ -97,20 +108,19 @@ def find_mounting(turning: Sequence[bool], drawn: Mounting, judge: Judge) -> Mou
     """
 
     def cost(mounting: Mounting) -> float:
-        changes = len(mounting.changed) + _HANGING * mounting.hangs
-        return judge(mounting) + float(_WORTH * changes)
+        return judge(mounting) + float(_WORTH * mounting.changes)
 
     best, least = drawn, cost(drawn)
     for _ in range(_MOST_ROUNDS):
         tried = [(cost(other), other) for other in _neighbours(best, drawn, turning)]
         score, other = min(tried, key=lambda one: one[0], default=(np.inf, best))
         if not score < least:
+            other = _tilted(best, judge)
+            score = cost(other)
+        if not score < least:
             break
         best, least = other, score
-    tilted = _tilted(best, judge)
-    angle = np.arccos(np.clip(_alike(tilted, best), -1.0, 1.0))
-    worth = cost(tilted) + _HANGING * _WORTH < least
-    return tilted if angle > _LEAST_TILT and worth else best
+    return best
 
 
 def _alike(one: Mounting, other: Mounting) -> float:
@@ -120,16 +130,21 @@ def _alike(one: Mounting, other: Mounting) -> float:
 
 
 def _tilted(mounting: Mounting, judge: Judge) -> Mounting:
-    """The same under the gravity of any direction near its own that leaves least."""
-    start = mounting.gravity
-    if not start.any():
-        return mounting
+    """The same under the gravity of any direction near its own that leaves least.
 
-    def left(down: Array) -> float:
-        return judge(mounting.under(down)) if down.any() else np.inf
+    That itself where it is closer than `_LEAST_TILT`.
+    """
+    down = mounting.gravity / max(float(np.linalg.norm(mounting.gravity)), _ROUNDING)
+    aside = np.linalg.svd(down[None, :])[2][1:]
 
-    found = minimize(left, start, method="Nelder-Mead", options={"maxfev": 60, "xatol": 0.05})
-    return mounting.under(found.x)
+    def left(tilt: Array) -> float:
+        return judge(mounting.under(down + tilt @ aside))
+
+    start = _FIRST_TILT * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    options = {"initial_simplex": start, "maxfev": 50, "xatol": 0.01, "fatol": 0.01}
+    found = minimize(left, start[0], method="Nelder-Mead", options=options)
+    tilted = mounting.under(down + found.x @ aside)
+    return tilted if _alike(tilted, mounting) < np.cos(_LEAST_TILT) else mounting
 
 
 def _neighbours(best: Mounting, drawn: Mounting, turning: Sequence[bool]) -> Iterator[Mounting]:
@@ -143,15 +158,11 @@ def _neighbours(best: Mounting, drawn: Mounting, turning: Sequence[bool]) -> Ite
         for k, turns in enumerate(turning)
     }
     singles = [best.counted({k: option}) for k, options in one.items() for option in options]
-    yield from singles
-    downs = [best.under(down) for down in _DOWN if drawn.gravity.any()]
-    downs = [other for other in downs if _alike(other, best) < 1.0 - 1e-9]
-    if best.hangs:
-        downs = [other for other in downs if _alike(other, drawn) < 1.0 - 1e-9]
-        downs.append(Mounting(best.direction, best.zero, drawn.gravity))
-    yield from downs
-    for other, single in product(downs, singles):
-        yield Mounting(single.direction, single.zero, other.gravity, other.hangs)
+    for single in (best, *singles):
+        yield single
+        if drawn.gravity.any():
+            yield replace(single, gravity=drawn.gravity, hangs=False)
+            yield from (single.under(down) for down in _DOWN)
     # Two joints that are both off are off by their zeros: that is what a maker's zero posture is.
     for a, b in combinations(one, 2):
         for first, second in product(one[a], one[b]):

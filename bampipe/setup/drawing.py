@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
+from bampipe.physics.robot import Robot
 from bampipe.setup.corrections import (
     Correction,
     exchange_corrections,
+    gravity_corrections,
     quarter_turn_pairs,
     quarter_turns,
     sign_corrections,
@@ -69,6 +71,13 @@ class DrawnSearch:
     signals: Signals
     tested: int = field(default=0, init=False)
 
+    @property
+    def robot(self) -> Robot:
+        """Whose bodies are drawn."""
+        robot = self.system.model.device.robot
+        assert robot is not None
+        return robot
+
     def find_mistakes(self, exchanged: bool) -> tuple[Finding, ...]:
         """The mistakes of the set-up, the one that spoils most first; none if one is left over.
 
@@ -100,6 +109,7 @@ class DrawnSearch:
     def _singles(self, exchanged: bool) -> Iterator[Correction]:
         yield from sign_corrections(self.signals)
         yield from quarter_turns(self.signals)
+        yield from gravity_corrections(self.signals, self.robot)
         if exchanged:
             yield from exchange_corrections(self.signals)
             yield from unit_corrections(self.signals)
@@ -138,7 +148,8 @@ class DrawnSearch:
         self.tested += 1
         with np.errstate(all="ignore"):
             changed = [change.of_motion(motion, self.signals) for motion in self.motions]
-        return judge_drawn(self.system, changed, change.of_band(self.band))
+        added = np.array(change.gravity or self.robot.gravity) - self.robot.gravity
+        return judge_drawn(self.system, changed, change.of_band(self.band), added)
 
 
 @dataclass(frozen=True)
@@ -162,7 +173,9 @@ def is_drawn(system: System) -> bool:
     return system.model.device.robot is not None and bool(_bodies(system))
 
 
-def judge_drawn(system: System, motions: Sequence[Motion], band: Band) -> Plausibility | None:
+def judge_drawn(
+    system: System, motions: Sequence[Motion], band: Band, added: Array
+) -> Plausibility | None:
     """What bodies as drawn leave of the applied force; None where it cannot be computed.
 
     Each axis has besides an inertia and friction of its own, and one factor for its bodies, within
@@ -170,10 +183,11 @@ def judge_drawn(system: System, motions: Sequence[Motion], band: Band) -> Plausi
 
     Args:
         system: the bare device; motions: as a set-up has them; band: of the residual.
+        added: to gravity as the device file states it, m/s2, (3,).
     """
     n = len(system.coordinates)
     with np.errstate(all="ignore"):
-        parts = [_columns(system, motion, band) for motion in motions]
+        parts = [_columns(system, motion, band, added) for motion in motions]
     columns = np.concatenate([part[0] for part in parts])
     applied, used = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
     if not (np.isfinite(columns).all() and np.isfinite(applied).all()):
@@ -189,7 +203,9 @@ def _bodies(system: System) -> list[int]:
     return [i for i, p in enumerate(system.parameters) if p.weighed and not p.fixed and p.sd > 0.0]
 
 
-def _columns(system: System, motion: Motion, band: Band) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _columns(
+    system: System, motion: Motion, band: Band, added: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Columns (K, n_q, m) of a trial, bodies first, the applied force (K, n_q), and what moves."""
     p, known = system.prior, set(_bodies(system))
     for i, item in enumerate(system.parameters):
@@ -198,7 +214,12 @@ def _columns(system: System, motion: Motion, band: Band) -> tuple[Array, Array, 
     u = motion.inputs(system.inputs)
     at = motion.kinematics
     z = system.memory(*at, u, p, motion.t)
-    shapes = [system.required(*at, z, u, p), *_drive(motion.qd, motion.qdd)]
+    required = system.required(*at, z, u, p)
+    robot = system.model.device.robot
+    if robot is not None and added.any():
+        still = np.zeros_like(motion.q), np.zeros_like(motion.q)
+        required = required + robot.drawn_forces(motion.q, *still, added)
+    shapes = [required, *_drive(motion.qd, motion.qdd)]
     for turns in _shared_motors(system):
         turned = motion.qd @ turns, motion.qdd @ turns
         shapes += _drive(*(np.outer(part, turns != 0.0) for part in turned))

@@ -123,6 +123,7 @@ def _record(
         signals=correction.signals,
         factor=correction.factor,
         offset=correction.offset,
+        gravity=correction.change.gravity,
         axes=tuple(system.coordinates[i] for i in axes),
         sentence=sentence,
         evidence=describe_evidence(system, axes, found.before, found.after, found.drawn),

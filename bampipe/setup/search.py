@@ -131,6 +131,9 @@ class CorrectionSearch:
             stated: what the set-up as it is stated explains of ``motions``.
             placeholders: signals whose scale stands at exactly 1.
         """
+        against = self._against_drawing()
+        if against:
+            return against
         change, now = Change.none(len(self.signals.names)), stated
         found: list[Finding] = []
         while len(found) < MOST_MISTAKES and self._is_suspicious(now, placeholders):
@@ -139,9 +142,12 @@ class CorrectionSearch:
                 break
             found.append(step)
             change, now = step.correction.change.after(change), step.after
-        found = [f for f in found if now is None or is_explained(f, now)]
-        if found or self.over_position is not None or not is_drawn(self.system):
-            return tuple(found)
+        return tuple(f for f in found if now is None or is_explained(f, now))
+
+    def _against_drawing(self) -> tuple[Finding, ...]:
+        """The mistakes that bodies as drawn show; those that are free take on much of them."""
+        if not is_drawn(self.system):
+            return ()
         short = shorten(self.motions, _DRAWN_SAMPLES)
         search = DrawnSearch(self.system, short, self.band, self.signals)
         against = search.find_mistakes(exchanged=self.has_few_axes)

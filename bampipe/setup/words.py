@@ -15,6 +15,12 @@ def describe_correction(correction: Correction, session: IngestResult) -> str:
     """One sentence without a full stop: the mistake, a colon, what to write in session.toml."""
     if correction.kind == "clock":
         return _clock(correction, session)
+    if correction.change.gravity is not None:
+        shown = ", ".join(f"{v:.4g}" for v in correction.change.gravity)
+        return (
+            "gravity does not point there in the frame of the base: put gravity ="
+            f" [{shown}] into [robot] of the device file, if the robot is mounted so"
+        )
     if correction.kind == "zero":
         return _zero(correction, session)
     if correction.kind == "exchange":
