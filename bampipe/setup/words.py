@@ -18,8 +18,8 @@ def describe_correction(correction: Correction, session: IngestResult) -> str:
     if correction.change.gravity is not None:
         shown = ", ".join(f"{v:.4g}" for v in correction.change.gravity)
         return (
-            "gravity does not point there in the frame of the base: put gravity ="
-            f" [{shown}] into [robot] of the device file, if the robot is mounted so"
+            "gravity points elsewhere in the frame of the base: if the robot is mounted so, write"
+            f" gravity = [{shown}] into [robot] of the device file"
         )
     if correction.kind == "zero":
         return _zero(correction, session)
