@@ -8,6 +8,7 @@ from itertools import takewhile
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bampipe.data.lumping import LumpedBodies
@@ -16,6 +17,8 @@ from bampipe.data.robot_tree import MOVING, DriveLimits, Tree, TreeJoint, gravit
 from bampipe.data.robot_xml import DEEPEST
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names
+
+Array = NDArray[np.float64]
 
 _MANY = 8
 """Most names that a message lists."""
@@ -100,6 +103,21 @@ def select_chain(
     if held_still:
         notes = (f"held at zero beside the chain: {join_names(held_still, _MANY)}", *notes)
     return Chain(tables, limits, base, tip, notes, *gravity_at(tree, base))
+
+
+def frame_of_tip(tree: Tree, base: str, tip: str) -> tuple[Array, Array]:
+    """Rotation (3, 3) and place (3,), m, of the tip's frame in that of the last joint that moves.
+
+    Raises:
+        InputError: no path between the links.
+    """
+    turn, offset = np.eye(3), np.zeros(3)
+    for joint in tree.path(base, tip):
+        if joint.kind != "fixed":
+            turn, offset = np.eye(3), np.zeros(3)
+            continue
+        offset, turn = offset + turn @ joint.offset, turn @ joint.turn
+    return turn, offset
 
 
 def _tables(path: Sequence[TreeJoint], lumped: LumpedBodies, where: str) -> dict[str, Any]:

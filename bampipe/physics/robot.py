@@ -243,6 +243,14 @@ class Robot(Declaration):
         )
         return np.ascontiguousarray(table.transpose(0, 2, 1).reshape(-1, INERTIAL * n))
 
+    def describe_mass(self, place: int, factor: float) -> str:
+        """Say that the drives ask for ``factor`` times the mass of a body as drawn."""
+        joint = self.joints[place]
+        return (
+            f"the body on {joint.name} is about {factor:.2g} times as heavy as drawn"
+            f" ({joint.mass:.3g} kg), by all drives together"
+        )
+
     def columns(self, q: Array, qd: Array, qdd: Array) -> list[list[list[Any]]]:
         """What one of each inertial number adds to the joints' forces: [joint][link][number].
 
@@ -255,14 +263,20 @@ class Robot(Declaration):
         a, b, c = (list(np.ascontiguousarray(x.T)) for x in (q, qd, qdd))
         return columns(Algebra.numbers(), self.links, a, b, c, gravity_vector(self))
 
-    def drawn_forces(self, q: Array, qd: Array, qdd: Array, gravity: Array) -> Array:
+    def drawn_forces(
+        self, q: Array, qd: Array, qdd: Array, gravity: Array, only: int | None = None
+    ) -> Array:
         """Forces of the joints, (T, n), that the drawn bodies require along a motion.
 
         Args:
             q, qd, qdd: a motion, (T, n), rad or m and derivatives.
             gravity: in the frame of the base, m/s2, (3,), or (3, T) where it differs.
+            only: number of the body that alone is there; None for all.
         """
-        bodies = [list(joint.inertial) for joint in self.joints]
+        bodies = [
+            list(joint.inertial) if only in (None, k) else [0.0] * INERTIAL
+            for k, joint in enumerate(self.joints)
+        ]
         a, b, c = (list(np.ascontiguousarray(part.T)) for part in (q, qd, qdd))
         down = (gravity[0], gravity[1], gravity[2])
         forces = joint_forces(Algebra.numbers(), self.links, bodies, a, b, c, down)

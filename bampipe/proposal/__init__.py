@@ -86,7 +86,9 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
             )
     elif chosen.device.robot is not None:
         several = len(chosen.device.robot.joints) > 1
-        columns = find_robot_columns(chosen.device, chosen.device.robot, found, clock.t, notes)
+        columns = find_robot_columns(
+            folder, chosen.device, chosen.device.robot, found, clock.t, notes
+        )
         chosen = _with_guessed_motors(folder, chosen, columns)
         match.joints, match.of_robot = columns.columns, several
         match.turned, match.gears = columns.turned, columns.gears

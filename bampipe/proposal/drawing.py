@@ -142,11 +142,6 @@ class Comparison:
         """Whether each joint turns."""
         return [c.unit == "rad" for c in self.device.coordinates]
 
-    def required(self, mounting: Mounting) -> Array:
-        """Drives (K, n) that the drawn bodies require."""
-        parts = self._required(mounting)
-        return np.asarray(parts[0] + np.tensordot(mounting.gravity, parts[1:], 1))
-
     def _required(self, mounting: Mounting) -> Array:
         """Drives (4, K, n) required without gravity, and by 1 m/s2 of it along each axis."""
         moved = self.motion.scaled(mounting.direction)
@@ -156,6 +151,20 @@ class Comparison:
         gravity = np.repeat(np.eye(4)[1:], len(moved.rate), axis=1)
         parts = self.robot.drawn_forces(q, qd, qdd, gravity) / self.ratio
         return parts.reshape(4, -1, len(self.ratio))
+
+    def by_number(self, mounting: Mounting) -> list[list[Array]]:
+        """By joint and body, what one of each inertial number adds beside losses, (K, 10)."""
+        moved = self.motion.scaled(mounting.direction)
+        under = self.robot.model_copy(update={"gravity": tuple(mounting.gravity)})
+        columns = under.columns(moved.position + mounting.zero, moved.rate, moved.change)
+        count = len(moved.rate)
+        return [
+            [
+                loss.without(np.array([np.broadcast_to(c, count) for c in body])).T / ratio
+                for body in row
+            ]
+            for row, loss, ratio in zip(columns, self.losses, self.ratio, strict=True)
+        ]
 
     def values(self, k: int) -> Array:
         """Drive ``k`` (K,), in the unit of the device."""

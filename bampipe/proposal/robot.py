@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,7 @@ from bampipe.proposal.gears import (
     find_gears,
     known_gears,
 )
+from bampipe.proposal.heavier import describe_heavier_body
 from bampipe.proposal.joints import Group, pair_joints
 from bampipe.proposal.mounting import Mounting
 from bampipe.proposal.notes import Notes
@@ -71,12 +73,13 @@ class RobotColumns:
 
 
 def find_robot_columns(
-    device: Device, robot: Robot, found: Survey, t: Array, notes: Notes
+    folder: Path, device: Device, robot: Robot, found: Survey, t: Array, notes: Notes
 ) -> RobotColumns:
     """Pair columns with joints and drives, and hold them against the drawing.
 
     Args:
-        device, robot: the robot; found: the log; t: (T,) time, s.
+        folder: of the robot's file; device, robot: the robot.
+        found: the log; t: (T,) time, s.
         notes: what is guessed is noted, and how sure it is.
     """
     pairing = pair_joints(device, found)
@@ -151,6 +154,8 @@ def find_robot_columns(
     mounting = None
     if few is not None and many is not None:
         mounting, judged = find_best_mounting(few, many)
+        heavier = describe_heavier_body(many, mounting, folder)
+        notes.check += [heavier] if heavier else []
     by_input = dict(zip(device.forces, judged, strict=True))
     notes.check += _sentences(device, columns, by_input)
     return RobotColumns(columns, by_input, mounting=mounting)

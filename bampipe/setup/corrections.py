@@ -91,6 +91,11 @@ def sign_corrections(signals: Signals) -> Iterator[Correction]:
         yield Correction("sign", tuple(names), change, 0.0 if len(names) == 1 else 1.0, -1.0)
 
 
+def encoder_sign_corrections(signals: Signals) -> list[Correction]:
+    """Reversed encoders."""
+    return [one for one in sign_corrections(signals) if set(one.signals) <= set(signals.axes)]
+
+
 def exchange_corrections(signals: Signals) -> Iterator[Correction]:
     """Columns that stand for each other: as raw readings, or with all that belongs to them."""
     count = len(signals.names)

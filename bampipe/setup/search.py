@@ -10,6 +10,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.estimate.heavier_body import HeavierBody
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.setup.corrections import (
@@ -23,7 +24,7 @@ from bampipe.setup.corrections import (
     sign_corrections,
     unit_corrections,
 )
-from bampipe.setup.drawing import DrawnSearch, is_drawn
+from bampipe.setup.drawing import DrawnSearch, find_body_unlike_drawn, is_drawn
 from bampipe.setup.finding import (
     ALIKE,
     JUDGED_ERROR,
@@ -75,6 +76,7 @@ class CorrectionSearch:
         system: the bare device; motions: the trials as they are stated, short enough.
         band: of the residual; folds: of the trials; signals: of the session.
         tested: number of set-ups tried.
+        heavier: the drawn body that alone is far heavier or lighter; None where none is.
         over_position: what the stated set-up explains with a torque over position that the device
             lacks, where that rather than a mistake is what spoils it; None else.
     """
@@ -86,6 +88,7 @@ class CorrectionSearch:
     signals: Signals
     tested: int = field(default=0, init=False)
     over_position: Plausibility | None = field(default=None, init=False)
+    heavier: HeavierBody | None = field(default=None, init=False)
 
     @property
     def has_few_axes(self) -> bool:
@@ -132,7 +135,7 @@ class CorrectionSearch:
             placeholders: signals whose scale stands at exactly 1.
         """
         against = self._against_drawing()
-        if against:
+        if against or self.heavier is not None:
             return against
         change, now = Change.none(len(self.signals.names)), stated
         found: list[Finding] = []
@@ -149,7 +152,8 @@ class CorrectionSearch:
         if not is_drawn(self.system):
             return ()
         short = shorten(self.motions, _DRAWN_SAMPLES)
-        search = DrawnSearch(self.system, short, self.band, self.signals)
+        self.heavier = find_body_unlike_drawn(self.system, short, self.band)
+        search = DrawnSearch(self.system, short, self.band, self.signals, self.heavier)
         against = search.find_mistakes(exchanged=self.has_few_axes)
         self.tested += search.tested
         return against
