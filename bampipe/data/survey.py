@@ -24,7 +24,8 @@ _WORDS = {
     "brake": "brake bremse",
     "acceleration": "acc accel acceleration qdd ddq beschleunigung",
     "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate",
-    "force": "force f fx fy fz torque tau trq kraft moment loadcell wrench effort",
+    "force": "force f fx fy fz torque tau trq kraft moment loadcell wrench effort"
+    " eff efforts torques",
     "current": "current curr cur i iq amp amps ampere strom spulenstrom coil",
     "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung",
     "position": "pos position angle theta phi psi q enc encoder disp displacement x stroke winkel"

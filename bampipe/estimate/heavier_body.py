@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 Array = NDArray[np.float64]
 
 _FAR = 2.0
-"""Factor, or one over it, from which a mass is no longer what a drawing is wrong by."""
+"""Factor from which a mass is no longer what a drawing is wrong by."""
 _LEAST_LEFT = 3e-3
 """Share of a drive's mean square below which no drawing is believed to be better than another."""
 _WORTH = np.log(4.0)
@@ -23,7 +23,7 @@ _EXPLAINED = 0.3
 
 @dataclass(frozen=True)
 class HeavierBody:
-    """A body that explains the drives where it is heavier or lighter than drawn.
+    """A body that explains the drives where it is heavier than drawn.
 
     Attributes:
         place: number of the body; factor: of its mass and inertia over those drawn.
@@ -36,7 +36,7 @@ class HeavierBody:
 def find_heavier_body(drives: Sequence[Array], bodies: Sequence[Array]) -> HeavierBody | None:
     """The one body whose mass lets the drawing explain all drives; None where none does.
 
-    Drives that are all in another unit are explained by one number, too: whichever explains more.
+    A drive in another unit, or all of them, is one number, too: a body must explain more.
 
     Args:
         drives: by joint, what losses leave of its drive, (K,), N.m or N, each K its own.
@@ -44,25 +44,25 @@ def find_heavier_body(drives: Sequence[Array], bodies: Sequence[Array]) -> Heavi
     """
     size = [max(float(np.mean(drive**2)), np.finfo(float).tiny) for drive in drives]
 
-    def misfit(left: Sequence[Array]) -> float:
+    def misfit(left: Sequence[Array]) -> Array:
         shares = [float(np.mean(rest**2)) / s for rest, s in zip(left, size, strict=True)]
-        return float(np.log(np.array(shares) + _LEAST_LEFT).sum())
+        return np.log(np.array(shares) + _LEAST_LEFT)
 
     whole = [columns.sum(axis=1) for columns in bodies]
     rest = [drive - force for drive, force in zip(drives, whole, strict=True)]
-    more, scaled = _fitted(rest, whole, size)
-    least = min(misfit(rest), misfit(scaled)) if more > -1.0 else misfit(rest)
-    best: tuple[float, int, float, list[Array]] | None = None
+    drawn, scaled = misfit(rest), misfit(_fitted(rest, whole, size)[1])
+    alone = misfit([_fitted([r], [w], [1.0])[1][0] for r, w in zip(rest, whole, strict=True)])
+    least = min(float(scaled.sum()), float(drawn.sum() + (alone - drawn).min()))
+    best: tuple[float, HeavierBody, list[Array]] | None = None
     for place in range(bodies[0].shape[1]):
-        own = [columns[:, place] for columns in bodies]
-        change, left = _fitted(rest, own, size)
-        score = misfit(left)
-        if change > -1.0 and (best is None or score < best[0]):
-            best = score, place, 1.0 + change, left
-    if best is None or abs(np.log(best[2])) < np.log(_FAR) or best[0] > least - _WORTH:
+        change, left = _fitted(rest, [columns[:, place] for columns in bodies], size)
+        score = float(misfit(left).sum())
+        if 1.0 + change > _FAR and score < (best[0] if best else least - _WORTH):
+            best = score, HeavierBody(place, 1.0 + change), left
+    if best is None:
         return None
-    left = sum(float(np.mean(one**2)) for one in best[3]) / sum(size)
-    return HeavierBody(best[1], best[2]) if left < _EXPLAINED else None
+    share = sum(float(np.mean(one**2)) for one in best[2]) / sum(size)
+    return best[1] if share < _EXPLAINED else None
 
 
 def _fitted(

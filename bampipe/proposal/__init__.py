@@ -16,6 +16,7 @@ import numpy as np
 from bampipe.data.survey import DRIVERS, survey
 from bampipe.errors import InputError
 from bampipe.files import write_text
+from bampipe.lists import join_names
 from bampipe.proposal.clock import clock_of
 from bampipe.proposal.device import (
     DEVICE,
@@ -196,7 +197,14 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
                 f"{chosen.name}: torque_constant 1.0 is not yours yet: all forces and inertias"
                 " scale with it"
             )
-    notes.check += [f"no body has this: {line}" for line in robot.impossible]
+    notes.check += [
+        f"no body has this, and the nearest that one can have is taken: {line}"
+        for line in robot.impossible
+    ]
+    if robot.undrawn:
+        notes.check.append(
+            f"no mass is drawn on {join_names(robot.undrawn)}: put it in where there is a body"
+        )
 
 
 def _not_used(match: Matcher) -> list[str]:

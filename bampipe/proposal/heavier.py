@@ -14,7 +14,7 @@ from bampipe.proposal.mounting import Mounting
 
 
 def describe_heavier_body(compared: Comparison, mounting: Mounting, folder: Path) -> str:
-    """Say which body is far heavier or lighter than drawn; "" where none is, or no torque tells.
+    """Say which body is far heavier than drawn; "" where none is, or no torque tells.
 
     Args:
         compared: drives, N.m or N, with the drawn bodies.
@@ -36,7 +36,7 @@ def describe_heavier_body(compared: Comparison, mounting: Mounting, folder: Path
         return ""
     joint = robot.joints[found.place]
     said = robot.describe_mass(found.place, found.factor)
-    if joint is not robot.joints[-1] or found.factor < 1.0 or robot.payload is not None:
+    if joint is not robot.joints[-1] or robot.payload is not None:
         return f"{said}: is that what is mounted there? put its mass, centre and inertia in"
     rest = [drive - forces.sum(axis=1) for drive, forces in zip(drives, bodies, strict=True)]
     mass, center = fit_point_mass(

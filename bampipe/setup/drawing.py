@@ -65,7 +65,7 @@ class DrawnSearch:
     Attributes:
         system: the bare device; motions: the trials as they are stated, short enough.
         band: of the residual; signals: of the session.
-        heavier: the body that is not as heavy as drawn.
+        heavier: the body that is heavier than drawn.
         tested: number of set-ups tried.
     """
 
@@ -186,7 +186,7 @@ def drawn_robot(system: System) -> Robot:
 def find_body_unlike_drawn(
     system: System, motions: Sequence[Motion], band: Band
 ) -> HeavierBody | None:
-    """The body that alone is far heavier or lighter than drawn, as all drives have it."""
+    """The body that alone is far heavier than drawn, as all drives have it."""
     robot, n = drawn_robot(system), len(system.coordinates)
     if system.model.device.force_unit == "A":
         return None
@@ -197,7 +197,7 @@ def find_body_unlike_drawn(
             columns, applied, used = _columns(system, motion, band)
             each = [
                 band.thin(robot.drawn_forces(*motion.kinematics, np.array(robot.gravity), only=k))
-                for k in range(n)
+                for k in range(len(robot.joints))
             ]
             forces = np.stack(each, axis=2)
             beside = applied - columns[:, :, 0] + forces.sum(axis=2)
@@ -237,7 +237,7 @@ def judge_drawn(
     Args:
         system: the bare device; motions: as a set-up has them; band: of the residual.
         added: to gravity as the device file states it, m/s2, (3,).
-        heavier: the body that is not as heavy as drawn.
+        heavier: the body that is heavier than drawn.
     """
     n = len(system.coordinates)
     with np.errstate(all="ignore"):

@@ -76,7 +76,7 @@ class CorrectionSearch:
         system: the bare device; motions: the trials as they are stated, short enough.
         band: of the residual; folds: of the trials; signals: of the session.
         tested: number of set-ups tried.
-        heavier: the drawn body that alone is far heavier or lighter; None where none is.
+        heavier: the drawn body that alone is far heavier; None where none is.
         over_position: what the stated set-up explains with a torque over position that the device
             lacks, where that rather than a mistake is what spoils it; None else.
     """

@@ -65,13 +65,13 @@ def describe_lack(system: System, before: Plausibility, after: Plausibility) -> 
 
 
 def describe_heavier(system: System, found: HeavierBody) -> str:
-    """A sentence without a full stop on a body that is far heavier or lighter than drawn."""
+    """A sentence without a full stop on a body that is far heavier than drawn."""
     robot = system.model.device.robot
     assert robot is not None
     joint = robot.joints[found.place]
     more = (found.factor - 1.0) * joint.mass
     said = robot.describe_mass(found.place, found.factor)
-    if joint is robot.joints[-1] and more > 0.0 and robot.payload is None:
+    if joint is robot.joints[-1] and robot.payload is None:
         return (
             f"{said}: a tool of about {more:.2g} kg? put it into [robot.payload] of the device file"
         )
