@@ -138,7 +138,7 @@ def find_gears(
         ratio = start
         for _ in range(_ALTERNATIONS):
             with_gears = held(few, ratio)
-            mounting = find_mounting(with_gears.turning, drawn, with_gears.misfit)
+            mounting = find_mounting(with_gears.turning, drawn, with_gears.misfit, stands=True)
             ratio = fitted(ratio, mounting)[1]
             found = sound(ratio, mounting)
             # Wrong zeros with reductions to match them explain much; only the right ones all.

@@ -95,7 +95,9 @@ class Mounting:
 Judge = Callable[[Mounting], float]
 
 
-def find_mounting(turning: Sequence[bool], drawn: Mounting, judge: Judge) -> Mounting:
+def find_mounting(
+    turning: Sequence[bool], drawn: Mounting, judge: Judge, stands: bool = False
+) -> Mounting:
     """The quarter turns, directions and gravity that let the drawing explain most.
 
     One of them is changed at a time, or two: the second of two that are off hides what the first
@@ -105,6 +107,7 @@ def find_mounting(turning: Sequence[bool], drawn: Mounting, judge: Judge) -> Mou
         turning: whether each joint turns; those that slide can only be counted the other way round.
         drawn: as everything is stated.
         judge: sum over the joints of the logarithm of what is left, with a mounting.
+        stands: whether gravity is as stated, as where reductions are unknown, too.
     """
 
     def cost(mounting: Mounting) -> float:
@@ -112,9 +115,9 @@ def find_mounting(turning: Sequence[bool], drawn: Mounting, judge: Judge) -> Mou
 
     best, least = drawn, cost(drawn)
     for _ in range(_MOST_ROUNDS):
-        tried = [(cost(other), other) for other in _neighbours(best, drawn, turning)]
+        tried = [(cost(other), other) for other in _neighbours(best, drawn, turning, stands)]
         score, other = min(tried, key=lambda one: one[0], default=(np.inf, best))
-        if not score < least:
+        if not score < least and not stands:
             other = _tilted(best, judge)
             score = cost(other)
         if not score < least:
@@ -147,7 +150,9 @@ def _tilted(mounting: Mounting, judge: Judge) -> Mounting:
     return tilted if _alike(tilted, mounting) < np.cos(_LEAST_TILT) else mounting
 
 
-def _neighbours(best: Mounting, drawn: Mounting, turning: Sequence[bool]) -> Iterator[Mounting]:
+def _neighbours(
+    best: Mounting, drawn: Mounting, turning: Sequence[bool], stands: bool
+) -> Iterator[Mounting]:
     one = {
         k: [
             (direction, zero)
@@ -160,7 +165,7 @@ def _neighbours(best: Mounting, drawn: Mounting, turning: Sequence[bool]) -> Ite
     singles = [best.counted({k: option}) for k, options in one.items() for option in options]
     for single in (best, *singles):
         yield single
-        if drawn.gravity.any():
+        if drawn.gravity.any() and not stands:
             yield replace(single, gravity=drawn.gravity, hangs=False)
             yield from (single.under(down) for down in _DOWN)
     # Two joints that are both off are off by their zeros: that is what a maker's zero posture is.

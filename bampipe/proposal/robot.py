@@ -92,12 +92,28 @@ def find_robot_columns(
         if chosen is not None and others:
             listed = "; ".join(str(other) for other in others)
             notes.check.append(f"of several {what}, {chosen} are taken, not {listed}")
+    turns = _turns(device, robot)
+
+    def explain(positions: Group, drives: Group) -> Gears | None:
+        """How the drawing explains the drives, best mounted; None where they are not comparable."""
+        few, many = (
+            motion_along(positions_of(device, positions, t), t, rows)
+            for rows in (FEW_ROWS, MOST_ROWS)
+        )
+        if few is None or many is None or turns is None:
+            return None
+        compared = [Comparison(device, robot, drives, turns, motion) for motion in (few, many)]
+        return Gears(turns, *find_best_mounting(*compared))
+
+    found_some: Gears | None = None
+    if positions is not None and drives is not None:
+        found_some = explain(positions, drives)
+        other_unit = _in_unit_of_range(device, positions)
+        other = explain(other_unit, drives) if other_unit is not None else None
+        if other_unit is not None and other is not None and mean_left(other.drives) < _BETTER:
+            positions, found_some = other_unit, other
     columns: dict[str, SurveyedColumn] = {}
     if positions is not None:
-        other_unit = _in_unit_ofrange_of(device, positions)
-        if other_unit is not None and drives is not None:
-            judged = _judge(device, robot, other_unit, drives, t)
-            positions = other_unit if judged and mean_left(judged) < _BETTER else positions
         columns |= dict(zip(_joints(device), positions.columns, strict=True))
     if drives is not None:
         columns |= dict(zip(device.forces, drives.columns, strict=True))
@@ -105,60 +121,48 @@ def find_robot_columns(
         columns |= pairing.some_drives
     if positions is None or drives is None:
         return RobotColumns(columns, {})
-    judged = _judge(device, robot, positions, drives, t)
-    sound = bool(judged) and fits(judged)
-    beyond = _beyondrange_of(device, positions, of_joint=sound)
-    guessed = positions is not pairing.positions[0] and bool(judged) and mean_left(judged) > DOUBTED
-    turns = _turns(device, robot)
-    if turns is not None and (turns != 1.0).any() and (beyond or not sound):
-        of_motors = [
-            (group, known)
-            for group in (positions, _in_si(device, pairing.positions[0]))
-            if (known := known_gears(device, robot, group, drives, t, turns)) is not None
-        ]
-        if of_motors:
-            group, gears = min(of_motors, key=lambda item: mean_left(item[1].drives))
-            if beyond or mean_left(gears.drives) < mean_left(judged):
-                return _geared(device, columns, group, gears, notes, given=True)
-    if judged and not robot.motors and (guessed or not sound):
+    left = mean_left(found_some.drives) if found_some is not None else np.inf
+    sound = found_some is not None and fits(found_some.drives)
+    beyond = _beyond_range(device, positions, of_joint=sound)
+    guessed = positions is not pairing.positions[0] and DOUBTED < left < np.inf
+    groups = (positions, _in_si(device, pairing.positions[0]))
+    known = turns is not None and (turns != 1.0).any()
+    geared: list[tuple[Group, Gears]] = []
+    if turns is not None and known and (beyond or not sound):
+        each = [(g, known_gears(device, robot, g, drives, t, turns)) for g in groups]
+        geared = [(g, gears) for g, gears in each if gears is not None]
+    elif found_some is not None and not robot.motors and (guessed or not sound):
         # Hundreds without a unit are degrees, or radians of a motor.
-        geared = [
-            (group, fitted)
-            for group in (positions, _in_si(device, pairing.positions[0]))
-            if (fitted := find_gears(device, robot, group, drives, t)) is not None
-        ]
-        if geared:
-            group, gears = min(geared, key=lambda item: mean_left(item[1].drives))
-            if not sound or mean_left(gears.drives) < _BETTER * mean_left(judged):
-                return _geared(device, columns, group, gears, notes)
+        each = [(g, find_gears(device, robot, g, drives, t)) for g in groups]
+        geared = [(g, gears) for g, gears in each if gears is not None]
+    if geared:
+        group, gears = min(geared, key=lambda item: mean_left(item[1].drives))
+        better = mean_left(gears.drives) < left * (1.0 if known else _BETTER)
+        if better or (bool(beyond) if known else not sound):
+            return _geared(device, columns, group, gears, notes, given=known)
     notes.check += beyond
-    if not judged or (beyond and not sound):
+    if found_some is None or (beyond and not sound):
         return RobotColumns(columns, {})
-    if not (positions.named or drives.named):
-        other = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
-        turned = _judge(device, robot, *other, t)
-        if turned and mean_left(turned) < _BETTER * mean_left(judged):
+    if not (positions.named or drives.named or sound):
+        ordered = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
+        other = explain(*ordered)
+        if other is not None and mean_left(other.drives) < _BETTER * left:
             notes.check.append(
                 "columns stand in the alphabetical order of the joints' names, since weight and"
-                f" inertia as drawn explain {1.0 - mean_left(turned):.1%} of the drives that way,"
-                f" {max(1.0 - mean_left(judged), 0.0):.1%} in the order of the chain"
+                f" inertia as drawn explain {1.0 - mean_left(other.drives):.1%} of the drives that"
+                f" way, {max(1.0 - left, 0.0):.1%} in the order of the chain"
             )
-            judged = turned
-            columns |= dict(zip(_joints(device), other[0].columns, strict=True))
-            columns |= dict(zip(device.forces, other[1].columns, strict=True))
-            positions, drives = other
-    turns = turns if turns is not None else np.ones(len(judged))
-    few, many = (
-        _compare(device, robot, positions, drives, t, turns, rows) for rows in (FEW_ROWS, MOST_ROWS)
-    )
-    mounting = None
-    if few is not None and many is not None:
-        mounting, judged = find_best_mounting(few, many)
-        heavier = describe_heavier_body(many, mounting, folder)
+            found_some, (positions, drives) = other, ordered
+            columns |= dict(zip(_joints(device), positions.columns, strict=True))
+            columns |= dict(zip(device.forces, drives.columns, strict=True))
+    motion = motion_along(positions_of(device, positions, t), t, MOST_ROWS)
+    if motion is not None:
+        compared = Comparison(device, robot, drives, found_some.ratio, motion)
+        heavier = describe_heavier_body(compared, found_some.mounting, folder)
         notes.check += [heavier] if heavier else []
-    by_input = dict(zip(device.forces, judged, strict=True))
+    by_input = dict(zip(device.forces, found_some.drives, strict=True))
     notes.check += _sentences(device, columns, by_input)
-    return RobotColumns(columns, by_input, mounting=mounting)
+    return RobotColumns(columns, by_input, mounting=found_some.mounting)
 
 
 def _geared(
@@ -207,7 +211,7 @@ def _in_alphabetical_order(device: Device, group: Group) -> Group:
     return replace(group, columns=tuple(group.columns[k] for k in order))
 
 
-def _in_unit_ofrange_of(device: Device, group: Group) -> Group | None:
+def _in_unit_of_range(device: Device, group: Group) -> Group | None:
     """The positions in degrees or millimetres where they state no unit and only these fit."""
     found = []
     for c, column in zip(device.coordinates, group.columns, strict=True):
@@ -230,7 +234,7 @@ def _in_unit_ofrange_of(device: Device, group: Group) -> Group | None:
     return replace(group, columns=tuple(found)) if changed else None
 
 
-def _beyondrange_of(device: Device, positions: Group, of_joint: bool) -> list[str]:
+def _beyond_range(device: Device, positions: Group, of_joint: bool) -> list[str]:
     found = []
     for c, column in zip(device.coordinates, positions.columns, strict=True):
         span = float(np.ptp(np.nan_to_num(column.values))) * scale_to(c.unit, column)
@@ -247,28 +251,6 @@ def _beyondrange_of(device: Device, positions: Group, of_joint: bool) -> list[st
                 f" {width:.3g}: {why}"
             )
     return found
-
-
-def _judge(device: Device, robot: Robot, positions: Group, drives: Group, t: Array) -> list[Drive]:
-    """How each drive goes with the drawing; none where drives are not one a joint."""
-    ratio = _turns(device, robot)
-    if ratio is None:
-        return []
-    compared = _compare(device, robot, positions, drives, t, ratio, MOST_ROWS)
-    return [] if compared is None else compared.hold(compared.drawn)
-
-
-def _compare(
-    device: Device,
-    robot: Robot,
-    positions: Group,
-    drives: Group,
-    t: Array,
-    ratio: Array,
-    rows: int,
-) -> Comparison | None:
-    motion = motion_along(positions_of(device, positions, t), t, rows)
-    return None if motion is None else Comparison(device, robot, drives, ratio, motion)
 
 
 def _turns(device: Device, robot: Robot) -> Array | None:
