@@ -273,12 +273,19 @@ class Robot(Declaration):
         return np.ascontiguousarray(table.transpose(0, 2, 1).reshape(-1, INERTIAL * n))
 
     def describe_mass(self, place: int, factor: float) -> str:
-        """Say that the drives ask for ``factor`` times the mass of a body as drawn."""
+        """Say that the drives ask for ``factor`` times the mass of a body as drawn, and what to do.
+
+        Of the last body, which may hold a tool, without its numbers as ``[robot.payload]``.
+        """
         joint = self.joints[place]
-        return (
+        said = (
             f"the body on {joint.name} is about {factor:.2g} times as heavy as drawn"
             f" ({joint.mass:.3g} kg), by all drives together"
         )
+        if joint is not self.joints[-1] or self.payload is not None:
+            return f"{said}: is that what is mounted there? put its mass, centre and inertia in"
+        more = (factor - 1.0) * joint.mass
+        return f"{said}: a tool of about {more:.2g} kg? put it into [robot.payload]"
 
     def columns(self, q: Array, qd: Array, qdd: Array) -> list[list[list[Any]]]:
         """What one of each inertial number adds to the joints' forces: [joint][link][number].

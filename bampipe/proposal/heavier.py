@@ -37,7 +37,7 @@ def describe_heavier_body(compared: Comparison, mounting: Mounting, folder: Path
     joint = robot.joints[found.place]
     said = robot.describe_mass(found.place, found.factor)
     if joint is not robot.joints[-1] or robot.payload is not None:
-        return f"{said}: is that what is mounted there? put its mass, centre and inertia in"
+        return said
     rest = [drive - forces.sum(axis=1) for drive, forces in zip(drives, bodies, strict=True)]
     mass, center = fit_point_mass(
         rest,
@@ -49,4 +49,4 @@ def describe_heavier_body(compared: Comparison, mounting: Mounting, folder: Path
         turn, offset = frame_of_tip(read_tree(folder / robot.urdf), robot.base, robot.tip)
         center = turn.T @ (center - offset)
     place = ", ".join(f"{value:.2g}" for value in center)
-    return f"{said}: a tool? put in [robot.payload] mass = {mass:.3g}, center = [{place}]"
+    return f"{said} mass = {mass:.3g}, center = [{place}]"

@@ -28,17 +28,7 @@ from bampipe.setup.corrections import (
     sign_corrections,
     unit_corrections,
 )
-from bampipe.setup.finding import (
-    ALIKE,
-    LEAST_GAIN,
-    MOST_MISTAKES,
-    RANKED_ERROR,
-    Finding,
-    distinct,
-    gain_of,
-    is_explained,
-    spoils_sound_axes,
-)
+from bampipe.setup.finding import MOST_MISTAKES, Finding, Tried, choose, is_explained
 from bampipe.setup.plausibility import Plausibility
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import standstill_of
@@ -103,14 +93,14 @@ class DrawnSearch:
     def _best(self, change: Change, before: Plausibility, exchanged: bool) -> list[Finding]:
         """The mistake whose correction gains most, or two: one right and one not may be worse."""
         singles = self._try_all(change, [(one,) for one in self._singles(exchanged)])
-        best = self._choose(before, singles)
+        best = choose(before, singles, drawn=True)
         if not best or best[0].after.worst_error > SUSPICIOUS_DRAWN:
             mounted = product(
                 gravity_corrections(self.signals, self.robot),
                 encoder_sign_corrections(self.signals),
             )
             pairs = self._try_all(change, chain(quarter_turn_pairs(self.signals), mounted))
-            best = self._choose(before, [*singles, *pairs])
+            best = choose(before, [*singles, *pairs], drawn=True)
         return best
 
     def _singles(self, exchanged: bool) -> Iterator[Correction]:
@@ -121,35 +111,15 @@ class DrawnSearch:
             yield from exchange_corrections(self.signals)
             yield from unit_corrections(self.signals)
 
-    def _try_all(self, change: Change, options: Iterable[tuple[Correction, ...]]) -> list[_Tried]:
+    def _try_all(self, change: Change, options: Iterable[tuple[Correction, ...]]) -> list[Tried]:
         found = []
         for option in options:
             changed = change
             for correction in option:
                 changed = correction.change.after(changed)
             after = self._judge(changed)
-            if after is not None:
-                found.append(_Tried(option, after))
+            found += [Tried(option, after)] if after is not None else []
         return found
-
-    def _choose(self, before: Plausibility, tried: Sequence[_Tried]) -> list[Finding]:
-        ranked = sorted(tried, key=lambda one: one.score)
-        for best in ranked:
-            gain = gain_of(before, best.after, best.cost)
-            if gain < LEAST_GAIN or spoils_sound_axes(before, best.after):
-                continue
-            rivals = [
-                other.option[0]
-                for other in ranked
-                if len(best.option) == len(other.option) == 1
-                and other.option[0].signals != best.option[0].signals
-                and other.score < best.score + ALIKE
-            ]
-            alike = distinct(rivals)
-            return [
-                Finding(one, alike, before, best.after, gain, drawn=True) for one in best.option
-            ]
-        return []
 
     def _judge(self, change: Change) -> Plausibility | None:
         self.tested += 1
@@ -158,22 +128,6 @@ class DrawnSearch:
         added = np.array(change.gravity or self.robot.gravity) - self.robot.gravity
         band = change.of_band(self.band)
         return judge_drawn(self.system, changed, band, added, self.heavier)
-
-
-@dataclass(frozen=True)
-class _Tried:
-    """Corrections that were tried together, and what they explain."""
-
-    option: tuple[Correction, ...]
-    after: Plausibility
-
-    @property
-    def cost(self) -> float:
-        return sum(one.cost for one in self.option)
-
-    @property
-    def score(self) -> float:
-        return self.after.score(RANKED_ERROR) + self.cost
 
 
 def drawn_robot(system: System) -> Robot:

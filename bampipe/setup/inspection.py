@@ -12,17 +12,12 @@ from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, SetupResult
+from bampipe.setup.drawing import drawn_robot
 from bampipe.setup.finding import Finding, spoilt_axes
 from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
 from bampipe.setup.search import CorrectionSearch, shorten
-from bampipe.setup.words import (
-    describe_correction,
-    describe_evidence,
-    describe_heavier,
-    describe_lack,
-    describe_size,
-)
+from bampipe.setup.words import describe_correction, describe_evidence, describe_lack, describe_size
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Change, Signals
@@ -66,7 +61,8 @@ def inspect_setup(
     ]
     warnings += _describe_travel(system, motions)
     if search.heavier is not None:
-        warnings.append(describe_heavier(system, search.heavier))
+        robot = drawn_robot(system)
+        warnings.append(robot.describe_mass(search.heavier.place, search.heavier.factor))
     if held is not None and search.over_position is not None:
         warnings += describe_lack(system, held, search.over_position)
     named = " ".join(mistake.sentence for mistake in mistakes)

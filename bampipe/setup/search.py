@@ -29,14 +29,14 @@ from bampipe.setup.finding import (
     ALIKE,
     JUDGED_ERROR,
     LEAST_GAIN,
+    LEAST_GAIN_PLACEHOLDER,
     MOST_MISTAKES,
     RANKED_ERROR,
     SUSPICIOUS_ERROR,
     Finding,
-    distinct,
-    gain_of,
+    Tried,
+    choose,
     is_explained,
-    spoils_sound_axes,
 )
 from bampipe.setup.plausibility import Plausibility, axes_without_pose, judge_setup
 from bampipe.trials.folds import Folds
@@ -48,8 +48,6 @@ Array = NDArray[np.float64]
 SUSPICIOUS_PRIORS = 5.0
 """Sum of objections, beyond the usual, from which other set-ups are tried: two parameters beyond
 two deviations."""
-LEAST_GAIN_PLACEHOLDER = 4.0
-"""The same for a scale that stands at exactly 1, as nobody has filled it in."""
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
 """A factor, an angle (rad) and a share of an axis' travel below which what is off is no mistake of
 set-up but an effect to be diagnosed."""
@@ -185,11 +183,11 @@ class CorrectionSearch:
         """The mistake whose correction gains most beyond what is stated, None if none does."""
         before = now or _nothing_explained(self.system)
         tried = self._try_best(change, self._discrete())
-        best = self._choose(before, tried, placeholders)
-        if self.has_few_axes and self._is_suspicious(best.after if best else now, ()):
+        best = choose(before, tried, placeholders)
+        if self.has_few_axes and self._is_suspicious(best[0].after if best else now, ()):
             tried += self._try_best(change, self._continuous(change))
-            best = self._choose(before, tried, placeholders)
-        return best
+            best = choose(before, tried, placeholders)
+        return next(iter(best), None)
 
     def _discrete(self) -> Iterator[Correction]:
         yield from sign_corrections(self.signals)
@@ -238,44 +236,15 @@ class CorrectionSearch:
                     best, least = x, score
         return family(best)
 
-    def _try_best(
-        self, change: Change, corrections: Iterable[Correction]
-    ) -> list[tuple[Correction, Plausibility]]:
+    def _try_best(self, change: Change, corrections: Iterable[Correction]) -> list[Tried]:
         """Screen all corrections; return the best with what they explain of all trials."""
         screened = [(self.screen(correction, change), correction) for correction in corrections]
         screened.sort(key=lambda one: one[0])
         tried = []
         for score, correction in screened[:_SHORTLIST]:
-            if math.isfinite(score):
-                found = self.judge(correction.change.after(change))
-                if found is not None:
-                    tried.append((correction, found))
+            found = self.judge(correction.change.after(change)) if math.isfinite(score) else None
+            tried += [Tried((correction,), found)] if found is not None else []
         return tried
-
-    def _choose(
-        self,
-        before: Plausibility,
-        tried: Sequence[tuple[Correction, Plausibility]],
-        placeholders: Sequence[str],
-    ) -> Finding | None:
-        ranked = sorted(tried, key=lambda one: one[1].score(RANKED_ERROR) + one[0].cost)
-        for correction, after in ranked:
-            gain = gain_of(before, after, correction.cost)
-            hinted = correction.kind == "scale" and set(correction.signals) <= set(placeholders)
-            if gain < (LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN):
-                continue
-            if spoils_sound_axes(before, after):
-                continue
-            own = after.score(RANKED_ERROR) + correction.cost
-            rivals = tuple(
-                other
-                for other, found in ranked
-                if other is not correction
-                and (other.kind, other.signals) != (correction.kind, correction.signals)
-                and found.score(RANKED_ERROR) + other.cost < own + ALIKE
-            )
-            return Finding(correction, distinct(rivals), before, after, gain)
-        return None
 
 
 def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-from bampipe.estimate.heavier_body import HeavierBody
 from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
@@ -62,20 +61,6 @@ def describe_lack(system: System, before: Plausibility, after: Plausibility) -> 
         for i, axis in enumerate(system.coordinates)
         if after.error[i] < before.error[i] / 1.5
     ]
-
-
-def describe_heavier(system: System, found: HeavierBody) -> str:
-    """A sentence without a full stop on a body that is far heavier than drawn."""
-    robot = system.model.device.robot
-    assert robot is not None
-    joint = robot.joints[found.place]
-    more = (found.factor - 1.0) * joint.mass
-    said = robot.describe_mass(found.place, found.factor)
-    if joint is robot.joints[-1] and robot.payload is None:
-        return (
-            f"{said}: a tool of about {more:.2g} kg? put it into [robot.payload] of the device file"
-        )
-    return f"{said}: is that what is mounted there? put its mass, centre and inertia in"
 
 
 def _fall(axis: int, before: Plausibility, after: Plausibility) -> str:

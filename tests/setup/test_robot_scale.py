@@ -13,7 +13,7 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
 from bampipe.setup.corrections import scaled
-from bampipe.setup.finding import Finding
+from bampipe.setup.finding import Finding, Tried, choose
 from bampipe.setup.plausibility import Plausibility
 from bampipe.setup.search import CorrectionSearch
 from bampipe.trials.folds import Folds
@@ -121,7 +121,7 @@ def test_what_spoils_a_joint_that_was_right_is_no_mistake(third: float, named: b
         for error, objection in (((0.10, 0.55, 0.08, 0.21), 1.0), ((0.12, 0.32, third, 0.21), 0.5))
     )
     twice = scaled(search.signals, FORCES, 2.0, 0.0)
-    assert (search._choose(before, [(twice, after)], ()) is not None) == named
+    assert bool(choose(before, [Tried((twice,), after)])) == named
 
 
 def turned(factor: float, zero: float, joint: int, drive: float) -> list[Motion]:

@@ -446,6 +446,18 @@ def test_gravity_of_a_base_that_does_not_stand(
     assert [c.name for c in session.channels if c.scale < 0.0] == ["torque_shoulder"]
 
 
+def test_efforts_that_are_called_eff_are_drives(tmp_path: Path) -> None:
+    write_log(tmp_path)
+    table = pd.read_csv(tmp_path / "log.csv")
+    joints = {"1": "shoulder", "2": "elbow"}
+    names = {f"q{n}": f"{j}_pos" for n, j in joints.items()}
+    names |= {f"tau{n}": f"{j}_eff" for n, j in joints.items()}
+    table.rename(columns=names).to_csv(tmp_path / "log.csv", index=False)
+    assert proposed(tmp_path).fill_in == []
+    channels = {c.name: c.column for c in read_session(tmp_path).channels}
+    assert channels == {"torque_shoulder": "shoulder_eff", "torque_elbow": "elbow_eff"}
+
+
 def test_a_heavy_tool_is_said_with_the_payload_that_it_suggests(tmp_path: Path) -> None:
     arm.record_logs(
         tmp_path / "log", 6, "ZYYX", style="joint_states", trials=1, drawing_error=0.0,
