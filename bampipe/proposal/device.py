@@ -175,6 +175,13 @@ def with_motors(
     return replace(chosen, text=text, device=_complete(folder, text))
 
 
+def with_gravity(folder: Path, chosen: ChosenDevice, said: str) -> ChosenDevice:
+    """A new device file of a robot with a line on gravity."""
+    head, motors, rest = chosen.text.partition("\n[robot.motors")
+    text = f"{head}{said}  # guess: by the drawn bodies\n{motors}{rest}"
+    return replace(chosen, text=text, device=_complete(folder, text))
+
+
 def _complete(folder: Path, text: str) -> Device:
     return registry.device_from(complete_device(tomllib.loads(text), folder, DEVICE), DEVICE)
 
