@@ -47,9 +47,7 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
     p_values = {e: chance_of(drop, selection.chance) for e, drop in weighed.drops.items()}
     # Of what chance gives as well, nothing is sure.
     probability = {
-        e: min(share, 1.0)
-        if p_values.get(e, 0.0) <= c.significance
-        else min(share, 1.0 - p_values[e])
+        e: min(share, 1.0 if p_values.get(e, 0.0) <= c.significance else 1.0 - p_values[e])
         for e, share in weighed.effects.items()
     }
     where = {e: effect_axes(initial, final, e) for e in probability}
@@ -61,7 +59,7 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
         listed = dict(sorted(listed.items(), key=lambda pair: -pair[1]))
         unknown = min(float(weighed.unknown[axis]), 1.0)
         axes.append(_judge(session, selection, axis, name, listed, unknown))
-    ranking = rank_effects(selection, probability, p_values)
+    ranking = rank_effects(selection, probability, p_values, 1.0 - c.probability)
     return Conclusion(
         tuple(axes), selected, tuple(ranking), _sets(selection),
         NullDistribution(
@@ -155,9 +153,14 @@ def effect_axes(initial: Fit, final: Fit, effect: str) -> tuple[int, ...]:
 
 
 def rank_effects(
-    selection: Selection, probability: Mapping[str, float], p_values: Mapping[str, float]
+    selection: Selection,
+    probability: Mapping[str, float],
+    p_values: Mapping[str, float],
+    mentioned: float,
 ) -> list[RankedEffect]:
     """Effects of the most probable set, then the others by what each gains alone.
+
+    Sets that are ``mentioned`` have at least that probability.
 
     The error without an effect of the set, beside the others, or with another one alone, follows
     from the log evidence by the independent samples of the axis.
@@ -194,7 +197,7 @@ def rank_effects(
                 p_value=p_values.get(effect, chance_of(gain, selection.chance)),
                 score=gain,
                 parameters={n: float(v) for n, v in values.items() if n in _own(final, effect)},
-                indistinguishable_from=_alike(selection, effect),
+                indistinguishable_from=_alike(selection, effect, mentioned),
             )
         )
     return rows
@@ -205,13 +208,13 @@ def _own(fit: Fit, effect: str) -> frozenset[str]:
     return frozenset(q.name for item in found for q in item.parameters)
 
 
-def _alike(selection: Selection, effect: str) -> tuple[str, ...]:
+def _alike(selection: Selection, effect: str, mentioned: float) -> tuple[str, ...]:
     """Effects that take the place of one in a set which is as good as undecided against it."""
     best = {*selection.effects}
     found = []
     for one in selection.weighed.sets[1:]:
         swapped = {*one.effects} ^ best
-        if len(swapped) == 2 and effect in swapped and one.probability >= 0.1:
+        if len(swapped) == 2 and effect in swapped and one.probability >= mentioned:
             found += [e for e in swapped if e != effect]
     return tuple(sorted({*found}))
 

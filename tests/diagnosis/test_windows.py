@@ -35,6 +35,6 @@ def test_blocks_of_one_trial_are_mapped_under_its_name() -> None:
         band=SimpleNamespace(thinned_rows=lambda n: np.arange(n)),
         system=SimpleNamespace(coordinates=()),
     )
-    found = _map_variables(SimpleNamespace(initial=initial))  # type: ignore[arg-type]
+    found = _map_variables(initial)  # type: ignore[arg-type]
     assert set(found["trial_id"]) == {"t1"}
     assert found["t"].tolist() == [0.0, 1.0, 2.0, 4.0, 5.0, 6.0]

@@ -1,0 +1,151 @@
+"""The likelihood: weights, what replays share, stops, heavy tails, bounds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.session import Session, system_of
+from bampipe.trials.likelihood import (
+    Likelihood,
+    Noise,
+    Problem,
+    Samples,
+    solve_bounded,
+    take_samples,
+)
+
+
+@pytest.fixture(scope="module")
+def fitted(record):
+    """The arm, which lacks nothing, fitted under the likelihood."""
+    trials, recipe = record("bam", 6)
+    session = Session(trials, Criteria())
+    start = session.fit_plainly(recipe, system_of(recipe).prior).evidence.p
+    return session, session.fit(recipe, start)
+
+
+def factors(fit, residual):
+    """Of the common bias, and of the replay that stops, by axis, each (n_q,)."""
+    problem = fit.likelihood.pose(fit.evidence, residual)
+    solved = problem.to_parameters @ problem.solve().base
+    n_q = len(residual)
+    return solved[-2 * n_q : -n_q], solved[-n_q:]
+
+
+def test_a_replay_has_unit_variance_in_units_of_its_noise(fitted):
+    """Fast or slow; by replays that the noise was not made of, without the error of any model."""
+    session, fit = fitted
+    like = fit.likelihood
+    exact = Likelihood.of(fit.evidence, like.samples, like.noise, 1e-9, 1e-9)
+    fresh = session.replay(fit.evidence, fit.evidence.p, 6, first=100)
+    for axis, here in enumerate(like.samples):
+        rows = np.array([take_samples(r, here, axis) for r in fresh]) - like.noise.bias[axis]
+        square = np.mean((rows * exact.root[axis]) ** 2, axis=0)
+        speed = like.noise.speed[axis]
+        by_speed = [square[speed == k].mean() for k in np.unique(speed)]
+        assert 0.6 < min(by_speed) and max(by_speed) < 1.7
+        spread = 1.0 / exact.root[axis]
+        assert spread.max() > 1.5 * spread.min()
+
+
+def test_what_a_model_may_be_wrong_by_weighs_less_where_the_force_is_large(fitted):
+    _, fit = fitted
+    like = fit.likelihood
+    loose = Likelihood.of(fit.evidence, like.samples, like.noise, 1e-9, 0.05)
+    for force, root in zip(loose.applied, loose.root, strict=True):
+        large, small = np.abs(force) > np.quantile(np.abs(force), [[0.9], [0.1]])
+        assert root[large].mean() < 0.6 * root[~small].mean()
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0, 1.4])
+def test_what_all_replays_share_goes_to_the_factor_of_the_bias(fitted, share):
+    _, fit = fitted
+    noise = fit.likelihood.noise
+    by_replay = [r[0] + (share - 1.0) * b for r, b in zip(noise.residuals, noise.bias, strict=True)]
+    of_bias, of_stops = factors(fit, by_replay)
+    assert of_bias + of_stops == pytest.approx(np.full(3, share), abs=0.2)
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.8, 0.8), (-0.7, 0.0), (4.0, 1.5)])
+def test_friction_that_truly_stops_has_a_factor_of_its_own_within_bounds(fitted, share, found):
+    _, fit = fitted
+    noise = fit.likelihood.noise
+    # Unlike anything the model's own parameters could do.
+    rng = np.random.default_rng(3)
+    stops = tuple(np.abs(b).max() * rng.normal(size=b.shape) for b in noise.bias)
+    like = replace(fit.likelihood, noise=replace(noise, stopping=stops))
+    residual = [b + share * s for b, s in zip(noise.bias, stops, strict=True)]
+    assert factors(replace(fit, likelihood=like), residual)[1] == pytest.approx(
+        np.full(3, found), abs=0.1
+    )
+
+
+def problem_of(y, base, *, independent=None, lower=-np.inf, upper=np.inf, absence=None):
+    """A problem of one axis whose parameters (n,) are known to be about zero, sd 100."""
+    n, rows = base.shape[1], len(y)
+    nothing, place = np.zeros(rows), np.zeros(rows, dtype=np.int64)
+    samples = Samples(np.arange(rows), place, place, independent or float(rows))
+    noise = Noise((nothing,), (nothing + 1.0,), (nothing,), (nothing[None],), (place,))
+    like = Likelihood((samples,), noise, (nothing + 1.0,), (nothing + 1.0,), (np.ones((rows, 1)),))
+    bounds = np.broadcast_to(lower, n), np.broadcast_to(upper, n)
+    precision = 1e-4 * np.eye(n)
+    return Problem(like, (y,), (base,), precision, np.zeros(n), np.eye(n), *bounds, absence or {})
+
+
+@pytest.fixture
+def line():
+    """y + 2 x0 - x1 + noise = 0 at (2, -1)... in the sign of a residual, and its columns."""
+    rng = np.random.default_rng(1)
+    base = rng.normal(size=(400, 2))
+    return -base @ [2.0, -1.0] + 0.1 * rng.normal(size=400), base
+
+
+def test_parameters_and_strengths_stay_within_bounds_and_the_rest_moves_along(line):
+    y, base = line
+    free = problem_of(y, base).solve()
+    assert free.base == pytest.approx([2.0, -1.0], abs=0.03)
+    held = problem_of(y, base, upper=np.array([1.5, np.inf])).solve()
+    assert held.base[0] == pytest.approx(1.5)
+    given = np.linalg.lstsq(base[:, 1:], -y - 1.5 * base[:, 0], rcond=None)[0]
+    assert held.base[1] == pytest.approx(given[0], abs=1e-3)
+    assert held.cost > free.cost
+    # A column beyond the model's own, whose strength would be negative, is left out.
+    one = problem_of(y, base[:, :1])
+    xx, xy = (base.T @ base)[None], (base.T @ y)[None]
+    yy = np.array([y @ y])
+    out = solve_bounded(one, xx, xy, yy, np.array([0.0]), np.array([np.inf]))
+    assert out.held.tolist() == [True] and out.unknowns[1] == 0.0
+    inside = solve_bounded(one, xx, xy, yy, np.array([-3.0]), np.array([0.0]))
+    assert inside.unknowns == pytest.approx(free.base, abs=1e-6)
+
+
+def test_an_effect_that_is_taken_away_has_the_change_that_takes_it_away(line):
+    y, base = line
+    problem = problem_of(y, base)
+    gone = solve_bounded(problem, *problem.sums(), absent={1: 0.25})
+    assert gone.base[1] == pytest.approx(0.25)
+    given = np.linalg.lstsq(base[:, :1], -y - 0.25 * base[:, 1], rcond=None)[0]
+    assert gone.base[0] == pytest.approx(given[0], abs=1e-3)
+
+
+def test_a_few_samples_that_no_replay_has_do_not_decide_under_heavy_tails(line):
+    y, base = line
+    y = y.copy()
+    wild = np.arange(0, 400, 40)
+    y[wild] += 6.0 * np.sign(base[wild, 0])
+    plain = problem_of(y, base)
+    off = abs(plain.solve().base[0] - 2.0)
+    like, problem = plain.likelihood, plain
+    for _ in range(4):
+        like = plain.likelihood.with_heavy_tails(problem, tails=4.0)
+        rows = zip(like.root, (y,), (base,), strict=True)
+        ((root, one, columns),) = rows
+        problem = replace(plain, likelihood=like, y=(root * one,), base=(root[:, None] * columns,))
+        problem = replace(problem, likelihood=plain.likelihood)
+    assert abs(problem.solve().base[0] - 2.0) < 0.5 * off
+    calm = np.setdiff1d(np.arange(400), wild)
+    assert like.root[0][wild].max() < 0.5 * like.root[0][calm].mean()
