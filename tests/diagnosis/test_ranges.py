@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from sessions import BAND, bam, made
 
-from bampipe.diagnosis.session import system_of
 from bampipe.diagnosis.ranges import MachineScale
+from bampipe.diagnosis.session import system_of
 from bampipe.physics import Model, registry
 from bampipe.trials.evidence import gather_evidence
 
