@@ -95,12 +95,12 @@ def _chance(before: np.ndarray, after: np.ndarray, columns: int, more: int) -> f
     left = float(after @ after)
     if left <= 0.0:
         return 0.0
-    freedom = max(len(after) / _correlated(after) - columns, 1.0)
+    freedom = max(len(after) / correlated(after) - columns, 1.0)
     f = (float(before @ before) / left - 1.0) * freedom / more
     return float(fdtrc(more, freedom, f))
 
 
-def _correlated(rest: np.ndarray) -> float:
+def correlated(rest: np.ndarray) -> float:
     """Samples of a residual (T,) that say as much as one: neighbours err alike."""
     n = len(rest)
     power = np.abs(np.fft.rfft(rest - rest.mean(), 2 * n)) ** 2

@@ -8,6 +8,7 @@ from itertools import takewhile
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bampipe.data.lumping import LumpedBodies
@@ -16,6 +17,8 @@ from bampipe.data.robot_tree import MOVING, DriveLimits, Tree, TreeJoint, gravit
 from bampipe.data.robot_xml import DEEPEST
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names
+
+Array = NDArray[np.float64]
 
 _MANY = 8
 """Most names that a message lists."""
@@ -85,6 +88,7 @@ def select_chain(
     _refuse_broken(tree, where)
     base = _link(base, tree, where) if base else _only_root(tree, where)
     tip = _link(tip, tree, where) if tip else _only_end(tree, base, where)
+    tree, held_alone = _hold_followers(tree, tree.path(base, tip, where))
     path = tree.path(base, tip, where)
     if payload is not None:
         held = tree.bodies[tip].joined(Body.of_table(payload))
@@ -95,11 +99,52 @@ def select_chain(
     lumped = LumpedBodies(tree, moving)
     tables = _tables(path, lumped, where)
     limits = {identifier(joint.name): joint.limits for joint in moving}
-    held_still = [joint.name for start in moving for joint in lumped.held_on(start.child)]
+    held_still = [*held_alone] + [
+        joint.name for start in moving for joint in lumped.held_on(start.child)
+    ]
     notes = tree.notes
     if held_still:
         notes = (f"held at zero beside the chain: {join_names(held_still, _MANY)}", *notes)
     return Chain(tables, limits, base, tip, notes, *gravity_at(tree, base))
+
+
+def _hold_followers(tree: Tree, path: Sequence[TreeJoint]) -> tuple[Tree, list[str]]:
+    """The tree with joints that follow others of the path alone, and those now held still.
+
+    What follows a joint beside the path is held at zero, and one that follows a follower follows
+    what moves that.
+    """
+    own = {joint.name: joint for joint in path if joint.kind != "fixed"}
+    joints, held = list(tree.joints), []
+    for k, joint in enumerate(joints):
+        if joint.mimic is None or joint.name not in own:
+            continue
+        (other, ratio, zero), seen = joint.mimic, {joint.name}
+        while other in own and other not in seen and own[other].mimic is not None:
+            seen.add(other)
+            after, by, at = own[other].mimic or ("", 1.0, 0.0)
+            other, ratio, zero = after, ratio * by, zero + ratio * at
+        if other in own and other not in seen:
+            joints[k] = replace(joint, mimic=(other, ratio, zero))
+        else:
+            joints[k] = replace(joint, kind="fixed", mimic=None)
+            held.append(joint.name)
+    return replace(tree, joints=joints), held
+
+
+def frame_of_tip(tree: Tree, base: str, tip: str) -> tuple[Array, Array]:
+    """Rotation (3, 3) and place (3,), m, of the tip's frame in that of the last joint that moves.
+
+    Raises:
+        InputError: no path between the links.
+    """
+    turn, offset = np.eye(3), np.zeros(3)
+    for joint in tree.path(base, tip):
+        if joint.kind != "fixed":
+            turn, offset = np.eye(3), np.zeros(3)
+            continue
+        offset, turn = offset + turn @ joint.offset, turn @ joint.turn
+    return turn, offset
 
 
 def _tables(path: Sequence[TreeJoint], lumped: LumpedBodies, where: str) -> dict[str, Any]:
@@ -126,6 +171,9 @@ def _tables(path: Sequence[TreeJoint], lumped: LumpedBodies, where: str) -> dict
             "velocity": max(joint.limits.velocity, 0.0),
             **lumped.body_on(joint.child).table(),
         }
+        if joint.mimic is not None:
+            other, ratio, zero = joint.mimic
+            table |= {"follows": identifier(other), "ratio": ratio, "zero": zero}
         found[name] = {"after": before, **table} if before else table
         turn, offset, before, fixed_between = np.eye(3), np.zeros(3), name, False
     return found

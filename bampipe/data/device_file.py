@@ -87,13 +87,15 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
             where=where,
             remedy='choose a part: base = "..." and tip = "..." in [robot]',
         )
-    kinds = {joint: str(entry.get("kind")) for joint, entry in joints.items()}
+    kinds = {
+        joint: str(entry.get("kind")) for joint, entry in joints.items() if not entry.get("follows")
+    }
     if not set(kinds.values()) <= set(_UNITS):
         return table
     motors = robot.get("motors", {})
     if not _well_formed(motors, kinds):  # the check of its fields says what is wrong
         motors = {}
-    filled = _filled(kinds, {joint: limits.get(joint, DriveLimits()) for joint in joints}, motors)
+    filled = _filled(kinds, {joint: limits.get(joint, DriveLimits()) for joint in kinds}, motors)
     if source and not table.get("source"):
         filled["source"] = source
     return {**filled, **table, "robot": robot}

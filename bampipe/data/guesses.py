@@ -7,18 +7,27 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import oaconvolve
+from scipy.optimize import minimize_scalar
 
-from bampipe.data.angle_torque import AngleTorque, angle_torque, least_squares
+from bampipe.data.angle_torque import AngleTorque, angle_torque, correlated, least_squares
 from bampipe.data.quality.clock import rate_of
 from bampipe.data.session import SECONDS
+from bampipe.data.smoothing import SmoothedMotion
 from bampipe.data.units import spelled
 
 RATES_HZ = (4.0, 30_000.0)
 """Sample rates at which motion is logged."""
 
-_SMOOTHED_S = 0.06
-"""Length of the window over which motion and input are smoothed before they are compared, s."""
+_SPANS, _STEP = (0.5, 4.0 * np.pi), 0.01
+"""Angles that a joint spans while it is logged, rad, and a step of their logarithm."""
+_WEIGHT_LEAVES, _SURE_TURNING = 0.5, 0.03
+"""Of what a straight line leaves of the drive, what a sine may leave, and the relative standard
+error up to which what a reading is worth is proposed."""
+_MOST_ROWS = 20_000
+"""Of which that is found."""
+_LEAST_SIGN_BIT, _SIGN_GAP = 7, 0.7
+"""Lowest bit that is taken for a sign, and the largest magnitude, as a share of it, by which an
+empty range below the bit shows it."""
 
 _NICE = (1, 1.2, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 7.5, 8)
 
@@ -101,24 +110,12 @@ def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False
         t: (T,) s; q: (T,) position; column: (T,).
         angle: whether the position is an angle in rad, on which gravity may depend.
     """
-    step = float(np.median(np.diff(t)))
-    width = max(5, round(_SMOOTHED_S / step) | 1)
-    if len(t) < 4 * width + 20:
+    motion = SmoothedMotion.of(t, q)
+    if motion is None:
         return Driven(0.0)
-    window = np.hanning(width + 2)[1:-1] / np.hanning(width + 2).sum()
-
-    def smoothed(values: np.ndarray) -> np.ndarray:
-        return np.asarray(oaconvolve(values, window, "same"))
-
-    smooth = smoothed(q)
-    qd = np.gradient(smooth, step)
-    qdd = np.gradient(qd, step)
-    inner = slice(2 * width, -2 * width or None)
-    # Both sides alike: what one filter takes off the motion, it takes off the column too.
-    sides = [smoothed(qdd), smoothed(qd), smoothed(np.sign(qd)), np.ones_like(q)]
-    moving = np.column_stack(sides)[inner]
-    position = smoothed(smooth)[inner]
-    target = smoothed(smoothed(column))[inner]
+    moving = np.column_stack([motion.moving, np.ones_like(q)])[motion.inner]
+    position = motion.position[motion.inner]
+    target = motion.smooth(column)[motion.inner]
     spread = float(np.sum((target - target.mean()) ** 2)) if len(target) else 0.0
     if spread == 0.0:
         return Driven(0.0)
@@ -132,22 +129,123 @@ def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False
     return Driven(share, inertia, viscous, coulomb, pose)
 
 
-def signed_register(values: np.ndarray) -> int:
-    """Bits of an unsigned register that holds signed numbers, 0 where it is none."""
+@dataclass(frozen=True)
+class Turning:
+    """What readings of a position are worth, by the weight that goes with the sine of the angle.
+
+    Attributes:
+        size: raw units of one radian of the joint; sd: its standard error.
+        zero: reading where the joint hangs.
+    """
+
+    size: float
+    sd: float
+    zero: float
+
+
+def find_turning(t: np.ndarray, q: np.ndarray, drive: np.ndarray) -> Turning | None:
+    """Raw units of a radian at which a drive goes best with the sine of the angle.
+
+    Args:
+        t: (T,) s; q: (T,) position in counts, or of a motor before its gear; drive: (T,).
+
+    Returns:
+        None where weight does not show it, or not to a few per cent.
+    """
+    motion = SmoothedMotion.of(t, q)
+    if motion is None or np.ptp(q) == 0.0:
+        return None
+    rows = np.arange(len(q))[motion.inner][:: max(1, len(q) // _MOST_ROWS)]
+    moving = np.column_stack([motion.moving, np.ones_like(q)])[rows]
+    position, target = motion.position[rows], motion.smooth(drive)[rows]
+    middle, span = float(np.median(position)), float(np.ptp(position))
+
+    def fitted(x: float) -> tuple[np.ndarray, np.ndarray]:
+        angle = np.exp(x) / span * (position - middle)
+        return least_squares(np.column_stack([moving, np.sin(angle), np.cos(angle)]), target)
+
+    def left(x: float) -> float:
+        rest = fitted(x)[1]
+        return float(rest @ rest)
+
+    # What an angle spans, by its logarithm: from half a radian to two turns.
+    tried = np.linspace(math.log(_SPANS[0]), math.log(_SPANS[1]), 60)
+    costs = [left(x) for x in tried]
+    best = int(np.argmin(costs))
+    if best in (0, len(tried) - 1):
+        return None
+    found = minimize_scalar(left, bounds=(tried[best - 1], tried[best + 1]), method="bounded")
+    x, least = float(found.x), float(found.fun)
+    line = least_squares(np.column_stack([moving, position]), target)[1]
+    coefficients, rest = fitted(x)
+    curvature = (left(x + _STEP) - 2.0 * least + left(x - _STEP)) / _STEP**2
+    freedom = max(len(rest) / correlated(rest) - 7.0, 1.0)
+    if least > _WEIGHT_LEAVES * float(line @ line) or curvature <= 0.0:
+        return None
+    sd = float(np.sqrt(2.0 * least / freedom / curvature))
+    if sd > _SURE_TURNING:
+        return None
+    *beside, sine, cosine = coefficients[[1, 2, 4, 5]]
+    hangs = np.arctan2(-cosine, sine) if sum(beside) >= 0.0 else np.arctan2(cosine, -sine)
+    size = span / float(np.exp(x))
+    return Turning(size, sd * size, middle + size * float(hangs))
+
+
+@dataclass(frozen=True)
+class Register:
+    """How an unsigned register holds signed numbers.
+
+    Attributes:
+        bits: of its width, of two's complement; 0 where it has a sign bit.
+        sign_bit: number of the bit that stands for minus, the lower ones being the magnitude.
+    """
+
+    bits: int = 0
+    sign_bit: int = 0
+
+    @property
+    def fields(self) -> str:
+        """What the session file says of it, after a comma."""
+        if self.bits:
+            return f", wrap_bits = {self.bits}, signed = true"
+        return f", sign_bit = {self.sign_bit}"
+
+    @property
+    def words(self) -> str:
+        if self.bits:
+            return f"a signed register of {self.bits} bits"
+        return f"sign and magnitude: bit {self.sign_bit} stands for minus"
+
+    def signed(self, values: np.ndarray) -> np.ndarray:
+        """What readings (T,) stand for."""
+        half = 2.0 ** (self.bits - 1 if self.bits else self.sign_bit)
+        negative = values - 2.0 * half if self.bits else half - values
+        return np.where(values >= half, negative, values)
+
+
+def find_register(values: np.ndarray) -> Register | None:
+    """How an unsigned register holds its sign, None where it holds none.
+
+    Two's complement leaves the middle of the range empty, sign and magnitude the upper part of
+    either half. In both the readings leap where the number crosses 0, and not once they are signed.
+    """
     known = values[np.isfinite(values)]
     if len(known) == 0 or known.min() < 0 or not np.all(known == np.rint(known)):
-        return 0
+        return None
     for bits in (16, 32):
         top, half = 2.0**bits, 2.0 ** (bits - 1)
         if half < known.max() < top and np.any(known < half) and np.any(known > 0.75 * top):
             middle = np.mean((known > 0.25 * top) & (known < 0.75 * top))
-            return bits if middle < 0.01 else 0
-    return 0
-
-
-def signed(values: np.ndarray, bits: int) -> np.ndarray:
-    """What an unsigned register of so many bits stands for; the values themselves where 0."""
-    return np.where(values >= 2.0 ** (bits - 1), values - 2.0**bits, values) if bits else values
+            return Register(bits=bits) if middle < 0.01 else None
+    bit = int(np.log2(max(known.max(), 1.0)))
+    half, register = 2.0**bit, Register(sign_bit=bit)
+    above, below = known[known > half] - half, known[known < half]
+    if bit < _LEAST_SIGN_BIT or min(len(above), len(below)) < 3:
+        return None
+    leaps, steps = (np.abs(np.diff(v)) for v in (known, register.signed(known)))
+    # A gap below the bit that no reading crosses; or, of what fills it, no leap.
+    empty = max(above.max(), below.max()) < _SIGN_GAP * half
+    return register if empty or steps.max() < 0.5 * leaps.max() else None
 
 
 def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:

@@ -80,7 +80,9 @@ def put_bodies(
         base, tip: of the chain.
         bodies, limits: by joint of the chain.
     """
-    moving = [joint for joint in tree.path(base, tip) if joint.kind != "fixed"]
+    # A joint that follows one beside the chain is held, too, and has no body of its own.
+    path = [joint for joint in tree.path(base, tip) if joint.kind != "fixed"]
+    moving = [joint for joint in path if identifier(joint.name) in bodies]
     lumped = LumpedBodies(tree, moving)
     placed = dict(tree.bodies)
     named = {joint.name: identifier(joint.name) for joint in moving}

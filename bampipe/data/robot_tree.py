@@ -56,6 +56,8 @@ class TreeJoint:
         angles: of ``turn``, about the fixed axes x, y, z, rad.
         axis: in its own frame.
         limits: of its drive.
+        mimic: the joint that it follows, its motion for one of that, and its position where that
+            is at zero, rad or m; None where it moves by itself.
     """
 
     name: str
@@ -67,6 +69,7 @@ class TreeJoint:
     angles: tuple[float, float, float]
     axis: list[float]
     limits: DriveLimits
+    mimic: tuple[str, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -176,6 +179,9 @@ def tree_of_tables(tables: Mapping[str, Mapping[str, Any]]) -> Tree:
                 (roll, pitch, yaw),
                 [float(v) for v in table.get("axis", (0.0, 0.0, 1.0))],
                 DriveLimits(),
+                (str(table["follows"]), float(table.get("ratio", 1)), float(table.get("zero", 0)))
+                if table.get("follows")
+                else None,
             )
         )
     return Tree(bodies, joints)

@@ -71,10 +71,11 @@ class StreamLayout:
                 where=where,
                 remedy="log the position",
             )
-        wrapped = [channel.name for channel in session.channels if channel.wrap_bits]
-        if wrapped:
+        registers = [encoder.name for encoder in session.encoders if encoder.sign_bit]
+        registers += [c.name for c in session.channels if c.sign_bit or c.wrap_bits]
+        if registers:
             raise InputError(
-                f"channel {wrapped[0]} is a register that wraps, which a stream cannot undo",
+                f"{registers[0]} is a register that holds a sign, which a stream cannot undo",
                 where=where,
                 remedy="log it as a signed number",
             )

@@ -103,7 +103,12 @@ def _joint(entry: ElementTree.Element, where: str) -> TreeJoint:
         number("dynamics", "friction"),
     )
     shown = (angles[0], angles[1], angles[2])
-    return TreeJoint(name, kind, ends[0], ends[1], turn, offset, shown, axis, limits)
+    mimic = None
+    follows = entry.find("mimic")
+    if follows is not None and follows.get("joint"):
+        ratio = numbers(follows, "multiplier", "1", 1, place)[0]
+        mimic = str(follows.get("joint")), ratio, numbers(follows, "offset", "0", 1, place)[0]
+    return TreeJoint(name, kind, ends[0], ends[1], turn, offset, shown, axis, limits, mimic)
 
 
 def urdf_text(name: str, tree: Tree, comment: str) -> str:
@@ -132,6 +137,11 @@ def urdf_text(name: str, tree: Tree, comment: str) -> str:
                 effort=repr(own.effort or _UNLIMITED), velocity=repr(own.velocity or _UNLIMITED),
             )  # fmt: skip
             _put_losses(entry, own)
+            if joint.mimic is not None:
+                other, ratio, zero = joint.mimic
+                ElementTree.SubElement(
+                    entry, "mimic", joint=other, multiplier=repr(ratio), offset=repr(zero)
+                )
     return document(robot, comment)
 
 

@@ -245,7 +245,7 @@ def _identified_joints(
             joint.velocity,
             damping=max(value.get(f"viscous.{joint.name}", 0.0), 0.0),
             friction=max(value.get(f"coulomb.{joint.name}", 0.0), 0.0),
-            armature=float(drives[joint.name]),
+            armature=float(drives.get(joint.name, 0.0)),
         )
     return bodies, limits
 

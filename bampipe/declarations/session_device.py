@@ -96,6 +96,9 @@ def _mismatches(session: Session, device: Device) -> Iterator[InputError]:
         yield InputError(
             f"found \"{session.force.unit}\", but device '{device.name}' takes {device.force_unit}",
             where=f"{where}: force.unit",
+            remedy="lever_m, its distance from the axis in m, makes a torque of a force"
+            if (session.force.unit, device.force_unit) == ("N", "N.m")
+            else "",
         )
 
 

@@ -223,9 +223,10 @@ class Search:
             normal[:nb, :nb] += p.precision
             used = np.flatnonzero(~solved.held)
             # What a set takes away does not move along: its place can be taken by a twin of it.
-            free = hold_parameters(p.to_parameters, absent, n)[1]
-            moving = nb - (n - free.shape[1])
-            inside = _schur(free.T @ normal @ free, moving)[np.ix_(used, used)]
+            if absent:
+                free = hold_parameters(p.to_parameters, absent, n)[1]
+                normal = free.T @ normal @ free
+            inside = _schur(normal, nb - (n - len(normal)))[np.ix_(used, used)]
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
             member = np.repeat(np.arange(len(keys)), widths)[used]
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)

@@ -141,9 +141,11 @@ def select_effects(
     """
     progress(0.0, "replaying the model")
     initial = current = session.fit(recipe, start)
-    steps, tried = [current], {frozenset(recipe.effects)}
+    steps = [current]
+    fits: dict[frozenset[str], Fit | None] = {frozenset(recipe.effects): current}
     gains: dict[str, float] = {}
     known: Search | None = None
+    last = False
     for number in range(_MOST_ROUNDS):
         progress(0.1 + 0.1 * number, "weighing sets of effects")
         with open_search(session, current, without, known) as search:
@@ -154,19 +156,22 @@ def select_effects(
                 gains = {key[0]: none - cost for cost, key in beside}
             room = session.criteria.most_effects - len(current.recipe.effects) + len(recipe.effects)
             pool = _explore(search, room, deep=room if number == 0 else min(_DEEP, room))
-            moved = None
-            last = number == _MOST_ROUNDS - 1
+            moved: Fit | None = None
+            last |= number == _MOST_ROUNDS - 1
             better = [(c, k) for c, k in sorted(pool.values()) if c < none - _WORTH]
             for _, keys in [] if last else better[:_TRIED]:
                 wider = change_set(current.recipe, keys)
-                if frozenset(wider.effects) in tried:
-                    continue
-                tried.add(frozenset(wider.effects))
+                members = frozenset(wider.effects)
+                if members in fits:
+                    # By its own noise the set is not the better one: the earlier one is the last.
+                    moved = fits[members]
+                    last = moved is not None
+                    break
                 progress(0.15 + 0.1 * number, f"fitting {', '.join(names(keys))}")
-                moved = session.try_fit(wider, start_of(search, keys, wider))
+                fits[members] = moved = session.try_fit(wider, start_of(search, keys, wider))
                 if moved is not None and is_better(current, moved, search.solve(keys)):
                     break
-                moved = None
+                fits[members] = moved = None
             if moved is None:
                 # What promised more by its linear problem did not keep that when it was fitted.
                 pool = {n: (c, k) for n, (c, k) in pool.items() if c >= none - _WORTH}
@@ -176,7 +181,7 @@ def select_effects(
                 weighed = weigh_sets(search, pool, recipe.effects, session.seed)
                 return Selection(
                     initial, current, weighed, chance, search.largest_gain(), gains,
-                    tuple(steps), last or room <= 0,
+                    tuple(steps), number == _MOST_ROUNDS - 1 or room <= 0,
                 )  # fmt: skip
         current = moved
         steps.append(current)

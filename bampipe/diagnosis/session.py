@@ -30,6 +30,7 @@ from bampipe.trials.likelihood import (
     Problem,
     Solved,
     describe_noise,
+    dry_friction,
     lay_out_samples,
     solve_bounded,
     take_samples,
@@ -310,13 +311,10 @@ class Fit:
             rms.append(np.sqrt(np.mean(rows**2, axis=1)) if b.size else np.zeros(len(rows)))
         return NoiseFloor.of_errors([*np.array(rms).T])
 
-    @cached_property
-    def stopping_rms(self) -> Array:
-        """Of the bias, what friction that stops the machine leaves, by axis, (n_q,), N.m or N."""
-        n_q = len(self.likelihood.samples)
-        factors = (self.problem.to_parameters @ self.solved.base)[-n_q:]
-        pairs = zip(self.likelihood.noise.stopping, factors, strict=True)
-        return np.array([rms(factor * c) for c, factor in pairs])
+    @property
+    def creeping_floor(self) -> Array:
+        """The error of replays that creep where they turn, as the device says, (n_q,), N.m or N."""
+        return np.array([rms(rows) for rows in self.likelihood.noise.residuals])
 
     @cached_property
     def rows_beyond_bias(self) -> tuple[Array, ...]:
@@ -374,14 +372,12 @@ def _residuals_of_replay(seed: tuple[int, ...]) -> list[Array]:
 
 def _narrower_friction(evidence: Evidence) -> list[Array]:
     """What Coulomb friction leaves whose sign is narrower than the model's, by trial, (K, n_q)."""
-    e, coordinates = evidence, evidence.system.model.device.coordinates
-    known = dict(zip((q.name for q in e.system.parameters), e.p.tolist(), strict=True))
-    dry = np.array([abs(known.get(f"coulomb.{c.name}", 0.0)) for c in coordinates])
-    width = np.array([c.sign_width for c in coordinates])
+    e = evidence
+    dry, width = dry_friction(e)
     rows = [
         dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width)) for m in e.motions
     ]
-    thin = e.band.thin_trials(rows, range(len(coordinates)))
+    thin = e.band.thin_trials(rows, range(len(dry)))
     return [values * used for values, used in zip(thin, e.used, strict=True)]
 
 

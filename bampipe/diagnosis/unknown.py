@@ -71,10 +71,13 @@ def spline_columns(evidence: Evidence, axis: int) -> list[Array]:
 def _quantities(evidence: Evidence, trial: int, axis: int) -> list[Array]:
     motion, n_q = evidence.motions[trial], len(evidence.system.coordinates)
     since, _ = since_reversal(motion, axis)
+    fitted = evidence.fitted[trial]
+    # The load by the model, not as measured: a function of that could take all of it away.
+    load = (fitted.applied - fitted.residual)[:, axis]
     return [
         motion.q[:, axis],
         np.abs(motion.qd[:, axis]),
-        evidence.fitted[trial].applied[:, axis],
+        load,
         np.log(since + 0.02),
         *(motion.q[:, other] for other in range(n_q) if other != axis),
     ]

@@ -52,10 +52,18 @@ class Judged:
 
     Attributes:
         estimate: the parameters; error: (n_q,) held-out, N.m or N.
+        published_error: (n_q,) of the parameters themselves on the same trials, N.m or N: those of
+            a filter that a late sample has thrown off are not those that it had without a trial.
     """
 
     estimate: Estimate
     error: Array
+    published_error: Array
+
+    @property
+    def worse_error(self) -> Array:
+        """The larger of both, (n_q,)."""
+        return np.maximum(self.error, self.published_error)
 
 
 def judge(squares: UnbiasedFit, folds: Folds, estimate: Estimate) -> Judged:
@@ -71,19 +79,21 @@ def judge(squares: UnbiasedFit, folds: Folds, estimate: Estimate) -> Judged:
     """
     problem, raw = squares.problem, squares.raw
     shift = _bias(squares, estimate)
-    total, count = np.zeros(len(raw.residual_sd)), np.zeros(len(raw.residual_sd))
+    n_q = len(raw.residual_sd)
+    total, count = np.zeros((2, n_q)), np.zeros(n_q)
     for trial, (stacked, left_out) in enumerate(zip(raw.stacked, estimate.held_out, strict=True)):
         if not folds.judged[trial]:
             continue
-        p = left_out.copy()
-        p[problem.free] = np.clip(p[problem.free] + shift, problem.lower, problem.upper)
-        if problem.linear:
-            found = stacked.residual + stacked.slope @ (p - raw.p)[problem.free]
-        else:
-            found = problem.band.thin(problem.residual(trial, p)) * stacked.used
-        total += np.sum(found**2, axis=0)
+        for which, given in enumerate((left_out, estimate.p)):
+            p = given.copy()
+            p[problem.free] = np.clip(p[problem.free] + shift, problem.lower, problem.upper)
+            if problem.linear:
+                found = stacked.residual + stacked.slope @ (p - raw.p)[problem.free]
+            else:
+                found = problem.band.thin(problem.residual(trial, p)) * stacked.used
+            total[which] += np.sum(found**2, axis=0)
         count += np.sum(stacked.used, axis=0)
-    return Judged(estimate, np.sqrt(total / np.maximum(count, 1.0)))
+    return Judged(estimate, *np.sqrt(total / np.maximum(count, 1.0)))
 
 
 def _bias(squares: UnbiasedFit, estimate: Estimate) -> Array:
@@ -101,7 +111,7 @@ def _bias(squares: UnbiasedFit, estimate: Estimate) -> Array:
 def relative_errors(system: System, judged: Sequence[Judged]) -> Array:
     """Return each method's error over the least of all, on the worst axis that is driven."""
     driven = [axis not in system.undriven for axis in system.coordinates]
-    error = np.array([each.error for each in judged])[:, driven]
+    error = np.array([each.worse_error for each in judged])[:, driven]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.nan_to_num(error / error.min(axis=0), nan=1.0, posinf=np.inf)
     return np.asarray(ratio.max(axis=1, initial=1.0))

@@ -279,7 +279,7 @@ def _newton_euler(
     text = Text()
     algebra = Algebra.symbols(text)
     inertial = [numbers[k : k + INERTIAL] for k in range(0, len(numbers), INERTIAL)]
-    still = [0] * len(links)
+    still = [0] * len(q)
     # Names for all of it: one compiled function gives them to every model of this robot.
     mass = [[text.name(m) for m in row] for row in mass_matrix(algebra, links, inertial, q)]
     bias, dynamics = (

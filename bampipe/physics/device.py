@@ -271,7 +271,7 @@ class Device(Declaration):
     @property
     def speed_limits(self) -> Mapping[str, float]:
         """Highest speed of each coordinate of which one is known, rad/s or m/s."""
-        drawn = {j.name: j.velocity for j in self.robot.joints if j.velocity} if self.robot else {}
+        drawn = {j.name: j.velocity for j in self.robot.moving if j.velocity} if self.robot else {}
         return drawn | {axis: e.speed for axis, e in self.ranges.items() if e.speed is not None}
 
     def cross_faults(self) -> Iterator[InputError]:
@@ -336,10 +336,10 @@ class Device(Declaration):
                 )
             return
         kinds = {"revolute": "rotary", "prismatic": "linear"}
-        joints = [(joint.name, kinds[joint.kind]) for joint in self.robot.joints]
+        joints = [(joint.name, kinds[joint.kind]) for joint in self.robot.moving]
         if joints != [(c.name, c.kind) for c in self.coordinates]:
             yield InputError(
-                "the joints are not the coordinates",
+                "the joints that follow no other are not the coordinates",
                 where="robot.joints",
                 remedy="one coordinate a joint, of its name, in its order: rotary for revolute,"
                 " linear for prismatic",

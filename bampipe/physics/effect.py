@@ -351,8 +351,8 @@ def _neighbours(device: Device) -> dict[str, tuple[str, str]]:
     kinds = {c.name: c.kind for c in device.coordinates}
     return {
         f"{joint.after}-{joint.name}": (joint.after, joint.name)
-        for joint in device.robot.joints
-        if joint.after and kinds[joint.after] == kinds[joint.name]
+        for joint in device.robot.moving
+        if joint.after in kinds and kinds[joint.after] == kinds[joint.name]
     }
 
 

@@ -34,6 +34,8 @@ class Link:
         axis: unit vector of the joint, in the frame of this link.
         position: of the joint in the frame of the link before, m.
         rotation: matrix whose columns are this link's axes in the frame of the link before, at 0.
+        follows: index of the link whose joint this one follows, -1 for one that moves by itself.
+        ratio, zero: its position is ratio times that of the other plus zero.
     """
 
     parent: int
@@ -41,6 +43,9 @@ class Link:
     axis: Vector
     position: Vector
     rotation: tuple[Vector, Vector, Vector]
+    follows: int = -1
+    ratio: float = 1.0
+    zero: float = 0.0
 
 
 @dataclass
@@ -126,8 +131,11 @@ def joint_forces(
         algebra: symbols or numbers.
         links: parents before children.
         inertial: by link, mass, first moment and inertia about the joint, ten numbers, SI.
-        q, qd, qdd: by joint, rad or m and derivatives.
+        q, qd, qdd: by joint that follows no other, rad or m and derivatives.
         gravity: m/s2 in the frame of the base.
+
+    Returns:
+        Those of the same joints.
     """
     a = algebra
     moving = _motion(a, links, q, qd, qdd, gravity)
@@ -156,6 +164,31 @@ def joint_forces(
             turned = moving[i].into_parent(moment[i])
             lever = _cross(moving[i].offset, onward)
             moment[parent] = _named(a, _sum(moment[parent], turned, lever))
+    return [
+        a.name(sum(ratio * found[i] for i, ratio in turned))
+        if len(turned) > 1
+        else found[turned[0][0]]
+        for turned in _turned_by_each(links)
+    ]
+
+
+def _turned_by_each(links: Sequence[Link]) -> list[list[tuple[int, float]]]:
+    """By joint that follows no other, the links that it moves, itself first, and how far."""
+    return [
+        [(i, 1.0), *((k, link.ratio) for k, link in enumerate(links) if link.follows == i)]
+        for i, own in enumerate(links)
+        if own.follows < 0
+    ]
+
+
+def _of_all(links: Sequence[Link], values: Sequence[Any], position: bool) -> list[Any]:
+    """Positions, or their derivatives, of all joints by those of joints that follow no other."""
+    found: list[Any] = [0] * len(links)
+    for turned, value in zip(_turned_by_each(links), values, strict=True):
+        for i, ratio in turned:
+            found[i] = value if i == turned[0][0] else ratio * value
+            if position and links[i].follows >= 0:
+                found[i] = found[i] + links[i].zero
     return found
 
 
@@ -188,7 +221,18 @@ def columns(
             found[j][i] = [
                 a.name(_dot(turn, moment) + _dot(push, force)) for force, moment in by_number
             ]
-    return found
+    return [
+        [
+            [
+                sum(ratio * found[i][link][number] for i, ratio in turned)
+                for number in range(INERTIAL)
+            ]
+            for link in range(len(links))
+        ]
+        if len(turned) > 1
+        else found[turned[0][0]]
+        for turned in _turned_by_each(links)
+    ]
 
 
 def _wrenches(a: Algebra, at: _Moving) -> list[tuple[Vector, Vector]]:
@@ -217,7 +261,7 @@ def potential_energy(
     gravity: Vector,
 ) -> Any:
     """Return the potential energy of gravity, J; zero where all moments are at the base."""
-    still = [0] * len(links)
+    still = [0] * len(q)
     moving = _motion(algebra, links, q, still, still, gravity)
     heights: list[Any] = []
     total: Any = 0
@@ -238,7 +282,7 @@ def mass_matrix(
     q: Sequence[Any],
 ) -> list[list[Any]]:
     """Return the mass matrix: column by column, the forces of a unit acceleration at rest."""
-    n = len(links)
+    n = len(q)
     mass: list[list[Any]] = [[0] * n for _ in range(n)]
     for j in range(n):
         unit = [int(i == j) for i in range(n)]
@@ -258,7 +302,8 @@ def _motion(
 ) -> list[_Moving]:
     found: list[_Moving] = []
     still: tuple[Vector, Vector, Vector] = (ZERO, ZERO, ZERO)
-    for link, x, v, w in zip(links, q, qd, qdd, strict=True):
+    of_all = (_of_all(links, values, k == 0) for k, values in enumerate((q, qd, qdd)))
+    for link, x, v, w in zip(links, *of_all, strict=True):
         if link.parent >= 0:
             before = found[link.parent]
             rate, rate_change, change = before.rate, before.rate_change, before.change

@@ -179,13 +179,14 @@ def _describe_robot(device: Device, robot: Robot) -> str:
     """The chain as a table, one line a joint, then what is known of it before any data."""
     rows = [_HEAD]
     for joint in robot.joints:
-        unit = device.coordinate(joint.name).unit
+        unit = "rad" if joint.kind == "revolute" else "m"
         low, high = device.limits.get(joint.name, (None, None))
         rows.append(
             (
                 joint.name,
                 joint.kind,
-                joint.after or robot.base or "base",
+                (joint.after or robot.base or "base")
+                + (f", follows {joint.follows}" if joint.follows else ""),
                 _triple(joint.position),
                 _triple(joint.axis),
                 "" if low is None else f"{low:.4g} to {high:.4g} {unit}",

@@ -13,7 +13,14 @@ from pydantic import Field
 
 from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.expression import Name
-from bampipe.physics.newton_euler import INERTIAL, Algebra, Link, Vector, columns
+from bampipe.physics.newton_euler import (
+    INERTIAL,
+    Algebra,
+    Link,
+    Vector,
+    columns,
+    joint_forces,
+)
 from bampipe.physics.parameter import Parameter
 from bampipe.schema import (
     ByName,
@@ -42,8 +49,9 @@ _ROUNDING = 1e-10
 """Rotations by quarter turns, written with eleven digits, leave less than this beside 0 and 1."""
 _NO_EFFECT = 1e-9
 """Of the largest column: an inertial number below it changes no joint's force."""
-_LEAST_SHARE = 0.01
-"""Of the robot's mass and length: uncertainty is at least that of a link of this size."""
+_LEAST_SHARE, _UNDRAWN_SHARE = 0.01, 0.1
+"""Of the robot's mass and length: uncertainty is at least that of a link of this size, and that of
+one whose mass is not drawn."""
 _TRIANGLE = 1e-6
 """Share by which a principal moment may exceed the sum of the other two: rounding of drawings."""
 
@@ -62,6 +70,9 @@ class Joint(NamedDeclaration):
         " axes, rad",
     )
     axis: Triple = Field(default=(0.0, 0.0, 1.0), description="Of the motion, in its own frame")
+    follows: str = Field(default="", description="The joint that it follows; empty: none")
+    ratio: Number = Field(default=1.0, description="Its motion for one of the joint it follows")
+    zero: Number = Field(default=0.0, description="Its position where that is at zero, rad or m")
     mass: Number = Field(default=0.0, description="Of the body behind it, kg, as drawn")
     center: Triple = Field(default=(0.0, 0.0, 0.0), description="Its centre of mass, m")
     inertia: Annotated[Several[Number], Field(min_length=6, max_length=6)] = Field(
@@ -87,9 +98,19 @@ class Joint(NamedDeclaration):
 
     @property
     def inertial(self) -> Array:
-        """The ten numbers of the body, about the joint; see `INERTIAL_NAMES`."""
-        c = np.array(self.center)
-        about = _matrix(self.inertia) + self.mass * (c @ c * np.eye(3) - np.outer(c, c))
+        """The ten numbers of the body, about the joint; see `INERTIAL_NAMES`.
+
+        Of numbers that no body has, those of the nearest that one can have: nothing where the mass
+        is negative, and no negative spread of mass along a principal axis.
+        """
+        if self.mass < 0.0:
+            return np.zeros(INERTIAL)
+        c, drawn = np.array(self.center), _matrix(self.inertia)
+        if self.impossible:
+            spread, axes = np.linalg.eigh(0.5 * np.trace(drawn) * np.eye(3) - drawn)
+            spread = np.maximum(spread, 0.0)
+            drawn = spread.sum() * np.eye(3) - axes * spread @ axes.T
+        about = drawn + self.mass * (c @ c * np.eye(3) - np.outer(c, c))
         upper = about[np.triu_indices(3)]
         return np.array([self.mass, *(self.mass * c), *upper])
 
@@ -178,11 +199,18 @@ class Robot(Declaration):
                     remedy="the joint before stands first; leave it out for the base",
                 )
             known.append(joint.name)
+        alone = [joint.name for joint in self.moving]
+        for joint in self.joints:
+            if joint.follows and joint.follows not in alone:
+                yield InputError(
+                    f"there is no joint {joint.follows!r} that follows none",
+                    where=f"joints.{joint.name}.follows",
+                )
         for name, motor in self.motors.items():
             for turned in motor.turns:
-                if turned not in known:
+                if turned not in alone:
                     yield InputError(
-                        f"there is no joint {turned!r}{did_you_mean(turned, known)}",
+                        f"there is no joint {turned!r}{did_you_mean(turned, alone)}",
                         where=f"motors.{name}.turns",
                     )
             if motor.torque_constant_sd is not None and motor.torque_constant is None:
@@ -202,6 +230,11 @@ class Robot(Declaration):
                 remedy="leave out torque_constant_sd where the constant is known best",
             )
 
+    @property
+    def moving(self) -> tuple[Joint, ...]:
+        """The joints that follow no other: the coordinates."""
+        return tuple(joint for joint in self.joints if not joint.follows)
+
     @cached_property
     def links(self) -> tuple[Link, ...]:
         """The joints as `newton_euler` wants them."""
@@ -213,6 +246,9 @@ class Robot(Declaration):
                 _exact(np.array(joint.axis) / math.hypot(*joint.axis)),
                 _exact(np.array(joint.position)),
                 _rows(rotation_matrix(joint.rotation)),
+                place.get(joint.follows, -1),
+                joint.ratio,
+                joint.zero,
             )
             for joint in self.joints
         )
@@ -228,19 +264,34 @@ class Robot(Declaration):
     def regressor(self) -> Array:
         """Slopes of the joint forces by all inertial numbers along a rich motion, (rows, 10 n)."""
         rng = np.random.default_rng(0)
-        n = len(self.joints)
+        n, moving = len(self.joints), len(self.moving)
         samples = 40 * max(n, 1)
-        found = self.columns(*(rng.uniform(-2.0, 2.0, (n, samples)).T for _ in range(3)))
+        found = self.columns(*(rng.uniform(-2.0, 2.0, (moving, samples)).T for _ in range(3)))
         table = np.array(
             [[np.broadcast_to(c, samples) for link in row for c in link] for row in found]
         )
         return np.ascontiguousarray(table.transpose(0, 2, 1).reshape(-1, INERTIAL * n))
 
+    def describe_mass(self, place: int, factor: float) -> str:
+        """Say that the drives ask for ``factor`` times the mass of a body as drawn, and what to do.
+
+        Of the last body, which may hold a tool, without its numbers as ``[robot.payload]``.
+        """
+        joint = self.joints[place]
+        said = (
+            f"the body on {joint.name} is about {factor:.2g} times as heavy as drawn"
+            f" ({joint.mass:.3g} kg), by all drives together"
+        )
+        if joint is not self.joints[-1] or self.payload is not None:
+            return f"{said}: is that what is mounted there? put its mass, centre and inertia in"
+        more = (factor - 1.0) * joint.mass
+        return f"{said}: a tool of about {more:.2g} kg? put it into [robot.payload]"
+
     def columns(self, q: Array, qd: Array, qdd: Array) -> list[list[list[Any]]]:
         """What one of each inertial number adds to the joints' forces: [joint][link][number].
 
         Args:
-            q, qd, qdd: a motion, (T, joints), rad or m and derivatives.
+            q, qd, qdd: a motion of `moving`, (T, joints), rad or m and derivatives.
 
         Returns:
             Numbers, or (T,) where they differ, N.m or N.
@@ -248,15 +299,35 @@ class Robot(Declaration):
         a, b, c = (list(np.ascontiguousarray(x.T)) for x in (q, qd, qdd))
         return columns(Algebra.numbers(), self.links, a, b, c, gravity_vector(self))
 
+    def drawn_forces(
+        self, q: Array, qd: Array, qdd: Array, gravity: Array, only: int | None = None
+    ) -> Array:
+        """Forces of the joints, (T, n), that the drawn bodies require along a motion.
+
+        Args:
+            q, qd, qdd: a motion, (T, n), rad or m and derivatives.
+            gravity: in the frame of the base, m/s2, (3,), or (3, T) where it differs.
+            only: number of the body that alone is there; None for all.
+        """
+        bodies = [
+            list(joint.inertial) if only in (None, k) else [0.0] * INERTIAL
+            for k, joint in enumerate(self.joints)
+        ]
+        a, b, c = (list(np.ascontiguousarray(part.T)) for part in (q, qd, qdd))
+        down = (gravity[0], gravity[1], gravity[2])
+        forces = joint_forces(Algebra.numbers(), self.links, bodies, a, b, c, down)
+        return np.column_stack([np.broadcast_to(force, len(q)) for force in forces])
+
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """The inertial numbers of all bodies, those fixed that no motion of the joints shows."""
-        heaviest = max(sum(abs(joint.mass) for joint in self.joints), 1e-3)
+        heaviest = max(sum(max(joint.mass, 0.0) for joint in self.joints), 1e-3)
         longest = max((joint.size for joint in self.joints), default=0.0) or 0.1
         found = []
         for joint, matters in zip(self.joints, self.matters, strict=True):
-            mass = max(abs(joint.mass), _LEAST_SHARE * heaviest)
-            size = max(joint.size, _LEAST_SHARE * longest)
+            least = _LEAST_SHARE if joint.mass > 0.0 else _UNDRAWN_SHARE
+            mass = max(joint.mass, least * heaviest)
+            size = max(joint.size, least * longest)
             for k, short in enumerate(INERTIAL_NAMES):
                 power = 0 if k == 0 else 1 if k < 4 else 2
                 entry = Parameter(
@@ -283,6 +354,11 @@ class Robot(Declaration):
     def impossible(self) -> list[str]:
         """What no body can have among the drawn numbers, one sentence each."""
         return [line for joint in self.joints for line in joint.impossible]
+
+    @property
+    def undrawn(self) -> list[str]:
+        """The joints behind which neither mass nor inertia is drawn."""
+        return [j.name for j in self.joints if j.mass == 0.0 and not any(j.inertia)]
 
 
 class Payload(Declaration):

@@ -16,18 +16,22 @@ import numpy as np
 from bampipe.data.survey import survey
 from bampipe.errors import InputError
 from bampipe.files import write_text
+from bampipe.lists import join_names
 from bampipe.proposal.clock import clock_of
 from bampipe.proposal.device import (
     DEVICE,
     ChosenDevice,
     find_device,
     new_device,
+    with_gravity,
     with_motors,
 )
 from bampipe.proposal.encoders import encoders_table
 from bampipe.proposal.inputs import input_tables
 from bampipe.proposal.matching import Matcher
+from bampipe.proposal.mounting import Mounting
 from bampipe.proposal.notes import Notes, quoted
+from bampipe.proposal.readings import fresh_readings, signed_readings
 from bampipe.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
 from bampipe.proposal.trials import trials_tables
 
@@ -72,9 +76,10 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
         )
     found = survey(folder, names)
     notes = Notes(check=list(found.remarks))
+    found, registers = signed_readings(fresh_readings(found, notes))
     chosen = find_device(folder, found, device)
     clock = clock_of(found, notes)
-    match = Matcher(found, clock.t, set(clock.columns))
+    match = Matcher(found, clock.t, set(clock.columns), registers)
     if chosen is None:
         chosen = new_device(folder, match, notes)
         positions = len([c for c in found.of("position") if not c.is_constant])
@@ -84,11 +89,16 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
             )
     elif chosen.device.robot is not None:
         several = len(chosen.device.robot.joints) > 1
-        columns = find_robot_columns(chosen.device, chosen.device.robot, found, clock.t, notes)
+        columns = find_robot_columns(
+            folder, chosen.device, chosen.device.robot, found, clock.t, notes
+        )
         chosen = _with_guessed_motors(folder, chosen, columns)
         match.joints, match.of_robot = columns.columns, several
         match.turned, match.gears = columns.turned, columns.gears
-        match.counting = columns.counting
+        if columns.mounting is not None:
+            chosen = _hung(folder, chosen, columns.mounting, notes)
+            joints = [c.name for c in chosen.device.coordinates]
+            match.counting = dict(zip(joints, columns.mounting.by_joint, strict=True))
         _check_robot(chosen, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
@@ -104,7 +114,7 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
     return ProposedSession(
         session="\n".join(lines) + "\n",
         device=chosen.text,
-        fill_in=notes.fill_in,
+        fill_in=notes.questions,
         check=notes.check,
         passed=[
             f"{name}: {reason.removeprefix(name).lstrip(':, ')}" for name, reason in found.passed
@@ -154,6 +164,21 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColum
     return chosen
 
 
+def _hung(folder: Path, chosen: ChosenDevice, mounting: Mounting, notes: Notes) -> ChosenDevice:
+    """The robot under the gravity that the drawn bodies ask for, where that is not as stated."""
+    if not mounting.hangs:
+        return chosen
+    gravity = ", ".join(
+        f"{v:.4g}" for v in np.where(np.abs(mounting.gravity) < 1e-9, 0.0, mounting.gravity)
+    )
+    said = f"gravity = [{gravity}]"
+    notes.check.append(
+        f"{said} in the frame of the base, by weight and inertia as drawn: is the robot mounted so?"
+        + ("" if chosen.text else f" put that into [robot] of {chosen.name}")
+    )
+    return with_gravity(folder, chosen, said) if chosen.text else chosen
+
+
 def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> None:
     """What a look at the columns does not show of a robot."""
     robot = chosen.device.robot
@@ -171,7 +196,14 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
                 f"{chosen.name}: torque_constant 1.0 is not yours yet: all forces and inertias"
                 " scale with it"
             )
-    notes.check += [f"no body has this: {line}" for line in robot.impossible]
+    notes.check += [
+        f"no body has this, and the nearest that one can have is taken: {line}"
+        for line in robot.impossible
+    ]
+    if robot.undrawn:
+        notes.check.append(
+            f"no mass is drawn on {join_names(robot.undrawn)}: put it in where there is a body"
+        )
 
 
 def _not_used(match: Matcher) -> list[str]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.quality.stamps import spread_stamps, unroll
 from bampipe.data.session import SECONDS
 from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import spelled
@@ -16,6 +17,13 @@ _RECORDED = ":@time"
 """End of the name under which the reader of ROS bags has the time of recording."""
 _LIKELY_RATE_HZ = 100.0
 """Assumed for the other guesses where nothing shows the rate."""
+_COUNTERS = frozenset(["tick", "ticks", "cycle", "cycles", "timestep", "timesteps", "cyccnt"])
+"""Words in the name of a clock that counts at a rate of its own."""
+_SLOW_HZ = 40.0
+"""Below, accelerations of a joint that stops within a tenth of a second are not seen."""
+_OF_ROWS = (
+    "the logger's set-up has it; else the number of rows over the seconds that the recording took"
+)
 
 
 @dataclass(frozen=True)
@@ -37,7 +45,8 @@ class ProposedClock:
 
 def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     """Propose a clock: by stamps in one column or two, else by counting samples."""
-    times = found.of("time")
+    counters = [c for c in found.columns if words(c.name) and set(words(c.name)) <= _COUNTERS]
+    times = [*found.of("time"), *counters]
     seconds = [c for c in times if _whole_seconds(c)]
     rest = [c for c in times if _nanoseconds_on_top(c)]
     if seconds and rest:
@@ -49,19 +58,33 @@ def clock_of(found: Survey, notes: Notes) -> ProposedClock:
 
 
 def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
-    kind = guesses.time_unit(column.values, column.unit)
-    t = (column.values - column.values[0]) * SECONDS.get(kind, 1.0)
+    stamps = column.values - column.values[np.isfinite(column.values)][0]
+    known, rows = np.isfinite(stamps), np.arange(len(stamps))
+    stamps = np.interp(rows, rows[known], spread_stamps(unroll(stamps[known])[0])[0])
+    named = f"column = {quoted(column.name)}"
+    counter = not _COUNTERS.isdisjoint(words(column.name))
+    kind = "" if counter else guesses.time_unit(stamps, column.unit)
     if not kind:
-        note = notes.ask("the unit of time: no unit gives a likely rate")
-        lines = (f"column = {quoted(column.name)}", f'unit = "{UNKNOWN}"{note}')
-        rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, the true rate")
-        samples = np.arange(len(t)) / _LIKELY_RATE_HZ
-        return ProposedClock(samples, (column.name,), _table(*lines), rate)
-    rate_hz = guesses.sample_rate(t)
+        if counter:
+            step = float(np.median(np.diff(stamps)))
+            note = notes.ask(
+                f"ticks_per_s, what {column.name} counts in a second, and sample_rate_hz, a"
+                f" {step:.6g}th of it",
+                "the clock of the timer or processor, in its data sheet or firmware; else what it"
+                " counted over the seconds that the recording took",
+            )
+            table = _table(named, 'unit = "ticks"', f"ticks_per_s = 0.0{note}")
+        else:
+            note = notes.ask("the unit of time: no unit gives a likely rate", _OF_ROWS)
+            table = _table(named, f'unit = "{UNKNOWN}"{note}')
+        rate = f'sample_rate_hz = "{UNKNOWN}"'
+        samples = np.arange(len(stamps)) / _LIKELY_RATE_HZ
+        return ProposedClock(samples, (column.name,), table, rate)
+    t = stamps * SECONDS.get(kind, 1.0)
     said = kind == "datetime" or spelled(column.unit, tuple(SECONDS)) == kind
     note = "" if said else notes.guess(f"time in {kind}, by the rate that it gives")
-    lines = (f"column = {quoted(column.name)}", f'unit = "{kind}"{note}')
-    return ProposedClock(t, (column.name,), _table(*lines), _stamped_rate(rate_hz, notes))
+    rate = _stamped_rate(guesses.sample_rate(t), notes)
+    return ProposedClock(t, (column.name,), _table(named, f'unit = "{kind}"{note}'), rate)
 
 
 def _in_two_columns(seconds: SurveyedColumn, rest: SurveyedColumn, notes: Notes) -> ProposedClock:
@@ -95,7 +118,7 @@ def _counted(found: Survey, notes: Notes) -> ProposedClock:
     stamps = next((column for column in found.of("time") if not column.is_constant), None)
     why = "no column increases like a time" if stamps is None else _describe_stamps(stamps)
     note = notes.guess(f"samples are counted: {why}")
-    rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, the true rate")
+    rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, rows a second", _OF_ROWS)
     return ProposedClock(samples / _LIKELY_RATE_HZ, (), _table(f'unit = "samples"{note}'), rate)
 
 
@@ -113,7 +136,9 @@ def _table(*lines: str) -> tuple[str, ...]:
 
 def _stamped_rate(rate_hz: float, notes: Notes) -> str:
     slowest, fastest = guesses.RATES_HZ
-    doubt = "" if slowest <= rate_hz <= fastest else "; motion is not logged so: is its unit right?"
+    doubt = "" if rate_hz > _SLOW_HZ else "; too slow for inertia and quick reversals: log faster"
+    if not slowest <= rate_hz <= fastest:
+        doubt = "; motion is not logged so: is its unit right?"
     note = notes.guess(f"{rate_hz:g} Hz, from the time stamps{doubt}")
     return f"sample_rate_hz = {rate_hz:g}{note}"
 
@@ -132,4 +157,5 @@ def _nanoseconds_on_top(column: SurveyedColumn) -> bool:
 
 def _increases(values: np.ndarray) -> bool:
     known = values[np.isfinite(values)]
+    known = spread_stamps(unroll(known)[0])[0] if len(known) > 3 else known
     return len(known) > 3 and float(np.mean(np.diff(known) > 0)) > 0.9

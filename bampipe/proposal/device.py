@@ -21,19 +21,22 @@ from bampipe.files import read_toml
 from bampipe.physics import registry
 from bampipe.physics.device import KINDS, Device
 from bampipe.proposal.encoders import measured_position
-from bampipe.proposal.gravity import weight_of
+from bampipe.proposal.gravity import MOST_TRAVEL, weight_of
 from bampipe.proposal.joints import chain_logged
 from bampipe.proposal.matching import Matcher
 from bampipe.proposal.notes import Notes
-from bampipe.proposal.positions import in_counts, position_in_si, scale_to, slides
+from bampipe.proposal.positions import SLIDING, in_counts, position_in_si, scale_to, slides
 from bampipe.proposal.starter import starter_device
 from bampipe.proposal.starter_input import Drive
 
 DEVICE = "device.toml"
 _SCHEMA = "bampipe.device/1"
 _MAY_SLIDE = " (no unit says that it slides: if it does, bampipe init FOLDER --device slider)"
+_MAY_TURN = " (by a force in N alone: if it turns, call its column {0}_rad or {0}_deg)"
 _HEAD_BYTES = 4096
 """Of a file that cannot be read whole, in which its first element is looked for."""
+_SAME_DRIVE = 0.8
+"""Correlation beyond which a current and a force are of one drive: that of a coil has its own."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +175,13 @@ def with_motors(
     return replace(chosen, text=text, device=_complete(folder, text))
 
 
+def with_gravity(folder: Path, chosen: ChosenDevice, said: str) -> ChosenDevice:
+    """A new device file of a robot with a line on gravity."""
+    head, motors, rest = chosen.text.partition("\n[robot.motors")
+    text = f"{head}{said}  # guess: by the drawn bodies\n{motors}{rest}"
+    return replace(chosen, text=text, device=_complete(folder, text))
+
+
 def _complete(folder: Path, text: str) -> Device:
     return registry.device_from(complete_device(tomllib.loads(text), folder, DEVICE), DEVICE)
 
@@ -224,17 +234,20 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     linear = slides(position, found)
     driver, role = match.driver(position)
     supply = match.supply(driver) if role == "duty" else None
-    # A current recorded beside a force is that of a coil or a brake.
-    coil = role == "force" and any(not c.is_constant for c in found.of("current"))
+    coil = role == "force" and _has_coil(driver, match, notes)
+    position = position if linear else _at_joint(position, driver, match)
     fit = _rough_fit(position, driver, role, linear, match.t)
     drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
     weight, on_gravity = weight_of(position, fit, linear, found)
     starter = starter_device(position.name, linear, drive, fit, weight, width)
     kind = "linear" if linear else "rotary"
-    doubt = "" if linear or position.conversion is not None else _MAY_SLIDE
+    doubt = "" if position.conversion is not None else _MAY_SLIDE
+    if doubt and linear:
+        doubt = "" if set(words(position.name)) & SLIDING else _MAY_TURN.format(position.name)
+    what = "torque" if role == "force" and not linear else role
     notes.check.append(
-        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {role}{doubt}; put in what you"
+        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {what}{doubt}; put in what you"
         " know of it"
     )
     for constant in starter.placeholders:
@@ -250,6 +263,45 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         starter.text,
         {name: column for name, column in columns.items() if column is not None},
     )
+
+
+def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bool:
+    """Whether a current beside a force is that of a coil or a brake, rather than of the drive."""
+    currents = [c for c in match.found.of("current") if not c.is_constant]
+    alike = [c for c in currents if driver is not None and _go_together(c.values, driver.values)]
+    for current in alike:
+        assert driver is not None
+        match.used.add(current.name)
+        notes.check.append(
+            f"{current.name} goes with {driver.name}: both are of the drive, and {driver.name} is"
+            " taken; either would do"
+        )
+    return len(alike) < len(currents)
+
+
+def _go_together(one: np.ndarray, other: np.ndarray) -> bool:
+    known = np.isfinite(one) & np.isfinite(other)
+    return abs(float(np.corrcoef(one[known], other[known])[0, 1])) > _SAME_DRIVE
+
+
+def _at_joint(
+    position: SurveyedColumn, driver: SurveyedColumn | None, match: Matcher
+) -> SurveyedColumn:
+    """The angle of the joint, where counts or a motor's angle are read and the weight shows it."""
+    known, counted = position.conversion, in_counts(position)
+    turns = known is not None and known.si == "rad"
+    scale = known.scale if known is not None else 1.0
+    if driver is None or not counted:
+        far = turns and float(np.ptp(position.values)) * scale > MOST_TRAVEL
+        if driver is None or not far:
+            return position
+    values = np.nan_to_num(driver.values)
+    worth = guesses.find_turning(match.t, np.nan_to_num(position.values), values)
+    if worth is None:
+        return position
+    match.turning = {position.name: worth}
+    angle = (position.values - worth.zero) / worth.size
+    return replace(position, values=angle, stated="rad", unit="rad")
 
 
 def _sign_width(position: SurveyedColumn, t: np.ndarray, linear: bool) -> float:

@@ -27,13 +27,18 @@ def encoders_table(
     for axis in device.coordinates:
         column = measured_position(axis.name, len(device.coordinates), match, notes)
         if column is None:
-            note = notes.ask(f"the column of the position of {axis.name}")
+            note = notes.ask_column(axis.name, axis.unit, "position")
             lines.append(f"{axis.name} = {entry(UNKNOWN, axis.unit)}{note}")
             continue
         axes[axis.name] = column
         match.used.add(column.name)
         alone = len(device.coordinates) == 1
-        lines.append(f"{axis.name} = {_encoder(axis, alone, column, match, notes)}")
+        table = _encoder(axis, alone, column, match, notes)
+        register = match.registers.get(column.name)
+        if register is not None:
+            table = table.replace(" }", f"{register.fields} }}", 1)
+            notes.check.append(f"{column.name} is {register.words}")
+        lines.append(f"{axis.name} = {table}")
     return [*lines, ""], axes
 
 
@@ -59,7 +64,17 @@ def _encoder(
     if is_velocity(column):
         return _integrated(axis, column, notes)
     if in_counts(column):
-        return _counted(axis, column, notes)
+        return _counted(axis, column, match, notes)
+    worth = match.turning.get(column.name)
+    if worth is not None and column.conversion is not None:
+        turns, sd = (column.conversion.scale * part for part in (worth.size, worth.sd))
+        said = spelled(column.unit, _POSITION_UNITS)
+        fields = f", gear_ratio = {turns:.4g}, zero_counts = {worth.zero:.4g}"
+        return entry(column.name, said, fields) + notes.guess(
+            f"{column.name} is the position of the motor of {axis.name}, which turns {turns:.4g} ±"
+            f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
+            " the angle; put in the ratio of the gear"
+        )
     if axis.name in match.gears:
         turns = match.gears[axis.name]
         said = spelled(column.unit, _POSITION_UNITS) or guesses.likely_unit(
@@ -80,7 +95,10 @@ def _encoder(
             return table + notes.guess(f"{column.name} {how}")
         return table + ("" if column.stated else notes.guess(f"{column.name} in {column.unit}"))
     if column.by_looks:
-        note = notes.ask(f"the unit of {column.name}, which looks like the position of {axis.name}")
+        note = notes.ask(
+            f"the unit of {column.name}, which looks like the position of {axis.name}",
+            "who wrote the logger, or by how far the machine moves; rad, deg, m and mm are usual",
+        )
         return entry(column.name, UNKNOWN, velocity) + note
     by_size = guesses.likely_unit(axis.unit, column.values)
     likely, why = (by_size, ", by its size") if by_size else (axis.unit, "")
@@ -122,14 +140,30 @@ def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
     )
 
 
-def _counted(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
-    middle = float(np.median(column.values))
-    return (
-        f"{{ column = {quoted(column.name)}, counts_per_unit = 0.0, zero_counts = {middle:.0f},"
-        f' unit = "{axis.unit}" }}'
-    ) + notes.ask(
-        f"counts_per_unit of {axis.name}, the counts in one {axis.unit}; zero_counts is a guess"
+def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: Notes) -> str:
+    """The entry of an encoder that counts; the weight of a joint may show what a count is worth."""
+    worth = match.turning.get(column.name)
+    zero = worth.zero if worth is not None else float(np.median(column.values))
+    size = f"{worth.size:.5g}" if worth is not None else "0.0"
+    counting = f"counts_per_unit = {size}, zero_counts = {zero:.0f}"
+    table = f'{{ column = {quoted(column.name)}, {counting}, unit = "{axis.unit}" }}'
+    if worth is not None:
+        turn, sd = 2.0 * np.pi * worth.size, 2.0 * np.pi * worth.sd
+        return table + notes.guess(
+            f"{column.name} counts {turn:.5g} ± {_rounded(sd)} a turn of {axis.name}, and"
+            f" {zero:.0f} where it hangs, by its weight, which goes with the sine of the angle; put"
+            " in the encoder's counts a turn, times the gear, by 2 pi"
+        )
+    return table + notes.ask(
+        f"counts_per_unit of {axis.name}, the counts in one {axis.unit}; zero_counts is a guess",
+        "counts a turn in the encoder's data sheet, times the gear, by 2 pi"
+        if axis.unit == "rad"
+        else "the scale's data sheet",
     )
+
+
+def _rounded(sd: float) -> str:
+    return f"{float(f'{sd:.1g}'):g}"
 
 
 def _velocity_beside(axis: Coordinate, alone: bool, match: Matcher, notes: Notes) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,21 +10,20 @@ from scipy.optimize import least_squares
 
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
-from bampipe.proposal.directions import Counting, find_counting
 from bampipe.proposal.drawing import (
     FEW_ROWS,
     MOST_ROWS,
+    Comparison,
     Drive,
     JointMotion,
     fits,
-    hold,
-    left_by,
     mean_left,
     motion_along,
     positions_of,
     range_of,
 )
 from bampipe.proposal.joints import Group
+from bampipe.proposal.mounting import Mounting, find_mounting
 
 Array = NDArray[np.float64]
 
@@ -48,13 +47,22 @@ class Gears:
 
     Attributes:
         ratio: turns of each motor for one of its joint, (n,).
-        counting: direction and zero of the joints.
+        mounting: of the joints and the base.
         drives: what they make of the drives.
     """
 
     ratio: Array
-    counting: Counting
+    mounting: Mounting
     drives: list[Drive]
+
+
+def find_best_mounting(few: Comparison, many: Comparison) -> tuple[Mounting, list[Drive]]:
+    """The mounting that lets the drawing explain most by a few rows, and the drives by many."""
+    judged = many.hold(many.drawn)
+    if max(drive.left for drive in judged) < DOUBTED:
+        return many.drawn, judged
+    mounting = find_mounting(few.turning, few.drawn, few.misfit)
+    return mounting, many.hold(mounting) if mounting.is_changed else judged
 
 
 def known_gears(
@@ -71,15 +79,11 @@ def known_gears(
     few, many = (motion_along(q / turns, t, rows) for rows in (FEW_ROWS, MOST_ROWS))
     if few is None or many is None:
         return None
-    counting = Counting.as_drawn(len(turns))
-    judged = hold(device, robot, many, drives, turns)
-    if max(drive.left for drive in judged) >= DOUBTED:
-        left = left_by(device, robot, few, drives, turns)
-        counting = find_counting([c.unit == "rad" for c in device.coordinates], left)
-        motion = many.counted(counting.direction, counting.zero)
-        judged = hold(device, robot, motion, drives, turns)
-    counting = Counting(counting.direction * np.sign(turns), counting.zero)
-    return Gears(np.abs(turns), counting, judged)
+    mounting, judged = find_best_mounting(
+        *(Comparison(device, robot, drives, turns, motion) for motion in (few, many))
+    )
+    turned = replace(mounting, direction=mounting.direction * np.sign(turns))
+    return Gears(np.abs(turns), turned, judged)
 
 
 def find_gears(
@@ -99,17 +103,16 @@ def find_gears(
         return None
     in_torque = device.force_unit == "N.m"
 
-    def held(motors: JointMotion, ratio: Array, counting: Counting) -> list[Drive]:
-        motion = motors.counted(counting.direction / ratio, counting.zero)
-        return hold(device, robot, motion, drives, at_joint)
+    def held(motors: JointMotion, ratio: Array) -> Comparison:
+        return Comparison(device, robot, drives, at_joint, motors.scaled(1.0 / ratio))
 
-    def fitted(ratio: Array, counting: Counting) -> tuple[float, Array]:
+    def fitted(ratio: Array, mounting: Mounting) -> tuple[float, Array]:
         """Cost and reductions of the fit that starts at ``ratio``."""
 
         def misfit(x: Array) -> Array:
             tried = at_joint.copy()
             tried[moved] = np.exp(x)
-            judged = held(few, tried, counting)
+            judged = held(few, tried).hold(mounting)
             left = np.sqrt([max(drive.left, 1e-12) for drive in judged])
             if not in_torque:
                 return np.asarray(left)
@@ -122,24 +125,23 @@ def find_gears(
         best[moved] = np.exp(found.x)
         return float(found.cost), best
 
-    def sound(ratio: Array, counting: Counting) -> Gears | None:
-        judged = held(many, ratio, counting)
+    def sound(ratio: Array, mounting: Mounting) -> Gears | None:
+        judged = held(many, ratio).hold(mounting)
         # A gear that speeds up would take the joint further beyond its range than the log goes.
-        return Gears(ratio, counting, judged) if fits(judged) and ratio.min() >= 1.0 else None
+        return Gears(ratio, mounting, judged) if fits(judged) and ratio.min() >= 1.0 else None
 
     starts = [np.where(moved, factor * least, 1.0) for factor in _MARGINS]
-    drawn = Counting.as_drawn(len(least))
+    drawn = held(few, at_joint).drawn
     ratio = min((fitted(start, drawn) for start in starts), key=lambda one: one[0])[1]
     found = sound(ratio, drawn)
     for start in starts if found is None else ():
         ratio = start
         for _ in range(_ALTERNATIONS):
-            motion = few.counted(1.0 / ratio, np.zeros(len(ratio)))
-            left = left_by(device, robot, motion, drives, at_joint)
-            counting = find_counting([c.unit == "rad" for c in device.coordinates], left)
-            ratio = fitted(ratio, counting)[1]
-            found = sound(ratio, counting)
+            with_gears = held(few, ratio)
+            mounting = find_mounting(with_gears.turning, drawn, with_gears.misfit, stands=True)
+            ratio = fitted(ratio, mounting)[1]
+            found = sound(ratio, mounting)
             # Wrong zeros with reductions to match them explain much; only the right ones all.
             if found is not None and mean_left(found.drives) < _SURE_LEFT:
                 return found
-    return found if found is not None and not found.counting.changed else None
+    return found if found is not None and not found.mounting.is_changed else None

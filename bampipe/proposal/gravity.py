@@ -16,7 +16,7 @@ _ANGLES = frozenset(
 )
 _UPRIGHT = frozenset(["yaw", "pan", "azimuth", "heading"])
 """What an axis that stands upright, and carries no weight, is called."""
-_MOST_TRAVEL = 4.0 * np.pi
+MOST_TRAVEL = 4.0 * np.pi
 """Beyond two turns, rad, an angle is rather that of a motor before its gear."""
 _DOUBTS: dict[Reading, str] = {
     "either": "a torque follows the angle, and over so short a travel a spring's looks alike",
@@ -81,4 +81,4 @@ def _may_carry(position: SurveyedColumn, found: Survey) -> bool:
     if not is_angle or said & _UPRIGHT:
         return False
     scale = known.scale if known is not None and known.si == "rad" else 1.0
-    return in_counts(position) or float(np.ptp(position.values)) * scale <= _MOST_TRAVEL
+    return in_counts(position) or float(np.ptp(position.values)) * scale <= MOST_TRAVEL

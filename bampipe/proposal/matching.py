@@ -28,20 +28,24 @@ class Matcher:
         found: the columns.
         t: (T,) time stamps of the first log, s.
         used: names of the columns that have a meaning already; grows as tables are proposed.
+        registers: columns that hold signed numbers in a register, and how.
         joints: columns of a robot's joints and drives, by name of joint or input; of what stands
             there no other column is thought.
         turned: inputs that are logged with the other sign.
         of_robot: whether the device is a robot of several joints.
         gears: joints whose position is that of a motor, which turns so often for one of theirs.
+        turning: what the readings of a position are worth, by the weight on it, by name of column.
         counting: of a robot's joints, direction and zero against the drawing, see `RobotColumns`.
     """
 
     found: Survey
     t: np.ndarray
     used: set[str]
+    registers: Mapping[str, guesses.Register]
     joints: Mapping[str, SurveyedColumn] = field(default_factory=dict)
     turned: frozenset[str] = frozenset()
     gears: Mapping[str, float] = field(default_factory=dict)
+    turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
     counting: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     of_robot: bool = False
 
@@ -125,7 +129,7 @@ class Matcher:
         """
         named = [c for role in DRIVERS for c in self.found.of(role) if not c.is_constant]
         best = self.driving(position) or next(iter(named), None)
-        if best is not None and not best.unit and guesses.signed_register(best.values):
+        if best is not None and not best.unit and best.name in self.registers:
             # What a servo calls its load is the share of the supply that its bridge is on, or a
             # current: no force comes as a register.
             return best, "duty" if self.supply(best) is not None else "current"
@@ -156,7 +160,6 @@ class Matcher:
                 continue
             if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
                 continue
-            values = guesses.signed(values, guesses.signed_register(values))
             share[column.name] = guesses.driven(self.t, travelled(position, self.t), values).share
         roles = {column.name: column.role for column in self.found.columns}
         fitting = [name for name in share if share[name] >= _DRIVEN]

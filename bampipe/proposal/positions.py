@@ -9,7 +9,7 @@ from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import unit
 from bampipe.data.velocity import integral
 
-_SLIDING = frozenset(["stroke", "displacement", "disp", "weg", "hub", "carriage", "piston"])
+SLIDING = frozenset(["stroke", "displacement", "disp", "weg", "hub", "carriage", "piston"])
 _FEWEST_COUNTS = 100
 
 
@@ -32,7 +32,7 @@ def slides(column: SurveyedColumn, found: Survey) -> bool:
     known = column.conversion
     if known is not None and known.si:
         return known.si in ("m", "m/s")
-    if set(words(column.name)) & _SLIDING:
+    if set(words(column.name)) & SLIDING:
         return True
     forces = [column.conversion for column in found.of("force")]
     return any(force is not None and force.si == "N" for force in forces)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,22 +12,28 @@ from numpy.typing import NDArray
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
-from bampipe.proposal.directions import Counting, find_counting
 from bampipe.proposal.drawing import (
     FEW_ROWS,
     MOST_ROWS,
+    Comparison,
     Drive,
     fits,
-    hold,
-    judge_along,
-    left_by,
     mean_left,
     motion_along,
     positions_of,
     range_of,
 )
-from bampipe.proposal.gears import BEYOND, DOUBTED, Gears, find_gears, known_gears
+from bampipe.proposal.gears import (
+    BEYOND,
+    DOUBTED,
+    Gears,
+    find_best_mounting,
+    find_gears,
+    known_gears,
+)
+from bampipe.proposal.heavier import describe_heavier_body
 from bampipe.proposal.joints import Group, pair_joints
+from bampipe.proposal.mounting import Mounting
 from bampipe.proposal.notes import Notes
 from bampipe.proposal.positions import scale_to
 
@@ -51,14 +58,13 @@ class RobotColumns:
         columns: by name of joint or input.
         drives: by name of input, where drawing and log can be compared.
         gears: by joint whose position is that of a motor, its turns for one of the joint.
-        counting: by joint, its direction against the drawing, 1 or -1, and the angle that is added
-            to its reading times that, rad.
+        mounting: of the joints and the base against the drawing; None where nothing tells.
     """
 
     columns: Mapping[str, SurveyedColumn]
     drives: Mapping[str, Drive]
     gears: Mapping[str, float] = field(default_factory=dict)
-    counting: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    mounting: Mounting | None = None
 
     @property
     def turned(self) -> frozenset[str]:
@@ -67,12 +73,13 @@ class RobotColumns:
 
 
 def find_robot_columns(
-    device: Device, robot: Robot, found: Survey, t: Array, notes: Notes
+    folder: Path, device: Device, robot: Robot, found: Survey, t: Array, notes: Notes
 ) -> RobotColumns:
     """Pair columns with joints and drives, and hold them against the drawing.
 
     Args:
-        device, robot: the robot; found: the log; t: (T,) time, s.
+        folder: of the robot's file; device, robot: the robot.
+        found: the log; t: (T,) time, s.
         notes: what is guessed is noted, and how sure it is.
     """
     pairing = pair_joints(device, found)
@@ -85,12 +92,28 @@ def find_robot_columns(
         if chosen is not None and others:
             listed = "; ".join(str(other) for other in others)
             notes.check.append(f"of several {what}, {chosen} are taken, not {listed}")
+    turns = _turns(device, robot)
+
+    def explain(positions: Group, drives: Group) -> Gears | None:
+        """How the drawing explains the drives, best mounted; None where they are not comparable."""
+        few, many = (
+            motion_along(positions_of(device, positions, t), t, rows)
+            for rows in (FEW_ROWS, MOST_ROWS)
+        )
+        if few is None or many is None or turns is None:
+            return None
+        compared = [Comparison(device, robot, drives, turns, motion) for motion in (few, many)]
+        return Gears(turns, *find_best_mounting(*compared))
+
+    found_some: Gears | None = None
+    if positions is not None and drives is not None:
+        found_some = explain(positions, drives)
+        other_unit = _in_unit_of_range(device, positions)
+        other = explain(other_unit, drives) if other_unit is not None else None
+        if other_unit is not None and other is not None and mean_left(other.drives) < _BETTER:
+            positions, found_some = other_unit, other
     columns: dict[str, SurveyedColumn] = {}
     if positions is not None:
-        other_unit = _in_unit_ofrange_of(device, positions)
-        if other_unit is not None and drives is not None:
-            judged = _judge(device, robot, other_unit, drives, t)
-            positions = other_unit if judged and mean_left(judged) < _BETTER else positions
         columns |= dict(zip(_joints(device), positions.columns, strict=True))
     if drives is not None:
         columns |= dict(zip(device.forces, drives.columns, strict=True))
@@ -98,76 +121,48 @@ def find_robot_columns(
         columns |= pairing.some_drives
     if positions is None or drives is None:
         return RobotColumns(columns, {})
-    judged = _judge(device, robot, positions, drives, t)
-    sound = bool(judged) and fits(judged)
-    beyond = _beyondrange_of(device, positions, of_joint=sound)
-    guessed = positions is not pairing.positions[0] and bool(judged) and mean_left(judged) > DOUBTED
-    turns = _turns(device, robot)
-    if turns is not None and (turns != 1.0).any() and (beyond or not sound):
-        of_motors = [
-            (group, known)
-            for group in (positions, _in_si(device, pairing.positions[0]))
-            if (known := known_gears(device, robot, group, drives, t, turns)) is not None
-        ]
-        if of_motors:
-            group, gears = min(of_motors, key=lambda item: mean_left(item[1].drives))
-            if beyond or mean_left(gears.drives) < mean_left(judged):
-                return _geared(device, columns, group, gears, notes, given=True)
-    if judged and not robot.motors and (guessed or not sound):
+    left = mean_left(found_some.drives) if found_some is not None else np.inf
+    sound = found_some is not None and fits(found_some.drives)
+    beyond = _beyond_range(device, positions, of_joint=sound)
+    guessed = positions is not pairing.positions[0] and DOUBTED < left < np.inf
+    groups = (positions, _in_si(device, pairing.positions[0]))
+    known = turns is not None and (turns != 1.0).any()
+    geared: list[tuple[Group, Gears]] = []
+    if turns is not None and known and (beyond or not sound):
+        each = [(g, known_gears(device, robot, g, drives, t, turns)) for g in groups]
+        geared = [(g, gears) for g, gears in each if gears is not None]
+    elif found_some is not None and not robot.motors and (guessed or not sound):
         # Hundreds without a unit are degrees, or radians of a motor.
-        geared = [
-            (group, fitted)
-            for group in (positions, _in_si(device, pairing.positions[0]))
-            if (fitted := find_gears(device, robot, group, drives, t)) is not None
-        ]
-        if geared:
-            group, gears = min(geared, key=lambda item: mean_left(item[1].drives))
-            if not sound or mean_left(gears.drives) < _BETTER * mean_left(judged):
-                return _geared(device, columns, group, gears, notes)
+        each = [(g, find_gears(device, robot, g, drives, t)) for g in groups]
+        geared = [(g, gears) for g, gears in each if gears is not None]
+    if geared:
+        group, gears = min(geared, key=lambda item: mean_left(item[1].drives))
+        better = mean_left(gears.drives) < left * (1.0 if known else _BETTER)
+        if better or (bool(beyond) if known else not sound):
+            return _geared(device, columns, group, gears, notes, given=known)
     notes.check += beyond
-    if not judged or (beyond and not sound):
+    if found_some is None or (beyond and not sound):
         return RobotColumns(columns, {})
-    if not (positions.named or drives.named):
-        other = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
-        turned = _judge(device, robot, *other, t)
-        if turned and mean_left(turned) < _BETTER * mean_left(judged):
+    if not (positions.named or drives.named or sound):
+        ordered = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
+        other = explain(*ordered)
+        if other is not None and mean_left(other.drives) < _BETTER * left:
             notes.check.append(
                 "columns stand in the alphabetical order of the joints' names, since weight and"
-                f" inertia as drawn explain {1.0 - mean_left(turned):.1%} of the drives that way,"
-                f" {max(1.0 - mean_left(judged), 0.0):.1%} in the order of the chain"
+                f" inertia as drawn explain {1.0 - mean_left(other.drives):.1%} of the drives that"
+                f" way, {max(1.0 - left, 0.0):.1%} in the order of the chain"
             )
-            judged = turned
-            columns |= dict(zip(_joints(device), other[0].columns, strict=True))
-            columns |= dict(zip(device.forces, other[1].columns, strict=True))
-            positions, drives = other
-    counting, judged = _counted(device, robot, positions, drives, t, judged)
-    by_input = dict(zip(device.forces, judged, strict=True))
+            found_some, (positions, drives) = other, ordered
+            columns |= dict(zip(_joints(device), positions.columns, strict=True))
+            columns |= dict(zip(device.forces, drives.columns, strict=True))
+    motion = motion_along(positions_of(device, positions, t), t, MOST_ROWS)
+    if motion is not None:
+        compared = Comparison(device, robot, drives, found_some.ratio, motion)
+        heavier = describe_heavier_body(compared, found_some.mounting, folder)
+        notes.check += [heavier] if heavier else []
+    by_input = dict(zip(device.forces, found_some.drives, strict=True))
     notes.check += _sentences(device, columns, by_input)
-    return RobotColumns(
-        columns, by_input, counting=dict(zip(_joints(device), counting, strict=True))
-    )
-
-
-def _counted(
-    device: Device, robot: Robot, positions: Group, drives: Group, t: Array, judged: list[Drive]
-) -> tuple[list[tuple[float, float]], list[Drive]]:
-    """Direction and zero of each joint, and what they make of the drives, as `find_counting`."""
-    ratio = _turns(device, robot)
-    few, many = (
-        motion_along(positions_of(device, positions, t), t, rows) for rows in (FEW_ROWS, MOST_ROWS)
-    )
-    counting = Counting.as_drawn(len(device.coordinates))
-    if few is None or many is None or ratio is None:
-        return counting.by_joint, judged
-
-    if max(drive.left for drive in judged) < DOUBTED:
-        return counting.by_joint, judged
-    left = left_by(device, robot, few, drives, ratio)
-    counting = find_counting([c.unit == "rad" for c in device.coordinates], left)
-    if not counting.changed:
-        return counting.by_joint, judged
-    motion = many.counted(counting.direction, counting.zero)
-    return counting.by_joint, hold(device, robot, motion, drives, ratio)
+    return RobotColumns(columns, by_input, mounting=found_some.mounting)
 
 
 def _geared(
@@ -196,9 +191,7 @@ def _geared(
         f"drawing, drives' inertia and friction explain {explained:.1%} of the drives"
     )
     drives = dict(zip(device.forces, found.drives, strict=True))
-    return RobotColumns(
-        paired, drives, gears, dict(zip(joints, found.counting.by_joint, strict=True))
-    )
+    return RobotColumns(paired, drives, gears, found.mounting)
 
 
 def _in_si(device: Device, group: Group) -> Group:
@@ -218,7 +211,7 @@ def _in_alphabetical_order(device: Device, group: Group) -> Group:
     return replace(group, columns=tuple(group.columns[k] for k in order))
 
 
-def _in_unit_ofrange_of(device: Device, group: Group) -> Group | None:
+def _in_unit_of_range(device: Device, group: Group) -> Group | None:
     """The positions in degrees or millimetres where they state no unit and only these fit."""
     found = []
     for c, column in zip(device.coordinates, group.columns, strict=True):
@@ -241,7 +234,7 @@ def _in_unit_ofrange_of(device: Device, group: Group) -> Group | None:
     return replace(group, columns=tuple(found)) if changed else None
 
 
-def _beyondrange_of(device: Device, positions: Group, of_joint: bool) -> list[str]:
+def _beyond_range(device: Device, positions: Group, of_joint: bool) -> list[str]:
     found = []
     for c, column in zip(device.coordinates, positions.columns, strict=True):
         span = float(np.ptp(np.nan_to_num(column.values))) * scale_to(c.unit, column)
@@ -258,14 +251,6 @@ def _beyondrange_of(device: Device, positions: Group, of_joint: bool) -> list[st
                 f" {width:.3g}: {why}"
             )
     return found
-
-
-def _judge(device: Device, robot: Robot, positions: Group, drives: Group, t: Array) -> list[Drive]:
-    """How each drive goes with the drawing; none where drives are not one a joint."""
-    ratio = _turns(device, robot)
-    if ratio is None:
-        return []
-    return judge_along(device, robot, positions_of(device, positions, t), drives, ratio, t)
 
 
 def _turns(device: Device, robot: Robot) -> Array | None:

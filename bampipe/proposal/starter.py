@@ -30,7 +30,7 @@ _TAKEN = frozenset(
         ),
     ]
 )
-_FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "torque", "tau"}
+_FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "eff", "torque", "tau"}
 _DRIVE = "drive = true                        # from a motor; false: from a force sensor\n"
 _PRESCRIBED = "prescribed = true                   # guess: a test bench gives the stroke\n"
 _FASTEST_S = 2e-4

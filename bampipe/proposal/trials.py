@@ -60,6 +60,7 @@ def _kind(file: str, device: Device, notes: Notes) -> list[str]:
     if "viscous" in said:
         return [
             'kind = "viscous"' + notes.guess(f"{file} is a viscous trial, by its name"),
-            "viscous_n_s_per_m = 0.0" + notes.ask("viscous_n_s_per_m, the commanded damping"),
+            "viscous_n_s_per_m = 0.0"
+            + notes.ask("viscous_n_s_per_m, the damping", "the commands of the brakes' controller"),
         ]
     return ['kind = "free"']

@@ -71,3 +71,8 @@ class FilterResult(Result):
     disturbances: dict[str, tuple[Disturbance, ...]] = Field(
         default_factory=dict, description="By trial: stretches that are left out"
     )
+    force_offsets: dict[str, dict[str, float]] = Field(
+        default_factory=dict,
+        description="By trial and force, N, N.m or A: what it reads too much against the mean of"
+        " the trials, where it is zeroed anew in each, and what was taken off",
+    )

@@ -85,15 +85,18 @@ class MainsHum(Record):
 
 
 class DeadStretch(Record):
-    """Where a sensor reads one value while the machine moves."""
+    """Where a sensor reads one value while the machine moves, or is at the end of its range."""
 
     column: str
     start_s: Size = Field(description="Since the start of the trial")
-    end_s: Positive
+    end_s: Size
+    rail: float | None = Field(default=None, description="That value, where the range ends with it")
 
     @property
     def sentence(self) -> str:
         """What is the matter with which column."""
+        if self.rail is not None:
+            return f"'{self.column}' stands at a rail"
         return f"'{self.column}' reads one and the same value while the machine moves"
 
 

@@ -9,7 +9,7 @@ from pydantic import Field
 from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
-Kind = Literal["sign", "scale", "exchange", "zero", "clock"]
+Kind = Literal["sign", "scale", "exchange", "zero", "clock", "gravity"]
 
 
 class PossibleMistake(Record):
@@ -17,7 +17,8 @@ class PossibleMistake(Record):
 
     kind: Kind
     signals: Names = Field(
-        description="Axes, force channels and other channels that it concerns; none of a clock"
+        description="Axes, force channels and other channels that it concerns; none of a clock or"
+        " of gravity"
     )
     sentence: str = Field(description="What is wrong, and what to write instead")
 
@@ -29,6 +30,9 @@ class SetupMistake(PossibleMistake):
         default=1.0, description="By which their readings must be multiplied, of a scale or clock"
     )
     offset: float = Field(default=0.0, description="Which must be added, rad or m, of a zero")
+    gravity: tuple[float, float, float] | None = Field(
+        default=None, description="In the frame of a robot's base, m/s2, where that is mistaken"
+    )
     axes: Names = Field(description="Whose equations it spoils")
     evidence: str = Field(description="What changes once it is set right")
     error_before: dict[str, Size] = Field(

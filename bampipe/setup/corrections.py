@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from itertools import combinations, permutations, product
 
 import numpy as np
 
+from bampipe.physics.robot import Robot
 from bampipe.results.setup import Kind
 from bampipe.trials.signals import Change, Signals
 
@@ -90,6 +91,11 @@ def sign_corrections(signals: Signals) -> Iterator[Correction]:
         yield Correction("sign", tuple(names), change, 0.0 if len(names) == 1 else 1.0, -1.0)
 
 
+def encoder_sign_corrections(signals: Signals) -> list[Correction]:
+    """Reversed encoders."""
+    return [one for one in sign_corrections(signals) if set(one.signals) <= set(signals.axes)]
+
+
 def exchange_corrections(signals: Signals) -> Iterator[Correction]:
     """Columns that stand for each other: as raw readings, or with all that belongs to them."""
     count = len(signals.names)
@@ -116,6 +122,22 @@ def clock_corrections(signals: Signals) -> Iterator[Correction]:
     for factor in CLOCKS:
         none = Change.none(len(signals.names))
         yield Correction("clock", (), Change(none.gain, none.offset, factor), 2.0, factor)
+
+
+def gravity_corrections(signals: Signals, robot: Robot) -> Iterator[Correction]:
+    """A base that hangs or lies along another of its axes, or halfway between two or three."""
+    stated = np.array(robot.gravity)
+    size = float(np.linalg.norm(stated))
+    for along in product((-1.0, 0.0, 1.0), repeat=3):
+        down = np.array(along)
+        if not size or not down.any():
+            continue
+        x, y, z = (float(v) for v in size * down / np.linalg.norm(down))
+        if np.allclose((x, y, z), stated, atol=1e-3 * size):
+            continue
+        none = Change.none(len(signals.names))
+        change = Change(none.gain, none.offset, gravity=(x, y, z))
+        yield Correction("gravity", (), change, 1.0 if np.abs(down).sum() == 1.0 else 3.0)
 
 
 def unit_corrections(signals: Signals) -> Iterator[Correction]:

@@ -8,32 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.estimate.heavier_body import HeavierBody, find_heavier_body
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
+from bampipe.physics.robot import Robot
 from bampipe.setup.corrections import (
     Correction,
+    encoder_sign_corrections,
     exchange_corrections,
+    gravity_corrections,
     quarter_turn_pairs,
     quarter_turns,
     sign_corrections,
     unit_corrections,
 )
-from bampipe.setup.finding import (
-    ALIKE,
-    LEAST_GAIN,
-    MOST_MISTAKES,
-    RANKED_ERROR,
-    Finding,
-    distinct,
-    gain_of,
-    is_explained,
-    spoils_sound_axes,
-)
+from bampipe.setup.finding import MOST_MISTAKES, Finding, Tried, choose, is_explained
 from bampipe.setup.plausibility import Plausibility
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import standstill_of
@@ -60,6 +55,7 @@ class DrawnSearch:
     Attributes:
         system: the bare device; motions: the trials as they are stated, short enough.
         band: of the residual; signals: of the session.
+        heavier: the body that is heavier than drawn.
         tested: number of set-ups tried.
     """
 
@@ -67,7 +63,13 @@ class DrawnSearch:
     motions: Sequence[Motion]
     band: Band
     signals: Signals
+    heavier: HeavierBody | None = None
     tested: int = field(default=0, init=False)
+
+    @property
+    def robot(self) -> Robot:
+        """Whose bodies are drawn."""
+        return drawn_robot(self.system)
 
     def find_mistakes(self, exchanged: bool) -> tuple[Finding, ...]:
         """The mistakes of the set-up, the one that spoils most first; none if one is left over.
@@ -77,7 +79,7 @@ class DrawnSearch:
         """
         change, found = Change.none(len(self.signals.names)), list[Finding]()
         before = self._judge(change)
-        while before is not None and before.worst_error > SUSPICIOUS_DRAWN:
+        while before is not None and (found or before.worst_error > SUSPICIOUS_DRAWN):
             step = self._best(change, before, exchanged)
             if not step or len(found) + len(step) > MOST_MISTAKES:
                 break
@@ -89,72 +91,84 @@ class DrawnSearch:
         return tuple(found) if explained else ()
 
     def _best(self, change: Change, before: Plausibility, exchanged: bool) -> list[Finding]:
-        """The mistake whose correction gains most, or two zeros: one right and one not is worse."""
+        """The mistake whose correction gains most, or two: one right and one not may be worse."""
         singles = self._try_all(change, [(one,) for one in self._singles(exchanged)])
-        best = self._choose(before, singles)
+        best = choose(before, singles, drawn=True)
         if not best or best[0].after.worst_error > SUSPICIOUS_DRAWN:
-            pairs = self._try_all(change, quarter_turn_pairs(self.signals))
-            best = self._choose(before, [*singles, *pairs])
+            mounted = product(
+                gravity_corrections(self.signals, self.robot),
+                encoder_sign_corrections(self.signals),
+            )
+            pairs = self._try_all(change, chain(quarter_turn_pairs(self.signals), mounted))
+            best = choose(before, [*singles, *pairs], drawn=True)
         return best
 
     def _singles(self, exchanged: bool) -> Iterator[Correction]:
         yield from sign_corrections(self.signals)
         yield from quarter_turns(self.signals)
+        yield from gravity_corrections(self.signals, self.robot)
         if exchanged:
             yield from exchange_corrections(self.signals)
             yield from unit_corrections(self.signals)
 
-    def _try_all(self, change: Change, options: Iterable[tuple[Correction, ...]]) -> list[_Tried]:
+    def _try_all(self, change: Change, options: Iterable[tuple[Correction, ...]]) -> list[Tried]:
         found = []
         for option in options:
             changed = change
             for correction in option:
                 changed = correction.change.after(changed)
             after = self._judge(changed)
-            if after is not None:
-                found.append(_Tried(option, after))
+            found += [Tried(option, after)] if after is not None else []
         return found
-
-    def _choose(self, before: Plausibility, tried: Sequence[_Tried]) -> list[Finding]:
-        ranked = sorted(tried, key=lambda one: one.score)
-        for best in ranked:
-            gain = gain_of(before, best.after, best.cost)
-            if gain < LEAST_GAIN or spoils_sound_axes(before, best.after):
-                continue
-            rivals = [
-                other.option[0]
-                for other in ranked
-                if len(best.option) == len(other.option) == 1
-                and other.option[0].signals != best.option[0].signals
-                and other.score < best.score + ALIKE
-            ]
-            alike = distinct(rivals)
-            return [
-                Finding(one, alike, before, best.after, gain, drawn=True) for one in best.option
-            ]
-        return []
 
     def _judge(self, change: Change) -> Plausibility | None:
         self.tested += 1
         with np.errstate(all="ignore"):
             changed = [change.of_motion(motion, self.signals) for motion in self.motions]
-        return judge_drawn(self.system, changed, change.of_band(self.band))
+        added = np.array(change.gravity or self.robot.gravity) - self.robot.gravity
+        band = change.of_band(self.band)
+        return judge_drawn(self.system, changed, band, added, self.heavier)
 
 
-@dataclass(frozen=True)
-class _Tried:
-    """Corrections that were tried together, and what they explain."""
+def drawn_robot(system: System) -> Robot:
+    """The robot of a device that is one."""
+    robot = system.model.device.robot
+    assert robot is not None
+    return robot
 
-    option: tuple[Correction, ...]
-    after: Plausibility
 
-    @property
-    def cost(self) -> float:
-        return sum(one.cost for one in self.option)
+def find_body_unlike_drawn(
+    system: System, motions: Sequence[Motion], band: Band
+) -> HeavierBody | None:
+    """The body that alone is far heavier than drawn, as all drives have it."""
+    robot, n = drawn_robot(system), len(system.coordinates)
+    if system.model.device.force_unit == "A":
+        return None
+    drives: list[list[Array]] = [[] for _ in range(n)]
+    bodies: list[list[Array]] = [[] for _ in range(n)]
+    with np.errstate(all="ignore"):
+        for motion in motions:
+            columns, applied, used = _columns(system, motion, band)
+            each = [
+                band.thin(robot.drawn_forces(*motion.kinematics, np.array(robot.gravity), only=k))
+                for k in range(len(robot.joints))
+            ]
+            forces = np.stack(each, axis=2)
+            beside = applied - columns[:, :, 0] + forces.sum(axis=2)
+            if not (np.isfinite(columns).all() and np.isfinite(beside).all()):
+                return None
+            for k in range(n):
+                rows, lost = used[:, k], columns[used[:, k], k, 1:]
+                drives[k].append(_without(lost, beside[rows, k]))
+                bodies[k].append(_without(lost, forces[rows, k]))
+    return find_heavier_body(
+        [np.concatenate(parts) for parts in drives], [np.concatenate(parts) for parts in bodies]
+    )
 
-    @property
-    def score(self) -> float:
-        return self.after.score(RANKED_ERROR) + self.cost
+
+def _without(columns: Array, target: Array) -> Array:
+    """What columns (K, m) leave of a target, (K,) or (K, p)."""
+    return np.asarray(target - columns @ _fitted(columns, target))
 
 
 def is_drawn(system: System) -> bool:
@@ -162,7 +176,13 @@ def is_drawn(system: System) -> bool:
     return system.model.device.robot is not None and bool(_bodies(system))
 
 
-def judge_drawn(system: System, motions: Sequence[Motion], band: Band) -> Plausibility | None:
+def judge_drawn(
+    system: System,
+    motions: Sequence[Motion],
+    band: Band,
+    added: Array,
+    heavier: HeavierBody | None = None,
+) -> Plausibility | None:
     """What bodies as drawn leave of the applied force; None where it cannot be computed.
 
     Each axis has besides an inertia and friction of its own, and one factor for its bodies, within
@@ -170,10 +190,12 @@ def judge_drawn(system: System, motions: Sequence[Motion], band: Band) -> Plausi
 
     Args:
         system: the bare device; motions: as a set-up has them; band: of the residual.
+        added: to gravity as the device file states it, m/s2, (3,).
+        heavier: the body that is heavier than drawn.
     """
     n = len(system.coordinates)
     with np.errstate(all="ignore"):
-        parts = [_columns(system, motion, band) for motion in motions]
+        parts = [_columns(system, motion, band, added, heavier) for motion in motions]
     columns = np.concatenate([part[0] for part in parts])
     applied, used = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
     if not (np.isfinite(columns).all() and np.isfinite(applied).all()):
@@ -189,7 +211,13 @@ def _bodies(system: System) -> list[int]:
     return [i for i, p in enumerate(system.parameters) if p.weighed and not p.fixed and p.sd > 0.0]
 
 
-def _columns(system: System, motion: Motion, band: Band) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _columns(
+    system: System,
+    motion: Motion,
+    band: Band,
+    added: Array | None = None,
+    heavier: HeavierBody | None = None,
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Columns (K, n_q, m) of a trial, bodies first, the applied force (K, n_q), and what moves."""
     p, known = system.prior, set(_bodies(system))
     for i, item in enumerate(system.parameters):
@@ -198,7 +226,17 @@ def _columns(system: System, motion: Motion, band: Band) -> tuple[Array, Array, 
     u = motion.inputs(system.inputs)
     at = motion.kinematics
     z = system.memory(*at, u, p, motion.t)
-    shapes = [system.required(*at, z, u, p), *_drive(motion.qd, motion.qdd)]
+    required = system.required(*at, z, u, p)
+    robot = drawn_robot(system)
+    gravity = np.array(robot.gravity)
+    if added is not None and added.any():
+        still = np.zeros_like(motion.q)
+        required = required + robot.drawn_forces(motion.q, still, still, added)
+        gravity = gravity + added
+    if heavier is not None:
+        body = robot.drawn_forces(*at, gravity, only=heavier.place)
+        required = required + (heavier.factor - 1.0) * body
+    shapes = [required, *_drive(motion.qd, motion.qdd)]
     for turns in _shared_motors(system):
         turned = motion.qd @ turns, motion.qdd @ turns
         shapes += _drive(*(np.outer(part, turns != 0.0) for part in turned))
@@ -232,11 +270,11 @@ def _left(columns: Array, applied: Array) -> float:
         return 0.0
     found = _fitted(columns, applied)
     scale = float(np.clip(found[0], 1.0 / _FARTHEST_SCALE, _FARTHEST_SCALE))
-    rest = applied - scale * columns[:, 0]
-    rest = rest - columns[:, 1:] @ _fitted(columns[:, 1:], rest)
+    rest = _without(columns[:, 1:], applied - scale * columns[:, 0])
     return float(np.sqrt(np.mean(rest**2))) / size
 
 
 def _fitted(columns: Array, target: Array) -> Array:
     scale = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
-    return np.asarray(np.linalg.lstsq(columns / scale, target, rcond=_RIDGE)[0] / scale)
+    found = np.linalg.lstsq(columns / scale, target, rcond=_RIDGE)[0]
+    return np.asarray((found.T / scale).T)

@@ -16,6 +16,8 @@ stand below 0.15 with any one effect hidden, a gravity compensator that lags beh
 LEAST_GAIN = 7.0
 """Score that setting a mistake right must gain: the error of one axis falls to 42 %, say. Of sound
 sessions no other set-up gains more than 5.0, of mistaken ones the right one at least 7.9."""
+LEAST_GAIN_PLACEHOLDER = 4.0
+"""The same for a scale that stands at exactly 1, as nobody has filled it in."""
 EXPLAINED = 0.6
 """Error that must be left of a spoilt axis at most, as a share of the applied force."""
 JUDGED_ERROR, RANKED_ERROR = 0.1, 0.01
@@ -46,6 +48,64 @@ class Finding:
     after: Plausibility
     gain: float
     drawn: bool = False
+
+
+@dataclass(frozen=True)
+class Tried:
+    """Corrections that were tried together, and what they explain."""
+
+    option: tuple[Correction, ...]
+    after: Plausibility
+
+    @property
+    def cost(self) -> float:
+        """How unlikely a person is to make these mistakes, in the unit of the score."""
+        return sum(one.cost for one in self.option)
+
+    @property
+    def score(self) -> float:
+        """The lower, the better."""
+        return self.after.score(RANKED_ERROR) + self.cost
+
+    @property
+    def signals(self) -> set[tuple[str, tuple[str, ...]]]:
+        """What is mistaken: the kinds, and the signals of each."""
+        return {(one.kind, one.signals) for one in self.option}
+
+
+def choose(
+    before: Plausibility,
+    tried: Sequence[Tried],
+    placeholders: Sequence[str] = (),
+    drawn: bool = False,
+) -> list[Finding]:
+    """The mistakes that set most right, of those worth naming; none if none is.
+
+    Args:
+        before: what is explained without; tried: what may be mistaken.
+        placeholders: signals whose scale stands at exactly 1.
+        drawn: whether all that is with bodies as drawn.
+    """
+    ranked = sorted(tried, key=lambda one: one.score)
+    for best in ranked:
+        gain = gain_of(before, best.after, best.cost)
+        hinted = all(
+            one.kind == "scale" and set(one.signals) <= set(placeholders) for one in best.option
+        )
+        least = LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN
+        if gain < least or spoils_sound_axes(before, best.after):
+            continue
+        rivals = [
+            other.option[0]
+            for other in ranked
+            if len(best.option) == len(other.option) == 1
+            and other.signals != best.signals
+            and other.score < best.score + ALIKE
+        ]
+        return [
+            Finding(one, distinct(rivals), before, best.after, gain, drawn) for one in best.option
+        ]
+    return []
 
 
 def spoilt_axes(finding: Finding) -> list[int]:

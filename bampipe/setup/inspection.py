@@ -12,6 +12,7 @@ from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, SetupResult
+from bampipe.setup.drawing import drawn_robot
 from bampipe.setup.finding import Finding, spoilt_axes
 from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
@@ -59,6 +60,9 @@ def inspect_setup(
         if entry.state == "hardly_moves"
     ]
     warnings += _describe_travel(system, motions)
+    if search.heavier is not None:
+        robot = drawn_robot(system)
+        warnings.append(robot.describe_mass(search.heavier.place, search.heavier.factor))
     if held is not None and search.over_position is not None:
         warnings += describe_lack(system, held, search.over_position)
     named = " ".join(mistake.sentence for mistake in mistakes)
@@ -123,6 +127,7 @@ def _record(
         signals=correction.signals,
         factor=correction.factor,
         offset=correction.offset,
+        gravity=correction.change.gravity,
         axes=tuple(system.coordinates[i] for i in axes),
         sentence=sentence,
         evidence=describe_evidence(system, axes, found.before, found.after, found.drawn),

@@ -10,6 +10,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.estimate.heavier_body import HeavierBody
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.setup.corrections import (
@@ -23,19 +24,19 @@ from bampipe.setup.corrections import (
     sign_corrections,
     unit_corrections,
 )
-from bampipe.setup.drawing import DrawnSearch, is_drawn
+from bampipe.setup.drawing import DrawnSearch, find_body_unlike_drawn, is_drawn
 from bampipe.setup.finding import (
     ALIKE,
     JUDGED_ERROR,
     LEAST_GAIN,
+    LEAST_GAIN_PLACEHOLDER,
     MOST_MISTAKES,
     RANKED_ERROR,
     SUSPICIOUS_ERROR,
     Finding,
-    distinct,
-    gain_of,
+    Tried,
+    choose,
     is_explained,
-    spoils_sound_axes,
 )
 from bampipe.setup.plausibility import Plausibility, axes_without_pose, judge_setup
 from bampipe.trials.folds import Folds
@@ -47,8 +48,6 @@ Array = NDArray[np.float64]
 SUSPICIOUS_PRIORS = 5.0
 """Sum of objections, beyond the usual, from which other set-ups are tried: two parameters beyond
 two deviations."""
-LEAST_GAIN_PLACEHOLDER = 4.0
-"""The same for a scale that stands at exactly 1, as nobody has filled it in."""
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
 """A factor, an angle (rad) and a share of an axis' travel below which what is off is no mistake of
 set-up but an effect to be diagnosed."""
@@ -75,6 +74,7 @@ class CorrectionSearch:
         system: the bare device; motions: the trials as they are stated, short enough.
         band: of the residual; folds: of the trials; signals: of the session.
         tested: number of set-ups tried.
+        heavier: the drawn body that alone is far heavier; None where none is.
         over_position: what the stated set-up explains with a torque over position that the device
             lacks, where that rather than a mistake is what spoils it; None else.
     """
@@ -86,6 +86,7 @@ class CorrectionSearch:
     signals: Signals
     tested: int = field(default=0, init=False)
     over_position: Plausibility | None = field(default=None, init=False)
+    heavier: HeavierBody | None = field(default=None, init=False)
 
     @property
     def has_few_axes(self) -> bool:
@@ -131,6 +132,9 @@ class CorrectionSearch:
             stated: what the set-up as it is stated explains of ``motions``.
             placeholders: signals whose scale stands at exactly 1.
         """
+        against = self._against_drawing()
+        if against or self.heavier is not None:
+            return against
         change, now = Change.none(len(self.signals.names)), stated
         found: list[Finding] = []
         while len(found) < MOST_MISTAKES and self._is_suspicious(now, placeholders):
@@ -139,11 +143,15 @@ class CorrectionSearch:
                 break
             found.append(step)
             change, now = step.correction.change.after(change), step.after
-        found = [f for f in found if now is None or is_explained(f, now)]
-        if found or self.over_position is not None or not is_drawn(self.system):
-            return tuple(found)
+        return tuple(f for f in found if now is None or is_explained(f, now))
+
+    def _against_drawing(self) -> tuple[Finding, ...]:
+        """The mistakes that bodies as drawn show; those that are free take on much of them."""
+        if not is_drawn(self.system):
+            return ()
         short = shorten(self.motions, _DRAWN_SAMPLES)
-        search = DrawnSearch(self.system, short, self.band, self.signals)
+        self.heavier = find_body_unlike_drawn(self.system, short, self.band)
+        search = DrawnSearch(self.system, short, self.band, self.signals, self.heavier)
         against = search.find_mistakes(exchanged=self.has_few_axes)
         self.tested += search.tested
         return against
@@ -175,11 +183,11 @@ class CorrectionSearch:
         """The mistake whose correction gains most beyond what is stated, None if none does."""
         before = now or _nothing_explained(self.system)
         tried = self._try_best(change, self._discrete())
-        best = self._choose(before, tried, placeholders)
-        if self.has_few_axes and self._is_suspicious(best.after if best else now, ()):
+        best = choose(before, tried, placeholders)
+        if self.has_few_axes and self._is_suspicious(best[0].after if best else now, ()):
             tried += self._try_best(change, self._continuous(change))
-            best = self._choose(before, tried, placeholders)
-        return best
+            best = choose(before, tried, placeholders)
+        return next(iter(best), None)
 
     def _discrete(self) -> Iterator[Correction]:
         yield from sign_corrections(self.signals)
@@ -228,44 +236,15 @@ class CorrectionSearch:
                     best, least = x, score
         return family(best)
 
-    def _try_best(
-        self, change: Change, corrections: Iterable[Correction]
-    ) -> list[tuple[Correction, Plausibility]]:
+    def _try_best(self, change: Change, corrections: Iterable[Correction]) -> list[Tried]:
         """Screen all corrections; return the best with what they explain of all trials."""
         screened = [(self.screen(correction, change), correction) for correction in corrections]
         screened.sort(key=lambda one: one[0])
         tried = []
         for score, correction in screened[:_SHORTLIST]:
-            if math.isfinite(score):
-                found = self.judge(correction.change.after(change))
-                if found is not None:
-                    tried.append((correction, found))
+            found = self.judge(correction.change.after(change)) if math.isfinite(score) else None
+            tried += [Tried((correction,), found)] if found is not None else []
         return tried
-
-    def _choose(
-        self,
-        before: Plausibility,
-        tried: Sequence[tuple[Correction, Plausibility]],
-        placeholders: Sequence[str],
-    ) -> Finding | None:
-        ranked = sorted(tried, key=lambda one: one[1].score(RANKED_ERROR) + one[0].cost)
-        for correction, after in ranked:
-            gain = gain_of(before, after, correction.cost)
-            hinted = correction.kind == "scale" and set(correction.signals) <= set(placeholders)
-            if gain < (LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN):
-                continue
-            if spoils_sound_axes(before, after):
-                continue
-            own = after.score(RANKED_ERROR) + correction.cost
-            rivals = tuple(
-                other
-                for other, found in ranked
-                if other is not correction
-                and (other.kind, other.signals) != (correction.kind, correction.signals)
-                and found.score(RANKED_ERROR) + other.cost < own + ALIKE
-            )
-            return Finding(correction, distinct(rivals), before, after, gain)
-        return None
 
 
 def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:

@@ -15,6 +15,12 @@ def describe_correction(correction: Correction, session: IngestResult) -> str:
     """One sentence without a full stop: the mistake, a colon, what to write in session.toml."""
     if correction.kind == "clock":
         return _clock(correction, session)
+    if correction.change.gravity is not None:
+        shown = ", ".join(f"{v:.4g}" for v in correction.change.gravity)
+        return (
+            "gravity points elsewhere in the frame of the base: if the robot is mounted so, write"
+            f" gravity = [{shown}] into [robot] of the device file"
+        )
     if correction.kind == "zero":
         return _zero(correction, session)
     if correction.kind == "exchange":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -37,8 +38,9 @@ from bampipe.trials.band import LEAST_HZ, find_band
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.disturbances import find_disturbances
 from bampipe.trials.folds import Folds
+from bampipe.trials.force_offsets import find_force_offsets
 from bampipe.trials.kinematics import AxisFilter, Kinematics
-from bampipe.trials.motion import input_derivatives, n_samples
+from bampipe.trials.motion import Motion, input_derivatives, n_samples
 from bampipe.trials.reading import held_out_trials, read_motion_of
 from bampipe.trials.sensors import Sensors
 
@@ -162,22 +164,30 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         kinematics = replace(kinematics, input_cutoff_hz=needed)
         written = _write_motions(path, samples, ids, kinematics, progress)
     progress(0.95, "disturbances")
-    free = set(trials.loc[trials["kind"] == MOVING[0], "trial_id"])
+    of_kind = set(trials.loc[trials["kind"] == MOVING[0], "trial_id"])
+    free = [name for name in names if name in of_kind]
     held_out = held_out_trials(run)
+    fitted = [k for k, name in enumerate(free) if name not in held_out]
     band = Band(rate, tuple(bands[axis].cutoff_hz for axis in system.coordinates))
-    disturbances = _disturbances(
-        system, out, session, [k for k in names if k in free], held_out, band
-    )
-    result = _result(config, kinematics, axes, choices, written, bands, disturbances)
+    dead = _dead(session)
+    offsets = find_force_offsets(system, _motions(path, free, system, dead), band, fitted)
+    if offsets:
+        written = _write_motions(path, samples, ids, kinematics, progress, offsets)
+    disturbances = _disturbances(_motions(path, free, system, dead), system, band, fitted, dead)
+    result = _result(config, kinematics, axes, choices, written, bands, disturbances, offsets)
     progress(0.97, "the set-up")
-    setup = _inspect(system, out, session, names, free - held_out, bands, disturbances)
+    setup = _inspect(system, out, session, names, of_kind - held_out, bands, disturbances)
     setup.write(out)
     notes = [f"{name}: not used: {reason}" for name, reason in written.skipped.items()]
-    notes += [
-        f"{name}: {one.start_s:.1f} to {one.end_s:.1f} s left out: {one.reason}"
-        for name, stretches in disturbances.items()
-        for one in stretches
-    ]
+    notes += _describe_offsets(offsets, session)
+    for name, stretches in disturbances.items():
+        for reason in dict.fromkeys(one.reason for one in stretches):
+            of_it = [one for one in stretches if one.reason == reason]
+            where = f"{of_it[0].start_s:.1f} to {of_it[-1].end_s:.1f} s"
+            if len(of_it) > 1:
+                lasting = sum(one.end_s - one.start_s for one in of_it)
+                where = f"{len(of_it)} stretches, {lasting:.1f} s in all,"
+            notes.append(f"{name}: {where} left out: {reason}")
     return result.write(out) | {"setup": list(setup.lines), "notes": notes}
 
 
@@ -209,9 +219,14 @@ def _nothing_to_differentiate(
 
 
 def _write_motions(
-    path: Path, samples: Path, ids: Sequence[str], kinematics: Kinematics, progress: Progress
+    path: Path,
+    samples: Path,
+    ids: Sequence[str],
+    kinematics: Kinematics,
+    progress: Progress,
+    offsets: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
 ) -> _Written:
-    """Differentiate each trial and write them all to ``path``."""
+    """Differentiate each trial, its forces without their ``offsets``, and write all to ``path``."""
     written = _Written({axis: [] for axis in kinematics.axes}, {}, {})
     with ParquetAppender(path) as file:
         for number, trial_id in enumerate(ids):
@@ -220,6 +235,8 @@ def _write_motions(
             if isinstance(trial, str):
                 written.skipped[trial_id] = trial
                 continue
+            for name, offset in offsets.get(trial_id, {}).items():
+                trial.frame[name] -= offset
             frame, errors = _differentiate(trial, kinematics)
             file.append(frame)
             written.interpolated[trial_id] = float(np.mean(trial.grid.bridged))
@@ -228,34 +245,63 @@ def _write_motions(
     return written
 
 
-def _disturbances(
-    system: System,
-    out: Path,
-    session: IngestResult,
-    free: Sequence[str],
-    held_out: Collection[str],
-    band: Band,
-) -> dict[str, tuple[Disturbance, ...]]:
-    """Find where a sensor of a moving trial is dead, and what else disturbs the free ones."""
-    path = out / "filter/kinematics.parquet"
-    found = {
+def _dead(session: IngestResult) -> dict[str, tuple[Disturbance, ...]]:
+    """Where a sensor of a moving trial is dead, by trial."""
+    return {
         name: tuple(
             Disturbance(start_s=one.start_s, end_s=one.end_s, reason=one.sentence)
             for one in stretches
         )
         for name, stretches in session.dead.items()
     }
-    motions = TrialCache(
-        lambda k: read_motion_of(path, free[k], system, found.get(free[k], ())),
-        len(free),
-        n_samples,
-        names=free,
-    )
-    fitted = [k for k, name in enumerate(free) if name not in held_out]
+
+
+def _motions(
+    path: Path,
+    names: Sequence[str],
+    system: System,
+    left_out: Mapping[str, Sequence[Disturbance]],
+) -> TrialCache[Motion]:
+    """The trials just written."""
+
+    def read(number: int) -> Motion:
+        return read_motion_of(path, names[number], system, left_out.get(names[number], ()))
+
+    return TrialCache(read, len(names), n_samples, names=names)
+
+
+def _disturbances(
+    motions: TrialCache[Motion],
+    system: System,
+    band: Band,
+    fitted: Sequence[int],
+    dead: Mapping[str, tuple[Disturbance, ...]],
+) -> dict[str, tuple[Disturbance, ...]]:
+    """Where a sensor is dead, and what else disturbs the free trials."""
+    found = dict(dead)
     for name, stretches in find_disturbances(system, motions, band, fitted).items():
         both = (*found.get(name, ()), *stretches)
         found[name] = tuple(sorted(both, key=lambda one: one.start_s))
     return found
+
+
+def _describe_offsets(
+    offsets: Mapping[str, Mapping[str, float]], session: IngestResult
+) -> Iterator[str]:
+    """Say by force what each trial's zero is off."""
+    force = session.force
+    names = {name: None for by_force in offsets.values() for name in by_force}
+    for name in names:
+        gain, unit = 1.0, force.unit
+        if name in force.columns and force.raw_unit:
+            row = force.calibration[force.columns.index(name)]
+            if sum(entry != 0.0 for entry in row) == 1:
+                gain, unit = sum(row), force.raw_unit
+        each = ", ".join(f"{trial} {by[name] / gain:+.3g}" for trial, by in offsets.items())
+        yield (
+            f"{name} is zeroed anew in each trial: against their mean it reads {each} {unit} too"
+            " much, which is taken off; of held-out trials, too, by their own samples"
+        )
 
 
 def _inspect(
@@ -291,7 +337,7 @@ def _bands(
 ) -> dict[str, ResidualBand]:
     """Find the band in which residuals are compared, from the trials just written."""
     path = out / "filter/kinematics.parquet"
-    motions = TrialCache(lambda k: read_motion_of(path, ids[k], system), len(ids), n_samples)
+    motions = _motions(path, ids, system, {})
     sensors = Sensors.from_result(session, system.coordinates, system.model.device.forces)
     return find_band(system, motions, sensors, kinematics, config.band_hz)
 
@@ -450,6 +496,7 @@ def _result(
     written: _Written,
     bands: Mapping[str, ResidualBand],
     disturbances: dict[str, tuple[Disturbance, ...]],
+    offsets: dict[str, dict[str, float]],
 ) -> FilterResult:
     """Return what filter.json holds."""
     entries = {}
@@ -475,6 +522,7 @@ def _result(
         bridged_fraction=written.interpolated,
         skipped=written.skipped,
         disturbances=disturbances,
+        force_offsets=offsets,
         headline=f"{kinematics.method}, {len(written.interpolated)} trials; bandwidth {widest}; "
         f"residuals compared below {residuals}",
     )

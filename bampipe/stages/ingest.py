@@ -84,7 +84,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         _write_device(session.device_file, device, out / "ingest")
     notes = [*description.sensor_warnings, *(line.sentence for line in description.mains_hum)]
     if device.robot is not None:
-        notes += [f"no body has what is drawn: {line}" for line in device.robot.impossible]
+        notes += [
+            f"no body has what is drawn, and the nearest is taken: {line}"
+            for line in device.robot.impossible
+        ]
     notes += [f"{place}: its source still says `fill in`" for place in description.placeholders]
     if every > 1:
         notes.append(

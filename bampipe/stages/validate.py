@@ -28,7 +28,7 @@ from bampipe.results.checks import find_failed_checks
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.rounding import significant
-from bampipe.results.standing import standing
+from bampipe.results.standing import AT_FLOOR, standing
 from bampipe.results.validate import (
     AxisError,
     ForceError,
@@ -177,12 +177,13 @@ def _noise_floor(
         return None, [f"No noise floor: simulating the fitted model failed ({error})."]
     notes = []
     for i, axis in enumerate(evidence.system.coordinates):
-        stops, level = found.stopping_rms[i], found.noise_floor.level[i]
-        if stops > 0.5 * level:
+        creeps, level = found.creeping_floor[i], found.noise_floor.level[i]
+        if level > AT_FLOOR * creeps:
             unit = evidence.system.torque_units[i]
             notes.append(
-                f"{axis}: of the noise floor of {significant(level)} {unit}, {significant(stops)}"
-                " are of friction that stops the machine where it turns, between two samples."
+                f"{axis}: the noise floor of {significant(level)} {unit} is that of friction that"
+                " stops the machine where it turns; replays that creep there, as `sign_width`"
+                f" says, leave {significant(creeps)}."
             )
     return found.noise_floor, notes
 

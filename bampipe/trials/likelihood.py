@@ -3,12 +3,13 @@
 Of the samples of an axis that count, in the words of docs/method_residual:
 
     y = f(motion; theta) + beta b + gamma c + e
-    var e ~ s^2 (v(z) + tau^2 (b^2 + g^2 c^2) + (delta F)^2), with the tails of Student's t
+    var e ~ s^2 (v(z) + tau^2 (b^2 + g^2 c^2) + h^2 + (delta F)^2), with the tails of Student's t
 
 y is what the fitted model leaves, low-passed; b the mean of replays of the model (what filters do
 to its residual where friction turns, which the measurement shares); c the residual of a replay
 whose friction truly stops the machine where it turns, and g a first guess of its factor; v what
-single replays leave around b, by speed; F the applied force; s a scale of each axis, which is found
+single replays leave around b, by speed; h what friction is off because no log says when between two
+samples a machine turns; F the applied force; s a scale of each axis, which is found
 with the rest. Parameters have their priors and bounds; so have the nuisance parameters: the factors
 beta and gamma of each axis, and the time by which inputs were sampled late.
 """
@@ -191,12 +192,16 @@ class Likelihood:
             for m in e.motions
             for kept in [e.band.thinned_rows(len(m.t))]
         ]
+        turning = [np.zeros_like(r) for r in e.residual]
+        if bias_error:
+            turning = e.band.thin_trials(_error_of_turning(e), axes)
         root, force = [], []
         for axis, here in enumerate(samples):
             f, y = take_samples(applied, here, axis), take_samples(e.residual, here, axis)
             variance = (
                 noise.variance[axis]
                 + bias_error**2 * noise.variance_of_bias(axis, y)
+                + take_samples(turning, here, axis) ** 2
                 + (discrepancy * f) ** 2
             )
             least = _LEAST * float(variance.mean()) if variance.size else 0.0
@@ -288,6 +293,26 @@ class Problem:
     def solve(self) -> Solved:
         """The change of the model's own parameters that is most likely."""
         return solve_bounded(self, *self.sums())
+
+
+def _error_of_turning(evidence: Evidence) -> list[Array]:
+    """What is not known of friction as a log does not say when between two samples a machine turns.
+
+    By trial, each (T, n_q), N.m or N: the change of friction from sample to sample, times the
+    standard deviation of a moment that lies evenly between two of them.
+    """
+    dry, width = dry_friction(evidence)
+    jumps = [np.gradient(np.tanh(m.qd / width), axis=0) for m in evidence.motions]
+    return [dry * jump / np.sqrt(12.0) for jump in jumps]
+
+
+def dry_friction(evidence: Evidence) -> tuple[Array, Array]:
+    """Coulomb friction of each axis in a model and the width of its sign, both (n_q,)."""
+    coordinates = evidence.system.model.device.coordinates
+    values = zip(evidence.system.parameters, evidence.p.tolist(), strict=True)
+    known = {parameter.name: abs(value) for parameter, value in values}
+    dry = np.array([known.get(f"coulomb.{c.name}", 0.0) for c in coordinates])
+    return dry, np.array([c.sign_width for c in coordinates])
 
 
 def _pose(

@@ -121,15 +121,17 @@ def _stated(name: str, session: IngestResult) -> str:
 
 @dataclass(frozen=True)
 class Change:
-    """Signals and clock as another set-up has them: value' = gain @ value + offset, t' = time * t.
+    """What another set-up says: value' = gain @ value + offset, t' = time * t, and gravity.
 
     Attributes:
         gain: (n, n); offset: (n,), in the order of the signals; time: of the clock.
+        gravity: in the frame of a robot's base, m/s2; None where it is as the device file says.
     """
 
     gain: Array
     offset: Array
     time: float = 1.0
+    gravity: tuple[float, float, float] | None = None
 
     @classmethod
     def none(cls, count: int) -> Change:
@@ -139,7 +141,10 @@ class Change:
     def after(self, first: Change) -> Change:
         """Both, ``first`` first."""
         return Change(
-            self.gain @ first.gain, self.gain @ first.offset + self.offset, self.time * first.time
+            self.gain @ first.gain,
+            self.gain @ first.offset + self.offset,
+            self.time * first.time,
+            self.gravity or first.gravity,
         )
 
     def of_motion(self, motion: Motion, signals: Signals) -> Motion:

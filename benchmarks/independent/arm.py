@@ -44,6 +44,7 @@ class Arm:
         viscous, coulomb: at the joint; reach: (n, 2) range, rad or m.
         effort: largest drive, N.m or N; speed: rad/s or m/s.
         creep: speed over which dry friction comes up where nothing sticks, rad/s or m/s.
+        gravity: in the axes of the base, m/s2, (3,).
         hidden: effects by name, with the numbers that they have.
     """
 
@@ -62,6 +63,7 @@ class Arm:
     effort: Array
     speed: Array
     creep: float = CREEP
+    gravity: Array = field(default_factory=GRAVITY.copy)
     hidden: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @property
@@ -73,7 +75,7 @@ class Arm:
         n, samples = len(self.kinds), len(q)
         turn = np.broadcast_to(np.eye(3), (samples, 3, 3))
         place, velocity_w, rate_w, acceleration = (np.zeros((samples, 3)) for _ in range(4))
-        acceleration = acceleration - GRAVITY
+        acceleration = acceleration - self.gravity
         pivots, axes, forces, moments = [], [], [], []
         for k in range(n):
             # To the joint, on the body before it.
@@ -410,6 +412,8 @@ def record_logs(
     turned: Sequence[str] = (),
     soft_hz: float = 0.0,
     creep: float = CREEP,
+    gravity: Sequence[float] = tuple(GRAVITY),
+    heavier: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Write ``arm.urdf`` and CSV logs into ``folder``; returns the truth, written beside it.
 
@@ -422,16 +426,20 @@ def record_logs(
         turned: joints whose drive is logged with the other sign.
         soft_hz: how softly drives follow their path, natural frequency; 0 for exactly. Softly
             led joints stick where they turn round.
-        creep: as of the arm.
+        creep: as of the arm; gravity: as of the arm, of which the drawing says nothing.
+        heavier: by joint, how often its body is as heavy as it is drawn.
     """
     rng = np.random.default_rng([seed, 1])
     arm = build(kinds, seed)
-    arm.creep = creep
+    arm.creep, arm.gravity = creep, np.array(gravity)
     hide(arm, effects or {}, np.random.default_rng([seed, 2]))
     constants = rng.uniform(5.0, 12.0, len(kinds))
     sign = np.array([-1.0 if name in turned else 1.0 for name in arm.names])
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "arm.urdf").write_text(urdf(arm, rng, drawing_error))
+    for name, factor in (heavier or {}).items():
+        arm.mass[arm.names.index(name)] *= factor
+        arm.inertia[arm.names.index(name)] *= factor
     for number in range(trials):
         t, q, motor, drive = measure(arm, rng, seconds, rate_hz, noise, soft_hz)
         columns = headed(arm, style, t, q, sign * drive, constants)

@@ -11,7 +11,7 @@ import pytest
 from bampipe.data.device_file import read_device_file
 from bampipe.data.robot_file import read_chain
 from bampipe.errors import InputError
-from bampipe.physics import Model, compile_model
+from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
 from bampipe.physics.units import check_device
 from bampipe.run.hashing import digest_session
@@ -347,3 +347,56 @@ def test_an_encoder_that_reads_two_joints_gives_the_position_of_its_own() -> Non
     part_readings(SimpleNamespace(encoders=encoders), si)  # type: ignore[arg-type]
     np.testing.assert_allclose(si["q_one"], [0.1, 0.2])
     np.testing.assert_allclose(si["q_two"], [0.3, 0.5])
+
+
+FOLLOWS = '<mimic joint="{}" multiplier="{}" offset="{}"/></joint>'
+
+
+def following(entry: str, other: str, ratio: float, zero: float) -> str:
+    return entry.replace("</joint>", FOLLOWS.format(other, ratio, zero))
+
+
+def system_of(folder: Path, *parts: str) -> System:
+    folder.mkdir()
+    write(folder, *parts)
+    path = folder / "device.toml"
+    path.write_text('name = "a"\n[robot]\nurdf = "arm.urdf"\ngravity = [3.0, -5.0, -7.0]\n')
+    return compile_model(Model(device_from(read_device_file(path), str(path))))
+
+
+def test_a_joint_that_follows_another_moves_with_it(tmp_path: Path) -> None:
+    """By virtual work on the same chain with all its joints free."""
+    links = (link("l0"), link("l1", 2.0, 0.25), link("l2", 1.0, 0.2, 0.4), link("l3", 0.7, 0.1))
+    first, last = joint("a", "l0", "l1"), joint("c", "l2", "l3").replace("0 0 1", "1 0 0")
+    middle = joint("b", "l1", "l2").replace("0 0 1", "0 1 0")
+    free = system_of(tmp_path / "free", *links, first, middle, last)
+    held = system_of(tmp_path / "held", *links, first, following(middle, "a", -0.5, 0.3), last)
+    assert held.coordinates == ("a", "c")
+    assert held.model.device.forces == ("torque_a", "torque_c")
+    forces = []
+    moves = np.array([[1.0, 0.0], [-0.5, 0.0], [0.0, 1.0]])
+    q, qd, qdd = np.random.default_rng(0).normal(size=(3, 20, 2))
+    for system, by in ((held, np.eye(2)), (free, moves)):
+        p = np.array(
+            [
+                0.0 if x.name.startswith(("visc", "coul", "rotor")) else x.prior
+                for x in system.parameters
+            ]
+        )
+        at = q @ by.T + (np.array([0.0, 0.3, 0.0]) if system is free else 0.0)
+        none = np.zeros((20, 0)), np.zeros((20, len(system.inputs)))
+        forces.append(system.required(at, qd @ by.T, qdd @ by.T, *none, p) @ by)
+    np.testing.assert_allclose(forces[0], forces[1], rtol=0.0, atol=1e-11)
+    robot = held.model.device.robot
+    assert robot is not None
+    drawn = robot.drawn_forces(q, qd, qdd, np.array(robot.gravity))
+    np.testing.assert_allclose(drawn, forces[0], rtol=0.0, atol=1e-11)
+
+
+def test_what_follows_a_joint_beside_the_chain_is_held(tmp_path: Path) -> None:
+    beside = joint("side", "l1", "l9", x=0.1)
+    parts = (*chain_of(3), link("l9"), beside)
+    parts = tuple(following(p, "side", 2.0, 0.0) if 'name="j1"' in p else p for p in parts)
+    chain = read_chain(write(tmp_path, *parts), tip="l3")
+    assert list(chain.joints) == ["j0", "j2"]
+    assert any("held at zero" in note and "j1" in note for note in chain.notes)

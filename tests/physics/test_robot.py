@@ -182,6 +182,28 @@ def test_impossible_bodies_are_named() -> None:
     assert first == "j0: a mass of -1 kg"
     assert "largest moment exceeds the sum" in second
     assert "a negative moment of inertia" in third
+    assert wrong.undrawn == []
+    assert not wrong.joints[0].inertial.any()
+    for joint in wrong.joints[1:]:
+        # About the centre of mass: of no axis is the moment more than those of the other two.
+        c = np.array(joint.center)
+        six = joint.inertial[4:]
+        about = np.array([[six[0], six[1], six[2]], [six[1], six[3], six[4]], [six[2], *six[4:]]])
+        own = np.linalg.eigvalsh(about - joint.mass * (c @ c * np.eye(3) - np.outer(c, c)))
+        assert own[0] >= 0.0 and own[2] <= own[0] + own[1] + 1e-9
+
+
+def test_a_body_that_is_not_drawn_may_be_one() -> None:
+    """Its numbers start at nothing, and are not held there."""
+    device = random_robot(3, seed=3)
+    joints = {name: dict(j) for name, j in device.declaration["robot"]["joints"].items()}
+    joints["j1"] |= {"mass": 0.0, "center": [0.0, 0.0, 0.0], "inertia": [0.0] * 6}
+    robot = device_from({**device.declaration, "robot": {"joints": joints}}).robot
+    assert robot is not None
+    assert robot.undrawn == ["j1"] and robot.impossible == []
+    sd = {p.name: p.sd for p in robot.parameters}
+    heaviest = sum(joint.mass for joint in robot.joints)
+    assert sd["mass.j1"] == pytest.approx(robot.uncertainty * 0.1 * heaviest)
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
 from bampipe.setup.corrections import scaled
-from bampipe.setup.finding import Finding
+from bampipe.setup.finding import Finding, Tried, choose
 from bampipe.setup.plausibility import Plausibility
 from bampipe.setup.search import CorrectionSearch
 from bampipe.trials.folds import Folds
@@ -27,7 +27,7 @@ OFF = np.array([1.15, 0.9, 1.2, 0.85])
 
 
 @cache
-def arm() -> System:
+def arm(gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)) -> System:
     joints = {
         name: {
             "kind": "revolute", "position": [0.0, 0.0, 0.3], "rotation": [1.3, 0.0, 0.4],
@@ -36,18 +36,26 @@ def arm() -> System:
         } | ({"after": JOINTS[k - 1]} if k else {})
         for k, name in enumerate(JOINTS)
     }  # fmt: skip
-    table = {"name": "arm", "robot": {"joints": joints}}
+    table = {"name": "arm", "robot": {"joints": joints, "gravity": gravity}}
     return compile_model(Model(device_from(complete_device(table, None, ""))))  # type: ignore[arg-type]
 
 
-def motions(factor: float, viscous: float) -> list[Motion]:
-    """Two trials whose torques read ``factor`` times too much."""
-    system = arm()
+def motions(
+    factor: float,
+    viscous: float,
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
+    tool: float = 1.0,
+) -> list[Motion]:
+    """Two trials whose torques read ``factor`` times too much.
+
+    Under a gravity in the base's frame, m/s2, and with a last body ``tool`` times as heavy.
+    """
+    system = arm(gravity)
     p = system.prior
     for i, item in enumerate(system.parameters):
         short, _, name = item.name.rpartition(".")
         if short.startswith(("mass", "first", "inertia")) and not item.fixed:
-            p[i] *= OFF[JOINTS.index(name)]
+            p[i] *= OFF[JOINTS.index(name)] * (tool if name == JOINTS[-1] else 1.0)
         elif short in ("viscous", "coulomb"):
             p[i] = viscous if short == "viscous" else 4.0
     found = []
@@ -113,7 +121,7 @@ def test_what_spoils_a_joint_that_was_right_is_no_mistake(third: float, named: b
         for error, objection in (((0.10, 0.55, 0.08, 0.21), 1.0), ((0.12, 0.32, third, 0.21), 0.5))
     )
     twice = scaled(search.signals, FORCES, 2.0, 0.0)
-    assert (search._choose(before, [(twice, after)], ()) is not None) == named
+    assert bool(choose(before, [Tried((twice,), after)])) == named
 
 
 def turned(factor: float, zero: float, joint: int, drive: float) -> list[Motion]:
@@ -157,3 +165,35 @@ def test_two_joints_of_a_makers_zero_posture_are_found_together() -> None:
     zeros = {f.correction.signals[0]: f.correction.offset for f in found}
     assert zeros == {"two": -0.5 * np.pi, "three": 0.5 * np.pi}
     assert all(f.drawn and f.after.worst_error < 0.15 for f in found)
+
+
+@pytest.mark.parametrize("gravity", [(9.81, 0.0, 0.0), (0.0, 6.937, -6.937)])
+def test_a_base_that_does_not_stand_is_found_with_the_joint_that_is_reversed(
+    gravity: tuple[float, float, float],
+) -> None:
+    given = [
+        replace(m, q=m.q * REVERSED, qd=m.qd * REVERSED, qdd=m.qdd * REVERSED)
+        for m in motions(1.0, 2.0, gravity)
+    ]
+    found = find_mistakes(given)
+    assert {f.correction.kind: f.correction.signals for f in found} == {
+        "gravity": (),
+        "sign": ("two",),
+    }
+    (mounted,) = (f.correction.change.gravity for f in found if f.correction.kind == "gravity")
+    assert mounted == pytest.approx(gravity, abs=1e-3)
+    assert all(f.after.worst_error < 0.15 for f in found[-1:])
+
+
+REVERSED = np.array([1.0, -1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize(("tool", "factor"), [(1.0, None), (5.0, 5.0 * OFF[3])])
+def test_a_heavy_tool_is_no_mistake_of_units(tool: float, factor: float | None) -> None:
+    search = search_in(motions(1.0, 2.0, tool=tool))
+    assert search.find_mistakes(search.judge(Change.none(8)), ()) == ()
+    if factor is None:
+        assert search.heavier is None
+    else:
+        assert search.heavier is not None and search.heavier.place == 3
+        assert search.heavier.factor == pytest.approx(factor, rel=0.2)

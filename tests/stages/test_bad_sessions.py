@@ -438,8 +438,8 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         r"row 1002, column 'time_us': time starts again once; several recordings in one file",
     ),
     "many repeated stamps": (
-        table(lambda t: t["time_us"].__setitem__(slice(None), t["time_us"] // 4000 * 4000)),
-        "500 of 1000 time stamps are repeated",
+        table(lambda t: t["time_us"].__setitem__(slice(200, 300), t["time_us"][200])),
+        "99 of 1000 time stamps are repeated",
     ),
     "unit of time out of all proportion": (
         table(lambda t: t["time_us"].__imul__(40)),
@@ -469,10 +469,6 @@ ASIDE: dict[str, tuple[Damage, str]] = {
     "a column of infinities": (
         text(lambda s: re.sub(r"(\n(?:[^,\n]*,){4})[^,\n]*", r"\1inf", s)),
         "column 'force_x_v': holds no number at all",
-    ),
-    "force saturated": (
-        table(lambda t: np.clip(t["force_y_v"], -0.8, 0.8, out=t["force_y_v"]) is None),
-        r"column 'force_y_v': 2\d.\d% of the samples are at the rail -?0.8: saturated",
     ),
     "force frozen": (samples("force_z_v", slice(200, 800), 0.25), "reads 0.25 without a change"),
     "force disconnected": (samples("force_z_v", slice(None), 0.0), "frozen"),
@@ -578,6 +574,26 @@ REPAIRED: dict[str, tuple[Damage, str]] = {
         table(lambda t: t["time_us"].__imul__(1e-3)),
         "time stamps are in ms, not us",
     ),
+    "stamps of too few digits": (
+        table(lambda t: t["time_us"].__setitem__(slice(None), t["time_us"] // 4000 * 4000)),
+        "time stamps are rounded to 0.004 s: spread evenly",
+    ),
+    "a clock set back": (
+        table(lambda t: t["time_us"].__setitem__(slice(500, None), t["time_us"][500:] - 3e5)),
+        "the clock is set back by 0.3 s at row 502: bridged",
+    ),
+    "two queues, one late": (
+        rows(
+            lambda n: np.r_[
+                0:200, np.ravel(np.column_stack([np.r_[250:300], np.r_[200:250]])), 300:n
+            ]
+        ),
+        "100 rows written out of order sorted by their time stamps",
+    ),
+    "force saturated": (
+        table(lambda t: np.clip(t["force_y_v"], -0.8, 0.8, out=t["force_y_v"]) is None),
+        r"column 'force_y_v': 41.0% of the samples stand at the rail -0.8 and 0.8: left out",
+    ),
     "a few repeated stamps": (
         samples("time_us", [100, 200], [198_000, 398_000]),
         "2 rows with a repeated time stamp dropped",
@@ -590,7 +606,7 @@ REPAIRED: dict[str, tuple[Damage, str]] = {
     "a stamp missing": (cell(60, "time_us", ""), "1 row without a time stamp dropped"),
     "clock rolls over": (
         table(lambda t: t.update(time_us=np.mod(t["time_us"] + 2.0**32 - 1e6, 2.0**32))),
-        "clock rolls over at 32 bits once: unrolled",
+        "clock rolls over at 32 bits once, first at row 502: unrolled",
     ),
     "a gap near the end": (
         table(lambda t: t["time_us"].__setitem__(slice(800, None), t["time_us"][800:] + 1e6)),

@@ -252,10 +252,11 @@ def test_what_a_motor_is_told_may_rest_or_stand_at_its_limit_a_sensor_may_not(tm
         made.files["my/sled.toml"] = SLED.replace("force_unit", "drive = true\nforce_unit")
     session = made.write(tmp_path / "session")
     if not driven:
-        with pytest.raises(InputError, match="saturated"):
+        with pytest.raises(InputError, match="frozen"):
             run_ingest(session, tmp_path / "out")
         return
     run_ingest(session, tmp_path / "out")
+    assert read_json(tmp_path / "out/ingest/session.json")["dead"] == {}
     frame = read_parquet(tmp_path / "out/ingest/samples.parquet")
     np.testing.assert_allclose(frame.force_motor, 35.0 * table["motor"] + table["pulse"])
 

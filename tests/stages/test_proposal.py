@@ -31,6 +31,7 @@ from bampipe.physics import registry
 from bampipe.physics.units import check_device
 from bampipe.progress import silent
 from bampipe.proposal import propose, write_proposal
+from bampipe.proposal.notes import COLUMNS
 from bampipe.proposal.starter import starter_device
 from bampipe.proposal.starter_input import Drive
 from bampipe.stages import ingest
@@ -372,7 +373,8 @@ def test_a_clock_named_by_its_unit(tmp_path):
 def test_a_rate_that_nobody_knows_is_refused_until_it_is_given(tmp_path):
     write_stage_log(tmp_path / "a", "pos_mm", "load_cell_N")
     _, proposal = proposed(tmp_path / "a")
-    assert proposal.fill_in == ["sample_rate_hz, the true rate"]
+    (ask,) = proposal.fill_in
+    assert ask.startswith("sample_rate_hz, rows a second: ")
     with pytest.raises(InputError, match=r'sample_rate_hz: found "\?"'):
         read_session(tmp_path / "a")
 
@@ -391,7 +393,7 @@ def test_a_force_that_is_not_there_is_asked_for_where_it_is_read(tmp_path, comma
     header = "time [s],position [rad],current [A]"
     np.savetxt(tmp_path / "a.csv", table, fmt="%.6f", delimiter=",", header=header, comments="")
     session, proposal = proposed(tmp_path)
-    assert proposal.fill_in == ["the column of force_drive in N.m"]
+    assert proposal.fill_in == ["the column of force_drive in N.m: " + COLUMNS]
     assert session["force"] == {"columns": ["?"], "components": ["drive"], "unit": "N.m"}
     code, _, err = command("ingest", tmp_path)
     assert code == 2 and "fill in the name of the column" in err
@@ -623,7 +625,8 @@ def test_a_torque_in_per_cent_asks_for_its_gain(tmp_path):
     write_table(tmp_path / "a.csv", labelled("t,angle_deg,w,torque_percent", q=57.29578, u=20.0))
     session, proposal = proposed(tmp_path)
     assert session["force"]["unit"] == "V" and session["force"]["calibration_n_per_v"] == [[0.0]]
-    assert proposal.fill_in == ['calibration_n_per_v, N.m for one of "torque_percent"']
+    (ask,) = proposal.fill_in
+    assert ask.startswith('calibration_n_per_v, N.m for one of "torque_percent": ')
 
 
 def test_names_can_be_given_to_a_log_without_a_header(tmp_path, command: Command):
@@ -655,7 +658,93 @@ def test_a_load_in_a_register_is_no_force(tmp_path, beside: str, role: str):
     (drive,) = (c for c in session["channels"].values() if c["column"] == "load")
     assert drive["wrap_bits"] == 16 and drive["signed"]
     if beside:
-        assert proposal.fill_in == ["the scale of duty, 1 over full duty"]
+        (ask,) = proposal.fill_in
+        assert ask.startswith("the scale of duty, 1 over the reading of load at full duty")
     else:
         said = "a signed register of 16 bits: give its scale"
         assert any(said in line for line in proposal.check)
+
+
+def pendulum(names: str, q: float, u: float) -> dict[str, np.ndarray]:
+    """A joint that swings far: time, position and torque under other names, scaled."""
+    t = np.arange(3000) / 100.0
+    angle = 0.9 * np.sin(1.7 * t) + 0.5 * np.sin(4.1 * t + 1.0)
+    speed = np.gradient(angle, t)
+    torque = INERTIA * np.gradient(speed, t) + VISCOUS * speed + MOMENT * np.sin(angle)
+    torque += COULOMB * np.tanh(speed / 2e-3) + np.random.default_rng(5).normal(0.0, 0.01, 3000)
+    return dict(zip(names.split(","), (t, q * angle, u * torque), strict=True))
+
+
+def test_sign_bits_of_a_servo_are_taken_off_and_its_counts_shown_by_its_weight(tmp_path):
+    """Below zero the position reads 32768 and the magnitude, the load 1024 and the magnitude."""
+    table = pendulum("time,pos,load", 4096 / (2.0 * np.pi), 250.0)
+    signed = {name: np.rint(table[name]) for name in ("pos", "load")}
+    for name, bit in (("pos", 15), ("load", 10)):
+        table[name] = np.where(signed[name] < 0, 2.0**bit - signed[name], signed[name])
+    write_table(tmp_path / "a.csv", table | {"voltage": np.full(len(table["time"]), 12.0)})
+    session, proposal = proposed(tmp_path)
+    encoder = session["encoders"]["joint"]
+    assert encoder["sign_bit"] == 15
+    assert encoder["counts_per_unit"] == pytest.approx(4096 / (2.0 * np.pi), rel=0.02)
+    assert session["channels"]["duty"]["sign_bit"] == 10
+    assert "pos is sign and magnitude: bit 15 stands for minus" in proposal.check
+    assert [ask.split(",")[0] for ask in proposal.fill_in] == ["the scale of duty"]
+
+
+@pytest.mark.parametrize(
+    ("column", "unit"), [("handle_force_N", "N"), ("loadcell_kN", "kN"), ("kraft", "N")]
+)
+def test_a_force_on_a_joint_needs_a_lever(tmp_path, command: Command, column: str, unit: str):
+    scale = 1e-3 if unit == "kN" else 1.0
+    write_table(tmp_path / "a.csv", labelled(f"t,angle_rad,w,{column}", u=scale / 0.31))
+    session, proposal = proposed(tmp_path)
+    assert (session["force"]["unit"], session["force"]["lever_m"]) == (unit, 0.0)
+    (ask,) = proposal.fill_in
+    assert ask.startswith("lever_m, how far from the axis") and "measure it" in ask
+    code, _, err = command("ingest", tmp_path)
+    assert code == 2 and "force.lever_m: found 0, expected the distance in m from the axis" in err
+    text = (tmp_path / "session.toml").read_text().replace("lever_m = 0.0", "lever_m = 0.31")
+    (tmp_path / "session.toml").write_text(text)
+    found = samples(tmp_path, tmp_path / "out", "a")
+    whole = labelled("t,q,w,u")["u"][: len(found)]
+    np.testing.assert_allclose(found["force_drive"], whole, atol=2e-3)
+
+
+def test_a_current_that_goes_with_the_torque_is_no_coil(tmp_path):
+    table = labelled("t,angle_rad,w,torque_nm")
+    rng = np.random.default_rng(1)
+    table["current"] = table["torque_nm"] / 1.9 + rng.normal(0.0, 0.02, len(table["t"]))
+    write_table(tmp_path / "a.csv", table)
+    session, proposal = proposed(tmp_path)
+    assert session["force"]["columns"] == ["torque_nm"] and "coil_current" not in proposal.device
+    assert any("current goes with torque_nm" in line for line in proposal.check)
+
+
+def test_the_gear_of_a_motor_is_what_the_weight_says(tmp_path):
+    write_table(tmp_path / "a.csv", pendulum("t,motor_angle_deg,torque_nm", 70.0 * 57.29578, 1.0))
+    session, proposal = proposed(tmp_path)
+    assert session["encoders"]["joint"]["gear_ratio"] == pytest.approx(70.0, rel=0.02)
+    assert any("times for one turn of it, by its weight" in line for line in proposal.check)
+    assert "moment" in proposal.device
+
+
+def test_held_rows_are_proposed_at_their_true_rate(tmp_path):
+    log = labelled("t,angle_rad,w,torque_nm")
+    rows = np.arange(10 * len(log["t"]))
+    table = {name: values[rows // 10] for name, values in log.items()} | {"t": rows / 1000.0}
+    write_table(tmp_path / "a.csv", table)
+    session, proposal = proposed(tmp_path)
+    assert session["sample_rate_hz"] == 100
+    assert any(line.startswith("90% of the rows repeat the positions") for line in proposal.check)
+
+
+def test_ticks_of_a_counter_and_slow_logs_are_asked_about(tmp_path):
+    log = labelled("ticks,angle_rad,w,torque_nm", t=168e6)
+    write_table(tmp_path / "a.csv", log | {"ticks": np.rint(np.mod(log["ticks"], 2.0**32))})
+    session, proposal = proposed(tmp_path)
+    assert session["time"] == {"column": "ticks", "unit": "ticks", "ticks_per_s": 0.0}
+    (ask,) = proposal.fill_in
+    assert ask.startswith("ticks_per_s, what ticks counts in a second") and "data sheet" in ask
+    (tmp_path / "b").mkdir()
+    write_table(tmp_path / "b/a.csv", {n: v[::10] for n, v in labelled("t,q,w,u").items()})
+    assert any("too slow for inertia" in line for line in propose(tmp_path / "b").check)

@@ -18,6 +18,7 @@ from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.proposal import ProposedSession, propose, write_proposal
 from bampipe.proposal.drawing import Drive
+from bampipe.proposal.notes import COLUMNS
 
 URDF = """<?xml version="1.0"?><robot name="arm">
 <link name="base"/>
@@ -321,7 +322,7 @@ def test_a_drive_that_was_not_logged_is_asked_for_and_the_other_stays_where_it_i
     table = pd.read_csv(tmp_path / "log.csv").drop(columns="tau1")
     table.rename(columns={"tau2": names[1]}).to_csv(tmp_path / "log.csv", index=False)
     proposal = proposed(tmp_path)
-    assert proposal.fill_in == ["the column of torque_shoulder in N.m"]
+    assert proposal.fill_in == ["the column of torque_shoulder in N.m: " + COLUMNS]
     assert f'torque_elbow = {{ column = "{names[1]}"' in proposal.session
     with pytest.raises(InputError, match="fill in the name of the column") as caught:
         read_session(tmp_path)
@@ -420,6 +421,57 @@ def test_joints_counted_otherwise_than_drawn(
     assert drives == set(turned)
     said = [line for line in proposal.check if "by weight and inertia as drawn: look it up" in line]
     assert len(said) == len(counted)
+
+
+@pytest.mark.parametrize(
+    "down", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, -1.0)], ids=["side", "ceiling", "tilted"]
+)
+def test_gravity_of_a_base_that_does_not_stand(
+    tmp_path: Path, down: tuple[float, float, float]
+) -> None:
+    """With a joint that counts the other way, and a drive that is turned."""
+    gravity = 9.81 * np.array(down) / np.linalg.norm(down)
+    arm.record_logs(
+        tmp_path / "log", 21, "ZYYX", style="joint_states", trials=1, turned=["shoulder"],
+        gravity=gravity,
+    )  # fmt: skip
+    table = pd.read_csv(tmp_path / "log/log_01.csv")
+    table[["/joint_states/elbow/position", "/joint_states/elbow/velocity"]] *= -1.0
+    table.to_csv(tmp_path / "log/log_01.csv", index=False)
+    _, _, proposal = paired(tmp_path / "log")
+    assert any("in the frame of the base, by weight and inertia" in line for line in proposal.check)
+    device = read_device_file(tmp_path / "log/device.toml")
+    assert device["robot"]["gravity"] == pytest.approx(list(gravity), abs=0.01)
+    session = read_session(tmp_path / "log")
+    assert [e.axis for e in session.encoders if e.gear_ratio < 0.0] == ["elbow"]
+    assert [c.name for c in session.channels if c.scale < 0.0] == ["torque_shoulder"]
+
+
+def test_efforts_that_are_called_eff_are_drives(tmp_path: Path) -> None:
+    write_log(tmp_path)
+    table = pd.read_csv(tmp_path / "log.csv")
+    joints = {"1": "shoulder", "2": "elbow"}
+    names = {f"q{n}": f"{j}_pos" for n, j in joints.items()}
+    names |= {f"tau{n}": f"{j}_eff" for n, j in joints.items()}
+    table.rename(columns=names).to_csv(tmp_path / "log.csv", index=False)
+    assert proposed(tmp_path).fill_in == []
+    channels = {c.name: c.column for c in read_session(tmp_path).channels}
+    assert channels == {"torque_shoulder": "shoulder_eff", "torque_elbow": "elbow_eff"}
+
+
+def test_a_heavy_tool_is_said_with_the_payload_that_it_suggests(tmp_path: Path) -> None:
+    arm.record_logs(
+        tmp_path / "log", 6, "ZYYX", style="joint_states", trials=1, drawing_error=0.0,
+        heavier={"forearm": 4.0},
+    )  # fmt: skip
+    _, _, proposal = paired(tmp_path / "log")
+    (said,) = (line for line in proposal.check if "times as heavy as drawn" in line)
+    assert "on forearm is about 4 times" in said
+    true = arm.build("ZYYX", 6)
+    mass, center = re.search(r"mass = (.*), center = \[(.*)\]", said).groups()  # type: ignore[union-attr]
+    assert float(mass) == pytest.approx(3.0 * true.mass[3], rel=0.1)
+    placed = [float(v) for v in center.split(",")]
+    assert placed == pytest.approx(list(true.center[3]), abs=0.05)
 
 
 HAND = "".join(

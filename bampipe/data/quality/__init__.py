@@ -12,13 +12,13 @@ from bampipe.data.quality.channels import (
     fill_missing,
     refuse_frozen,
     refuse_other_units,
-    refuse_saturated,
     to_si,
     to_signed,
 )
 from bampipe.data.quality.clock import (
     cut_stretch,
     drop_backward_stamps,
+    keep_fresh_rows,
     keep_longest_stretch,
     note_clock,
     rate_of,
@@ -34,6 +34,7 @@ from bampipe.data.quality.encoders import (
     unwrap,
 )
 from bampipe.data.quality.motion import refuse_wrong_brakes, refuse_wrong_motion
+from bampipe.data.quality.rails import leave_out_rails
 from bampipe.data.quality.spikes import interpolate_spikes
 from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable
 from bampipe.data.quality.thinning import thin, thinning_factor
@@ -59,12 +60,14 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
     """
     table = TrialTable(raw, session, entry, limits)
     refuse_other_units(table, raw.units)
+    keep_fresh_rows(table)
     time_to_seconds(table)
     drop_backward_stamps(table)
     cut_stretch(table)
     keep_longest_stretch(table)
     for encoder in session.encoders:
         refuse_fractions(table, encoder)
+        to_signed(table, encoder)
         unwrap(table, encoder)
     for channel in session.channels:
         to_signed(table, channel)
@@ -81,8 +84,8 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
     if session.force is not None and session.force.volts:
         for column in session.force.columns:
             refuse_frozen(table, column)
-            refuse_saturated(table, column)
     note_dead_stretches(table)
+    leave_out_rails(table)
     columns = to_si(table)
     refuse_wrong_motion(table, columns)
     refuse_wrong_brakes(table, columns)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bampipe.data.quality.table import TrialTable, counted, in_rows, longest_run
-from bampipe.data.session import SECONDS, Channel, Session
+from bampipe.data.session import SECONDS, Channel, Encoder, Session
 from bampipe.data.session.channels import LARGEST_CONDITION
 from bampipe.data.units import unit
 from bampipe.errors import InputError
@@ -108,30 +108,6 @@ def refuse_frozen(table: TrialTable, column: str) -> None:
         )
 
 
-def refuse_saturated(table: TrialTable, column: str) -> None:
-    """Refuse a channel that piles up at its extreme: in runs, and far above the next level."""
-    values = table.columns[column]
-    levels, counts = np.unique(values, return_counts=True)
-    if len(levels) < 3:
-        return
-    for rail, pile, beside in (
-        (levels[-1], counts[-1], counts[-2]),
-        (levels[0], counts[0], counts[1]),
-    ):
-        share = pile / len(values)
-        if share <= table.limits.saturated_share or pile <= 5 * beside:
-            continue
-        start, length = longest_run(values == rail)
-        if length >= 5:
-            raise table.fault(
-                f"{share:.1%} of the samples are at the rail {rail:g}: saturated, more than"
-                f" {table.limits.saturated_share:.0%}",
-                column=column,
-                at=start,
-                remedy="lower the gain or the load",
-            )
-
-
 def to_si(table: TrialTable) -> dict[str, np.ndarray]:
     """Columns (T,) in SI units by name: q_<axis>, force_<component>, brake_<axis>, channels."""
     session, raw = table.session, table.columns
@@ -192,20 +168,25 @@ def part_readings(session: Session, si: dict[str, np.ndarray]) -> None:
         si[f"q_{axis}"] = values
 
 
-def to_signed(table: TrialTable, channel: Channel) -> None:
+def to_signed(table: TrialTable, register: Channel | Encoder) -> None:
     """Read the unsigned register of a signed number as what it stands for."""
-    if not channel.wrap_bits:
+    two, bit = getattr(register, "wrap_bits", None), register.sign_bit
+    if bit is not None:
+        period = 2.0 ** (bit + 1)
+    elif two is not None:
+        period = 2.0**two
+    else:
         return
-    period = 2.0**channel.wrap_bits
-    values = table.columns[channel.column]
+    values = table.columns[register.column]
     beyond = (values < 0.0) | (values >= period)
     table.refuse(
         beyond,
         lambda at: f"found {values[at]:g}, expected 0 to {period - 1.0:.0f}",
-        column=channel.column,
-        remedy="a column that is signed already needs no wrap_bits",
+        column=register.column,
+        remedy="a column that is signed already needs no wrap_bits and no sign_bit",
     )
-    values[values >= 0.5 * period] -= period
+    negative = values >= 0.5 * period
+    values[negative] = values[negative] - period if bit is None else 0.5 * period - values[negative]
 
 
 def _refuse_wild(table: TrialTable, values: np.ndarray, words: str, column: str) -> None:

@@ -4,16 +4,33 @@ from __future__ import annotations
 
 import numpy as np
 
-from bampipe.data.quality.table import TrialTable, counted, in_rows, in_times
+from bampipe.data.quality.stamps import COARSEST_STAMP, find_fresh_rows, spread_stamps, unroll
+from bampipe.data.quality.table import TrialTable, counted, find_runs, in_rows, in_times
 from bampipe.data.session import SECONDS
-
-COARSEST_STAMP = 0.05
-"""Share of a step to which time stamps may be rounded: their scatter is a third of it."""
 
 LONGEST_TRIAL_S = 3.2e7
 """A year: what is longer was not recorded in one go, and the unit of its clock is wrong."""
 _GAP = 1.6
 """Of the median step, beyond which samples are missing."""
+_SMOOTHER = 0.8
+"""Of the travel of the positions in the order of the file, in that of the stamps: below, rows were
+written late; above, the clock was set back."""
+_UNLIKELY_TWICE = 0.1
+"""Share of stamps that stand twice once rows are sorted, from which two recordings are mixed."""
+_SEAM = 3.0
+"""Times the largest step of a position, over which it goes on where a clock was set back."""
+
+
+def keep_fresh_rows(table: TrialTable) -> None:
+    """Drop rows that repeat the positions before them: a logger is faster than its source."""
+    encoders = table.session.encoders
+    kept = find_fresh_rows([table.columns[encoder.column] for encoder in encoders])
+    if kept is not None:
+        held = 1.0 - len(kept) / len(table)
+        table.keep(kept)
+        table.repairs.append(
+            f"{held:.0%} of the rows repeat the positions before them: new readings alone are kept"
+        )
 
 
 def time_to_seconds(table: TrialTable) -> None:
@@ -56,7 +73,7 @@ def time_to_seconds(table: TrialTable) -> None:
         real = unit.get(float(f"{table.session.tick * 10.0**-power:.0e}"))
         words = f"in {real}, not {declared}" if real else f"wrong by a factor of 1e{power}"
         table.repairs.append(f"time stamps are {words}, by the nominal rate: converted")
-    elif not 0.1 < ratio < 10.0:
+    elif table.session.clock.unit != "samples" and not 0.1 < ratio < 10.0:
         raise table.fault(
             f"the median step of {ratio / nominal:.3g} s does not fit sample_rate_hz = {nominal:g}",
             column=table.clock,
@@ -65,33 +82,81 @@ def time_to_seconds(table: TrialTable) -> None:
 
 
 def _unwrap_clock(table: TrialTable) -> None:
-    """Undo the roll-over of a clock that counts ticks in 32 bits."""
-    drops = np.flatnonzero(np.diff(table.t) < -(2.0**32) * 0.9)
-    if len(drops) and table.t.min() >= 0 and table.t.max() < 2.0**32:
-        turns = np.zeros(len(table))
-        turns[drops + 1] = 2.0**32
-        table.t = table.t + np.cumsum(turns)
-        table.repairs.append(f"clock rolls over at 32 bits {in_times(len(drops))}: unrolled")
+    """Undo the roll-over of a clock that counts, and spread stamps of too few digits."""
+    table.t, bits, rows = unroll(table.t)
+    if bits:
+        table.repairs.append(
+            f"clock rolls over at {bits} bits {in_times(len(rows))}, first at row"
+            f" {table.rows[rows[0]]}: unrolled"
+        )
+    table.t, rounding = spread_stamps(table.t)
+    if rounding:
+        table.repairs.append(
+            f"time stamps are rounded to {rounding * table.session.tick:.3g} s: spread evenly"
+        )
+
+
+def put_in_order(table: TrialTable) -> None:
+    """Sort rows that were written late, and bridge where the clock was set back.
+
+    Both let stamps fall. In the order of its stamps, the motion is smoother where rows are out of
+    order, and two motions are mixed where the clock was set back.
+    """
+    t = table.t
+    lone = np.zeros(len(table), dtype=bool)
+    # A single stamp that leaps ahead would put all that follow behind it: it goes first.
+    lone[1:-1] = (t[1:-1] > t[2:]) & (t[:-2] < t[2:])
+    if 0 < lone.sum() <= _few(table, len(table)):
+        table.keep(~lone)
+        table.repairs.append(f"{in_rows(int(lone.sum()))} with a time stamp out of order dropped")
+        t = table.t
+    mixed = np.maximum.accumulate(t)[:-1] > np.minimum.accumulate(t[::-1])[::-1][1:]
+    sources = [encoder.column for encoder in table.session.encoders]
+    positions = np.stack([np.nan_to_num(table.columns[column]) for column in sources])
+    order, late = np.arange(len(t)), 0
+    for start, stop in zip(*find_runs(mixed), strict=True):
+        rows = slice(start, stop + 1)
+        place = start + np.argsort(t[rows], kind="stable")
+        as_written, as_stamped = (
+            np.abs(np.diff(positions[:, which])).sum() for which in (np.r_[rows], place)
+        )
+        falls = start + np.flatnonzero(np.diff(t[rows]) < 0.0)
+        # Two recordings one after the other fall once, and their stamps are the same.
+        late_rows = len(falls) > 1 and np.mean(np.diff(t[place]) == 0.0) < _UNLIKELY_TWICE
+        if late_rows and as_stamped < _SMOOTHER * as_written:
+            order[rows] = place
+            late += int(np.sum(place != np.arange(start, stop + 1)))
+        elif len(falls) == 1:
+            at, step = int(falls[0]), float(np.median(np.diff(t)))
+            size = t[at] - t[at + 1] + step
+            # After a lone stamp that is wrong, the clock is where it was.
+            if (stop - at) * step > 0.5 * size and _goes_on(positions, at):
+                t[at + 1 :] += size
+                table.repairs.append(
+                    f"the clock is set back by {size:.3g} s at row {table.rows[at + 1]}: bridged"
+                )
+    if late:
+        table.keep(order)
+        table.repairs.append(f"{in_rows(late)} written out of order sorted by their time stamps")
+
+
+def _goes_on(positions: np.ndarray, at: int) -> bool:
+    """Whether positions (n, T) go on from row ``at`` to the next as they do elsewhere."""
+    steps = np.abs(np.diff(positions))
+    others = np.delete(steps, at, axis=1).max(axis=1)
+    return bool(np.all(steps[:, at] <= _SEAM * others))
 
 
 def drop_backward_stamps(table: TrialTable) -> None:
     """Leave strictly increasing stamps where few rows are in the way; else refuse the trial."""
-    t = table.t
-    if np.all(np.diff(t) > 0):
+    if np.all(np.diff(table.t) > 0):
         return
-    total = len(table)
-    # A single stamp that leaps ahead would put all that follow behind it: it goes first.
-    ahead = np.zeros(total, dtype=bool)
-    ahead[1:-1] = (t[1:-1] > t[2:]) & (t[:-2] < t[2:])
-    if 0 < ahead.sum() <= _few(table, total):
-        table.keep(~ahead)
-        t = table.t
-    else:
-        ahead[:] = False
+    put_in_order(table)
+    t, total = table.t, len(table)
     before = np.maximum.accumulate(t)[:-1]
     repeated = np.concatenate([[False], t[1:] == before])
     behind = np.concatenate([[False], t[1:] < before])
-    counts = int(repeated.sum()), int(behind.sum()) + int(ahead.sum())
+    counts = int(repeated.sum()), int(behind.sum())
     if sum(counts) > _few(table, total):
         at = int(np.argmax(repeated | behind))
         starts = 1 + np.flatnonzero(np.diff(t) < 0.0)

@@ -26,7 +26,8 @@ class CleaningLimits:
         dropped_share: largest share of rows that may be dropped for their time stamps.
         nan_run: longest run of missing samples that is interpolated.
         nan_share: largest share of missing samples in a channel.
-        saturated_share: largest share of samples at the rail of a force channel.
+        saturated_share: largest share of samples of a locked trial at the rail of a force channel;
+            of others, what is read at a rail is left out.
         frozen_share: largest share of the trial over which a force channel may stand still.
         still_rad, still_m: a free trial moves more than this, rad or m, on some axis.
         locked_rad, locked_m: a locked axis moves less than this, rad or m.

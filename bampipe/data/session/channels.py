@@ -65,6 +65,15 @@ Column = Annotated[
     Field(description="A column (or MATLAB variable) of the trial files"),
 ]
 Uncertainty = Annotated[float, Field(ge=0, lt=1)]
+SignBit = Annotated[
+    int | None,
+    Field(
+        ge=1,
+        le=62,
+        description="The column is a register whose bit of this number, from 0, stands for minus"
+        " and whose lower bits are the magnitude, such as 15",
+    ),
+]
 Columns = Annotated[Distinct[Column], Field(min_length=1, description="Columns of the trial files")]
 
 
@@ -92,9 +101,12 @@ class Clock(Declaration):
     """The time column."""
 
     column: str = Field(default="", description="Its name; left out where samples are counted")
-    unit: TimeUnit | Literal["samples"] = Field(
+    unit: TimeUnit | Literal["samples", "ticks"] = Field(
         description="datetime: dates and times; samples: no column, one sample each"
-        " 1/sample_rate_hz"
+        " 1/sample_rate_hz; ticks: of a counter, see ticks_per_s"
+    )
+    ticks_per_s: Positive | None = Field(
+        default=None, description='Rate of the counter, 1/s, where unit = "ticks"'
     )
     format: str = Field(
         default="",
@@ -125,6 +137,11 @@ class Clock(Declaration):
             )
         if self.format and not self.datetime:
             yield InputError('only for unit = "datetime"', where="format")
+        if (self.unit == "ticks") != (self.ticks_per_s is not None):
+            yield InputError(
+                'unit = "ticks" and ticks_per_s belong together',
+                remedy="ticks_per_s is what the counter counts in a second, by its data sheet",
+            )
         if self.nanoseconds and self.unit != "s":
             yield InputError('only for unit = "s"', where="nanoseconds")
 
@@ -171,7 +188,7 @@ class Encoder(NamedDeclaration):
         alias="resolution",
         description="Smallest step of a column that is not in counts, in its unit",
     )
-
+    sign_bit: SignBit = None
     also_reads: dict[ChannelName, Number] = Field(
         default={},
         description="Of an encoder on a motor that several joints turn: what it reads of other"
@@ -272,6 +289,11 @@ class Force(Declaration):
     raw_unit: Annotated[str, _unit_of("N", "N.m", "V")] = Field(
         alias="unit", description="Of the columns, such as kN or mN.m; only V needs a calibration"
     )
+    lever: NotNegative | None = Field(
+        default=None,
+        alias="lever_m",
+        description="Distance from the axis at which a force acts, m: makes a torque in N.m of it",
+    )
     frame: str = Field(default="", description="In which the components are given: free text")
     calibration_n_per_v: (
         Annotated[Several[Annotated[Several[Number], Field(min_length=1)]], Field(min_length=1)]
@@ -312,16 +334,21 @@ class Force(Declaration):
 
     @property
     def unit(self) -> str:
-        """Unit after calibration, "N" or "N.m"."""
+        """Unit after calibration and lever, "N" or "N.m"."""
+        return "N.m" if self.lever is not None else self._calibrated_unit
+
+    @property
+    def _calibrated_unit(self) -> str:
         return "N" if self.volts else _unit(self.raw_unit).si
 
     @cached_property
     def calibration(self) -> tuple[tuple[float, ...], ...]:
         """One row a component, one number a column: ``unit`` for one raw unit."""
-        if self.calibration_n_per_v is not None:
-            return self.calibration_n_per_v
         matrix = _unit(self.raw_unit).scale * np.eye(len(self.columns))
-        return tuple(tuple(float(v) for v in row) for row in matrix)
+        if self.calibration_n_per_v is not None:
+            matrix = np.array(self.calibration_n_per_v)
+        lever = 1.0 if self.lever is None else self.lever
+        return tuple(tuple(float(v) for v in row) for row in lever * matrix)
 
     @property
     def zero(self) -> tuple[float, ...]:
@@ -345,6 +372,17 @@ class Force(Declaration):
                     where="columns",
                     remedy='name the components: components = ["x", ...]',
                 )
+        if self.lever is not None and self._calibrated_unit != "N":
+            yield InputError(
+                f'given although unit = "{self.raw_unit}" is a torque already', where="lever_m"
+            )
+        if self.lever == 0.0:
+            yield InputError(
+                "found 0, expected the distance in m from the axis at which the force acts",
+                where="lever_m",
+                remedy='measure it; of a column that is a torque already, unit = "N.m" and no'
+                " lever_m",
+            )
         for key in ("calibration_n_per_v", "zero_v"):
             given = getattr(self, key) is not None
             if self.volts and not given:
@@ -457,6 +495,7 @@ class Channel(NamedDeclaration):
     signed: bool = Field(
         default=False, description="Whether a register of wrap_bits holds negative numbers"
     )
+    sign_bit: SignBit = None
     second_encoder_of: str = Field(
         default="",
         description="Axis of which it reads the position on the other side of the gear, in the"
@@ -485,7 +524,12 @@ class Channel(NamedDeclaration):
     @property
     def raw_unit(self) -> str:
         """Unit of the column, "" where the session file rescales it."""
-        rescaled = {"stated_scale", "stated_offset", "wrap_bits"} & self.model_fields_set
+        rescaled = {
+            "stated_scale",
+            "stated_offset",
+            "wrap_bits",
+            "sign_bit",
+        } & self.model_fields_set
         return "" if rescaled else self.stated_unit
 
     def cross_faults(self) -> Iterator[InputError]:
@@ -495,4 +539,10 @@ class Channel(NamedDeclaration):
             yield InputError(
                 "signed and wrap_bits belong together",
                 remedy="give wrap_bits = 16, signed = true for a signed register read as unsigned",
+            )
+        if self.sign_bit is not None and self.wrap_bits is not None:
+            yield InputError(
+                "given beside wrap_bits, and a register holds its sign in one way only",
+                where="sign_bit",
+                remedy="sign_bit: sign and magnitude; wrap_bits: two's complement",
             )

@@ -239,6 +239,8 @@ class Session(Declaration):
         """Length of one unit of the time column, s; of one sample where samples are counted."""
         if self.clock.unit == "samples":
             return 1.0 / self.sample_rate
+        if self.clock.ticks_per_s is not None:
+            return 1.0 / self.clock.ticks_per_s
         return SECONDS.get(self.clock.unit, 1.0)
 
     @cached_property
