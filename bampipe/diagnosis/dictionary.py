@@ -39,8 +39,9 @@ class Atom:
 
     Attributes:
         columns: by the number of each axis that it changes, (n, m) for its m strengths.
-        slopes: derivative of what it adds by each measured force at unit strength, by axis,
-            (n, n_forces); empty where what it adds does not depend on the force of that moment.
+        slopes: derivative of what it adds by each measured force, by axis, (n, n_forces, m), for
+            each of its strengths at one; empty where what it adds does not depend on the force of
+            that moment.
         log_gain: mean over the band of the logarithm of its gain where it filters the measured
             force, by axis, (n_q,); else zero.
     """
@@ -129,24 +130,35 @@ class Dictionary:
             return None
         system, nothing = item.system, np.zeros(len(self.samples))
         filters = not item.linear_indices and system.model.effects[-1].effect.kind == "input"
-        if system.driven and next(iter(found.values())).shape[1] == 1:
-            return Atom(found, self._slopes(item, self._parameters(item, values, 1.0)), nothing)
+        if system.driven:
+            return Atom(found, self._slopes(item, values), nothing)
         if filters:
-            return Atom(found, {}, self._log_gain(item, self._parameters(item, values, 1.0)))
+            p = self._parameters(item, values, np.zeros(0))
+            return Atom(found, {}, self._log_gain(item, p))
         return Atom(found, {}, nothing)
 
     def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
         """`make` each."""
         return [(key, self.make(key)) for key in keys]
 
-    def _parameters(self, item: Candidate, searched: Array, strength: float) -> Array:
+    def _parameters(self, item: Candidate, searched: Array, strengths: Array) -> Array:
         count = len(item.system.parameters) - len(item.parameters)
         p = np.concatenate([self.evidence.p[:count], [q.prior for q in item.parameters]])
         p[[count + i for i in item.searched_indices]] = searched
-        p[[count + i for i in item.linear_indices]] = strength
+        p[[count + i for i in item.linear_indices]] = strengths
         return p
 
-    def _slopes(self, item: Candidate, p: Array) -> dict[int, Array]:
+    def _slopes(self, item: Candidate, searched: Array) -> dict[int, Array]:
+        one_each = np.eye(len(item.linear_indices)) if item.linear_indices else np.zeros((1, 0))
+        each = [self._slopes_at(item, self._parameters(item, searched, b)) for b in one_each]
+        return {
+            axis: values
+            for axis in range(len(self.samples))
+            if (values := np.stack([slopes[axis] for slopes in each], axis=2)).any()
+        }
+
+    def _slopes_at(self, item: Candidate, p: Array) -> list[Array]:
+        """The same at given parameters, (n_p,), by axis, each (n, n_forces)."""
         e, system, rows = self.evidence, item.system, []
         for motion in e.motions:
             kept, u = e.band.thinned_rows(len(motion.t)), motion.inputs(system.inputs)
@@ -161,8 +173,7 @@ class Dictionary:
                 moved[:, column] += step
                 slope[:, :, j] = (system.contribution(*at, moved, p) - here) / step
             rows.append(slope)
-        found = {a: take_samples(rows, here, a) for a, here in enumerate(self.samples)}
-        return {axis: values for axis, values in found.items() if values.any()}
+        return [take_samples(rows, here, a) for a, here in enumerate(self.samples)]
 
     def _log_gain(self, item: Candidate, p: Array) -> Array:
         """Kolmogorov: what a filter takes off the innovations of all that goes through it."""

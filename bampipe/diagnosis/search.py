@@ -286,7 +286,7 @@ class Search:
             atom = self._atom(key)
             found = [f + g if g else f for f, g in zip(found, atom.log_gain, strict=True)]
             for axis, slope in atom.slopes.items():
-                moved[axis] = moved.get(axis, 0.0) + float(b[0]) * slope
+                moved[axis] = moved.get(axis, 0.0) + slope @ b
         for axis, slope in moved.items():
             plain = self.p.likelihood.slopes[axis]
             bare = np.linalg.norm(plain, axis=1)

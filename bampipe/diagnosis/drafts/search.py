@@ -157,16 +157,6 @@ class FormSearch(Search):
         other._weight = other.p.independent / np.maximum(other.yy, 1e-300)
         return other
 
-    def _volume(self, keys: Sequence[Key], strengths: Sequence[Array]) -> Array | None:
-        """As of effects, but that a form by the load or by a reading may have several strengths."""
-        other, ones = copy.copy(self), [np.ones(1)] * len(keys)
-        other.atoms = {
-            key: replace(atom, slopes={a: slope @ b for a, slope in atom.slopes.items()})
-            for key, b in zip(keys, strengths, strict=True)
-            if (atom := self.atoms[key]) is not None
-        }
-        return Search._volume(other, keys, ones)
-
     def gain_of_best_form(self) -> float:
         """Log evidence that the best form on the grid adds, nats; 0 where none adds any."""
         best = self.best_beside((), _PROMISING, shapes=1)
