@@ -79,10 +79,11 @@ class Search:
         self.atoms: dict[Key, Atom | None] = dict(known)
         self._with_base: dict[Key, dict[int, tuple[Array, Array, Array]]] = {}
         self._solved: dict[tuple[Key, ...], Solution] = {}
+        self._own_penalties: dict[str, float] = {}
         self.least_size = criteria.size
         self._squares: dict[Key, dict[int, Array]] = {}
         self.applied = [max(float(f @ f), 1e-300) for f in p.likelihood.applied]
-        self._weight = p.independent / np.maximum(self.yy, 1e-300)
+        self._weight = self._bare_weight = p.independent / np.maximum(self.yy, 1e-300)
         grid = [key for name in dictionary.candidates for key in dictionary.grid(name)]
         self.ensure(grid)
         places = {key: atom for key in grid if (atom := self.atoms[key]) is not None}
@@ -295,11 +296,32 @@ class Search:
         return found
 
     def penalty_of(self, keys: Sequence[Key]) -> float:
-        """What the prior of a set costs, without that of its parameters; of effects of the model,
-        what is gained where they are taken away."""
+        """What the prior of a set costs, without that of the parameters it adds.
+
+        Of effects of the model, what is gained where they are taken away.
+        """
         away = gone(keys)
-        saved = _STRENGTH * sum(len(self.p.absence[name]) for name in away)
+        saved = sum(self._penalty_of_own(name) for name in away)
         return self.log_prior * (len(away) - len(added(keys))) - saved
+
+    def _penalty_of_own(self, name: str) -> float:
+        """What the priors of the parameters of one of the model's effects cost."""
+        if name not in self._own_penalties:
+            p, places = self.p, list(self.p.absence[name])
+            to = p.to_parameters[places]
+            normal = np.tensordot(self._bare_weight, self.bb, 1) + p.precision
+            spread = to @ solve_scaled(normal, to.T)
+            strengths = np.array(list(p.absence[name].values()))
+            own = float(
+                penalise(
+                    np.linalg.pinv(spread, hermitian=True),
+                    p.spread[name],
+                    strengths,
+                    p.shapes[name],
+                )
+            )
+            self._own_penalties[name] = own
+        return self._own_penalties[name]
 
     def residual_rows(self, keys: Sequence[Key]) -> list[Array]:
         """What a set leaves, in units of the noise, by axis, each (n,)."""
@@ -587,8 +609,6 @@ class Search:
             yield beam
 
 
-_STRENGTH = 4.0
-"""The same of a strength."""
 _A_SHAPE = 2.5
 """Half the logarithm of the information on a shape over its range, as it comes out on the whole."""
 

@@ -260,6 +260,8 @@ class Problem:
         lower, upper: bounds of the change of those, (n_all,).
         absence: of each effect of the model, by the place of each of its strengths among the free
             parameters, the change that takes it away.
+        spread: of each, the standard deviations of these strengths before any data; shapes: how
+            many parameters it has beside them.
     """
 
     likelihood: Likelihood
@@ -271,6 +273,8 @@ class Problem:
     lower: Array
     upper: Array
     absence: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
+    spread: Mapping[str, Array] = field(default_factory=dict)
+    shapes: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def independent(self) -> Array:
@@ -346,11 +350,18 @@ def _pose(
     values, vectors = np.linalg.eigh(normal / size / size[:, None])
     kept = values > _DETERMINED * values[-1]
     to = vectors[:, kept] / np.sqrt(values[kept]) / size[:, None]
+    effects = evidence.system.model.effects
     return Problem(
         likelihood, tuple(y), tuple(x @ to for x in full),
         to.T @ (precision[:, None] * to), to.T @ (precision * known), to, lower, upper,
-        {item.name: _absence(evidence, item) for item in evidence.system.model.effects},
+        {item.name: _absence(evidence, item) for item in effects},
+        {item.name: _spread(item) for item in effects},
+        {i.name: sum(q.shape for q in i.parameters) for i in effects},
     )  # fmt: skip
+
+
+def _spread(item: BoundEffect) -> Array:
+    return np.array([q.sd for q in item.parameters if q.strength and not q.fixed])
 
 
 def _absence(evidence: Evidence, item: BoundEffect) -> dict[int, float]:
