@@ -312,15 +312,9 @@ class Search:
             normal = np.tensordot(self._bare_weight, self.bb, 1) + p.precision
             spread = to @ solve_scaled(normal, to.T)
             strengths = np.array(list(p.absence[name].values()))
-            own = float(
-                penalise(
-                    np.linalg.pinv(spread, hermitian=True),
-                    p.spread[name],
-                    strengths,
-                    p.shapes[name],
-                )
-            )
-            self._own_penalties[name] = own
+            known: Array = np.asarray(np.linalg.pinv(spread, hermitian=True), dtype=float)
+            own = penalise(known, p.spread[name], strengths, p.shapes[name])
+            self._own_penalties[name] = float(own)
         return self._own_penalties[name]
 
     def residual_rows(self, keys: Sequence[Key]) -> list[Array]:
