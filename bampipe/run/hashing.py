@@ -47,7 +47,7 @@ SHARED_CODE = (
     "trials",
     "setup",
     "identification",
-    "discover",
+    "diagnosis",
     "next_trial",
 )
 """Sub-packages that stages call, beside the single files; a change in one reruns every stage."""
