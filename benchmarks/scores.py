@@ -70,8 +70,8 @@ def write_tables(scores: Sequence[Scores], criteria: Criteria) -> str:
     facts = [*_alarms(clean, criteria), *_sets(hidden, criteria)]
     if outside:
         facts.append(
-            f"Sessions with an effect outside the library: {len(outside)}; something unknown is said"
-            f" to be missing in {sum(s.finds_unknown(criteria) for s in outside)}."
+            f"Sessions with an effect outside the library: {len(outside)}; something unknown is"
+            f" said to be missing in {sum(s.finds_unknown(criteria) for s in outside)}."
         )
     seconds = [s.seconds for s in done] or [np.nan]
     facts.append(f"A diagnosis took {np.median(seconds):.1f} s, at most {max(seconds):.1f} s.")
