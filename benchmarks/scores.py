@@ -67,23 +67,24 @@ def write_tables(scores: Sequence[Scores], criteria: Criteria) -> str:
     clean = [s for s in done if not s.effects and not s.outside]
     hidden = [s for s in done if s.effects and not s.outside]
     outside = [s for s in done if s.outside]
-    lines = [
-        f"{len(done)} sessions, {len(scores) - len(done)} refused; probability"
-        f" {criteria.probability:g}, significance {criteria.significance:g}",
-        "",
-        *_reliability([*hidden, *outside], criteria),
-        "",
-        *_alarms(clean, criteria),
-        *_sets(hidden, criteria),
-    ]
+    facts = [*_alarms(clean, criteria), *_sets(hidden, criteria)]
     if outside:
-        lines.append(
-            f"Of {len(outside)} sessions with an effect outside the library, something unknown is"
+        facts.append(
+            f"Sessions with an effect outside the library: {len(outside)}; something unknown is"
             f" said to be missing in {sum(s.finds_unknown(criteria) for s in outside)}."
         )
     seconds = [s.seconds for s in done] or [np.nan]
-    lines.append(f"A diagnosis took {np.median(seconds):.1f} s, at most {max(seconds):.1f} s.")
-    return "\n".join(lines)
+    facts.append(f"A diagnosis took {np.median(seconds):.1f} s, at most {max(seconds):.1f} s.")
+    return "\n".join(
+        [
+            f"{len(done)} sessions, {len(scores) - len(done)} refused; probability"
+            f" {criteria.probability:g}, significance {criteria.significance:g}",
+            "",
+            *_reliability([*hidden, *outside], criteria),
+            "",
+            *(f"- {fact}" for fact in facts),
+        ]
+    )
 
 
 def _reliability(scores: Iterable[Scores], criteria: Criteria) -> list[str]:
