@@ -28,7 +28,6 @@ million."""
 _MOST = 40
 LEAST_CHANCE = 1e-4
 """No chance is known to be smaller from a dozen replays."""
-_EULER = 0.5772156649015329
 
 
 @dataclass(frozen=True)
@@ -215,10 +214,13 @@ def _by_block(search: Search, keys: tuple[Key, ...], unknown: Unknown | None) ->
 def chance_of(gain: float, by_chance: Sequence[float]) -> float:
     """Probability that chance gives a largest gain of ``gain`` or more, from those of replays.
 
-    By the law of largest values (Gumbel 1935), with the mean and the scatter of those.
+    By the law of largest values (Gumbel 1935), with their median and quartiles, and no less than
+    the share of the replays that gave as much.
     """
     values = np.asarray(by_chance, dtype=float)
+    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
     # The evidence of one candidate alone scatters by half a nat a strength.
-    scale = max(float(values.std(ddof=1)) * np.sqrt(6.0) / np.pi, 1.0)
-    mode = float(values.mean()) - _EULER * scale
-    return max(float(-np.expm1(-np.exp(-(gain - mode) / scale))), LEAST_CHANCE)
+    scale = max(float(high - low) / (np.log(np.log(4.0)) - np.log(np.log(4.0 / 3.0))), 1.0)
+    beyond = (gain - float(middle)) / scale - np.log(np.log(2.0))
+    by_law = float(-np.expm1(-np.exp(-max(beyond, -50.0))))
+    return max(by_law, float(np.mean(values >= gain)), LEAST_CHANCE)
