@@ -61,6 +61,8 @@ _BY_SUFFIX = {
 """By a unit at the end of a name that says nothing else."""
 _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
 _PRESENT = frozenset(["current", "curr", "cur"])
+_LONGEST_WORD = 2
+"""Letters at the end of a name that are a word rather than a unit, such as the in of pos_in."""
 _UNIT_WORDS = {
     "time": ("us", "ms", "ns", "s"),
     "position": ("rad", "deg", "mm", "cm", "m"),
@@ -519,4 +521,7 @@ def _unit(name: str, stated: str, role: str) -> str:
     parts = re.split(r"[_\W]+", bare)
     suffix = parts[-1] if len(parts) > 1 else ""
     matches = [u for u in _UNIT_WORDS.get(role, ()) if u.lower() == suffix.lower()]
-    return matches[0] if matches else ""
+    if matches or role == "time" or len(suffix) <= _LONGEST_WORD:
+        return next(iter(matches), "")
+    known = unit(suffix)
+    return suffix if known is not None and _BY_UNIT.get(known.si) == role else ""

@@ -16,7 +16,7 @@ from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
 
 _FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "V")
 _SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])
-_FORCES = frozenset(["force", "kraft", "loadcell", "fx", "fy", "fz"])
+_FORCES = frozenset(["force", "forc", "kraft", "loadcell", "fx", "fy", "fz"])
 _TORQUES = frozenset(["torque", "tau", "trq", "moment", "effort", "drehmoment"])
 _QUANTITY = {"N": "force", "N.m": "torque", "A": "current", "V": "voltage"}
 _FEWEST_COUNTS = 100

@@ -9,7 +9,7 @@ from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import unit
 from bampipe.data.velocity import integral
 
-SLIDING = frozenset(["stroke", "displacement", "disp", "weg", "hub", "carriage", "piston"])
+SLIDING = frozenset(["stroke", "displacement", "disp", "dist", "weg", "hub", "carriage", "piston"])
 _FEWEST_COUNTS = 100
 
 

@@ -600,6 +600,19 @@ def test_units_at_the_end_of_names(tmp_path):
     assert "driven by a current" in proposal.device
 
 
+def test_a_torque_in_whole_units_of_its_name_is_no_count(tmp_path):
+    table = labelled("t_s,pos_deg,vel_deg_s,torque_mNm", q=57.29578, qd=57.29578, u=1e3)
+    write_table(tmp_path / "a.csv", table | {"torque_mNm": np.rint(table["torque_mNm"])})
+    session, proposal = proposed(tmp_path)
+    assert session["force"]["unit"] == "mN.m" and not proposal.fill_in
+
+
+def test_a_distance_slides_under_a_force(tmp_path):
+    write_table(tmp_path / "a.csv", labelled("t,dist,w,forc"))
+    session, proposal = proposed(tmp_path)
+    assert session["force"]["unit"] == "N" and "linear axis" in " ".join(proposal.check)
+
+
 def test_a_current_position_is_no_current_and_an_acceleration_drives_nothing(tmp_path):
     table = labelled("t,current_position,acc_x,torque_nm")
     table["acc_x"] = np.gradient(np.gradient(table["current_position"], table["t"]), table["t"])
