@@ -99,7 +99,9 @@ def starts_of(raw: RawTrial, clock: str) -> list[int]:
             turned = -np.diff(t[at - 1 : at + 1])[0] > 0.9 * 2.0**32  # a counter, not a clock
             goes_on = len(t) - at >= _LEAST and bool(np.all(np.diff(t[at : at + _LEAST]) > 0.0))
             back = abs(t[at] - t[begin]) <= _BACK * passed
-            if at - begin >= _LEAST and back and goes_on and not turned:
+            # A lone stamp that is wrong leaves those around it in order.
+            stays = at >= 2 and at + 1 < len(t) and bool(t[at + 1] < t[at - 2])
+            if at - begin >= _LEAST and back and goes_on and stays and not turned:
                 starts.add(int(at))
     return sorted(starts)
 

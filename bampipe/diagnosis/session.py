@@ -303,13 +303,18 @@ class Fit:
     def noise_floor(self) -> NoiseFloor:
         """What a model leaves that is the whole truth, by axis: noise of the sensors, and the bias.
 
-        That of replays, with the factors of the bias that the measurement has.
+        That of replays, with the factors of the bias that the measurement has, and what that bias
+        may be off where the machine turns.
         """
-        noise, rms = self.likelihood.noise, []
-        for of_replays, b, bias in zip(noise.residuals, noise.bias, self.bias, strict=True):
+        like, levels = self.likelihood, []
+        parts = zip(
+            like.noise.residuals, like.noise.bias, self.bias, like.bias_variance, strict=True
+        )
+        for of_replays, b, bias, variance in parts:
             rows = of_replays - b + bias
-            rms.append(np.sqrt(np.mean(rows**2, axis=1)) if b.size else np.zeros(len(rows)))
-        return NoiseFloor.of_errors([*np.array(rms).T])
+            square = np.mean(rows**2 + variance, axis=1) if b.size else np.zeros(len(rows))
+            levels.append(np.sqrt(square))
+        return NoiseFloor.of_errors([*np.array(levels).T])
 
     @property
     def creeping_floor(self) -> Array:

@@ -164,6 +164,7 @@ class Likelihood:
     Attributes:
         samples: of each axis that count; noise: of replays.
         root: one over the standard deviation of each sample, by axis, each (n,).
+        bias_variance: how far the bias may be off where the machine turns, by axis, each (n,).
         applied: the applied force, by axis, each (n,), N.m or N.
         slopes: its derivative by each measured force, by axis, each (n, n_forces).
     """
@@ -171,6 +172,7 @@ class Likelihood:
     samples: tuple[Samples, ...]
     noise: Noise
     root: tuple[Array, ...]
+    bias_variance: tuple[Array, ...]
     applied: tuple[Array, ...]
     slopes: tuple[Array, ...]
 
@@ -195,22 +197,19 @@ class Likelihood:
         turning = [np.zeros_like(r) for r in e.residual]
         if bias_error:
             turning = e.band.thin_trials(_error_of_turning(e), axes)
-        root, force = [], []
+        root, force, bias_variance = [], [], []
         for axis, here in enumerate(samples):
             f, y = take_samples(applied, here, axis), take_samples(e.residual, here, axis)
-            variance = (
-                noise.variance[axis]
-                + bias_error**2 * noise.variance_of_bias(axis, y)
-                + take_samples(turning, here, axis) ** 2
-                + (discrepancy * f) ** 2
-            )
+            of_bias = bias_error**2 * noise.variance_of_bias(axis, y)
+            of_bias = of_bias + take_samples(turning, here, axis) ** 2
+            variance = noise.variance[axis] + of_bias + (discrepancy * f) ** 2
             least = _LEAST * float(variance.mean()) if variance.size else 0.0
             # Where nothing scatters, all samples weigh alike.
             root.append(1.0 / np.sqrt(np.maximum(variance, least)) if least else np.ones(len(f)))
             force.append(f)
+            bias_variance.append(of_bias)
         return cls(
-            samples, noise, tuple(root),
-            tuple(force),
+            samples, noise, tuple(root), tuple(bias_variance), tuple(force),
             tuple(take_samples(plain, here, axis) for axis, here in enumerate(samples)),
         )  # fmt: skip
 

@@ -18,6 +18,8 @@ from bampipe.trials.likelihood import (
     take_samples,
 )
 
+pytest_plugins = ("recorded",)
+
 
 @pytest.fixture(scope="module")
 def fitted(record):
@@ -37,18 +39,17 @@ def factors(fit, residual):
 
 
 def test_a_replay_has_unit_variance_in_units_of_its_noise(fitted):
-    """Fast or slow; by replays that the noise was not made of, without the error of any model."""
+    """Fast or slow; by replays that the noise was not made of."""
     session, fit = fitted
     like = fit.likelihood
-    exact = Likelihood.of(fit.evidence, like.samples, like.noise, 1e-9, 1e-9)
     fresh = session.replay(fit.evidence, fit.evidence.p, 6, first=100)
     for axis, here in enumerate(like.samples):
         rows = np.array([take_samples(r, here, axis) for r in fresh]) - like.noise.bias[axis]
-        square = np.mean((rows * exact.root[axis]) ** 2, axis=0)
+        square = np.mean(rows**2, axis=0) / like.noise.variance[axis]
         speed = like.noise.speed[axis]
         by_speed = [square[speed == k].mean() for k in np.unique(speed)]
         assert 0.6 < min(by_speed) and max(by_speed) < 1.7
-        spread = 1.0 / exact.root[axis]
+        spread = np.sqrt(like.noise.variance[axis])
         assert spread.max() > 1.5 * spread.min()
 
 
@@ -90,7 +91,9 @@ def problem_of(y, base, *, independent=None, lower=-np.inf, upper=np.inf, absenc
     nothing, place = np.zeros(rows), np.zeros(rows, dtype=np.int64)
     samples = Samples(np.arange(rows), place, place, independent or float(rows))
     noise = Noise((nothing,), (nothing + 1.0,), (nothing,), (nothing[None],), (place,))
-    like = Likelihood((samples,), noise, (nothing + 1.0,), (nothing + 1.0,), (np.ones((rows, 1)),))
+    like = Likelihood(
+        (samples,), noise, (nothing + 1.0,), (nothing,), (nothing + 1.0,), (np.ones((rows, 1)),)
+    )
     bounds = np.broadcast_to(lower, n), np.broadcast_to(upper, n)
     precision = 1e-4 * np.eye(n)
     return Problem(like, (y,), (base,), precision, np.zeros(n), np.eye(n), *bounds, absence or {})

@@ -12,6 +12,8 @@ from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.physics import registry
 
+pytest_plugins = ("recorded",)
+
 
 def verdicts(found):
     return [axis.verdict for axis in found.axes]

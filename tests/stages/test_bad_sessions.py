@@ -435,7 +435,7 @@ ASIDE: dict[str, tuple[Damage, str]] = {
     "time backwards": (rows(lambda n: np.arange(n)[::-1]), "time runs backwards throughout"),
     "two recordings in one file": (
         rows(lambda n: np.r_[0:n, 0:n]),
-        r"row 1002, column 'time_us': time starts again once; several recordings in one file",
+        "row 1002: time starts again: 2 recordings in one file; give each a",
     ),
     "many repeated stamps": (
         table(lambda t: t["time_us"].__setitem__(slice(200, 300), t["time_us"][200])),

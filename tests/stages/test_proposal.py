@@ -534,7 +534,7 @@ def test_motion_and_force_with_clocks_of_their_own_are_joined(tmp_path, shift: f
     t, u = np.arange(0.0, 20.0, 0.01), np.arange(0.0, 20.0, 0.004)
     motion, force = np.sin(2.0 * t), np.cos(2.0 * (u + (shift if shift < 20 else 0.0)))
     write_table(tmp_path / "motion.csv", {"t": t, "angle_rad": motion})
-    write_table(tmp_path / "force.csv", {"stamp_ms": 1e3 * (u + shift), "Fz": force})
+    write_table(tmp_path / "force.csv", {"stamp_ms": 1e3 * (u + shift), "torque_nm": force})
     session, proposal = proposed(tmp_path)
     (part,) = session["trials"][0]["parts"]
     way = "start" if shift > 20 else "time"

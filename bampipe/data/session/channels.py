@@ -101,7 +101,7 @@ class Clock(Declaration):
     """The time column."""
 
     column: str = Field(default="", description="Its name; left out where samples are counted")
-    unit: TimeUnit | Literal["samples", "ticks"] = Field(
+    unit: Literal[TimeUnit, "samples", "ticks"] = Field(
         description="datetime: dates and times; samples: no column, one sample each"
         " 1/sample_rate_hz; ticks: of a counter, see ticks_per_s"
     )
