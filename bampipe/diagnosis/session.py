@@ -303,17 +303,21 @@ class Fit:
     def noise_floor(self) -> NoiseFloor:
         """What a model leaves that is the whole truth, by axis: noise of the sensors, and the bias.
 
-        That of replays, with the factors of the bias that the measurement has, and what that bias
-        may be off where the machine turns.
+        That of replays, with the factors of the bias that the measurement has. A machine may turn
+        just as they do, or be off by what is not known of that, or anything between: of these
+        floors, the one nearest to the error.
         """
         like, levels = self.likelihood, []
         parts = zip(
-            like.noise.residuals, like.noise.bias, self.bias, like.bias_variance, strict=True
-        )
-        for of_replays, b, bias, variance in parts:
+            like.noise.residuals, like.noise.bias, self.bias, like.bias_variance,
+            self.problem.y, like.root, strict=True,
+        )  # fmt: skip
+        for of_replays, b, bias, variance, y, root in parts:
             rows = of_replays - b + bias
-            square = np.mean(rows**2 + variance, axis=1) if b.size else np.zeros(len(rows))
-            levels.append(np.sqrt(square))
+            square = np.mean(rows**2, axis=1) if b.size else np.zeros(len(rows))
+            off = rms(y / root) ** 2 - float(np.median(square))
+            more = float(variance.mean()) if b.size else 0.0
+            levels.append(np.sqrt(square + np.clip(off, 0.0, more)))
         return NoiseFloor.of_errors([*np.array(levels).T])
 
     @property
