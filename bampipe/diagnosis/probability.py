@@ -57,7 +57,7 @@ class Weighed:
         effects: probability of each effect of any of them.
         unknown: probability that an axis lacks something unknown, (n_q,).
         functions: what that would be, by axis; None where an axis does not move.
-        drops: log evidence lost without each effect of the most probable set, nats.
+        drops: log evidence lost without each effect, by the best sets with it and without it, nats.
     """
 
     sets: tuple[WeighedSet, ...]
@@ -84,7 +84,7 @@ def weigh_sets(search: Search, pool: Pool, given: Sequence[str], seed: int) -> W
         if np.isfinite(search.cost(keys))
     ]
     sets = _share(search, named, given, seed)
-    effects = _by_effect(sets)
+    effects, drops = _by_effect(sets), _losses(sets)
     unknown, functions = np.zeros(len(search.p.y)), []
     for axis in range(len(unknown)):
         columns = spline_columns(evidence, axis)
@@ -105,9 +105,10 @@ def weigh_sets(search: Search, pool: Pool, given: Sequence[str], seed: int) -> W
         for effect in own:
             if axis in touched_axes(search, effect):
                 effects[effect] = min(effects[effect], here_too.get(effect, 0.0))
+                if unknown[axis] >= search.criteria.probability:
+                    drops[effect] = _losses(with_unknown).get(effect, 0.0)
         if unknown[axis] == unknown.max():
             sets = with_unknown
-    drops = {one.keys[0][0][1:]: -one.gain for one in named if one.keys in absent}
     return Weighed(sets, effects, unknown, tuple(functions), drops)
 
 
@@ -135,6 +136,16 @@ def _share(
         for s, share in zip(listed, shares, strict=True)
     ]
     return tuple(sorted(sets, key=lambda s: -s.probability))
+
+
+def _losses(sets: Sequence[WeighedSet]) -> dict[str, float]:
+    """For each effect, by how much the best set that holds it is ahead of the best without it."""
+    found = {}
+    for effect in {e for one in sets for e in one.effects}:
+        held = [one.log_evidence for one in sets if effect in one.effects]
+        others = [one.log_evidence for one in sets if effect not in one.effects]
+        found[effect] = max(held) - max(others, default=max(held) - _NEAR)
+    return found
 
 
 def _by_effect(sets: Sequence[WeighedSet]) -> dict[str, float]:
