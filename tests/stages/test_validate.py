@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,13 +15,11 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.files import digest_file, read_json, write_json, write_text
-from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
 from bampipe.run.settings import configure
 from bampipe.simulator import session as simulation
 from bampipe.stages import identify, validate
 from bampipe.stages.base import paths_of
-from bampipe.trials.noise_floor import NoiseFloor
 
 SQUARES = identify.Config(method="least-squares")
 
@@ -93,7 +90,8 @@ def test_shared_sessions_stand_out_where_something_is_missing(
     content = validated(identified(shared_run(tmp_path / name, name)))
     for axis, entry in content["axes"].items():
         ratio = entry["held_out_rmse"] / entry["noise_floor"]
-        assert ratio > 3.0 if axis == missing else ratio < 1.5, (axis, ratio)
+        # Of the floors of machines that creep or stop where they turn, the one nearest to the error.
+        assert ratio > 2.0 if axis == missing else ratio < 1.5, (axis, ratio)
 
 
 def test_what_brakes_do_is_judged_in_the_trials_in_which_they_act(tmp_path: Path) -> None:
@@ -211,18 +209,3 @@ def test_mistakes_are_told(simulated: RunFolder, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no parameter 'mass'"):
         validated(simulated)
     write_json(simulated.path("models/base/identify.json"), content | {"parameters": saved})
-
-
-def test_a_floor_that_play_makes_of_noise_is_said_to_be_one(monkeypatch) -> None:
-    system = compile_model(Model(registry.device("bam"), ("backlash:yaw",)))
-    monkeypatch.setattr(
-        validate, "force_noise_through_offset", lambda *_: np.array([0.0081, 0.0049, 0.0])
-    )
-    floor = NoiseFloor(np.full(3, 0.1), np.zeros(3), 3)
-    said = validate._noise_through_play(
-        SimpleNamespace(system=system), SimpleNamespace(sensors=None), floor
-    )
-    assert said == [
-        "yaw: of the noise floor of 0.100 N.m, 0.0900 are noise of the force, which moves the"
-        " mechanism by `backlash:yaw`. A quieter force sensor lets more be seen."
-    ]
