@@ -90,7 +90,7 @@ def test_shared_sessions_stand_out_where_something_is_missing(
     content = validated(identified(shared_run(tmp_path / name, name)))
     for axis, entry in content["axes"].items():
         ratio = entry["held_out_rmse"] / entry["noise_floor"]
-        # Of the floors of machines that creep or stop where they turn, the one nearest to the error.
+        # Of the floors of machines that creep or stop where they turn, the nearest to the error.
         assert ratio > 2.0 if axis == missing else ratio < 1.5, (axis, ratio)
 
 
