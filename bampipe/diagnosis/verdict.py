@@ -88,11 +88,13 @@ def _judge(
     named = tuple(e for e in listed if e in selection.effects)
     sure = [e for e, p in listed.items() if p >= c.probability]
     open_question = [e for e, p in listed.items() if p < c.probability]
-    remains = unknown >= c.probability or _exceeds_any_model(final, axis)
+    # At the floor, an unknown function follows what the bias is off, not the machine.
+    asked = unknown if against_floor == "above_floor" else 0.0
+    remains = asked >= c.probability or _exceeds_any_model(final, axis)
     verdict: Verdict
     if against_floor == "floor_missing":
         verdict = "no_verdict"
-    elif open_question or 1.0 - c.probability <= unknown < c.probability:
+    elif open_question or 1.0 - c.probability <= asked < c.probability:
         verdict = "undecided"
     elif sure:
         verdict = "missing"
