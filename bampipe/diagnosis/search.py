@@ -133,7 +133,8 @@ class Search:
         p, noise = self.p, self.p.likelihood.noise
         rows = zip(noise.residuals, p.likelihood.root, strict=True)
         other.p = replace(p, y=tuple(r[replay] * root for r, root in rows))
-        other.bb, other.by, other.yy = other.p.sums()
+        other.by = np.array([b.T @ y for b, y in zip(p.base, other.p.y, strict=True)])
+        other.yy = np.array([float(y @ y) for y in other.p.y])
         other.xy = [x.T @ y for x, y in zip(self.columns, other.p.y, strict=True)]
         other._with_base, other._solved = {}, {}
         other._weight = p.independent / np.maximum(other.yy, 1e-300)
@@ -341,7 +342,7 @@ class Search:
         known, p, nb = self.solve(keys), self.p, self.bb.shape[1]
         pinned = [k for name, _ in keys if name[0] == "-" for k in p.absence[name[1:]]]
         keys = added(tuple(sorted(keys)))
-        weight = p.independent / np.maximum(known.scale * p.count, 1e-300)
+        weight = known.weight
         parts = [self._products(key) for key in keys]
         widths = [self._atom(key).width for key in keys]
         at = np.concatenate([[nb], nb + np.cumsum(widths)]).astype(int)
@@ -498,7 +499,7 @@ class Search:
         extra = next(iter(more.values())).shape[1]
         p, nb = self.p, self.bb.shape[1]
         parts = [self._products(key) for key in keys]
-        weight = p.independent / np.maximum(known.scale * p.count, 1e-300)
+        weight = known.weight
         widths = [self._atom(key).width for key in keys]
         at = np.concatenate([[nb], nb + np.cumsum(widths)]).astype(int)
         n = int(at[-1]) + extra
