@@ -65,7 +65,6 @@ class Config:
         model: which model version to diagnose.
         probability: from which an effect is called missing.
         size: least share of the applied force of an axis that an effect must add to matter.
-        significance: chance of a false alarm in a session where nothing is missing.
         replicates: replays of the fitted model, as in a parametric bootstrap.
         expected_effects: how many effects a model is expected to lack.
         most_effects: beyond those of the model.
@@ -83,7 +82,6 @@ class Config:
     model: str = "base"
     probability: Annotated[float, Field(gt=0.5, lt=1)] = _DEFAULT.probability
     size: Fraction = _DEFAULT.size
-    significance: Fraction = _DEFAULT.significance
     replicates: Annotated[int, Field(ge=4)] = _DEFAULT.replicates
     expected_effects: Positive = _DEFAULT.expected_effects
     most_effects: Annotated[int, Field(ge=1)] = _DEFAULT.most_effects
