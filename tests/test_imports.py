@@ -41,7 +41,8 @@ LAWS = {
     ),
     "estimate": law("numpy scipy numba llvmlite filterpy", "compiled errors model_functions"),
     "diagnosis": law(
-        "numpy scipy sympy numba pyoperon", "errors lists physics estimate results trials workers"
+        "numpy scipy sympy numba pyoperon pydantic",
+        "errors lists physics estimate results schema trials workers",
     ),
     "results": law("pydantic", "errors files lists schema"),
     "data": law("numpy scipy pandas pyarrow h5py pydantic", "errors lists schema files results"),

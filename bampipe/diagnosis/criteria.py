@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 from scipy.special import lambertw
 
+from bampipe.schema import STRICT, Positive
 
-@dataclass(frozen=True)
+Fraction = Annotated[float, Field(gt=0, lt=1)]
+
+
+@checked_dataclass(frozen=True, config=STRICT)
 class Criteria:
     """What it takes for an effect to be called missing; each described in docs/method_selection.
 
@@ -29,27 +35,22 @@ class Criteria:
         beam: sets that are pursued side by side.
     """
 
-    probability: float = 0.9
-    size: float = 0.001
-    replicates: int = 12
-    expected_effects: float = 1.0
-    most_effects: int = 8
-    bias_error: float = 0.2
-    discrepancy: float = 0.003
-    tails: float = 4.0
-    block_s: float = 2.0
-    beam: int = 10
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            if not getattr(self, field.name) > 0:
-                raise ValueError(f"{field.name} must be positive")
+    probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.9
+    size: Fraction = 0.001
+    replicates: Annotated[int, Field(ge=4)] = 12
+    expected_effects: Positive = 1.0
+    most_effects: Annotated[int, Field(ge=1)] = 8
+    bias_error: Positive = 0.2
+    discrepancy: Positive = 0.003
+    tails: Positive = 4.0
+    block_s: Positive = 2.0
+    beam: Annotated[int, Field(ge=1)] = 10
 
     @property
     def largest_p_value(self) -> float:
         """The p-value from which on `most_probable` is below ``probability``."""
         odds_against = (1.0 - self.probability) / self.probability
-        return float(np.exp(lambertw(-min(odds_against, 1.0) / np.e, -1).real))
+        return float(np.exp(lambertw(-odds_against / np.e, -1).real))
 
 
 def most_probable(p_value: float) -> float:

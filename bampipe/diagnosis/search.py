@@ -18,7 +18,13 @@ from numpy.typing import NDArray
 
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
-from bampipe.trials.likelihood import Problem, hold_parameters, solve_bounded, solve_scaled
+from bampipe.trials.likelihood import (
+    Problem,
+    Samples,
+    hold_parameters,
+    solve_bounded,
+    solve_scaled,
+)
 
 Array = NDArray[np.float64]
 
@@ -139,6 +145,14 @@ class Search:
         other.xy = [x.T @ y for x, y in zip(self.columns, other.p.y, strict=True)]
         other._with_base, other._solved = {}, {}
         other._weight = p.independent / np.maximum(other.yy, 1e-300)
+        return other
+
+    def with_independent(self, samples: tuple[Samples, ...]) -> Search:
+        """The same search with other numbers of independent samples."""
+        other = copy(self)
+        other.p = replace(self.p, likelihood=replace(self.p.likelihood, samples=samples))
+        other._solved, other._own_penalties = {}, {}
+        other._weight = other._bare_weight = other.p.independent / np.maximum(self.yy, 1e-300)
         return other
 
     def largest_gain(self) -> tuple[float, str]:

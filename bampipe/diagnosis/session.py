@@ -28,6 +28,7 @@ from bampipe.trials.likelihood import (
     Likelihood,
     Noise,
     Problem,
+    Samples,
     Solved,
     describe_noise,
     dry_friction,
@@ -331,6 +332,12 @@ class Fit:
         """What is left once the bias is taken off, by axis, each (n,), N.m or N."""
         rows = zip(self.problem.y, self.problem.base, self.likelihood.root, strict=True)
         return tuple((y + x @ self.solved.base) / root for y, x, root in rows)
+
+    def count_independent(self, criteria: Criteria) -> tuple[Samples, ...]:
+        """The samples of each axis, with the number that are independent in what is left."""
+        band = self.evidence.band
+        lags = int(criteria.block_s * band.rate_hz / band.step)
+        return self.likelihood.count_independent(self.problem, lags)
 
     @property
     def rmse_beyond_bias(self) -> Array:

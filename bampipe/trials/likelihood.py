@@ -231,6 +231,24 @@ class Likelihood:
             root.append(self.root[axis] * np.sqrt((tails + 1.0) / (tails + square / mean)))
         return replace(self, root=tuple(root))
 
+    def count_independent(self, problem: Problem, lags: int) -> tuple[Samples, ...]:
+        """Count the samples of each axis that are independent in what a fit of the model leaves.
+
+        What a model lacks comes back with the motion, sample after sample; noise does not. There
+        are fewer independent samples by the sum of squared autocorrelations (Bartlett 1946, Journal
+        of the Royal Statistical Society, Supplement 8, 27), over that of replays.
+
+        Args:
+            problem: the fit, its solution at zero; lags: the most that are summed.
+        """
+        solved, counted = problem.solve(), []
+        for axis, here in enumerate(self.samples):
+            noise = (self.noise.residuals[axis] - self.noise.bias[axis]) * self.root[axis]
+            ours = _correlation(problem.y[axis] + problem.base[axis] @ solved.base, here, lags)
+            replays = float(np.median([_correlation(r, here, lags) for r in noise]))
+            counted.append(replace(here, independent=here.independent * min(replays / ours, 1.0)))
+        return tuple(counted)
+
     def pose(
         self,
         evidence: Evidence,
@@ -298,6 +316,24 @@ class Problem:
     def solve(self) -> Solved:
         """The change of the model's own parameters that is most likely."""
         return solve_bounded(self, *self.sums())
+
+
+def _correlation(values: Array, samples: Samples, lags: int) -> float:
+    """Sum of the squared autocorrelation of values (n,) up to a lag, both ways, within trials."""
+    total = np.zeros(lags + 1)
+    for trial in np.unique(samples.trial):
+        here = samples.trial == trial
+        rows = samples.rows[here]
+        series = np.zeros(int(np.ptp(rows)) + 1)
+        series[rows - rows[0]] = values[here]
+        size = 2 * len(series)
+        found = np.fft.irfft(np.abs(np.fft.rfft(series, size)) ** 2, size)[: len(series)][
+            : lags + 1
+        ]
+        total[: len(found)] += found
+    if not total[0] > 0.0:
+        return 1.0
+    return float(2.0 * np.sum((total / total[0]) ** 2) - 1.0)
 
 
 def _error_of_turning(evidence: Evidence) -> list[Array]:
