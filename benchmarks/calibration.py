@@ -135,9 +135,8 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--out", type=Path, help="add the scores as JSON, a line a session")
     parser.add_argument("--from", dest="read", type=Path, nargs="+", help="scores to read")
     parser.add_argument("--probability", type=float, default=Criteria.probability)
-    parser.add_argument("--significance", type=float, default=Criteria.significance)
     given = parser.parse_args(arguments)
-    criteria = Criteria(probability=given.probability, significance=given.significance)
+    criteria = Criteria(probability=given.probability)
     scores = [one for path in given.read or () for one in read_scores(path)]
     if not given.read:
         rows = list(csv.DictReader(given.runs.open(), delimiter="\t")) if given.runs else []

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
-from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.criteria import Criteria, most_probable
 
 TENTHS = np.linspace(0.0, 1.0, 11)
 
@@ -51,8 +51,10 @@ class Scores:
 
     def probabilities(self, criteria: Criteria) -> dict[str, float]:
         """Of each effect of any probable set; no surer than chance allows."""
-        doubtful = {e: p for e, (_, p) in self.drops.items() if p > criteria.significance}
-        return {e: min(p, 1.0 - doubtful.get(e, 0.0)) for e, p in self.effects_found.items()}
+        p_values = {e: p for e, (_, p) in self.drops.items()}
+        return {
+            e: min(p, most_probable(p_values.get(e, 0.0))) for e, p in self.effects_found.items()
+        }
 
     def finds_unknown(self, criteria: Criteria) -> bool:
         """Whether something is said to be missing that no effect of the library is."""
@@ -77,7 +79,7 @@ def write_tables(scores: Sequence[Scores], criteria: Criteria) -> str:
     return "\n".join(
         [
             f"{len(done)} sessions, {len(scores) - len(done)} refused; probability"
-            f" {criteria.probability:g}, significance {criteria.significance:g}",
+            f" {criteria.probability:g}",
             "",
             *_reliability([*hidden, *outside], criteria),
             "",

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+import numpy as np
+from scipy.special import lambertw
+
 
 @dataclass(frozen=True)
 class Criteria:
@@ -14,7 +17,6 @@ class Criteria:
             mentioned.
         size: least share of the applied force of an axis, root mean square, that an effect must add
             beyond what the other parameters could take over: no load cell is more linear.
-        significance: chance of a false alarm in a session where nothing is missing, by replicates.
         replicates: replays of a fitted model, as in a parametric bootstrap.
         expected_effects: how many effects a model is expected to lack: the prior of each is this
             over their number.
@@ -29,7 +31,6 @@ class Criteria:
 
     probability: float = 0.9
     size: float = 0.001
-    significance: float = 0.01
     replicates: int = 12
     expected_effects: float = 1.0
     most_effects: int = 8
@@ -43,3 +44,18 @@ class Criteria:
         for field in fields(self):
             if not getattr(self, field.name) > 0:
                 raise ValueError(f"{field.name} must be positive")
+
+    @property
+    def largest_p_value(self) -> float:
+        """The p-value from which on `most_probable` is below ``probability``."""
+        odds_against = (1.0 - self.probability) / self.probability
+        return float(np.exp(lambertw(-min(odds_against, 1.0) / np.e, -1).real))
+
+
+def most_probable(p_value: float) -> float:
+    """The highest probability that an effect can have which chance imitates with a p-value.
+
+    At even odds before (Sellke, Bayarri and Berger 2001, The American Statistician 55, 62).
+    """
+    p = min(max(p_value, 1e-300), 1.0 / np.e)
+    return float(1.0 / (1.0 - np.e * p * np.log(p)))

@@ -205,6 +205,6 @@ class Dictionary:
         return found
 
 
-_MULTIPLE = (0.5, 2.0)
+_MULTIPLE = (0.0, 2.0)
 """Of an effect that is not linear in its strength, by how much what it adds may be more or less
-than at its shape on the grid."""
+than at its shape on the grid. Less than all on the grid is as good as linear."""

@@ -247,8 +247,11 @@ def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
     for key, strength in zip(added(tuple(sorted(keys))), solution.strengths, strict=True):
         item = search.dictionary.candidates[key[0]]
         values = search.dictionary.values(key)
+        share = 1.0 if item.linear_indices else float(strength[0])
         known |= {
-            item.parameters[i].name: v for i, v in zip(item.searched_indices, values, strict=True)
+            q.name: share * v if q.strength else v
+            for i, v in zip(item.searched_indices, values, strict=True)
+            for q in [item.parameters[i]]
         }
         known |= {
             item.parameters[i].name: v for i, v in zip(item.linear_indices, strength, strict=False)

@@ -32,6 +32,7 @@ from bampipe.trials.likelihood import (
     describe_noise,
     dry_friction,
     lay_out_samples,
+    sign_widths,
     solve_bounded,
     take_samples,
 )
@@ -382,11 +383,12 @@ def _residuals_of_replay(seed: tuple[int, ...]) -> list[Array]:
 def _narrower_friction(evidence: Evidence) -> list[Array]:
     """What Coulomb friction leaves whose sign is narrower than the model's, by trial, (K, n_q)."""
     e = evidence
-    dry, width = dry_friction(e)
+    width = sign_widths(e)
     rows = [
-        dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width)) for m in e.motions
+        dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width))
+        for dry, m in zip(dry_friction(e), e.motions, strict=True)
     ]
-    thin = e.band.thin_trials(rows, range(len(dry)))
+    thin = e.band.thin_trials(rows, range(len(width)))
     return [values * used for values, used in zip(thin, e.used, strict=True)]
 
 

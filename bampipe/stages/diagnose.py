@@ -63,27 +63,25 @@ class Config:
 
     Attributes:
         model: which model version to diagnose.
-        probability: from which an effect is called missing.
-        size: least share of the applied force of an axis that an effect must add to matter.
-        significance: chance of a false alarm in a session where nothing is missing.
-        replicates: replays of the fitted model, as in a parametric bootstrap.
-        expected_effects: how many effects a model is expected to lack.
-        most_effects: beyond those of the model.
-        bias_error: relative error of the bias that filters leave where friction turns.
+        probability: the probability from which an effect is called missing.
+        size: the smallest share of the applied force of an axis that an effect must add to matter.
+        replicates: number of replicates of the fitted model, as in a parametric bootstrap.
+        expected_effects: number of effects that a model is expected to lack.
+        most_effects: largest number of effects that a set adds to the model.
+        bias_error: relative error of the bias that filters cause where friction reverses.
         discrepancy: error of any model, as a share of the applied force.
-        tails: degrees of freedom of Student's t distribution, as which errors are distributed.
-        block_s: stretches of time that are independent, s: one alone must not decide.
-        beam: sets of effects that are pursued side by side.
-        jobs: worker processes; 0 means one for each processor, eight at most.
-        seed: of the noise in the replays.
-        trust_setup: whether to diagnose in spite of a mistake that was named in the set-up.
-        without: effects that are not weighed, such as one that came to nothing when it was added.
+        tails: degrees of freedom of Student's t distribution of the errors.
+        block_s: length of stretches of time that count as independent, s: one must not decide.
+        beam: number of sets of effects that are pursued side by side.
+        jobs: number of worker processes; 0 means one for each processor, eight at most.
+        seed: seed of the noise in the replicates.
+        trust_setup: whether to diagnose in spite of a mistake that was found in the set-up.
+        without: effects that are not weighed, such as one that was added in vain.
     """
 
     model: str = "base"
     probability: Annotated[float, Field(gt=0.5, lt=1)] = _DEFAULT.probability
     size: Fraction = _DEFAULT.size
-    significance: Fraction = _DEFAULT.significance
     replicates: Annotated[int, Field(ge=4)] = _DEFAULT.replicates
     expected_effects: Positive = _DEFAULT.expected_effects
     most_effects: Annotated[int, Field(ge=1)] = _DEFAULT.most_effects

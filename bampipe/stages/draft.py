@@ -56,16 +56,16 @@ class Config:
 
     Attributes:
         model: which model version to draft for.
-        replicates: replays of the model, which are recombined to the null distribution.
-        significance: chance of a formula where nothing is missing.
-        jobs: worker processes; 0 means one for each processor, eight at most.
-        seed: of the noise in the replays.
-        curve: whether to draft a curve through points, where prediction is all that is wanted.
+        replicates: number of replicates of the model that are recombined to a null distribution.
+        probability: the probability that a formula is not chance, from which it is drafted.
+        jobs: number of worker processes; 0 means one for each processor, eight at most.
+        seed: seed of the noise in the replicates.
+        curve: whether to draft a curve through points instead, for prediction only.
     """
 
     model: str = "base"
     replicates: Annotated[int, Field(ge=4)] = Criteria.replicates
-    significance: Annotated[float, Field(gt=0, lt=1)] = Criteria.significance
+    probability: Annotated[float, Field(gt=0.5, lt=1)] = Criteria.probability
     jobs: Count = 0
     seed: Count = 0
     curve: bool = False
@@ -88,7 +88,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     system = compile_model(model)
     timing = run.read(IdentifyResult, config.model).input_timing
     trials = read_measured_trials(run, system, every_input=True, timing=timing)
-    criteria = Criteria(replicates=config.replicates, significance=config.significance)
+    criteria = Criteria(replicates=config.replicates, probability=config.probability)
     session = Session(
         replace(trials, motions=tuple(trials.motions)),
         criteria,
