@@ -1,4 +1,4 @@
-"""Stage draft: a formula for what no effect explains, as an effect file, with its chance level."""
+"""Stage draft: a formula for what no effect explains, as an effect file, with its p-value."""
 
 from __future__ import annotations
 
