@@ -15,7 +15,6 @@ from scipy.stats import beta
 from bampipe.diagnosis.criteria import Criteria, most_probable
 
 TENTHS = np.linspace(0.0, 1.0, 11)
-BEGIN, END = "<!-- printed by benchmarks/calibration.py -->", "<!-- end -->"
 
 
 @dataclass(frozen=True)
@@ -154,12 +153,3 @@ def read_scores(path: Path) -> Iterator[Scores]:
     """The scores of a file, a line each."""
     for line in path.read_text(encoding="utf-8").splitlines():
         yield Scores(**json.loads(line))
-
-
-def write_page(path: Path, tables: str) -> None:
-    """Put the tables in the place that a page marks for them."""
-    before, _, rest = path.read_text(encoding="utf-8").partition(BEGIN)
-    after = rest.partition(END)[2]
-    if not after:
-        raise SystemExit(f"{path} has no place for the tables: {BEGIN} ... {END}")
-    path.write_text(f"{before}{BEGIN}\n\n{tables}\n\n{END}{after}", encoding="utf-8")

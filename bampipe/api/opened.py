@@ -142,11 +142,11 @@ class Run:
         return self._read(DiagnoseResult, model).model_dump(mode="json")
 
     def drafts(self, model: str = "") -> dict[str, Any]:
-        """Formulas drafted for what no effect explains: curves, constants, chance level."""
+        """Formulas drafted for what no effect explains: curves, constants, p-values."""
         return self._read(DraftResult, model).model_dump(mode="json")
 
     def ranking(self, model: str = "") -> pd.DataFrame:
-        """The candidate effects, best first: error before and after, chance level."""
+        """The candidate effects, best first: error before and after, probability, p-value."""
         return pd.DataFrame(self.diagnosis(model)["ranking"])
 
     @property

@@ -19,20 +19,18 @@ class Criteria:
     """What it takes for an effect to be called missing; each described in docs/method_selection.
 
     Attributes:
-        probability: from which an effect is called missing, and below one minus which it is not
-            mentioned.
-        size: least share of the applied force of an axis, root mean square, that an effect must add
-            beyond what the other parameters could take over: no load cell is more linear.
-        replicates: replays of a fitted model, as in a parametric bootstrap.
-        expected_effects: how many effects a model is expected to lack: the prior of each is this
-            over their number.
-        most_effects: beyond those of the model.
-        bias_error: share by which the common bias of the replicates may be off, sample by sample.
-        discrepancy: root mean square error of any model, as a share of the applied force.
-        tails: degrees of freedom of Student's t distribution, as which errors are distributed.
-        block_s: length of the stretches of time that are taken as independent, s: one of them alone
-            must not decide.
-        beam: sets that are pursued side by side.
+        probability: the probability from which an effect is called missing; one that has less than
+            one minus that is not mentioned.
+        size: the smallest share of the applied force of an axis, root mean square, that an effect
+            must add to matter, beyond what other parameters could take over.
+        replicates: number of replicates of the fitted model, as in a parametric bootstrap.
+        expected_effects: number of effects that a model is expected to lack.
+        most_effects: largest number of effects that a set adds to the model.
+        bias_error: relative error of the bias that filters cause where friction reverses.
+        discrepancy: error of any model, root mean square, as a share of the applied force.
+        tails: degrees of freedom of Student's t distribution of the errors.
+        block_s: length of stretches of time that count as independent, s: one must not decide.
+        beam: number of sets of effects that are pursued side by side.
     """
 
     probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.9

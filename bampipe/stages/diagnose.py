@@ -59,10 +59,10 @@ class Config(Criteria):
 
     Attributes:
         model: which model version to diagnose.
-        jobs: worker processes; 0 means one for each processor, eight at most.
-        seed: of the noise in the replays.
-        trust_setup: whether to diagnose in spite of a mistake that was named in the set-up.
-        without: effects that are not weighed, such as one that came to nothing when it was added.
+        jobs: number of worker processes; 0 means one for each processor, eight at most.
+        seed: seed of the noise in the replicates.
+        trust_setup: whether to diagnose in spite of a mistake that was found in the set-up.
+        without: effects that are not weighed, such as one that was added in vain.
     """
 
     model: str = "base"

@@ -1,4 +1,4 @@
-"""Stage draft: a formula for what no effect explains, as an effect file, with its chance level."""
+"""Stage draft: a formula for what no effect explains, as an effect file, with its p-value."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ class Config(Criteria):
 
     Attributes:
         model: which model version to draft for.
-        jobs: worker processes; 0 means one for each processor, eight at most.
-        seed: of the noise in the replays.
-        curve: whether to draft a curve through points, where prediction is all that is wanted.
+        jobs: number of worker processes; 0 means one for each processor, eight at most.
+        seed: seed of the noise in the replicates.
+        curve: whether to draft a curve through points instead, for prediction only.
     """
 
     model: str = "base"

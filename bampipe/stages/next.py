@@ -82,10 +82,10 @@ class Config(Criteria):
             shown; the name of a parameter; or ``auto``: what the diagnosis asks for.
         seconds: length of the trial.
         plan: whether to make a set of trials, and its protocol sheet.
-        sd: what the plan is to bring every standard deviation below, as a share of the estimate.
-        confusion: what it is to bring every chance of confusing two effects below.
-        seed: of how people differ, and of sensor noise.
-        jobs: worker processes; 0 means one for each processor.
+        sd: goal of the plan for every standard deviation, as a share of the estimate.
+        confusion: goal of the plan for every chance of confusing two effects.
+        seed: seed of the variation between people, and of sensor noise.
+        jobs: number of worker processes; 0 means one for each processor.
     """
 
     model: str = "base"
