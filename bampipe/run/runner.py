@@ -8,7 +8,7 @@ import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from bampipe import compile_ahead
+from bampipe.compile_ahead import compiling_ahead
 from bampipe.errors import InputError, MissingResultError, NothingToDoError
 from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, unheard
@@ -35,7 +35,6 @@ class _Runner:
 
         name = self.root.name
         self.listen(Event(name, step.name, "start", 0.0, "" if reason == FIRST_TIME else reason))
-        compile_ahead.begin()
         started = datetime.now(UTC)
         clock = time.perf_counter()
         state = self.state
@@ -160,7 +159,7 @@ def run_session(request: Request, listen: Listener = unheard) -> Outcome:
         runner = _Runner(request, listen)
         staging.recover(runner.state)
         try:
-            with compile_ahead.compiling_ahead(request.processes):
+            with compiling_ahead(request.processes):
                 return runner.run()
         except InputError:
             if fresh and not runner.state.records:
