@@ -31,7 +31,7 @@ class _Runner:
         self.root = request.root
 
     def execute(self, step: Step, reason: str) -> StepResult:
-        from bampipe.results.run import StepRecord, Timing
+        from bampipe.results.run import Commit, StepRecord, Timing
 
         name = self.root.name
         self.listen(Event(name, step.name, "start", 0.0, "" if reason == FIRST_TIME else reason))
@@ -65,8 +65,10 @@ class _Runner:
         )
         seconds = time.perf_counter() - clock
         timing = Timing(started_at=started.isoformat(timespec="seconds"), seconds=round(seconds, 3))
-        staging.seal(out, step, made, timing, sorted(previous.keys() - written.keys()))
-        staging.commit(state, out)
+        remove = tuple(sorted(previous.keys() - written.keys()))
+        sealed = Commit(step=step.name, record=made, timing=timing, remove=remove)
+        staging.seal(out, sealed)
+        staging.commit(state, out, sealed)
         self.listen(Event(name, step.name, "done", 1.0))
         return StepResult(step.name, "done", reason, seconds, made.summary)
 
