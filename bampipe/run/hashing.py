@@ -42,6 +42,7 @@ SHARED_CODE = (
     "physics",
     "estimate",
     "results",
+    "phrases",
     "data",
     "declarations",
     "trials",
