@@ -112,7 +112,7 @@ class Run:
         """One row a parameter: estimate, sd, unit, and what else identification says."""
         frame = _rows(self._read(IdentifyResult, model).parameters)
         first = [name for name in ("estimate", "sd", "unit") if name in frame]
-        order = self._results.in_order(frame.index)
+        order = self._results.order_parameters(frame.index)
         return frame.loc[list(order), first + [c for c in frame if c not in first]]
 
     def covariance(self, model: str = "") -> pd.DataFrame:

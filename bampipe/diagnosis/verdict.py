@@ -19,7 +19,7 @@ from bampipe.results.diagnose import (
     Verdict,
     WeighedSet,
 )
-from bampipe.results.standing import standing
+from bampipe.results.floor import compare_with_floor
 
 Array = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def _judge(
     floor = final.noise_floor
     before, after = float(initial.held_out_rmse[axis]), float(final.held_out_rmse[axis])
     level, scatter = float(floor.level[axis]), float(floor.sd[axis])
-    against_floor = standing(after, level, scatter)
+    against_floor = compare_with_floor(after, level, scatter)
     named = tuple(e for e in listed if e in selection.effects)
     sure = [e for e, p in listed.items() if p >= c.probability]
     open_question = [e for e, p in listed.items() if p < c.probability]

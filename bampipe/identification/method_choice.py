@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from bampipe.errors import InputError
 from bampipe.identification.estimates import Estimate
+from bampipe.phrases.results import METHODS
 from bampipe.physics import System
-from bampipe.results.identify import METHODS_IN_WORDS, Method, MethodTried, MethodValue
+from bampipe.results.identify import Method, MethodTried, MethodValue
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd, significant
 from bampipe.trials.bias import UnbiasedFit
@@ -287,7 +288,7 @@ def describe_methods(system: System, methods: Mapping[Method, MethodTried]) -> l
         system: the model; methods: from `tabulate_methods`.
     """
     method, published = next(iter(methods.items()))
-    words = METHODS_IN_WORDS[method]
+    words = METHODS[method]
     sentences = [f"Published by {words}, although {doubt}." for doubt in published.doubts]
     for other, tried in methods.items():
         if other == method:
@@ -304,7 +305,7 @@ def describe_methods(system: System, methods: Mapping[Method, MethodTried]) -> l
             )
         if against:
             sentences.append(
-                f"Published by {words}, not by {METHODS_IN_WORDS[other]}: {'; '.join(against)}."
+                f"Published by {words}, not by {METHODS[other]}: {'; '.join(against)}."
             )
     return sentences
 

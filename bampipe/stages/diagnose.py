@@ -19,7 +19,6 @@ from bampipe.diagnosis.candidates import list_candidates
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.description import describe
 from bampipe.diagnosis.select import Selection, select_effects
-from bampipe.diagnosis.sentences import axis_sentences
 from bampipe.diagnosis.session import Session
 from bampipe.diagnosis.shape import residual_map, variables, worst_windows
 from bampipe.diagnosis.verdict import conclude
@@ -27,6 +26,7 @@ from bampipe.errors import InputError, NothingToDoError, did_you_mean
 from bampipe.estimate.simulation import Runaway
 from bampipe.identification.terms import effect_text
 from bampipe.next_trial.suggestion import suggest_trial
+from bampipe.phrases import diagnosis as phrases
 from bampipe.physics import compile_model, registry
 from bampipe.physics.effect import effect_from
 from bampipe.physics.recipe import Recipe
@@ -122,8 +122,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     result = result.model_copy(
         update={"suggested_trial": suggest_trial(session, selection.final, result)}
     )
-    headline = "; ".join(f"{axis}: {words}" for axis, words in result.verdicts_in_words.items())
-    return {"headline": headline, **_summary(result.write(out), result.limits)}
+    headline = "; ".join(f"{axis}: {phrases.verdict(result, axis)}" for axis in result.axes)
+    return {"headline": headline, **_summary(result.write(out), phrases.limits(result))}
 
 
 def _require_known(without: Sequence[str], recipe: Recipe) -> None:
@@ -204,7 +204,7 @@ def _result(
         for i, axis in enumerate(names)
         if result.axes[axis].remains
     }
-    said = axis_sentences(result, shapes)
+    said = phrases.describe_axes(result, shapes)
     axes = {
         axis: entry.model_copy(update={"sentence": said[axis]})
         for axis, entry in result.axes.items()

@@ -33,11 +33,11 @@ from bampipe.next_trial.primitives import Envelope, imitate_trials
 from bampipe.next_trial.reasons import explain_proposal, find_shown
 from bampipe.next_trial.sensitivity import HOPELESS, Blindness, find_blindness
 from bampipe.next_trial.suggestion import find_ambiguity, make_contest
+from bampipe.phrases.forecast import find_open, read_forecasts
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
-from bampipe.results.forecast import find_open, read_forecasts
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.next import Detectable, NextResult, Plan, Purpose

@@ -21,14 +21,14 @@ from bampipe.errors import InputError
 from bampipe.identification.drift import find_drift
 from bampipe.identification.free_run import free_runs
 from bampipe.identification.terms import describe_terms
+from bampipe.phrases.results import find_failed_checks
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
-from bampipe.results.checks import find_failed_checks
+from bampipe.results.floor import AT_FLOOR, compare_with_floor
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.rounding import significant
-from bampipe.results.standing import AT_FLOOR, standing
 from bampipe.results.validate import (
     AxisError,
     ForceError,
@@ -242,7 +242,7 @@ def _judged(
         **vars(found),
         noise_floor=level,
         noise_floor_sd=scatter,
-        standing=standing(found.held_out_rmse, level, scatter),
+        standing=compare_with_floor(found.held_out_rmse, level, scatter),
         expected_ratio=expected_ratio,
         estimate="refused" if refused else "accepted",
     )

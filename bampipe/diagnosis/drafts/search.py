@@ -24,7 +24,7 @@ from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.session import Fit, Session, shared, system_of, workers
 from bampipe.physics.recipe import Recipe
 from bampipe.results.draft import ChanceOfDraft
-from bampipe.results.standing import standing
+from bampipe.results.floor import compare_with_floor
 from bampipe.trials.evidence import gather_evidence
 
 Array = NDArray[np.float64]
@@ -305,7 +305,7 @@ class _AxisSearch:
         return float(found.held_out_rmse[self.axis])
 
     def _leaves_much(self, fit: Fit, option: Option) -> bool:
-        return standing(option.held_out_rmse, self._floor(fit)) == "above_floor"
+        return compare_with_floor(option.held_out_rmse, self._floor(fit)) == "above_floor"
 
     def _fit_forms(self, search: FormSearch, current: Option) -> list[Option]:
         """The model with each of the best forms, all parameters fitted together."""
