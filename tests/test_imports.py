@@ -46,7 +46,7 @@ LAWS = {
     "results": law("pydantic", "errors files lists schema"),
     "data": law("numpy scipy pandas pyarrow h5py pydantic", "errors lists schema files results"),
     "trials": law("numpy scipy pandas pyarrow numba", "errors files results physics estimate data"),
-    "setup": law("numpy", "errors lists results physics estimate trials"),
+    "setup": law("numpy scipy", "errors files lists results physics estimate data trials"),
     "identification": law(
         "numpy scipy pandas pyarrow numba pydantic",
         "schema errors lists results progress physics estimate data trials diagnosis",
@@ -65,7 +65,6 @@ LAWS = {
         "numpy scipy pandas pyarrow numba",
         "errors files results physics estimate data declarations trials identification",
     ),
-    "proposal": law("numpy scipy pandas pyarrow numba", "errors files lists physics estimate data"),
     "stages": law(
         "numpy scipy pandas pyarrow numba pydantic",
         "errors files schema results progress physics estimate data declarations trials "
@@ -85,7 +84,7 @@ LAWS = {
     "cli": law(
         "typer rich bampipe",
         "progress api errors files results run lab stages physics diagnosis data declarations "
-        "monitor proposal simulator",
+        "monitor setup simulator",
     ),
 }
 

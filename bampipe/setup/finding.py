@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bampipe.setup.corrections import Correction
+from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import Plausibility
 
 SUSPICIOUS_ERROR = 0.4
@@ -39,7 +39,7 @@ class Finding:
         correction: that sets it right; rivals: others that do so as well.
         before, after: what the set-ups explain.
         gain: of the score.
-        drawn: whether both are with bodies as drawn, see `judge_drawn`.
+        drawn: whether both are with bodies as drawn.
     """
 
     correction: Correction

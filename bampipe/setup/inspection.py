@@ -12,10 +12,10 @@ from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, SetupResult
-from bampipe.setup.drawing import drawn_robot
 from bampipe.setup.finding import Finding, spoilt_axes
 from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
+from bampipe.setup.robot_search import drawn_robot
 from bampipe.setup.search import CorrectionSearch, shorten
 from bampipe.setup.words import describe_correction, describe_evidence, describe_lack, describe_size
 from bampipe.trials.folds import Folds

@@ -13,18 +13,6 @@ from numpy.typing import NDArray
 from bampipe.estimate.heavier_body import HeavierBody
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
-from bampipe.setup.corrections import (
-    Correction,
-    clock_corrections,
-    exchange_corrections,
-    groups_of_like,
-    quarter_turns,
-    scaled,
-    shifted,
-    sign_corrections,
-    unit_corrections,
-)
-from bampipe.setup.drawing import DrawnSearch, find_body_unlike_drawn, is_drawn
 from bampipe.setup.finding import (
     ALIKE,
     JUDGED_ERROR,
@@ -38,7 +26,19 @@ from bampipe.setup.finding import (
     choose,
     is_explained,
 )
+from bampipe.setup.hypotheses import (
+    Correction,
+    clock_corrections,
+    exchange_corrections,
+    groups_of_like,
+    quarter_turns,
+    scaled,
+    shifted,
+    sign_corrections,
+    unit_corrections,
+)
 from bampipe.setup.plausibility import Plausibility, axes_without_pose, judge_setup
+from bampipe.setup.robot_search import DrawnSearch, is_drawn
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Change, Signals
@@ -132,9 +132,15 @@ class CorrectionSearch:
             stated: what the set-up as it is stated explains of ``motions``.
             placeholders: signals whose scale stands at exactly 1.
         """
-        against = self._against_drawing()
-        if against or self.heavier is not None:
-            return against
+        if is_drawn(self.system):
+            # Bodies that are free take on much of a mistake.
+            drawn = DrawnSearch(
+                self.system, shorten(self.motions, _DRAWN_SAMPLES), self.band, self.signals
+            )
+            mistakes = drawn.find_mistakes()
+            self.tested += drawn.tested
+            self.heavier = drawn.heavier
+            return mistakes
         change, now = Change.none(len(self.signals.names)), stated
         found: list[Finding] = []
         while len(found) < MOST_MISTAKES and self._is_suspicious(now, placeholders):
@@ -144,17 +150,6 @@ class CorrectionSearch:
             found.append(step)
             change, now = step.correction.change.after(change), step.after
         return tuple(f for f in found if now is None or is_explained(f, now))
-
-    def _against_drawing(self) -> tuple[Finding, ...]:
-        """The mistakes that bodies as drawn show; those that are free take on much of them."""
-        if not is_drawn(self.system):
-            return ()
-        short = shorten(self.motions, _DRAWN_SAMPLES)
-        self.heavier = find_body_unlike_drawn(self.system, short, self.band)
-        search = DrawnSearch(self.system, short, self.band, self.signals, self.heavier)
-        against = search.find_mistakes(exchanged=self.has_few_axes)
-        self.tested += search.tested
-        return against
 
     def _lacks_pose(self, stated: Plausibility, step: Finding | None) -> bool:
         """Whether a torque over position explains as much of the stated set-up as ``step`` does.

@@ -7,7 +7,7 @@ import math
 from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
-from bampipe.setup.corrections import FACTORS, Correction
+from bampipe.setup.hypotheses import FACTORS, Correction
 from bampipe.setup.plausibility import Plausibility, distance_from_prior
 
 

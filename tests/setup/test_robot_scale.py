@@ -12,8 +12,8 @@ from bampipe.data.device_file import complete_device
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
-from bampipe.setup.corrections import scaled
 from bampipe.setup.finding import Finding, Tried, choose
+from bampipe.setup.hypotheses import scaled
 from bampipe.setup.plausibility import Plausibility
 from bampipe.setup.search import CorrectionSearch
 from bampipe.trials.folds import Folds

@@ -30,10 +30,10 @@ from bampipe.errors import InputError
 from bampipe.physics import registry
 from bampipe.physics.units import check_device
 from bampipe.progress import silent
-from bampipe.proposal import propose, write_proposal
-from bampipe.proposal.notes import COLUMNS
-from bampipe.proposal.starter import starter_device
-from bampipe.proposal.starter_input import Drive
+from bampipe.setup.proposal import propose, write_proposal
+from bampipe.setup.proposal.notes import COLUMNS
+from bampipe.setup.proposal.starter import starter_device
+from bampipe.setup.proposal.starter_input import Drive
 from bampipe.stages import ingest
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations, product
 
@@ -25,6 +25,8 @@ FACTORS: dict[str, tuple[tuple[str, float], ...]] = {
 """Units that are taken for the SI unit, and that for them, by SI unit."""
 PLAIN = (10.0, 100.0, 1000.0, 2.0, 4.0)
 """Gains of an amplifier and edges of an encoder that are forgotten, or counted twice."""
+_ALIKE = 0.2
+"""Logarithm within which a factor that a drawing suggests is that of a unit or a gain."""
 CLOCKS = (1e-3, 1e3, 1e-6, 1e6, 1e-9, 1e9)
 USUAL = ("deg", "mm", "mN", "kN", "mA", "mV", "mN.m", "kN.m", "kgf")
 
@@ -68,6 +70,32 @@ def shifted(signals: Signals, axis: str, offset: float, cost: float) -> Correcti
     return Correction("zero", (axis,), change, cost, offset=offset)
 
 
+def turned(signals: Signals, names: Sequence[str], cost: float = 0.0) -> Correction:
+    """Signals ``names`` have the wrong sign."""
+    change = scaled(signals, names, -1.0, 0.0).change
+    return Correction("sign", tuple(names), change, cost, -1.0)
+
+
+def under_gravity(signals: Signals, gravity: Iterable[float], cost: float) -> Correction:
+    """Gravity is another in the frame of the base, m/s2, (3,)."""
+    none = Change.none(len(signals.names))
+    x, y, z = (float(v) for v in gravity)
+    change = Change(none.gain, none.offset, gravity=(x, y, z))
+    return Correction("gravity", (), change, cost)
+
+
+def unit_of_factor(signals: Signals, names: Sequence[str], factor: float) -> tuple[float, str]:
+    """The unit taken for another, or the gain, that is nearest to ``factor``; else that itself."""
+    place = signals.places(names)[0]
+    si, stated = signals.units[place], signals.stated[place]
+    units = FACTORS.get(si, ())
+    known = [(size, unit) for unit, size in units if stated == si and unit in USUAL]
+    known += [(1.0 / size, unit) for unit, size in units if stated == unit]
+    known += [(gain, "") for plain in PLAIN for gain in (plain, 1.0 / plain)]
+    nearest = min(known, key=lambda one: abs(math.log(one[0] / factor)))
+    return nearest if abs(math.log(nearest[0] / factor)) < _ALIKE else (float(factor), "")
+
+
 def groups_of_like(signals: Signals) -> tuple[tuple[str, ...], ...]:
     """Signals that share a mistake: each alone, then all axes of one unit, then all forces."""
     alone = [(name,) for name in (*signals.axes, *signals.forces, *signals.channels)]
@@ -87,13 +115,7 @@ def sign_corrections(signals: Signals) -> Iterator[Correction]:
         groups += [many] if len(many) > 1 else []
     groups += [(name,) for name in signals.brakes]
     for names in groups:
-        change = scaled(signals, names, -1.0, 0.0).change
-        yield Correction("sign", tuple(names), change, 0.0 if len(names) == 1 else 1.0, -1.0)
-
-
-def encoder_sign_corrections(signals: Signals) -> list[Correction]:
-    """Reversed encoders."""
-    return [one for one in sign_corrections(signals) if set(one.signals) <= set(signals.axes)]
+        yield turned(signals, names, 0.0 if len(names) == 1 else 1.0)
 
 
 def exchange_corrections(signals: Signals) -> Iterator[Correction]:
@@ -132,12 +154,9 @@ def gravity_corrections(signals: Signals, robot: Robot) -> Iterator[Correction]:
         down = np.array(along)
         if not size or not down.any():
             continue
-        x, y, z = (float(v) for v in size * down / np.linalg.norm(down))
-        if np.allclose((x, y, z), stated, atol=1e-3 * size):
-            continue
-        none = Change.none(len(signals.names))
-        change = Change(none.gain, none.offset, gravity=(x, y, z))
-        yield Correction("gravity", (), change, 1.0 if np.abs(down).sum() == 1.0 else 3.0)
+        gravity = size * down / np.linalg.norm(down)
+        if not np.allclose(gravity, stated, atol=1e-3 * size):
+            yield under_gravity(signals, gravity, 1.0 if np.abs(down).sum() == 1.0 else 3.0)
 
 
 def unit_corrections(signals: Signals) -> Iterator[Correction]:
@@ -155,14 +174,6 @@ def unit_corrections(signals: Signals) -> Iterator[Correction]:
             cost = 2.0
             yield scaled(signals, names, factor, cost)
             yield scaled(signals, names, 1.0 / factor, cost)
-
-
-def quarter_turn_pairs(signals: Signals) -> Iterator[tuple[Correction, Correction]]:
-    """Two rotary axes counted from others of their main directions, as a maker's zero posture."""
-    turns = list(quarter_turns(signals))
-    for first, second in combinations(turns, 2):
-        if first.signals != second.signals:
-            yield first, second
 
 
 def quarter_turns(signals: Signals) -> Iterator[Correction]:

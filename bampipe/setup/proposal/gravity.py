@@ -9,7 +9,7 @@ import numpy as np
 from bampipe.data.angle_torque import Reading
 from bampipe.data.guesses import Driven
 from bampipe.data.survey import Survey, SurveyedColumn, words
-from bampipe.proposal.positions import in_counts
+from bampipe.setup.proposal.positions import in_counts
 
 _ANGLES = frozenset(
     ["angle", "theta", "phi", "psi", "winkel", "joint", "rotation", "deg", "rad", "degrees"]

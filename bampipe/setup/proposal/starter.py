@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from bampipe.data.guesses import Driven
 from bampipe.data.survey import REFERENCE_WORDS, words
-from bampipe.proposal.gravity import Weight
-from bampipe.proposal.starter_input import Axis, Drive, Input, input_of
+from bampipe.setup.proposal.gravity import Weight
+from bampipe.setup.proposal.starter_input import Axis, Drive, Input, input_of
 
 _TAKEN = frozenset(
     [
