@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations, product
+from functools import reduce
+from itertools import combinations, permutations
 
 import numpy as np
 
-from bampipe.physics.robot import Robot
 from bampipe.results.setup import Kind
 from bampipe.trials.signals import Change, Signals
 
@@ -25,6 +25,11 @@ FACTORS: dict[str, tuple[tuple[str, float], ...]] = {
 """Units that are taken for the SI unit, and that for them, by SI unit."""
 PLAIN = (10.0, 100.0, 1000.0, 2.0, 4.0)
 """Gains of an amplifier and edges of an encoder that are forgotten, or counted twice."""
+MOST_TRAVEL = 4.0 * math.pi
+"""Beyond two turns, rad, an angle is rather that of a motor before its gear."""
+JOINT_SPANS = np.geomspace(0.5, MOST_TRAVEL, 20)
+"""What a joint may travel then, rad: weight goes with the sine of the angle, so that only a factor
+near the right one explains more."""
 _ALIKE = 0.2
 """Logarithm within which a factor that a drawing suggests is that of a unit or a gain."""
 CLOCKS = (1e-3, 1e3, 1e-6, 1e6, 1e-9, 1e9)
@@ -40,7 +45,7 @@ class Correction:
         change: what it makes of the readings.
         cost: how unlikely a person is to make it, in the unit of the score.
         factor, offset: of a scale or clock; of a zero, rad or m.
-        unit: that was meant, or that was stated for the SI unit, "" where no unit explains it.
+        meant, stated: unit of the readings, and the one written; "" where no unit explains it.
     """
 
     kind: Kind
@@ -49,18 +54,29 @@ class Correction:
     cost: float
     factor: float = 1.0
     offset: float = 0.0
-    unit: str = ""
+    meant: str = ""
+    stated: str = ""
+
+
+def combine(signals: Signals, corrections: Sequence[Correction]) -> Change:
+    """What all corrections make of the signals, the first one first."""
+    none = Change.none(len(signals.names))
+    return reduce(lambda first, one: one.change.after(first), corrections, none)
 
 
 def scaled(
-    signals: Signals, names: Sequence[str], factor: float, cost: float, unit: str = ""
+    signals: Signals,
+    names: Sequence[str],
+    factor: float,
+    cost: float,
+    units: tuple[str, str] = ("", ""),
 ) -> Correction:
     """Signals ``names`` read 1/``factor`` times what they should."""
     gain = np.eye(len(signals.names))
     for place in signals.places(names):
         gain[place, place] = factor
     none = np.zeros(len(signals.names))
-    return Correction("scale", tuple(names), Change(gain, none), cost, factor, unit=unit)
+    return Correction("scale", tuple(names), Change(gain, none), cost, factor, 0.0, *units)
 
 
 def shifted(signals: Signals, axis: str, offset: float, cost: float) -> Correction:
@@ -84,16 +100,28 @@ def under_gravity(signals: Signals, gravity: Iterable[float], cost: float) -> Co
     return Correction("gravity", (), change, cost)
 
 
-def unit_of_factor(signals: Signals, names: Sequence[str], factor: float) -> tuple[float, str]:
-    """The unit taken for another, or the gain, that is nearest to ``factor``; else that itself."""
+def resized(signals: Signals, names: Sequence[str], factor: float) -> Correction:
+    """Signals ``names`` read about 1/``factor`` times what they should: by a unit, if one is near.
+
+    Or by a gain of those that are usual.
+    """
     place = signals.places(names)[0]
-    si, stated = signals.units[place], signals.stated[place]
-    units = FACTORS.get(si, ())
-    known = [(size, unit) for unit, size in units if stated == si and unit in USUAL]
-    known += [(1.0 / size, unit) for unit, size in units if stated == unit]
-    known += [(gain, "") for plain in PLAIN for gain in (plain, 1.0 / plain)]
+    known = [*_units_taken(signals.units[place], signals.stated[place])]
+    known += [(gain, 2.0, ("", "")) for plain in PLAIN for gain in (plain, 1.0 / plain)]
     nearest = min(known, key=lambda one: abs(math.log(one[0] / factor)))
-    return nearest if abs(math.log(nearest[0] / factor)) < _ALIKE else (float(factor), "")
+    if abs(math.log(nearest[0] / factor)) > _ALIKE:
+        return scaled(signals, names, float(factor), 2.0)
+    return scaled(signals, names, *nearest)
+
+
+def _units_taken(si: str, stated: str) -> Iterator[tuple[float, float, tuple[str, str]]]:
+    """Factor, cost, and units meant and stated, where a unit is taken for another."""
+    for unit, factor in FACTORS.get(si, ()):
+        cost = 0.5 if unit in USUAL else 2.0
+        if stated == si:
+            yield factor, cost, (unit, si)
+        elif stated == unit:
+            yield 1.0 / factor, cost, (si, unit)
 
 
 def groups_of_like(signals: Signals) -> tuple[tuple[str, ...], ...]:
@@ -146,34 +174,15 @@ def clock_corrections(signals: Signals) -> Iterator[Correction]:
         yield Correction("clock", (), Change(none.gain, none.offset, factor), 2.0, factor)
 
 
-def gravity_corrections(signals: Signals, robot: Robot) -> Iterator[Correction]:
-    """A base that hangs or lies along another of its axes, or halfway between two or three."""
-    stated = np.array(robot.gravity)
-    size = float(np.linalg.norm(stated))
-    for along in product((-1.0, 0.0, 1.0), repeat=3):
-        down = np.array(along)
-        if not size or not down.any():
-            continue
-        gravity = size * down / np.linalg.norm(down)
-        if not np.allclose(gravity, stated, atol=1e-3 * size):
-            yield under_gravity(signals, gravity, 1.0 if np.abs(down).sum() == 1.0 else 3.0)
-
-
 def unit_corrections(signals: Signals) -> Iterator[Correction]:
     """Units taken for others, and factors of gains and counters."""
     for names in groups_of_like(signals):
         place = signals.places(names)[0]
-        si, stated = signals.units[place], signals.stated[place]
-        for unit, factor in FACTORS.get(si, ()):
-            cost = 0.5 if unit in USUAL else 2.0
-            if stated == si:
-                yield scaled(signals, names, factor, cost, unit)
-            elif stated == unit:
-                yield scaled(signals, names, 1.0 / factor, cost, unit)
+        for taken in _units_taken(signals.units[place], signals.stated[place]):
+            yield scaled(signals, names, *taken)
         for factor in PLAIN:
-            cost = 2.0
-            yield scaled(signals, names, factor, cost)
-            yield scaled(signals, names, 1.0 / factor, cost)
+            yield scaled(signals, names, factor, 2.0)
+            yield scaled(signals, names, 1.0 / factor, 2.0)
 
 
 def quarter_turns(signals: Signals) -> Iterator[Correction]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, reduce
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 
 from bampipe.estimate.heavier_body import HeavierBody
 from bampipe.estimate.low_pass import Band
@@ -15,31 +16,23 @@ from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
 from bampipe.physics.robot import Robot
 from bampipe.setup.drawn_bodies import Bounds, Comparison, Drive, JointMotion
-from bampipe.setup.finding import (
-    ALIKE,
-    LEAST_GAIN,
-    MOST_MISTAKES,
-    RANKED_ERROR,
-    Finding,
-    distinct,
-    gain_of,
-    is_explained,
-    spoils_sound_axes,
-)
+from bampipe.setup.finding import ALIKE, LEAST_GAIN, Finding, conclude, score_of
 from bampipe.setup.heavier import find_heavy, with_heavier_body
 from bampipe.setup.hypotheses import (
+    JOINT_SPANS,
+    MOST_TRAVEL,
     Correction,
     clock_corrections,
+    combine,
     exchange_corrections,
-    gravity_corrections,
     quarter_turns,
+    resized,
     scaled,
     shifted,
     sign_corrections,
     turned,
     under_gravity,
     unit_corrections,
-    unit_of_factor,
 )
 from bampipe.setup.mounting import Mounting, find_mounting
 from bampipe.setup.plausibility import FARTHEST, WEIGHT, Plausibility
@@ -56,6 +49,8 @@ _SUSPICIOUS = 0.15
 least."""
 _ALIKE_SHARES, _FAR_SHARE = np.log(1.5), np.log(1.5)
 """Within what logarithm drives are off alike, as of one unit, and from what on that is too much."""
+_NEXT = 0.3
+"""Logarithm within which the turns of a motor are sought from those on the grid."""
 _UNSURE = 0.3
 """Relative uncertainty of what a drawing asks of a drive, at least."""
 
@@ -146,7 +141,7 @@ class DrawnSearch:
         )
 
     @cached_property
-    def _gains(self) -> Array:
+    def _by_force(self) -> Array:
         """Joint forces by one of each force of the device, (n, forces)."""
         n, inputs = len(self.system.coordinates), len(self.system.inputs)
         at, p = (np.zeros((inputs + 1, n)),) * 3, self.system.prior
@@ -158,26 +153,20 @@ class DrawnSearch:
 
     def find_mistakes(self) -> tuple[Finding, ...]:
         """The mistakes of the set-up, the one that gains most first; none if one is left over."""
-        held = self._judge(())
+        held = self.judge(())
         if held is None or not _is_suspicious(held):
             return ()
         readings = [(one,) for one in self._readings()]
         weighed = [(self._misfit(option), option) for option in ((), *readings)]
-        best = min(weighed, key=lambda one: one[0])[1]
+        best = self._geared(min(weighed, key=lambda one: one[0])[1])
         options = [self._departures(start) for start in ([(), best] if best else [()])]
-        judged = [(self._score(option), option) for option in options]
-        chosen = self._without_idle(min(judged, key=lambda one: one[0])[1])
-        final = self._judge(chosen)
-        if final is None or not 0 < len(chosen) <= MOST_MISTAKES or spoils_sound_axes(held, final):
-            return ()
-        rivals = self._rivals(chosen[0]) if len(chosen) == 1 else ()
-        found = []
-        for one in chosen:
-            before = self._judge(_but(chosen, one)) or held
-            gain = gain_of(before, final, one.cost)
-            found.append(Finding(one, rivals, before, final, gain, drawn=True))
-        found.sort(key=lambda finding: -finding.gain)
-        return tuple(found) if all(is_explained(f, final) for f in found) else ()
+        chosen = min(options, key=lambda option: score_of(self.judge, option))
+        others = (
+            *sign_corrections(self.signals),
+            *quarter_turns(self.signals),
+            under_gravity(self.signals, [-g for g in self.stated.robot.gravity], 1.0),
+        )
+        return conclude(self.judge, chosen, others if len(chosen) == 1 else (), drawn=True)
 
     def _readings(self) -> Iterator[Correction]:
         """Hypotheses about what a column is, rather than how a joint is counted."""
@@ -186,15 +175,40 @@ class DrawnSearch:
             *exchange_corrections(self.signals),
             *unit_corrections(self.signals),
             *clock_corrections(self.signals),
+            *self._gears(),
         ):
             # Of a drive in another unit, the share tells.
             if correction.kind != "scale" or axes.issuperset(correction.signals):
                 yield correction
 
+    def _gears(self) -> Iterator[Correction]:
+        """Positions of motors: what they turn for one of the joint, on a grid."""
+        ends = [(m.position.min(axis=0), m.position.max(axis=0)) for m in self.stated.motions]
+        travel = np.max([high for _, high in ends], axis=0) - np.min(
+            [low for low, _ in ends], axis=0
+        )
+        for axis, turns, far in zip(self.signals.axes, self.stated.turning, travel, strict=True):
+            for span in JOINT_SPANS if turns and far > MOST_TRAVEL else ():
+                yield scaled(self.signals, [axis], float(span / far), 3.0)
+
+    def _geared(self, best: tuple[Correction, ...]) -> tuple[Correction, ...]:
+        """``best`` with the turns that explain most, where it is a position of a motor."""
+        if not best or best[0].kind != "scale":
+            return best
+
+        def tried(x: float) -> tuple[Correction, ...]:
+            return (scaled(self.signals, best[0].signals, best[0].factor * float(np.exp(x)), 3.0),)
+
+        found = minimize_scalar(
+            lambda x: self._misfit(tried(x)), bounds=(-_NEXT, _NEXT), method="bounded"
+        )
+        gain = self._misfit(best) - self._misfit(tried(found.x))
+        return tried(found.x) if gain > 2.0 * ALIKE / WEIGHT else best
+
     def _departures(self, start: tuple[Correction, ...]) -> tuple[Correction, ...]:
         """What ``start``, the best mounting under it and the drives' shares say is mistaken."""
         found = list(start)
-        compared = self._compare(self._change(start))
+        compared = self._compare(combine(self.signals, start))
         if compared is None:
             return start
         mounting = compared.drawn
@@ -216,9 +230,9 @@ class DrawnSearch:
         """Drives whose sign or size is not that of the bodies, each by itself or all alike."""
         single = {
             f: k
-            for k, row in enumerate(self._gains)
+            for k, row in enumerate(self._by_force)
             for f in np.flatnonzero(row)
-            if np.count_nonzero(row) == np.count_nonzero(self._gains[:, f]) == 1
+            if np.count_nonzero(row) == np.count_nonzero(self._by_force[:, f]) == 1
         }
         names = {f: self.signals.forces[f] for f in single}
         signs = [names[f] for f, k in single.items() if drives[k].is_turned]
@@ -235,51 +249,11 @@ class DrawnSearch:
         middle = float(np.median(logs)) if len(logs) else 0.0
         alike = len(logs) > 2 and np.abs(logs - middle).max() < _ALIKE_SHARES
         if alike and abs(middle) > _FAR_SHARE:
-            yield self._resized(self.signals.forces, np.exp(-middle))
+            yield resized(self.signals, self.signals.forces, np.exp(-middle))
             return
         for name, size in sizes.items():
             if abs(size) > np.log(_STATED[1]):
-                yield self._resized([name], np.exp(-size))
-
-    def _resized(self, names: Sequence[str], factor: float) -> Correction:
-        factor, unit = unit_of_factor(self.signals, names, factor)
-        return scaled(self.signals, names, factor, 0.5 if unit else 2.0, unit)
-
-    def _without_idle(self, chosen: tuple[Correction, ...]) -> tuple[Correction, ...]:
-        """Those of ``chosen`` without which enough more is left."""
-        while chosen:
-            whole = self._judge(chosen)
-            gains = {}
-            for one in chosen:
-                before = self._judge(_but(chosen, one))
-                known = before is not None and whole is not None
-                gains[id(one)] = gain_of(before, whole, one.cost) if known else np.inf  # type: ignore[arg-type]
-            least = min(chosen, key=lambda one: gains[id(one)])
-            if gains[id(least)] >= LEAST_GAIN:
-                break
-            chosen = _but(chosen, least)
-        return chosen
-
-    def _rivals(self, chosen: Correction) -> tuple[Correction, ...]:
-        """Other single mistakes that explain as much."""
-        most = self._score((chosen,)) + ALIKE
-        others = (
-            *sign_corrections(self.signals),
-            *quarter_turns(self.signals),
-            *gravity_corrections(self.signals, self.stated.robot),
-        )
-        return distinct(
-            [
-                one
-                for one in others
-                if (one.kind, one.signals) != (chosen.kind, chosen.signals)
-                and self._score((one,)) < most
-            ]
-        )
-
-    def _change(self, corrections: Sequence[Correction]) -> Change:
-        none = Change.none(len(self.signals.names))
-        return reduce(lambda first, one: one.change.after(first), corrections, none)
+                yield resized(self.signals, [name], np.exp(-size))
 
     def _compare(self, change: Change) -> Comparison | None:
         """The comparison with what ``change`` makes of readings and drives, zeros apart.
@@ -298,14 +272,14 @@ class DrawnSearch:
         if np.array_equal(drives, np.eye(forces)):
             return found
         # Drives at the joints are linear in the forces: what these become is found by those.
-        into = self._gains @ drives @ np.linalg.pinv(self._gains)
+        into = self._by_force @ drives @ np.linalg.pinv(self._by_force)
         return found.driven(into)
 
     def _hold(
         self, corrections: Sequence[Correction], bounds: Bounds
     ) -> tuple[Comparison, Mounting, list[Drive]] | None:
         self.tested += 1
-        change = self._change(corrections)
+        change = combine(self.signals, corrections)
         compared = self._compare(change)
         if compared is None:
             return None
@@ -326,8 +300,8 @@ class DrawnSearch:
         compared, mounting, _ = held
         return compared.misfit(mounting) + 2.0 * sum(one.cost for one in corrections) / WEIGHT
 
-    def _judge(self, corrections: Sequence[Correction]) -> Plausibility | None:
-        """What a set-up explains, as stated of all else."""
+    def judge(self, corrections: tuple[Correction, ...]) -> Plausibility | None:
+        """What a set-up explains, all else as stated."""
         held = self._hold(corrections, _STATED)
         if held is None:
             return None
@@ -339,15 +313,6 @@ class DrawnSearch:
         error = np.sqrt([drive.left for drive in drives])
         objections = 0.5 * np.minimum(off**2, FARTHEST**2)
         return Plausibility(error, compared.used.mean(axis=0), self.system.prior, objections)
-
-    def _score(self, corrections: Sequence[Correction]) -> float:
-        found = self._judge(corrections)
-        cost = sum(one.cost for one in corrections)
-        return np.inf if found is None else found.score(RANKED_ERROR) + cost
-
-
-def _but(corrections: tuple[Correction, ...], one: Correction) -> tuple[Correction, ...]:
-    return tuple(other for other in corrections if other is not one)
 
 
 def _is_suspicious(held: Plausibility) -> bool:

@@ -258,17 +258,25 @@ def _sentences(
 ) -> list[str]:
     """What weight and inertia of the drawn bodies say of the drives, a sentence each."""
     lines, agreed = [], []
+    together = len(drives) > 1 and all(drive.is_turned for drive in drives.values())
+    if together:
+        lines.append(
+            "all drives have the other sign, as torques on a drive rather than by it have: weight"
+            " and inertia as drawn, and friction, say so of each; `scale = -1.0` of each"
+            " channel sets that right"
+        )
     for c, (name, drive) in zip(device.coordinates, drives.items(), strict=True):
         column = columns[name].name
         if not drive.is_sure:
-            lines.append(
-                f"{column}: too little weight and inertia act on {c.name} to tell its sign"
-                + _by_friction(drive, c.name)
-            )
+            if not together:
+                lines.append(
+                    f"{column}: too little weight and inertia act on {c.name} to tell its sign"
+                    + _by_friction(drive, c.name)
+                )
             continue
-        size = abs(drive.share)
+        size, share = abs(drive.share), -drive.share if together else drive.share
         said = []
-        if drive.share < 0.0:
+        if share < 0.0:
             said.append(f"its sign is turned; or that of {c.name} is the wrong one")
         if device.force_unit == "A":
             agreed.append(f"{c.name} {1.0 / size:.3g} N.m/A")
@@ -282,7 +290,7 @@ def _sentences(
             agreed.append(f"{c.name} {size:.2f}")
         if said:
             lines.append(
-                f"{column} is {drive.share:.2g} ± {drive.error:.1g} times what the drawing"
+                f"{column} is {share:.2g} ± {drive.error:.1g} times what the drawing"
                 f" requires: {'; and '.join(said)}"
             )
     if agreed and device.force_unit == "A":
