@@ -19,7 +19,7 @@ from bampipe.diagnosis.session import Fit, Session
 from bampipe.errors import InputError
 from bampipe.estimate.bounded import invert_scaled
 from bampipe.estimate.influence import RemovedStretch, find_worst_stretch
-from bampipe.estimate.least_squares import Problem
+from bampipe.estimate.least_squares import BLOCKS_A_PARAMETER, Problem, covariance_by_blocks
 from bampipe.estimate.simulation import Runaway
 from bampipe.identification.estimates import Estimate, filtered_states, input_timing
 from bampipe.physics import System
@@ -45,8 +45,6 @@ _SETTLED = 0.3
 """Standard deviations by which such a fit moves at most."""
 _FARTHEST = 3.0
 """Standard deviations that a nonlinear fit moves at most where a trial is left out."""
-_BLOCKS = 3
-"""Fewer blocks a parameter, and their scatter knows a standard deviation to a third only."""
 _PERIODS = 10
 """Periods of the band in the shortest block that is taken as independent of the next."""
 _STRETCH_S = 1.0
@@ -142,39 +140,23 @@ class SquaresFit:
 
     @cached_property
     def covariance(self) -> Array:
-        """(n, n) by the scatter of blocks of time; of few, no less than independent samples give.
-
-        At the minimum the scores of all blocks add up to nothing: beside as many parameters as
-        blocks, some combination of them does not scatter at all.
-        """
+        """(n, n) by the scatter of blocks of time; see `covariance_by_blocks`."""
         pose = self.fit.problem
         inverse = invert_scaled(self.normal)
         fitted = float(np.trace(inverse @ (self.normal - pose.precision)))
         samples = lay_out_samples(self.fit.evidence, self._block_length(fitted))
-        count = 1 + max((int(here.block.max()) for here in samples if here.block.size), default=0)
-        scores = np.zeros((count, len(inverse)))
-        white, free, whole = np.array(pose.precision), 0.0, 0.0
-        for here, (x, left) in zip(samples, self.rows, strict=True):
-            np.add.at(scores, here.block, x * left[:, None])
-            white += here.independent / max(len(x), 1) * (x.T @ x)
-            free, whole = free + here.independent - fitted / len(samples), whole + here.independent
-        blocks = int(np.count_nonzero(scores.any(axis=1)))
-        meat = scores.T @ scores * (blocks / max(blocks - fitted, 1.0)) + pose.precision
+        found = covariance_by_blocks(
+            self.rows, pose.precision, [s.block for s in samples], [s.independent for s in samples]
+        )
         to = pose.to_parameters[: self.free.size]
-        found = to @ (inverse @ meat @ inverse) @ to.T
-        if blocks < _BLOCKS * fitted:
-            least = to @ (invert_scaled(white) * whole / max(free, 1.0)) @ to.T
-            ratio = np.diag(least) / np.maximum(np.diag(found), 1e-300)
-            widen = np.sqrt(np.maximum(ratio, 1.0))
-            found = found * np.outer(widen, widen)
-        return np.asarray(found)
+        return np.asarray(to @ found @ to.T)
 
     def _block_length(self, fitted: float) -> float:
         """Length of blocks, s: shorter where there are fewer than three a parameter."""
         band = self.trials.band
         seconds = sum(self.fit.evidence.sizes) / band.rate_hz
         least = _PERIODS / min(band.cutoff_hz)
-        return min(self.block_s, max(seconds / (_BLOCKS * max(fitted, 1.0)), least))
+        return min(self.block_s, max(seconds / (BLOCKS_A_PARAMETER * max(fitted, 1.0)), least))
 
     @cached_property
     def sd(self) -> Array:
