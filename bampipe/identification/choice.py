@@ -4,7 +4,8 @@ Least squares under the likelihood are always computed. They hold whatever the m
 that stays in their residual. The unscented filter is the more precise where the model is right and
 the machine answers the measured forces. It is published where all of this is so:
 
-1. no test bench, and no controller of a robot, gives the motion;
+1. no test bench, and no controller of a robot, gives the motion, and the model is linear in its
+   parameters;
 2. to follow it takes at most `MOST_EVALUATIONS` evaluations of the model;
 3. it follows the motion, and its innovations have the size that it expects;
 4. no parameter differs from that of least squares by more than chance (Hausman 1978,
@@ -43,7 +44,7 @@ _SHOWN = 4
 def why_not_filtered(system: System, squares: SquaresFit, longest_step_s: float) -> str | None:
     """Why the filter is not run: "" where there is nothing to say of it; None where it is run."""
     device = system.model.device
-    if device.prescribed or device.robot is not None:
+    if device.prescribed or device.robot is not None or not squares.problem.linear:
         return ""
     motions: Sequence[Motion] = squares.trials.motions
     each = steps_to_follow(system, squares.p[:-1], motions[0], longest_step_s)

@@ -57,12 +57,7 @@ class Estimate:
         report: further fields of the result.
         tabulate: makes the tables of the states and of the parameters along the data.
         doubts: why it may not be believed, a clause each; none where nothing speaks against it.
-        moved_by: from another system of the same parameters to how far its equations move the
-            estimates, (n,), nothing where they make the readings less likely; None for a method
-            that does not say.
-        width: with which the method smooths the sign of a velocity, times the model's.
-        spread: (n,) how far the estimates move between widths that are nearly as likely; None
-            where only one was asked.
+        notes: what else to know before believing it, a sentence each.
     """
 
     method: Method
@@ -75,9 +70,7 @@ class Estimate:
     report: dict[str, Any]
     tabulate: Callable[[], tuple[pd.DataFrame, pd.DataFrame]]
     doubts: tuple[str, ...] = ()
-    moved_by: Callable[[System], Array] | None = None
-    width: float = 1.0
-    spread: Array | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def evidence(self) -> dict[str, Any]:

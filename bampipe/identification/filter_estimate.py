@@ -28,7 +28,6 @@ from bampipe.identification.filter_run import (
     build_filter_model,
     choose_stride,
     clear_of_reversal_mask,
-    likelier,
     load_filter_trial,
     run_filter,
 )
@@ -48,36 +47,36 @@ from bampipe.identification.sensor_noise import (
     tune_noise,
     untuned_settings,
 )
+from bampipe.lists import join_names
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
+from bampipe.results.rounding import significant
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.disturbances import part_trials
 from bampipe.trials.motion import Motion, trial_names, trial_sizes
 
 Array = NDArray[np.float64]
 
-_RESTARTS = 5
-"""Further searches, each with four times the process noise of the one before."""
-_REGIONS = (30.0, 8.0)
-"""Standard deviations of least squares around its answer in which a model nonlinear in its
-parameters is searched: a prior as wide as a range leads such a filter astray."""
-_LEAST_REGION = 3e-4
-"""Least width of that, in standard deviations of the prior, times the number above."""
-_REPEATS, _AROUND = 4, 10.0
-"""Most passes more of such a model; how far around the last answer, in its standard deviations."""
+_RESTARTS = 3
+"""Searches from least squares, each with four times the process noise of the one before."""
+_LEAST_REGION = 1e-3
+"""Least deviation of least squares of a nonlinear model, in standard deviations of the prior."""
+_AROUND = 10.0
+"""Standard deviations around an answer, from which on a start adds a hundredth to what is known."""
 _PARTS, _LIKELIER = (1, 2, 4), 30.0
-"""By what the Runge-Kutta step is divided for it, and what that must add to the logarithm of a
-trial's likelihood: three times what it adds where friction is smooth on the scale of a step."""
+"""By what the Runge-Kutta step is divided, and what that must add to the logarithm of the
+likelihood: three times what it adds where friction is smooth on the scale of a step."""
 _NARROWER = (0.5, 0.25, 0.0625)
 """Widths of the smoothed sign, times the device's, that are tried."""
 _MOVED_TRIALS, _MOVED_SAMPLES = 5, 10_000
 """Trials, and samples of all, by which other equations move the answer or make it likelier."""
+_MOST, _SHOWN = 0.5, 6
+"""Share of the variance of a parameter from which on what the smoothing adds is said in words,
+and how many are named."""
 _SOUND_NIS = (0.5, 2.0)
 """Mean normalised innovation squared of a filter whose noise levels fit: 0.9 to 1.3 on sound
 sessions, 0.06 to 0.2 and 2.8 to 3.7 on those whose motion it lost."""
-_AGREE = 6.0
-"""Joint standard deviations within which filter and least squares are at one place."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +174,8 @@ class _Filtering:
     def attempts(self) -> list[Attempt]:
         """Where to start: the prior, then least squares with more and more process noise.
 
-        A model that is nonlinear in its parameters starts around least squares at first.
+        A model that is nonlinear in its parameters starts around least squares: a prior as wide as
+        a range leads such a filter astray.
         """
         task, count = self.task, self.count
         places, late = task.squares.free[:count], np.zeros(self.late_sd.size)
@@ -183,25 +183,12 @@ class _Filtering:
         prior_sd = np.append([item.sd for item in free], self.late_sd)
         first = np.append(task.start[places], late)
         spread = np.hypot(prior_sd, first - np.append(task.system.prior[places], late))
-        attempts: list[Attempt] = [(first, spread, 1.0)]
-        attempts += [(self.answer, prior_sd, 4.0**k) for k in range(_RESTARTS)]
         if task.squares.problem.linear:
-            return attempts
-        least = np.hypot(self.known, _LEAST_REGION * prior_sd)
-        around = [np.minimum(size * least, spread) for size in _REGIONS]
-        return [*((self.answer, region, 1.0) for region in around), *attempts]
-
-    def agrees(self, found: FilterRun) -> bool:
-        """Whether the filter is where least squares are, the timing left out.
-
-        Where the model is linear they have one answer at most, and no need to be asked.
-        """
-        if self.task.squares.problem.linear:
-            return True
-        value, slope = self.model.to_physical(found.theta)
-        sd = np.hypot(slope * np.sqrt(np.diag(found.covariance)), self.known)
-        apart = np.abs(value - self.answer)[: self.count]
-        return bool(np.all(apart < _AGREE * sd[: self.count]))
+            around, attempts = prior_sd, [(first, spread, 1.0)]
+        else:
+            least = np.hypot(self.known, _LEAST_REGION * prior_sd)
+            around, attempts = np.minimum(_AROUND * least, spread), []
+        return attempts + [(self.answer, around, 4.0**k) for k in range(_RESTARTS)]
 
     def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
         """Filter all trials from the first of some starts that holds on to the motion."""
@@ -219,15 +206,12 @@ class _Filtering:
 
         return run_filter(
             self.model, self.trials, attempts, settings, self.choice, report_progress, lost_error,
-            self.task.system.coordinates, self.agrees, 1 + len(_REGIONS),
+            self.task.system.coordinates,
         )  # fmt: skip
 
     def find(self) -> tuple[FilterRun, _Width | None]:
         """The run that counts, and the narrower width of the sign if readings ask for one."""
         found = self.run(self.attempts, self.settings)
-        if not self.task.squares.problem.linear:
-            finer = _choose_longest_step(found, self.model, self.trials[0])
-            found = _repeat_until_settled(found, self.model, finer, self.run)
         if self.task.system.model.device.prescribed:
             return found, None
         narrowed, step = self.task.narrowed, self.choice.longest_step_s
@@ -235,12 +219,15 @@ class _Filtering:
         if width is None:
             return found, None
         declared, self.model = self.model, _with_equations(self.model, narrowed(width.factor))
-        narrower = _repeat_until_settled(found, self.model, width.settings, self.run)
-        # A narrow sign may throw the filter off at one reversal of many.
-        if likelier(found, narrower) is found:
-            self.model = declared
-            return found, None
-        return narrower, width
+        value, slope = self.model.to_physical(found.theta)
+        around = _AROUND * slope * np.sqrt(np.diag(found.covariance))
+        with suppress(MotionLost):  # a narrow sign may throw it off at one reversal of many
+            again = self.run([(value, around, 1.0)], width.settings)
+            if again.log_likelihood > found.log_likelihood + _LIKELIER:
+                first = found.first or found.passes
+                return replace(again, restarts=found.restarts, repeats=1, first=first), width
+        self.model = declared
+        return found, None
 
 
 def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
@@ -253,11 +240,12 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
     found, width = filtering.find()
     model, count, system = filtering.model, filtering.count, task.system
     problem, motions = task.squares.problem, filtering.motions
-    covariance, blocks = sandwich_covariance(
+    sandwich, blocks = sandwich_covariance(
         found.ends, model.n_states, found.search_theta, found.search_covariance
     )
-    value, slope = model.to_physical(constrain(model, found.theta, covariance))
-    scaled = covariance * np.outer(slope, slope)
+    value, slope = model.to_physical(constrain(model, found.theta, sandwich))
+    scaled = sandwich * np.outer(slope, slope)
+    off, spread = _find_smoothing(found, width, filtering)
     p = np.append(task.start, task.squares.p[-1])
     p[problem.free] = value
     tight = slope * np.sqrt(np.diag(found.covariance))
@@ -273,27 +261,63 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
         "restarts": found.restarts,
         "repeats": found.repeats,
         "state_3sigma": state_3sigma(system, found.trials),
-        "convergence": convergence(names, model, found, covariance),
+        "convergence": convergence(names, model, found, sandwich),
     }
+    covariance = (scaled + np.outer(off, off) + np.diag(spread**2))[:count, :count]
+    smoothing = np.hypot(off, spread)[:count]
     rows = filtering.choice.trace_rows
     return Estimate(
         method="ukf",
         p=p,
         problem=problem,
-        covariance=scaled[:count, :count],
+        covariance=covariance,
         at_bound=at_bound[:count],
-        held_out=_leave_out(p, found, filtering, covariance),
-        details=[{"filter_sd": tight[k]} for k in range(count)],
+        held_out=_leave_out(p, found, filtering, sandwich),
+        details=[{"filter_sd": tight[k], "smoothing_sd": smoothing[k]} for k in range(count)],
         report=report,
         tabulate=lambda: (
             tabulate_states(system, motions, found, p[:-1], rows),
             tabulate_trace(names, model, motions, found, rows),
         ),
         doubts=_doubts(nis.mean),
-        moved_by=lambda other: _moved_by(other, found, model, filtering.trials)[:count],
-        width=width.factor if width is not None else 1.0,
-        spread=width.spread[:count] if width is not None else None,
+        notes=_describe_smoothing(names, smoothing, np.sqrt(np.diag(covariance)), width),
     )
+
+
+def _find_smoothing(
+    found: FilterRun, width: _Width | None, filtering: _Filtering
+) -> tuple[Array, Array]:
+    """How far the answer is from that without smoothing, and between likely widths, both (nt,).
+
+    A machine with dry friction truly stands still, where the model creeps within the width of its
+    smoothed sign. The filter errs in proportion to that width: it is off by twice what half the
+    width that it took moves it. A machine that does creep shows that by readings that the narrower
+    sign comes less close to. What widths that are nearly as likely disagree on is as uncertain.
+    """
+    factor = 1.0 if width is None else width.factor
+    narrower = filtering.task.narrowed(_NARROWER[0] * factor)
+    off = _moved_by(narrower, found, filtering.model, filtering.trials) / (1.0 - _NARROWER[0])
+    return off, np.zeros(off.size) if width is None else width.spread
+
+
+def _describe_smoothing(
+    names: Sequence[str], smoothing: Array, sd: Array, width: _Width | None
+) -> tuple[str, ...]:
+    """Sentences on a narrower sign, and on uncertainty that is for the most part of smoothing."""
+    said = []
+    if width is not None:
+        said.append(
+            f"The filter smooths the sign of the velocity over {significant(width.factor)} of the"
+            " device's `sign_width`, which makes the readings likelier."
+        )
+    most = smoothing**2 > _MOST * np.maximum(sd**2, np.finfo(float).tiny)
+    if most.any():
+        listed = [f"`{name}`" for name, here in zip(names, most, strict=True) if here]
+        said.append(
+            f"Most of the uncertainty of {join_names(listed, _SHOWN)} is that the sign of the"
+            " velocity is smoothed, where a machine stands still."
+        )
+    return tuple(said)
 
 
 def _leave_out(p: Array, found: FilterRun, filtering: _Filtering, covariance: Array) -> list[Array]:
@@ -429,55 +453,3 @@ def _doubts(nis: float) -> tuple[str, ...]:
         f"its normalised innovations squared are {nis:.2g} on average, 1 where its noise levels"
         " are right",
     )
-
-
-def _choose_longest_step(found: FilterRun, model: FilterModel, trial: Trial) -> FilterSettings:
-    """Return the settings with a step that makes a trial as likely as finer ones do.
-
-    Friction that falls within millimetres a second has changed before a step is over.
-    """
-
-    def log_likelihood(step: float) -> float:
-        wide = np.diag(_AROUND**2 * np.diag(found.covariance))
-        chosen = replace(found.settings, longest_step=step)
-        filtered = filter_trials(model, [trial], found.theta, wide, chosen)
-        return float(np.nansum(filtered.trials[0].log_likelihood))
-
-    step = found.settings.longest_step
-    # Where the filter fails, so will the passes that follow, which say why.
-    with suppress(FilterFailure):
-        tried = {part: log_likelihood(step / part) for part in _PARTS}
-        enough = max(tried.values()) - _LIKELIER
-        step /= min(part for part, likely in tried.items() if likely > enough)
-    return replace(found.settings, longest_step=step)
-
-
-def _repeat_until_settled(
-    found: FilterRun,
-    model: FilterModel,
-    settings: FilterSettings,
-    run_from: Callable[[Sequence[Attempt], FilterSettings], FilterRun],
-) -> FilterRun:
-    """Filter again around the answer until that no longer moves it.
-
-    One pass takes the model as straight across all that it did not know when it began; where the
-    model is nonlinear, that leaves its mark on the answer, and on the likelihood, which therefore
-    does not say which of two passes to believe. Passes from different starts settle at one place.
-    Where none does, the likeliest counts. A start this wide of an answer adds a hundredth to what
-    is known of it.
-    """
-    best = last = found
-    for repeats in range(1, 1 + _REPEATS):
-        value, slope = model.to_physical(last.theta)
-        sd = np.sqrt(np.diag(last.covariance))
-        try:
-            again = run_from([(value, _AROUND * slope * sd, 1.0)], settings)
-        except MotionLost:
-            break
-        again = replace(
-            again, restarts=found.restarts, repeats=repeats, first=found.first or found.passes
-        )
-        if np.all(np.abs(again.theta - last.theta) < sd):
-            return again
-        best, last = likelier(best, again), again
-    return best

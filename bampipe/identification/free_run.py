@@ -69,9 +69,9 @@ def free_runs(
         Errors in closed loop, else in open loop; only a ``reason`` where no free run is possible
         or meaningful.
     """
-    given = why_not_free(system, motions, parameters)
-    if given and not system.model.device.prescribed:
-        return FreeRun(reason=given)
+    why_not = why_not_free(system, motions, parameters)
+    if why_not and not system.model.device.prescribed:
+        return FreeRun(reason=why_not)
     law = compile_law(system.model.device)
     reason = "the device file declares no [controller]"
     if law is not None:

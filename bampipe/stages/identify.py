@@ -41,7 +41,6 @@ from bampipe.identification.least_squares_estimate import (
     require_enough,
 )
 from bampipe.identification.sensor_noise import Noise, sensor_noise
-from bampipe.identification.smoothing import describe_smoothing, with_smoothing
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
@@ -167,7 +166,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         notes=[
             *describe_methods(methods),
             *notes,
-            *describe_smoothing(system, estimate),
+            *estimate.notes,
             *(_describe_width(system, task.width) if task.width is not None else ()),
             *describe_calibration(estimate, moved),
             *summarise_bases(system, bases),
@@ -252,7 +251,7 @@ def _filter(
         config,
     )  # fmt: skip
     try:
-        return with_smoothing(estimate_by_filter(asked, progress), task.recipe), ""
+        return estimate_by_filter(asked, progress), ""
     except MotionLost as error:
         if config.method == "ukf":
             raise
