@@ -28,7 +28,7 @@ from independent import MACHINES, arm, record
 from independent.sensors import Conditions
 
 import bampipe
-from bampipe.proposal import propose, write_proposal
+from bampipe.setup.proposal import propose, write_proposal
 
 PIPELINE = """schema = "bampipe.pipeline/1"
 name = "mistakes"

@@ -48,7 +48,7 @@ LAWS = {
     "phrases": law("", "errors lists results"),
     "data": law("numpy scipy pandas pyarrow h5py pydantic", "errors lists schema files results"),
     "trials": law("numpy scipy pandas pyarrow numba", "errors files results physics estimate data"),
-    "setup": law("numpy", "errors lists results physics estimate trials"),
+    "setup": law("numpy scipy", "errors files lists results physics estimate data trials"),
     "identification": law(
         "numpy scipy pandas pyarrow numba pydantic",
         "schema errors lists results phrases progress physics estimate data trials diagnosis",
@@ -67,7 +67,6 @@ LAWS = {
         "numpy scipy pandas pyarrow numba",
         "errors files results physics estimate data declarations trials identification",
     ),
-    "proposal": law("numpy scipy pandas pyarrow numba", "errors files lists physics estimate data"),
     "stages": law(
         "numpy scipy pandas pyarrow numba pydantic",
         "errors files schema results phrases progress physics estimate data declarations trials "
@@ -92,7 +91,7 @@ LAWS = {
     "cli": law(
         "typer rich bampipe",
         "progress api errors files results phrases run lab stages physics diagnosis data "
-        "declarations monitor proposal simulator",
+        "declarations monitor setup simulator",
     ),
 }
 

@@ -11,7 +11,7 @@ from bampipe.data.quality.stamps import spread_stamps, unroll
 from bampipe.data.session import SECONDS
 from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import spelled
-from bampipe.proposal.notes import UNKNOWN, Notes, quoted
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted
 
 _RECORDED = ":@time"
 """End of the name under which the reader of ROS bags has the time of recording."""

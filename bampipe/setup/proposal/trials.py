@@ -9,8 +9,8 @@ from pathlib import Path
 from bampipe.data import guesses
 from bampipe.data.survey import SurveyedColumn, words
 from bampipe.physics.device import Device
-from bampipe.proposal.matching import Matcher
-from bampipe.proposal.notes import Notes, quoted
+from bampipe.setup.proposal.matching import Matcher
+from bampipe.setup.proposal.notes import Notes, quoted
 
 
 def trials_tables(

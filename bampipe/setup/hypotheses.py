@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations, product
+from functools import reduce
+from itertools import combinations, permutations
 
 import numpy as np
 
-from bampipe.physics.robot import Robot
 from bampipe.results.setup import Kind
 from bampipe.trials.signals import Change, Signals
 
@@ -25,6 +25,13 @@ FACTORS: dict[str, tuple[tuple[str, float], ...]] = {
 """Units that are taken for the SI unit, and that for them, by SI unit."""
 PLAIN = (10.0, 100.0, 1000.0, 2.0, 4.0)
 """Gains of an amplifier and edges of an encoder that are forgotten, or counted twice."""
+MOST_TRAVEL = 4.0 * math.pi
+"""Beyond two turns, rad, an angle is rather that of a motor before its gear."""
+JOINT_SPANS = np.geomspace(0.5, MOST_TRAVEL, 20)
+"""What a joint may travel then, rad: weight goes with the sine of the angle, so that only a factor
+near the right one explains more."""
+_ALIKE = 0.2
+"""Logarithm within which a factor that a drawing suggests is that of a unit or a gain."""
 CLOCKS = (1e-3, 1e3, 1e-6, 1e6, 1e-9, 1e9)
 USUAL = ("deg", "mm", "mN", "kN", "mA", "mV", "mN.m", "kN.m", "kgf")
 
@@ -38,7 +45,7 @@ class Correction:
         change: what it makes of the readings.
         cost: how unlikely a person is to make it, in the unit of the score.
         factor, offset: of a scale or clock; of a zero, rad or m.
-        unit: that was meant, or that was stated for the SI unit, "" where no unit explains it.
+        meant, stated: unit of the readings, and the one written; "" where no unit explains it.
     """
 
     kind: Kind
@@ -47,18 +54,29 @@ class Correction:
     cost: float
     factor: float = 1.0
     offset: float = 0.0
-    unit: str = ""
+    meant: str = ""
+    stated: str = ""
+
+
+def combine(signals: Signals, corrections: Sequence[Correction]) -> Change:
+    """What all corrections make of the signals, the first one first."""
+    none = Change.none(len(signals.names))
+    return reduce(lambda first, one: one.change.after(first), corrections, none)
 
 
 def scaled(
-    signals: Signals, names: Sequence[str], factor: float, cost: float, unit: str = ""
+    signals: Signals,
+    names: Sequence[str],
+    factor: float,
+    cost: float,
+    units: tuple[str, str] = ("", ""),
 ) -> Correction:
     """Signals ``names`` read 1/``factor`` times what they should."""
     gain = np.eye(len(signals.names))
     for place in signals.places(names):
         gain[place, place] = factor
     none = np.zeros(len(signals.names))
-    return Correction("scale", tuple(names), Change(gain, none), cost, factor, unit=unit)
+    return Correction("scale", tuple(names), Change(gain, none), cost, factor, 0.0, *units)
 
 
 def shifted(signals: Signals, axis: str, offset: float, cost: float) -> Correction:
@@ -66,6 +84,44 @@ def shifted(signals: Signals, axis: str, offset: float, cost: float) -> Correcti
     change = Change.none(len(signals.names))
     change.offset[signals.places([axis])] = offset
     return Correction("zero", (axis,), change, cost, offset=offset)
+
+
+def turned(signals: Signals, names: Sequence[str], cost: float = 0.0) -> Correction:
+    """Signals ``names`` have the wrong sign."""
+    change = scaled(signals, names, -1.0, 0.0).change
+    return Correction("sign", tuple(names), change, cost, -1.0)
+
+
+def under_gravity(signals: Signals, gravity: Iterable[float], cost: float) -> Correction:
+    """Gravity is another in the frame of the base, m/s2, (3,)."""
+    none = Change.none(len(signals.names))
+    x, y, z = (float(v) for v in gravity)
+    change = Change(none.gain, none.offset, gravity=(x, y, z))
+    return Correction("gravity", (), change, cost)
+
+
+def resized(signals: Signals, names: Sequence[str], factor: float) -> Correction:
+    """Signals ``names`` read about 1/``factor`` times what they should: by a unit, if one is near.
+
+    Or by a gain of those that are usual.
+    """
+    place = signals.places(names)[0]
+    known = [*_units_taken(signals.units[place], signals.stated[place])]
+    known += [(gain, 2.0, ("", "")) for plain in PLAIN for gain in (plain, 1.0 / plain)]
+    nearest = min(known, key=lambda one: abs(math.log(one[0] / factor)))
+    if abs(math.log(nearest[0] / factor)) > _ALIKE:
+        return scaled(signals, names, float(factor), 2.0)
+    return scaled(signals, names, *nearest)
+
+
+def _units_taken(si: str, stated: str) -> Iterator[tuple[float, float, tuple[str, str]]]:
+    """Factor, cost, and units meant and stated, where a unit is taken for another."""
+    for unit, factor in FACTORS.get(si, ()):
+        cost = 0.5 if unit in USUAL else 2.0
+        if stated == si:
+            yield factor, cost, (unit, si)
+        elif stated == unit:
+            yield 1.0 / factor, cost, (si, unit)
 
 
 def groups_of_like(signals: Signals) -> tuple[tuple[str, ...], ...]:
@@ -87,13 +143,7 @@ def sign_corrections(signals: Signals) -> Iterator[Correction]:
         groups += [many] if len(many) > 1 else []
     groups += [(name,) for name in signals.brakes]
     for names in groups:
-        change = scaled(signals, names, -1.0, 0.0).change
-        yield Correction("sign", tuple(names), change, 0.0 if len(names) == 1 else 1.0, -1.0)
-
-
-def encoder_sign_corrections(signals: Signals) -> list[Correction]:
-    """Reversed encoders."""
-    return [one for one in sign_corrections(signals) if set(one.signals) <= set(signals.axes)]
+        yield turned(signals, names, 0.0 if len(names) == 1 else 1.0)
 
 
 def exchange_corrections(signals: Signals) -> Iterator[Correction]:
@@ -124,45 +174,15 @@ def clock_corrections(signals: Signals) -> Iterator[Correction]:
         yield Correction("clock", (), Change(none.gain, none.offset, factor), 2.0, factor)
 
 
-def gravity_corrections(signals: Signals, robot: Robot) -> Iterator[Correction]:
-    """A base that hangs or lies along another of its axes, or halfway between two or three."""
-    stated = np.array(robot.gravity)
-    size = float(np.linalg.norm(stated))
-    for along in product((-1.0, 0.0, 1.0), repeat=3):
-        down = np.array(along)
-        if not size or not down.any():
-            continue
-        x, y, z = (float(v) for v in size * down / np.linalg.norm(down))
-        if np.allclose((x, y, z), stated, atol=1e-3 * size):
-            continue
-        none = Change.none(len(signals.names))
-        change = Change(none.gain, none.offset, gravity=(x, y, z))
-        yield Correction("gravity", (), change, 1.0 if np.abs(down).sum() == 1.0 else 3.0)
-
-
 def unit_corrections(signals: Signals) -> Iterator[Correction]:
     """Units taken for others, and factors of gains and counters."""
     for names in groups_of_like(signals):
         place = signals.places(names)[0]
-        si, stated = signals.units[place], signals.stated[place]
-        for unit, factor in FACTORS.get(si, ()):
-            cost = 0.5 if unit in USUAL else 2.0
-            if stated == si:
-                yield scaled(signals, names, factor, cost, unit)
-            elif stated == unit:
-                yield scaled(signals, names, 1.0 / factor, cost, unit)
+        for taken in _units_taken(signals.units[place], signals.stated[place]):
+            yield scaled(signals, names, *taken)
         for factor in PLAIN:
-            cost = 2.0
-            yield scaled(signals, names, factor, cost)
-            yield scaled(signals, names, 1.0 / factor, cost)
-
-
-def quarter_turn_pairs(signals: Signals) -> Iterator[tuple[Correction, Correction]]:
-    """Two rotary axes counted from others of their main directions, as a maker's zero posture."""
-    turns = list(quarter_turns(signals))
-    for first, second in combinations(turns, 2):
-        if first.signals != second.signals:
-            yield first, second
+            yield scaled(signals, names, factor, 2.0)
+            yield scaled(signals, names, 1.0 / factor, 2.0)
 
 
 def quarter_turns(signals: Signals) -> Iterator[Correction]:

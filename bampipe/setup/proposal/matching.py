@@ -10,7 +10,7 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
-from bampipe.proposal.positions import travelled
+from bampipe.setup.proposal.positions import travelled
 
 _DRIVEN = 0.5
 """Share of a column that the motion must explain for it to pass as what drives it."""
@@ -130,9 +130,10 @@ class Matcher:
         named = [c for role in DRIVERS for c in self.found.of(role) if not c.is_constant]
         best = self.driving(position) or next(iter(named), None)
         if best is not None and not best.unit and best.name in self.registers:
-            # What a servo calls its load is the share of the supply that its bridge is on, or a
-            # current: no force comes as a register.
-            return best, "duty" if self.supply(best) is not None else "current"
+            # What a servo calls its load is the share of the supply that its bridge is on: no force
+            # comes as a register, and a current is called one.
+            load = best.role != "current" or self.supply(best) is not None
+            return best, "duty" if load else "current"
         if best is None or best.role not in DRIVERS:
             return best, "force"
         duty = best.role == "voltage" and {"pwm", "duty"} & set(words(best.name))

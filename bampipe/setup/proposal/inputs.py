@@ -10,11 +10,11 @@ from bampipe.data import guesses
 from bampipe.data.survey import SurveyedColumn, words
 from bampipe.data.units import spelled, unit
 from bampipe.physics.device import Device
-from bampipe.proposal.device import ChosenDevice
-from bampipe.proposal.matching import Match, Matcher
-from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
+from bampipe.setup.proposal.device import ChosenDevice
+from bampipe.setup.proposal.matching import Match, Matcher
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
 
-_FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "V")
+_FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "kip", "V")
 _SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])
 _FORCES = frozenset(["force", "forc", "kraft", "loadcell", "fx", "fy", "fz"])
 _TORQUES = frozenset(["torque", "tau", "trq", "moment", "effort", "drehmoment"])

@@ -9,15 +9,14 @@ import numpy as np
 from bampipe.data.angle_torque import Reading
 from bampipe.data.guesses import Driven
 from bampipe.data.survey import Survey, SurveyedColumn, words
-from bampipe.proposal.positions import in_counts
+from bampipe.setup.hypotheses import MOST_TRAVEL
+from bampipe.setup.proposal.positions import in_counts
 
 _ANGLES = frozenset(
     ["angle", "theta", "phi", "psi", "winkel", "joint", "rotation", "deg", "rad", "degrees"]
 )
 _UPRIGHT = frozenset(["yaw", "pan", "azimuth", "heading"])
 """What an axis that stands upright, and carries no weight, is called."""
-MOST_TRAVEL = 4.0 * np.pi
-"""Beyond two turns, rad, an angle is rather that of a motor before its gear."""
 _DOUBTS: dict[Reading, str] = {
     "either": "a torque follows the angle, and over so short a travel a spring's looks alike",
     "both": "a torque follows the angle, and neither weight nor a spring alone explains it; what is"

@@ -20,14 +20,14 @@ from bampipe.estimate.white_noise import counting_step, white_noise_sd
 from bampipe.files import read_toml
 from bampipe.physics import registry
 from bampipe.physics.device import KINDS, Device
-from bampipe.proposal.encoders import measured_position
-from bampipe.proposal.gravity import MOST_TRAVEL, weight_of
-from bampipe.proposal.joints import chain_logged
-from bampipe.proposal.matching import Matcher
-from bampipe.proposal.notes import Notes
-from bampipe.proposal.positions import SLIDING, in_counts, position_in_si, scale_to, slides
-from bampipe.proposal.starter import starter_device
-from bampipe.proposal.starter_input import Drive
+from bampipe.setup.hypotheses import MOST_TRAVEL
+from bampipe.setup.proposal.encoders import measured_position
+from bampipe.setup.proposal.gravity import weight_of
+from bampipe.setup.proposal.joints import chain_logged
+from bampipe.setup.proposal.matching import Matcher
+from bampipe.setup.proposal.notes import Notes
+from bampipe.setup.proposal.positions import SLIDING, in_counts, position_in_si, scale_to, slides
+from bampipe.setup.proposal.starter import Drive, starter_device
 
 DEVICE = "device.toml"
 _SCHEMA = "bampipe.device/1"

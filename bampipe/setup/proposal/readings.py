@@ -7,7 +7,7 @@ from dataclasses import replace
 from bampipe.data.guesses import Register, find_register
 from bampipe.data.quality.stamps import find_fresh_rows
 from bampipe.data.survey import DRIVERS, Survey
-from bampipe.proposal.notes import Notes
+from bampipe.setup.proposal.notes import Notes
 
 
 def fresh_readings(found: Survey, notes: Notes) -> Survey:

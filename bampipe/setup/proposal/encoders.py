@@ -9,9 +9,9 @@ from bampipe.data.survey import SurveyedColumn, words
 from bampipe.data.units import spelled, unit
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
-from bampipe.proposal.matching import Matcher
-from bampipe.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
-from bampipe.proposal.positions import in_counts, is_velocity
+from bampipe.setup.proposal.matching import Matcher
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
+from bampipe.setup.proposal.positions import in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
 _MANY = 6

@@ -17,8 +17,9 @@ from bampipe.data.survey import survey
 from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.lists import join_names
-from bampipe.proposal.clock import clock_of
-from bampipe.proposal.device import (
+from bampipe.setup.mounting import Mounting
+from bampipe.setup.proposal.clock import clock_of
+from bampipe.setup.proposal.device import (
     DEVICE,
     ChosenDevice,
     find_device,
@@ -26,14 +27,13 @@ from bampipe.proposal.device import (
     with_gravity,
     with_motors,
 )
-from bampipe.proposal.encoders import encoders_table
-from bampipe.proposal.inputs import input_tables
-from bampipe.proposal.matching import Matcher
-from bampipe.proposal.mounting import Mounting
-from bampipe.proposal.notes import Notes, quoted
-from bampipe.proposal.readings import fresh_readings, signed_readings
-from bampipe.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
-from bampipe.proposal.trials import trials_tables
+from bampipe.setup.proposal.encoders import encoders_table
+from bampipe.setup.proposal.inputs import input_tables
+from bampipe.setup.proposal.matching import Matcher
+from bampipe.setup.proposal.notes import Notes, quoted
+from bampipe.setup.proposal.readings import fresh_readings, signed_readings
+from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
+from bampipe.setup.proposal.trials import trials_tables
 
 SESSION = "session.toml"
 

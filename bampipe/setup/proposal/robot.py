@@ -2,40 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.data.chain import frame_of_tip
+from bampipe.data.robot_file import read_tree
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
-from bampipe.proposal.drawing import (
-    FEW_ROWS,
-    MOST_ROWS,
-    Comparison,
-    Drive,
-    fits,
-    mean_left,
-    motion_along,
-    positions_of,
-    range_of,
-)
-from bampipe.proposal.gears import (
-    BEYOND,
-    DOUBTED,
-    Gears,
-    find_best_mounting,
-    find_gears,
-    known_gears,
-)
-from bampipe.proposal.heavier import describe_heavier_body
-from bampipe.proposal.joints import Group, pair_joints
-from bampipe.proposal.mounting import Mounting
-from bampipe.proposal.notes import Notes
-from bampipe.proposal.positions import scale_to
+from bampipe.setup.drawn_bodies import Drive, fits, mean_left
+from bampipe.setup.heavier import describe_heavy, find_heavy
+from bampipe.setup.mounting import Mounting
+from bampipe.setup.proposal.gears import BEYOND, DOUBTED, MOST_ROWS, Gears, Logged
+from bampipe.setup.proposal.joints import Group, pair_joints
+from bampipe.setup.proposal.notes import Notes
+from bampipe.setup.proposal.positions import scale_to
 
 Array = NDArray[np.float64]
 
@@ -92,56 +77,50 @@ def find_robot_columns(
         if chosen is not None and others:
             listed = "; ".join(str(other) for other in others)
             notes.check.append(f"of several {what}, {chosen} are taken, not {listed}")
-    turns = _turns(device, robot)
-
-    def explain(positions: Group, drives: Group) -> Gears | None:
-        """How the drawing explains the drives, best mounted; None where they are not comparable."""
-        few, many = (
-            motion_along(positions_of(device, positions, t), t, rows)
-            for rows in (FEW_ROWS, MOST_ROWS)
-        )
-        if few is None or many is None or turns is None:
-            return None
-        compared = [Comparison(device, robot, drives, turns, motion) for motion in (few, many)]
-        return Gears(turns, *find_best_mounting(*compared))
-
-    found_some: Gears | None = None
-    if positions is not None and drives is not None:
-        found_some = explain(positions, drives)
-        other_unit = _in_unit_of_range(device, positions)
-        other = explain(other_unit, drives) if other_unit is not None else None
-        if other_unit is not None and other is not None and mean_left(other.drives) < _BETTER:
-            positions, found_some = other_unit, other
+    turns, logged = _turns(device, robot), Logged(device, robot, t)
     columns: dict[str, SurveyedColumn] = {}
     if positions is not None:
         columns |= dict(zip(_joints(device), positions.columns, strict=True))
-    if drives is not None:
-        columns |= dict(zip(device.forces, drives.columns, strict=True))
-    else:
-        columns |= pairing.some_drives
-    if positions is None or drives is None:
+    if drives is None:
+        return RobotColumns({**columns, **pairing.some_drives}, {})
+    columns |= dict(zip(device.forces, drives.columns, strict=True))
+    if positions is None:
         return RobotColumns(columns, {})
-    left = mean_left(found_some.drives) if found_some is not None else np.inf
-    sound = found_some is not None and fits(found_some.drives)
-    beyond = _beyond_range(device, positions, of_joint=sound)
-    guessed = positions is not pairing.positions[0] and DOUBTED < left < np.inf
-    groups = (positions, _in_si(device, pairing.positions[0]))
+
+    def explain(positions: Group, drives: Group) -> Gears | None:
+        """How the drawing explains the drives; None where they cannot be compared."""
+        if turns is None:
+            return None
+        return logged.explain(logged.positions(positions), drives, turns)
+
+    stated = positions
+    best = explain(positions, drives)
+    other_unit = _in_unit_of_range(logged, positions)
+    other = explain(other_unit, drives) if other_unit is not None else None
+    if other_unit is not None and other is not None and mean_left(other.drives) < _BETTER:
+        positions, best = other_unit, other
+        columns |= dict(zip(_joints(device), positions.columns, strict=True))
+    left = mean_left(best.drives) if best is not None else np.inf
+    sound = best is not None and fits(best.drives)
+    beyond = _beyond_range(logged, positions, of_joint=sound)
+    guessed = positions is not stated and DOUBTED < left < np.inf
     known = turns is not None and (turns != 1.0).any()
     geared: list[tuple[Group, Gears]] = []
-    if turns is not None and known and (beyond or not sound):
-        each = [(g, known_gears(device, robot, g, drives, t, turns)) for g in groups]
-        geared = [(g, gears) for g, gears in each if gears is not None]
-    elif found_some is not None and not robot.motors and (guessed or not sound):
-        # Hundreds without a unit are degrees, or radians of a motor.
-        each = [(g, find_gears(device, robot, g, drives, t)) for g in groups]
-        geared = [(g, gears) for g, gears in each if gears is not None]
+    # Hundreds without a unit are degrees, or radians of a motor.
+    for group in (positions, _in_si(device, stated)):
+        gears = None
+        if turns is not None and known and (beyond or not sound):
+            gears = logged.explain_geared(logged.positions(group), drives, turns)
+        elif best is not None and not robot.motors and (guessed or not sound):
+            gears = logged.find_gears(logged.positions(group), drives)
+        geared += [(group, gears)] if gears is not None else []
     if geared:
         group, gears = min(geared, key=lambda item: mean_left(item[1].drives))
         better = mean_left(gears.drives) < left * (1.0 if known else _BETTER)
         if better or (bool(beyond) if known else not sound):
             return _geared(device, columns, group, gears, notes, given=known)
     notes.check += beyond
-    if found_some is None or (beyond and not sound):
+    if best is None or (beyond and not sound):
         return RobotColumns(columns, {})
     if not (positions.named or drives.named or sound):
         ordered = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
@@ -152,17 +131,27 @@ def find_robot_columns(
                 f" inertia as drawn explain {1.0 - mean_left(other.drives):.1%} of the drives that"
                 f" way, {max(1.0 - left, 0.0):.1%} in the order of the chain"
             )
-            found_some, (positions, drives) = other, ordered
+            best, (positions, drives) = other, ordered
             columns |= dict(zip(_joints(device), positions.columns, strict=True))
             columns |= dict(zip(device.forces, drives.columns, strict=True))
-    motion = motion_along(positions_of(device, positions, t), t, MOST_ROWS)
-    if motion is not None:
-        compared = Comparison(device, robot, drives, found_some.ratio, motion)
-        heavier = describe_heavier_body(compared, found_some.mounting, folder)
-        notes.check += [heavier] if heavier else []
-    by_input = dict(zip(device.forces, found_some.drives, strict=True))
+    compared = logged.compare(logged.positions(positions), drives, best.ratio, MOST_ROWS)
+    heavy = None
+    if compared is not None and device.force_unit != "A":
+        heavy = find_heavy(compared, best.mounting)
+    if compared is not None and heavy is not None:
+        in_tip = _placed_in_tip(folder, robot)
+        notes.check.append(describe_heavy(compared, best.mounting, heavy, in_tip))
+    by_input = dict(zip(device.forces, best.drives, strict=True))
     notes.check += _sentences(device, columns, by_input)
-    return RobotColumns(columns, by_input, mounting=found_some.mounting)
+    return RobotColumns(columns, by_input, mounting=best.mounting)
+
+
+def _placed_in_tip(folder: Path, robot: Robot) -> Callable[[Array], Array]:
+    """What makes of a place in the frame of the last joint one in that of the tip, (3,)."""
+    if robot.urdf is None:
+        return lambda center: center
+    turn, offset = frame_of_tip(read_tree(folder / robot.urdf), robot.base, robot.tip)
+    return lambda center: np.asarray(turn.T @ (center - offset))
 
 
 def _geared(
@@ -211,12 +200,12 @@ def _in_alphabetical_order(device: Device, group: Group) -> Group:
     return replace(group, columns=tuple(group.columns[k] for k in order))
 
 
-def _in_unit_of_range(device: Device, group: Group) -> Group | None:
+def _in_unit_of_range(logged: Logged, group: Group) -> Group | None:
     """The positions in degrees or millimetres where they state no unit and only these fit."""
-    found = []
-    for c, column in zip(device.coordinates, group.columns, strict=True):
+    device, found = logged.device, []
+    for c, column, width in zip(device.coordinates, group.columns, logged.ranges, strict=True):
         name, scale = _OTHER_UNITS[c.unit]
-        most = BEYOND * range_of(device, c.name)
+        most = BEYOND * width
         span = float(np.ptp(np.nan_to_num(column.values)))
         if column.unit or span <= most or span * scale > most:
             found.append(column)
@@ -234,11 +223,11 @@ def _in_unit_of_range(device: Device, group: Group) -> Group | None:
     return replace(group, columns=tuple(found)) if changed else None
 
 
-def _beyond_range(device: Device, positions: Group, of_joint: bool) -> list[str]:
+def _beyond_range(logged: Logged, positions: Group, of_joint: bool) -> list[str]:
     found = []
-    for c, column in zip(device.coordinates, positions.columns, strict=True):
+    joints = zip(logged.device.coordinates, positions.columns, logged.ranges, strict=True)
+    for c, column, width in joints:
         span = float(np.ptp(np.nan_to_num(column.values))) * scale_to(c.unit, column)
-        width = range_of(device, c.name)
         if span > BEYOND * width:
             why = "weight and inertia as drawn agree with that: is the range of the drawing right?"
             if not of_joint:
@@ -269,17 +258,25 @@ def _sentences(
 ) -> list[str]:
     """What weight and inertia of the drawn bodies say of the drives, a sentence each."""
     lines, agreed = [], []
+    together = len(drives) > 1 and all(drive.is_turned for drive in drives.values())
+    if together:
+        lines.append(
+            "all drives have the other sign, as torques on a drive rather than by it have: weight"
+            " and inertia as drawn, and friction, say so of each; `scale = -1.0` of each"
+            " channel sets that right"
+        )
     for c, (name, drive) in zip(device.coordinates, drives.items(), strict=True):
         column = columns[name].name
         if not drive.is_sure:
-            lines.append(
-                f"{column}: too little weight and inertia act on {c.name} to tell its sign"
-                + _by_friction(drive, c.name)
-            )
+            if not together:
+                lines.append(
+                    f"{column}: too little weight and inertia act on {c.name} to tell its sign"
+                    + _by_friction(drive, c.name)
+                )
             continue
-        size = abs(drive.share)
+        size, share = abs(drive.share), -drive.share if together else drive.share
         said = []
-        if drive.share < 0.0:
+        if share < 0.0:
             said.append(f"its sign is turned; or that of {c.name} is the wrong one")
         if device.force_unit == "A":
             agreed.append(f"{c.name} {1.0 / size:.3g} N.m/A")
@@ -293,7 +290,7 @@ def _sentences(
             agreed.append(f"{c.name} {size:.2f}")
         if said:
             lines.append(
-                f"{column} is {drive.share:.2g} ± {drive.error:.1g} times what the drawing"
+                f"{column} is {share:.2g} ± {drive.error:.1g} times what the drawing"
                 f" requires: {'; and '.join(said)}"
             )
     if agreed and device.force_unit == "A":
