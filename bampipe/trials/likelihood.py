@@ -277,10 +277,10 @@ class Problem:
         precision, moment: of what is known of these beforehand, (P, P) and (P,).
         to_parameters: (n_all, P) from these to the free parameters, nuisance parameters last.
         lower, upper: bounds of the change of those, (n_all,).
-        absence: of each effect of the model, by the place of each of its strengths among the free
-            parameters, the change that takes it away.
-        spread: of each, the standard deviations of these strengths before any data; shapes: how
-            many parameters it has beside them.
+        absence: of each effect of the model, by the place of each of its parameters among the free
+            ones, the change that takes it away.
+        spread: of each, the standard deviations of these strengths before any data; shapes: the
+            places of the parameters that it has beside them.
     """
 
     likelihood: Likelihood
@@ -293,7 +293,7 @@ class Problem:
     upper: Array
     absence: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     spread: Mapping[str, Array] = field(default_factory=dict)
-    shapes: Mapping[str, int] = field(default_factory=dict)
+    shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     @property
     def independent(self) -> Array:
@@ -405,7 +405,7 @@ def _pose(
         to.T @ (precision[:, None] * to), to.T @ (precision * known), to, lower, upper,
         {item.name: _absence(evidence, item) for item in effects},
         {item.name: _spread(item) for item in effects},
-        {i.name: sum(q.shape for q in i.parameters) for i in effects},
+        {item.name: _shapes(evidence, item) for item in effects},
     )  # fmt: skip
 
 
@@ -413,13 +413,21 @@ def _spread(item: BoundEffect) -> Array:
     return np.array([q.sd for q in item.parameters if q.strength and not q.fixed])
 
 
+def _shapes(evidence: Evidence, item: BoundEffect) -> tuple[int, ...]:
+    names = {q.name for q in item.parameters if q.shape}
+    parameters = evidence.system.parameters
+    return tuple(k for k, number in enumerate(evidence.free) if parameters[number].name in names)
+
+
 def _absence(evidence: Evidence, item: BoundEffect) -> dict[int, float]:
     strengths = {q.name for q in item.parameters if q.strength}
-    return {
+    away = {
         place: -float(evidence.p[number])
         for place, number in enumerate(evidence.free)
         if evidence.system.parameters[number].name in strengths
     }
+    # Without its strength a shape says nothing: it does not move to where it was expected.
+    return away | dict.fromkeys(_shapes(evidence, item), 0.0)
 
 
 @dataclass(frozen=True)
