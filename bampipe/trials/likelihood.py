@@ -234,18 +234,25 @@ class Likelihood:
     def count_independent(self, problem: Problem, lags: int) -> tuple[Samples, ...]:
         """Count the samples of each axis that are independent in what a fit of the model leaves.
 
-        What a model lacks comes back with the motion, sample after sample; noise does not. There
-        are fewer independent samples by the sum of squared autocorrelations (Bartlett 1946, Journal
-        of the Royal Statistical Society, Supplement 8, 27), over that of replays.
+        What a model lacks comes back with the motion, sample after sample; noise does not, coloured
+        or white. For what goes with the motion, as the applied force does, there are fewer samples
+        by the sum of the products of both autocorrelations (Bartlett 1935, Journal of the Royal
+        Statistical Society 98, 536), over the largest that a replay has.
 
         Args:
             problem: the fit, its solution at zero; lags: the most that are summed.
         """
         solved, counted = problem.solve(), []
         for axis, here in enumerate(self.samples):
-            noise = (self.noise.residuals[axis] - self.noise.bias[axis]) * self.root[axis]
-            ours = _correlation(problem.y[axis] + problem.base[axis] @ solved.base, here, lags)
-            replays = float(np.median([_correlation(r, here, lags) for r in noise]))
+            root = self.root[axis]
+            force = _correlate(self.applied[axis] * root, here, lags)
+
+            def inflation(values: Array, at: Samples = here, force: Array = force) -> float:
+                return max(2.0 * float(_correlate(values, at, lags) @ force) - 1.0, 1e-3)
+
+            ours = inflation(problem.y[axis] + problem.base[axis] @ solved.base)
+            noise = (self.noise.residuals[axis] - self.noise.bias[axis]) * root
+            replays = max((inflation(values) for values in noise), default=1.0)
             counted.append(replace(here, independent=here.independent * min(replays / ours, 1.0)))
         return tuple(counted)
 
@@ -318,8 +325,8 @@ class Problem:
         return solve_bounded(self, *self.sums())
 
 
-def _correlation(values: Array, samples: Samples, lags: int) -> float:
-    """Sum of the squared autocorrelation of values (n,) up to a lag, both ways, within trials."""
+def _correlate(values: Array, samples: Samples, lags: int) -> Array:
+    """Autocorrelation of values (n,) within trials, (lags + 1,); one and zeros of nothing."""
     total = np.zeros(lags + 1)
     for trial in np.unique(samples.trial):
         here = samples.trial == trial
@@ -327,13 +334,10 @@ def _correlation(values: Array, samples: Samples, lags: int) -> float:
         series = np.zeros(int(np.ptp(rows)) + 1)
         series[rows - rows[0]] = values[here]
         size = 2 * len(series)
-        found = np.fft.irfft(np.abs(np.fft.rfft(series, size)) ** 2, size)[: len(series)][
-            : lags + 1
-        ]
+        found = np.fft.irfft(np.abs(np.fft.rfft(series, size)) ** 2, size)
+        found = found[: min(len(series), lags + 1)]
         total[: len(found)] += found
-    if not total[0] > 0.0:
-        return 1.0
-    return float(2.0 * np.sum((total / total[0]) ** 2) - 1.0)
+    return np.asarray(total / total[0]) if total[0] > 0.0 else np.eye(1, lags + 1)[0]
 
 
 def _error_of_turning(evidence: Evidence) -> list[Array]:
