@@ -6,6 +6,7 @@ import ast
 import resource
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -150,6 +151,28 @@ def test_a_layer_imports_only_what_the_law_allows(layer: str) -> None:
     ]
     assert sources(layer)
     assert broken == []
+
+
+@pytest.mark.parametrize("layer", LAWS)
+def test_no_modules_of_a_layer_import_each_other_in_a_circle(layer: str) -> None:
+    """Not lazily either, nor for types alone."""
+    modules = {}
+    for path in sources(layer):
+        parts = ["bampipe", *path.relative_to(PACKAGE).with_suffix("").parts]
+        modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+
+    def module_of(name: str) -> str:
+        return name if name in modules else name.rpartition(".")[0]
+
+    graph = {
+        module: {module_of(name) for name in imported(path)} & modules.keys()
+        for module, path in modules.items()
+    }
+    assert any(graph.values()) or layer == "stages"  # no stage imports another
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"a circle of imports: {' <- '.join(error.args[1])}")
 
 
 def test_every_layer_is_under_the_law() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,7 +9,7 @@ from bampipe import generated_code
 from bampipe.errors import InputError
 from bampipe.physics import expression
 from bampipe.physics.device import Device
-from bampipe.physics.model import code_version
+from bampipe.physics.model import hash_content
 
 
 @dataclass(frozen=True)
@@ -47,16 +45,15 @@ def compile_law(device: Device) -> ControlLaw | None:
     if controller is None:
         return None
     inputs = (*controller.channels, *device.channels, "t")
-    content = json.dumps(["law", code_version(), device.declaration], sort_keys=True, default=str)
-    key = hashlib.sha256(content.encode()).hexdigest()[:24]
-    code = generated_code.load(key, lambda: ({}, {"law": _source(device, inputs)}))
+    key = hash_content(["law", device.declaration])
+    code = generated_code.load(key, lambda: ({}, {"law": _print_law(device, inputs)}))
     command = code.module("law").command
     states = controller.states
     limits = tuple((state.lower, state.upper) for state in states.values())
     return ControlLaw(inputs, device.forces, controller.rate_hz, tuple(states), limits, command)
 
 
-def _source(device: Device, inputs: tuple[str, ...]) -> str:
+def _print_law(device: Device, inputs: tuple[str, ...]) -> str:
     """Source of the law, printed from its expressions."""
     import sympy as sp
 

@@ -7,9 +7,11 @@ The bodies of a robot enter by Newton and Euler's equations instead: `newton_eul
 
 from __future__ import annotations
 
+import ast
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import sympy as sp
 
@@ -29,7 +31,7 @@ from bampipe.physics.newton_euler import (
     potential_energy,
 )
 from bampipe.physics.robot import gravity_vector
-from bampipe.physics.roles import compensation, delays
+from bampipe.physics.roles import find_compensation, find_delays
 from bampipe.physics.signals import ActingInputs, order_of_action
 from bampipe.physics.time_limit import OutOfTime, time_limit
 from bampipe.physics.vocabulary import Vocabulary, constant_symbol
@@ -52,7 +54,7 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
     """
     try:
         with time_limit(LONGEST_S):
-            return _derive(model, named_constants)
+            return _assemble_equations(Vocabulary(model, named_constants))
     except OutOfTime:
         raise InputError(
             f"deriving the equations of motion takes more than {LONGEST_S:g} s",
@@ -61,243 +63,171 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
         ) from None
 
 
-def _derive(model: Model, named_constants: bool) -> Equations:
-    d = Vocabulary(model, named_constants)
-    constants = [constant_symbol(c) for c in model.device.constants if named_constants]
-    device, axes = model.device, d.axes
-    n = len(axes)
-    raw_applied = d.table(device.applied, "applied")
-    side = d.table(device.side_load, "side_load")
-    forces = [d.channel[f] for f in device.forces]
-    input_map = [
-        [sp.diff(e, f) if f in e.free_symbols else sp.S.Zero for f in forces] for e in raw_applied
+def _assemble_equations(d: Vocabulary) -> Equations:
+    forces = _map_inputs(d)
+    terms = _collect_terms(d, forces)
+    _check_dependence(d, forces, terms)
+    motion = _combine_motion(d, terms.energies)
+    offset_rate = [d.ddt(e) if e != 0 else e for e in terms.offset]
+    rates, initial = ([entry[k] for entry in terms.states.values()] for k in (0, 1))
+    parts = [*forces.noisy, *terms.other, *rates, *initial, *terms.offset, *offset_rate]
+    used_symbols = _collect_symbols([*parts, *forces.logged])
+    inputs = [c for c in d.channels if d.channel[c] in used_symbols or c in d.model.device.forces]
+    residual = [
+        a + o - f for a, o, f in zip(forces.applied, terms.other, motion.dynamics, strict=True)
     ]
-
-    signals = ActingInputs(d, model.effects, raw_applied, side)
-    applied = [signals.put_in(e) for e in raw_applied]
-
-    noise = [*device.forces, *device.process_noise]
-    w = [sp.Symbol(f"w{i}", real=True) for i in range(len(noise))]
-    noisy = signals.acting | {f: signals.acting.get(f, f) + w[i] for i, f in enumerate(forces)}
-    applied_noise = [e.subs(noisy, simultaneous=True) for e in raw_applied]
-
-    kinetic = d.build(device.kinetic, d.base, "energy.kinetic")
-    potential = d.build(device.potential, d.base, "energy.potential")
-    other = _device_torque(d, w)
-
-    label = f"device {device.name!r}: energy.kinetic"
-    energies = [(label, device.kinetic, kinetic, potential)] if device.energy else []
-    offset = [sp.S.Zero] * n
-    # An offset is differentiated. It cannot follow the rates, so what a motor's back EMF takes off
-    # is left out of its load; nor states, so a lagging force counts as logged; and a delayed force
-    # is delayed to one order less in it.
-    prompt = ActingInputs(d, [e for e in model.effects if not e.effect.states], raw_applied, side)
-    lost = [d.channel[derivative(f, LAST_ORDER)] for f in device.forces]
-    none = dict.fromkeys([*d.qd, *lost], 0)
-    still = [prompt.put_in(e).subs(none) for e in raw_applied]
-    # Up to where the logged inputs are replaced by what acts of them, all is in terms of these.
-    delivered = list(raw_applied)
-    pulling = [sp.S.Zero] * n
-    of_states: dict[Any, tuple[Any, Any]] = {
-        z: (r, signals.initial[z]) for z, r in signals.rates.items()
-    }
-    for item in order_of_action(model.effects):
-        if "dry" in item.effect.names:
-            d.dry = _dry_friction(d, other)
-        if item.effect.uses_weight:
-            d.weight = [sp.diff(sum(v for *_, v in energies), q) for q in d.q]
-            d.pull = [w - t for w, t in zip(d.weight, pulling, strict=True)]
-        measures = item.effect.kind == "measurement"
-        symbols = d.effect_symbols(item, still if measures else delivered, side)
-        for key, tree in item.effect.expressions.items():
-            place = item.target_of(key)
-            if item.effect.kind == "input":
-                continue
-            value = d.rebuild_for(item, tree, symbols, key)
-            label = f"effect {item.name!r}: {key}"
-            if key == "kinetic":
-                energies.append((label, tree, value, sp.S.Zero))
-            elif key == "potential":
-                energies.append((label, tree, sp.S.Zero, value))
-            elif place not in axes:
-                raise InputError(f"effect {item.name!r}: {key}: device has no axis {place!r}")
-            elif measures:
-                behind = {q: q + o for q, o in zip(d.q, offset, strict=True) if o != 0}
-                offset[axes.index(place)] += value.subs(behind, simultaneous=True)
-            else:
-                other[axes.index(place)] += value
-                if item.effect.pulls:
-                    pulling[axes.index(place)] += value
-                if item.effect.acting_link:
-                    delivered[axes.index(place)] += value
-        for state in item.effect.states if item.effect.kind != "input" else ():
-            rate = d.rebuild_for(item, state.rate, symbols, f"states.{state.name}.rate")
-            first = d.rebuild_for(item, state.initial, symbols, f"states.{state.name}.initial")
-            z = d.z[item.prefix, state.name]
-            of_states[z] = signals.put_in(rate), signals.put_in_initial(first)
-    other = [signals.put_in(e) for e in other]
-    z_names = [".".join(key) for key in d.z]
-    rates, initial = ([of_states[z][k] for z in d.z.values()] for k in (0, 1))
-    others = [d.channel[c] for c in device.channels]
-    free, u = [*d.p.values(), *constants], [*d.channel.values()]
-    force0 = [d.channel[derivative(f, k)] for f in device.forces for k in range(LAST_ORDER)]
-    force0 += [*others, d.channel["t"]]
-    motion, memory = [*d.q, *d.qd], [*d.z.values()]
-    gains = [entry for row in input_map for entry in row]
-    words = "motion, inputs, parameters and internal states"
-    kinetics, potentials = [e[2] for e in energies], [e[3] for e in energies]
-    allow("the kinetic energy", [*kinetics], [*motion, *free], "positions, rates and parameters")
-    allow("the potential energy", [*potentials], [*d.q, *free], "positions and parameters")
-    allow(
-        "the effect of a force on the axes",
-        gains,
-        [*d.q, *others, *free],
-        "positions, parameters and channels that are no forces",
-    )
-    allow("a torque", other, [*motion, *u, *free, *memory, *w], words)
-    allow("the applied force", applied, [*motion, *u, *free, *memory], words)
-    allow("the rate of an internal state", rates, [*motion, *u, *free, *memory], words)
-    allow("an initial value", initial, [*d.q, *u, *free], "positions, inputs and parameters")
-    allow("an offset", offset, [*d.q, *force0, *free], "positions, forces and parameters")
-
-    terms = []
-    for label, tree, a, b in energies:
-        try:
-            terms.append(lagrange(a, b, tuple(d.q), tuple(d.qd)))
-        except OutOfTime:
-            raise d.too_long(tree, label) from None
-    mass = [[sum((t[0][i][j] for t in terms), sp.S.Zero) for j in range(n)] for i in range(n)]
-    bias = [sum((t[1][i] for t in terms), sp.S.Zero) for i in range(n)]
-    for row, term in zip(mass, bias, strict=True):
-        allow("the equation of motion", [*row, term], [*motion, *free], "motion and parameters")
-    kinetic, potential = sum(kinetics, sp.S.Zero), sum(potentials, sp.S.Zero)
-    dynamics = [
-        h + sum(m * x for m, x in zip(row, d.qdd, strict=True))
-        for h, row in zip(bias, mass, strict=True)
-    ]
-    bodies = _bodies(d)
-    if bodies is None:
-        check_inertia(model, mass, [*d.q, *constants])
-    else:
-        mass = [
-            [m + b for m, b in zip(*rows, strict=True)]
-            for rows in zip(mass, bodies.mass, strict=True)
-        ]
-        bias = [h + b for h, b in zip(bias, bodies.bias, strict=True)]
-        dynamics = [h + b for h, b in zip(dynamics, bodies.dynamics, strict=True)]
-        kinetic, potential = kinetic + bodies.kinetic, potential + bodies.potential
-
-    offset_rate = [d.ddt(e) for e in offset]
-    parts = [
-        *applied_noise,
-        *other,
-        *rates,
-        *initial,
-        *offset,
-        *offset_rate,
-    ]
-    used = set().union(*(e.free_symbols for e in [*parts, *raw_applied]))
-    inputs = [c for c in d.channels if d.channel[c] in used or c in device.forces]
-    residual = [a + o - f for a, o, f in zip(applied, other, dynamics, strict=True)]
-    linear: list[bool] = []
-    products: list[tuple[int, int]] = []
-    constant: list[bool] = []
-    unforced: list[bool] = []
-    lasting: list[dict[int, Any] | None] = []
-    varying = {*d.p.values(), *d.z.values()}
-    # An expression has few of a robot's hundred parameters, and sympy is slow to find a slope zero.
-    present = [(i, e, e.free_symbols) for i, e in enumerate(residual)]
-    elsewhere: set[Any] = set().union(*(e.free_symbols for e in [*rates, *offset]))
-    steps = bodies.steps if bodies else []
-    bodily: set[Any] = set().union(*(value.free_symbols for _, value in steps))
-    of_bodies: list[int] = []
-    named, quiet = {name for name, _ in steps}, dict.fromkeys(w, 0)
-    for i, symbol in enumerate(d.p.values()):
-        by_axis = {k: sp.diff(e, symbol) for k, e, symbols in present if symbol in symbols}
-        slopes = list(by_axis.values())
-        left: set[Any] = set().union(*(s.free_symbols for s in slopes))
-        curved = symbol in left and any(sp.diff(slope, symbol) != 0 for slope in slopes)
-        linear.append(not curved and symbol not in elsewhere)
-        constant.append(linear[i] and not left & varying)
-        unforced.append(constant[i] and left.isdisjoint(d.channel.values()))
-        if symbol in bodily and not by_axis:
-            of_bodies.append(i)
-        lasting.append(
-            {k: s.subs(quiet) for k, s in by_axis.items()}
-            if constant[i] and symbol not in bodily and left.isdisjoint(named)
-            else None
-        )
-        for j, earlier in enumerate([*d.p.values()][:i]):
-            if earlier in left and any(sp.diff(slope, earlier) != 0 for slope in slopes):
-                products.append((j, i))
     return Equations(
-        q=d.q, qd=d.qd, qdd=d.qdd, z=[*d.z.values()], z_names=z_names,
+        q=d.q, qd=d.qd, qdd=d.qdd, z=[*d.z.values()], z_names=[".".join(key) for key in d.z],
         u=[d.channel[c] for c in inputs], inputs=inputs,
-        p=list(d.p.values()), w=w, noise=noise,
-        steps=steps,
-        mass=mass, bias=bias, dynamics=dynamics, other=other,
-        applied=applied, applied_noise=applied_noise,
-        input_map=input_map, rates=rates, initial=initial,
-        offset=offset, offset_rate=offset_rate,
-        kinetic=kinetic, potential=potential, linear=linear, products=products, constant=constant,
-        unforced=unforced, lasting=lasting, of_bodies=of_bodies,
-        compensation=compensation(d, potential), delays=delays(d, applied),
+        p=list(d.p.values()), w=forces.w, noise=forces.noise,
+        steps=motion.steps, mass=motion.mass, bias=motion.bias, dynamics=motion.dynamics,
+        other=terms.other, applied=forces.applied, applied_noise=forces.noisy,
+        input_map=forces.input_map, rates=rates, initial=initial,
+        offset=terms.offset, offset_rate=offset_rate,
+        kinetic=motion.kinetic, potential=motion.potential,
+        **vars(_classify_parameters(d, residual, [*rates, *terms.offset], motion, forces.w)),
+        compensation=find_compensation(d, motion.potential, forces.logged, forces.side),
+        delays=find_delays(d, forces.applied),
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Bodies:
-    """What the bodies of a robot put into the equations, by names in ``steps``."""
+def _collect_symbols(expressions: Iterable[Any]) -> set[Any]:
+    return set().union(*(e.free_symbols for e in expressions))
 
-    steps: list[tuple[Any, Any]]
-    mass: list[list[Any]]
-    bias: list[Any]
-    dynamics: list[Any]
+
+@dataclass(frozen=True)
+class _Forces:
+    """Generalised forces of the inputs, one expression an axis.
+
+    Attributes:
+        logged: of the inputs as they are logged; side: their load across the motion.
+        signals: what acts of each logged input.
+        applied: of what acts; noisy: the same with the noise ``w`` on each measured force.
+        input_map: d logged / d force.
+        noise, w: names and symbols of the process noise, that of the forces first.
+    """
+
+    logged: list[Any]
+    side: list[Any]
+    signals: ActingInputs
+    applied: list[Any]
+    noisy: list[Any]
+    input_map: list[list[Any]]
+    noise: list[str]
+    w: list[Any]
+
+
+def _map_inputs(d: Vocabulary) -> _Forces:
+    """Map the measured inputs to the axes."""
+    device = d.model.device
+    logged, side = d.table(device.applied, "applied"), d.table(device.side_load, "side_load")
+    signals = ActingInputs(d, d.model.effects, logged, side)
+    measured = [d.channel[f] for f in device.forces]
+    noise = [*device.forces, *device.process_noise]
+    w = [sp.Symbol(f"w{i}", real=True) for i in range(len(noise))]
+    acting = signals.acting | {
+        f: signals.acting.get(f, f) + symbol for f, symbol in zip(measured, w, strict=False)
+    }
+    noisy, input_map = [], []
+    for expr in logged:
+        symbols = expr.free_symbols
+        values = {symbol: value for symbol, value in acting.items() if symbol in symbols}
+        noisy.append(expr.subs(values, simultaneous=True))
+        input_map.append([sp.diff(expr, f) if f in symbols else sp.S.Zero for f in measured])
+    applied = [signals.put_in(e) for e in logged]
+    return _Forces(logged, side, signals, applied, noisy, input_map, noise, w)
+
+
+class _Energy(NamedTuple):
+    """One contribution to the energies, and the expression that declares it, for messages."""
+
+    label: str
+    tree: ast.expr
     kinetic: Any
     potential: Any
 
 
-def _bodies(d: Vocabulary) -> _Bodies | None:
-    """Newton and Euler's equations of the bodies; None where the device is no robot."""
-    robot = d.model.device.robot
-    if robot is None:
-        return None
-    numbers = tuple(d.p[p.name] for p in robot.parameters)
-    motion = tuple(d.q), tuple(d.qd), tuple(d.qdd)
-    return _newton_euler(robot.links, gravity_vector(robot), numbers, motion)
+@dataclass(frozen=True)
+class _Terms:
+    """What device and effects put into the equations beside the applied force and bodies.
+
+    Attributes:
+        energies: contributions to the energies.
+        other: Q_other, an expression an axis; offset: true position minus measured.
+        states: by symbol of an internal state, its rate and its initial value.
+    """
+
+    energies: list[_Energy]
+    other: list[Any]
+    offset: list[Any]
+    states: dict[Any, tuple[Any, Any]]
 
 
-@cache
-def _newton_euler(
-    links: tuple[Link, ...],
-    gravity: Vector,
-    numbers: tuple[Any, ...],
-    motion: tuple[tuple[Any, ...], ...],
-) -> _Bodies:
-    """Every candidate effect of a robot has the same bodies: written once a process."""
-    q, qd, qdd = motion
-    text = Text()
-    algebra = Algebra.symbols(text)
-    inertial = [numbers[k : k + INERTIAL] for k in range(0, len(numbers), INERTIAL)]
-    still = [0] * len(q)
-    # Names for all of it: one compiled function gives them to every model of this robot.
-    mass = [[text.name(m) for m in row] for row in mass_matrix(algebra, links, inertial, q)]
-    bias, dynamics = (
-        [text.name(f) for f in joint_forces(algebra, links, inertial, q, qd, a, gravity)]
-        for a in (still, qdd)
-    )
-    momentum = [sum(m * v for m, v in zip(row, qd, strict=True)) for row in mass]
-    return _Bodies(
-        text.steps,
-        mass,
-        bias,
-        dynamics,
-        sum(p * v for p, v in zip(momentum, qd, strict=True)) / 2,
-        potential_energy(algebra, links, inertial, q, gravity),
-    )
+def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
+    """Build the expressions of the device and of each effect, in the order in which they act."""
+    device, signals = d.model.device, forces.signals
+    acting = [e for e in order_of_action(d.model.effects) if e.effect.kind != "input"]
+    kinetic = d.build(device.kinetic, d.base, "energy.kinetic")
+    potential = d.build(device.potential, d.base, "energy.potential")
+    label = f"device {device.name!r}: energy.kinetic"
+    energies = [_Energy(label, device.kinetic, kinetic, potential)] if device.energy else []
+    other, offset = _build_device_torque(d, forces.w), [sp.S.Zero for _ in d.axes]
+    measures = any(e.effect.kind == "measurement" for e in acting)
+    prompt_force = _find_prompt_forces(d, forces) if measures else []
+    # Up to where the logged inputs are replaced by what acts of them, all is in terms of these.
+    delivered_force, pull = list(forces.logged), [sp.S.Zero for _ in d.axes]
+    states = {z: (rate, signals.initial[z]) for z, rate in signals.rates.items()}
+    for item in acting:
+        effect, by_axis = item.effect, offset if item.effect.kind == "measurement" else other
+        if "dry" in effect.names:
+            d.dry = _find_dry_friction(d, other)
+        if effect.uses_weight:
+            d.weight = [sp.diff(sum(e.potential for e in energies), q) for q in d.q]
+            d.pull = [w - t for w, t in zip(d.weight, pull, strict=True)]
+        symbols = d.effect_symbols(
+            item, prompt_force if by_axis is offset else delivered_force, forces.side
+        )
+        for key, tree in effect.expressions.items():
+            value, place = d.rebuild_for(item, tree, symbols, key), item.target_of(key)
+            label = f"effect {item.name!r}: {key}"
+            if effect.kind == "energy":
+                pair = (value, sp.S.Zero) if key == "kinetic" else (sp.S.Zero, value)
+                energies.append(_Energy(label, tree, *pair))
+                continue
+            if place not in d.axes:
+                raise InputError(f"{label}: device has no axis {place!r}")
+            axis = d.axes.index(place)
+            if by_axis is offset:
+                behind = {q: q + o for q, o in zip(d.q, offset, strict=True) if o != 0}
+                value = value.subs(behind, simultaneous=True)
+            by_axis[axis] += value
+            if effect.pulls:
+                pull[axis] += value
+            if by_axis is other and effect.acting_link:
+                delivered_force[axis] += value
+        for state in effect.states:
+            rate, initial = d.rebuild_state(item, state, symbols)
+            z = d.z[item.prefix, state.name]
+            states[z] = signals.put_in(rate), signals.put_in_initial(initial)
+    other = [signals.put_in(e) for e in other]
+    return _Terms(energies, other, offset, {z: states[z] for z in d.z.values()})
 
 
-def _device_torque(d: Vocabulary, w: list[Any]) -> list[Any]:
+def _find_prompt_forces(d: Vocabulary, forces: _Forces) -> list[Any]:
+    """Generalised forces that an offset may follow, by axis.
+
+    An offset is differentiated. It cannot follow the rates, so what a motor's back EMF takes off
+    is left out of its load; nor states, so a lagging force counts as logged; and a delayed force
+    is delayed to one order less in it.
+    """
+    memoryless = [e for e in d.model.effects if not e.effect.states]
+    signals = ActingInputs(d, memoryless, forces.logged, forces.side)
+    lost = [d.channel[derivative(f, LAST_ORDER)] for f in d.model.device.forces]
+    zeros = dict.fromkeys([*d.qd, *lost], 0)
+    return [signals.put_in(e).subs(zeros) for e in forces.logged]
+
+
+def _build_device_torque(d: Vocabulary, w: Sequence[Any]) -> list[Any]:
     """Q_other of the device without effects: its own torques, friction, brakes, process noise."""
     device = d.model.device
     other = d.table(device.torque, "torque")
@@ -313,8 +243,180 @@ def _device_torque(d: Vocabulary, w: list[Any]) -> list[Any]:
     return other
 
 
-def _dry_friction(d: Vocabulary, other: list[Any]) -> list[Any]:
+def _find_dry_friction(d: Vocabulary, other: Sequence[Any]) -> list[Any]:
     """What of ``other`` turns with the sign of the motion, by axis."""
     slid = sp.Dummy()
     signs = [d.sgn(rate) for rate in d.qd]
     return [-sp.diff(e.subs(sign, slid), slid) for e, sign in zip(other, signs, strict=True)]
+
+
+def _constants(d: Vocabulary) -> list[Any]:
+    """Symbols of the device's constants, where they are not put in as numbers."""
+    return [constant_symbol(c) for c in d.model.device.constants if d.named_constants]
+
+
+def _check_dependence(d: Vocabulary, forces: _Forces, terms: _Terms) -> None:
+    """Refuse expressions that depend on what their place in the equations does not allow."""
+    device = d.model.device
+    others = [d.channel[c] for c in device.channels]
+    prompt_force = [d.channel[derivative(f, k)] for f in device.forces for k in range(LAST_ORDER)]
+    free, u, motion = [*d.p.values(), *_constants(d)], [*d.channel.values()], [*d.q, *d.qd]
+    all_symbols = [*motion, *u, *free, *d.z.values()]
+    words = "motion, inputs, parameters and internal states"
+    rates, initial = ([entry[k] for entry in terms.states.values()] for k in (0, 1))
+    kinetic, potential = ([getattr(e, k) for e in terms.energies] for k in ("kinetic", "potential"))
+    gains = [gain for row in forces.input_map for gain in row]
+    by_gain = "positions, parameters and channels that are no forces"
+    allow("the kinetic energy", kinetic, [*motion, *free], "positions, rates and parameters")
+    allow("the potential energy", potential, [*d.q, *free], "positions and parameters")
+    allow("the effect of a force on the axes", gains, [*d.q, *others, *free], by_gain)
+    allow("a torque", terms.other, [*all_symbols, *forces.w], words)
+    allow("the applied force", forces.applied, all_symbols, words)
+    allow("the rate of an internal state", rates, all_symbols, words)
+    allow("an initial value", initial, [*d.q, *u, *free], "positions, inputs and parameters")
+    symbols_allowed = [*d.q, *prompt_force, *others, d.channel["t"], *free]
+    allow("an offset", terms.offset, symbols_allowed, "positions, forces and parameters")
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """The left side of the equations of motion, by names in ``steps``.
+
+    Attributes:
+        steps, mass, bias, dynamics, kinetic, potential: as in `Equations`.
+        names, numbers: symbols that the steps define, and those that they read.
+    """
+
+    steps: list[tuple[Any, Any]]
+    mass: list[list[Any]]
+    bias: list[Any]
+    dynamics: list[Any]
+    kinetic: Any
+    potential: Any
+    names: frozenset[Any] = frozenset()
+    numbers: frozenset[Any] = frozenset()
+
+
+def _combine_motion(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
+    """Put together what the energies require and, of a robot, what its bodies require."""
+    energy_motion, robot = _apply_lagrange(d, energies), d.model.device.robot
+    if robot is None:
+        check_inertia(d.model, energy_motion.mass, [*d.q, *_constants(d)])
+        return energy_motion
+    numbers = tuple(d.p[p.name] for p in robot.parameters)
+    motion = tuple(d.q), tuple(d.qd), tuple(d.qdd)
+    bodies = _apply_newton_euler(robot.links, gravity_vector(robot), numbers, motion)
+    return _Motion(
+        bodies.steps,
+        [_add(*rows) for rows in zip(energy_motion.mass, bodies.mass, strict=True)],
+        _add(energy_motion.bias, bodies.bias),
+        _add(energy_motion.dynamics, bodies.dynamics),
+        energy_motion.kinetic + bodies.kinetic,
+        energy_motion.potential + bodies.potential,
+        bodies.names,
+        bodies.numbers,
+    )
+
+
+def _add(one: Sequence[Any], other: Sequence[Any]) -> list[Any]:
+    return [a + b for a, b in zip(one, other, strict=True)]
+
+
+def _apply_lagrange(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
+    """Lagrange's equation of all energies, one after the other."""
+    n, mass_terms, bias_terms = len(d.axes), [], []
+    for label, tree, kinetic, potential in energies:
+        try:
+            mass, bias = lagrange(kinetic, potential, tuple(d.q), tuple(d.qd))
+        except OutOfTime:
+            raise d.too_long(tree, label) from None
+        mass_terms.append(mass)
+        bias_terms.append(bias)
+    mass = [[sum((m[i][j] for m in mass_terms), sp.S.Zero) for j in range(n)] for i in range(n)]
+    bias = [sum((h[i] for h in bias_terms), sp.S.Zero) for i in range(n)]
+    symbols_allowed = [*d.q, *d.qd, *d.p.values(), *_constants(d)]
+    for row, term in zip(mass, bias, strict=True):
+        allow("the equation of motion", [*row, term], symbols_allowed, "motion and parameters")
+    dynamics = [
+        h + sum(m * x for m, x in zip(row, d.qdd, strict=True))
+        for h, row in zip(bias, mass, strict=True)
+    ]
+    kinetic = sum((e.kinetic for e in energies), sp.S.Zero)
+    potential = sum((e.potential for e in energies), sp.S.Zero)
+    return _Motion([], mass, bias, dynamics, kinetic, potential)
+
+
+@cache
+def _apply_newton_euler(
+    links: tuple[Link, ...],
+    gravity: Vector,
+    numbers: tuple[Any, ...],
+    motion: tuple[tuple[Any, ...], ...],
+) -> _Motion:
+    """Newton and Euler's equations of a robot's bodies, once a process for all its models."""
+    q, qd, qdd = motion
+    text = Text()
+    algebra = Algebra.symbols(text)
+    inertial = [numbers[k : k + INERTIAL] for k in range(0, len(numbers), INERTIAL)]
+    zeros = [0] * len(q)
+    # Names for all of it: one compiled function gives them to every model of this robot.
+    mass = [[text.name(m) for m in row] for row in mass_matrix(algebra, links, inertial, q)]
+    bias, dynamics = (
+        [text.name(f) for f in joint_forces(algebra, links, inertial, q, qd, a, gravity)]
+        for a in (zeros, qdd)
+    )
+    momentum = [sum(m * v for m, v in zip(row, qd, strict=True)) for row in mass]
+    kinetic = sum(p * v for p, v in zip(momentum, qd, strict=True)) / 2
+    potential = potential_energy(algebra, links, inertial, q, gravity)
+    names = frozenset(name for name, _ in text.steps)
+    numbers_read = frozenset(_collect_symbols(value for _, value in text.steps))
+    return _Motion(text.steps, mass, bias, dynamics, kinetic, potential, names, numbers_read)
+
+
+@dataclass(frozen=True)
+class _Parameters:
+    """How the residual depends on each parameter; see `Equations`."""
+
+    linear: list[bool]
+    products: list[tuple[int, int]]
+    constant: list[bool]
+    unforced: list[bool]
+    lasting: list[dict[int, Any] | None]
+    of_bodies: list[int]
+
+
+def _classify_parameters(
+    d: Vocabulary, residual: Sequence[Any], beside: Sequence[Any], motion: _Motion, w: Sequence[Any]
+) -> _Parameters:
+    """Find how the residual depends on each parameter.
+
+    Args:
+        residual: one expression an axis; beside: other expressions of the model, in which a
+            parameter makes it nonlinear; motion: whose steps stand in the residual by name; w: the
+            noise, which slopes leave out.
+    """
+    classes = _Parameters([], [], [], [], [], [])
+    p, varying = [*d.p.values()], {*d.p.values(), *d.z.values()}
+    inputs, no_noise = {*d.channel.values()}, dict.fromkeys(w, 0)
+    elsewhere = _collect_symbols(beside)
+    # An expression has few of a robot's hundred parameters, and sympy is slow to find a slope zero.
+    with_symbols = [(k, e, e.free_symbols) for k, e in enumerate(residual)]
+    for i, symbol in enumerate(p):
+        by_axis = {k: sp.diff(e, symbol) for k, e, symbols in with_symbols if symbol in symbols}
+        slopes = [*by_axis.values()]
+        slope_symbols, bodily = _collect_symbols(slopes), symbol in motion.numbers
+        candidates = slope_symbols.intersection(p[: i + 1])
+        curving = {s for s in candidates if any(sp.diff(slope, s) != 0 for slope in slopes)}
+        linear = symbol not in curving and symbol not in elsewhere
+        constant = linear and not slope_symbols & varying
+        lasts = constant and not bodily and slope_symbols.isdisjoint(motion.names)
+        classes.linear.append(linear)
+        classes.constant.append(constant)
+        classes.unforced.append(constant and slope_symbols.isdisjoint(inputs))
+        if lasts and not slope_symbols.isdisjoint(w):
+            by_axis = {k: slope.subs(no_noise) for k, slope in by_axis.items()}
+        classes.lasting.append(by_axis if lasts else None)
+        classes.products.extend((j, i) for j in range(i) if p[j] in curving)
+        if bodily and not by_axis:
+            classes.of_bodies.append(i)
+    return classes

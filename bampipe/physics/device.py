@@ -362,9 +362,7 @@ class Device(Declaration):
 
     def has_dry_friction(self, axis: str) -> bool:
         """Whether the device adds dry friction of its own to ``axis``, beside the base term."""
-        tree = self.torque.get(axis)
-        calls = [n.func for n in ast.walk(tree) if isinstance(n, ast.Call)] if tree else []
-        return any(isinstance(f, ast.Name) and f.id == "sgn" for f in calls)
+        return axis in self.torque and expression.calls([self.torque[axis]], "sgn")
 
     def has_weight(self, axis: str) -> bool:
         """Whether the device's potential energy depends on the position of ``axis``."""

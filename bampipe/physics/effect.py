@@ -171,38 +171,33 @@ class Effect(Declaration):
     @cached_property
     def expressions(self) -> Mapping[str, ast.expr]:
         """Its expressions: ``torque``, or ``torque.<place>`` where there is one a place."""
-        found: dict[str, ast.expr] = {}
+        results: dict[str, ast.expr] = {}
         for key in _EXPRESSIONS[self.kind][0]:
             value = getattr(self, key)
             if isinstance(value, Mapping):
-                found |= {f"{key}.{place}": tree for place, tree in value.items()}
+                results |= {f"{key}.{place}": tree for place, tree in value.items()}
             elif value is not None:
-                found[key] = value
-        return found
+                results[key] = value
+        return results
 
     @property
     def formulas(self) -> tuple[str, ...]:
         """Its expressions as lines of text, states with their rates."""
-        lines = []
+        pairs: list[tuple[str, object]] = []
         for key in ("torque", "input", "kinetic", "potential", "offset"):
-            value = self.declaration.get(key)
-            if isinstance(value, str):
-                lines.append(f"{key} = {' '.join(value.split())}")
-            elif isinstance(value, Mapping):
-                lines += [f"{key} of {at} = {' '.join(str(v).split())}" for at, v in value.items()]
+            value = self.declaration.get(key, {})
+            by_place = value if isinstance(value, Mapping) else {"": value}
+            pairs += [(f"{key} of {at}" if at else key, text) for at, text in by_place.items()]
         for name, state in self.declaration.get("states", {}).items():
-            lines.append(f"d {name}/dt = {' '.join(str(state['rate']).split())}")
-            if "initial" in state:
-                lines.append(f"{name} at the start = {state['initial']}")
-        return tuple(lines)
+            pairs.append((f"d {name}/dt", state["rate"]))
+            pairs += [(f"{name} at the start", state[k]) for k in ("initial",) if k in state]
+        return tuple(f"{left} = {' '.join(str(right).split())}" for left, right in pairs)
 
     @property
     def is_dry_friction(self) -> bool:
         """Whether it is a torque on axes that turns with the sign of their motion."""
-        nodes = (node for tree in self.expressions.values() for node in ast.walk(tree))
-        names = (node.func for node in nodes if isinstance(node, ast.Call))
-        turns = any(isinstance(name, ast.Name) and name.id == "sgn" for name in names)
-        return self.kind == "torque" and self.scope in ("axis", "axis_pair") and turns
+        on_axes = self.kind == "torque" and self.scope in ("axis", "axis_pair")
+        return on_axes and expression.calls(self.expressions.values(), "sgn")
 
     @property
     def acting_link(self) -> Link | None:
@@ -245,7 +240,7 @@ class Effect(Declaration):
             return tuple(
                 c.name
                 for c in device.coordinates
-                if not self._lacks(c.kind)
+                if not self._lacks_kind(c.kind)
                 and ("brake" not in used or c.name in device.brakes)
                 and ("dry" not in used or device.has_dry_friction(c.name))
             )
@@ -257,7 +252,7 @@ class Effect(Declaration):
             return device.components
         if self.scope == "force_pair":
             return tuple(force_pairs(device))
-        return ("",) if self._fits(device) else ()
+        return ("",) if self._fits_device(device) else ()
 
     def pairs(self, device: Device) -> dict[str, tuple[str, str]]:
         """The pairs of axes of ``device`` that it makes sense for, by what follows the colon.
@@ -265,7 +260,7 @@ class Effect(Declaration):
         Neighbouring joints where it acts on both, else axes that lie near each other, either way.
         """
         if self.kind == "energy" or (isinstance(self.torque, Mapping) and len(self.torque) > 1):
-            return _neighbours(device)
+            return _list_neighbours(device)
         names = [c.name for c in device.coordinates]
         farthest = _FARTHEST if device.robot is None else 1
         return {
@@ -304,29 +299,22 @@ class Effect(Declaration):
             return False
         return self.names - set(self.parameters) == {"q"}
 
-    def _lacks(self, kind: str) -> bool:
+    def _lacks_kind(self, kind: str) -> bool:
         """Whether a parameter has no entry for this kind of axis."""
         return any(getattr(entry, kind, entry) is None for entry in self.parameters.values())
 
-    def _fits(self, device: Device) -> bool:
+    def _fits_device(self, device: Device) -> bool:
         """Whether every name that a device-wide effect uses exists in ``device``."""
-        known = set(device.definitions) | set(device.constants) | {"t"}
-        known |= {c.name for c in device.coordinates} | {p.name for p in device.parameters}
-        for force in device.forces:
-            known |= {derivative(force, k) for k in range(len(INPUT_ORDERS))}
-        known |= set(device.channels)
-        known |= set(device.brakes.values()) | set(self.parameters) | {s.name for s in self.states}
-        for c in device.coordinates:
-            known |= {
-                f"{prefix}_{c.name}"
-                for prefix in ("qd", "applied", "viscous", "coulomb", "load", "weight", "pull")
-            }
+        axes, forces = [c.name for c in device.coordinates], [*device.forces]
         keys = {key.partition(".")[2] for key in self.expressions} - {""}
-        places = {c.name for c in device.coordinates} | set(device.forces)
-        if EACH in keys and device.forces:
-            places |= {EACH}
-            known |= {derivative("f", k) for k in range(len(INPUT_ORDERS))}
-        return keys <= places and self.names <= known
+        places = {*axes, *forces, *([EACH] if forces else [])}
+        symbols = [*forces, *(["f"] if EACH in keys and forces else [])]
+        known = {derivative(symbol, k) for symbol in symbols for k in range(len(INPUT_ORDERS))}
+        terms = ("qd", "applied", "viscous", "coulomb", "load", "weight", "pull")
+        known |= {f"{term}_{axis}" for term in terms for axis in axes} | {"t", *axes}
+        known |= {*device.definitions, *device.constants, *device.channels, *self.parameters}
+        known |= {entry.name for entry in (*device.parameters, *self.states)}
+        return keys <= places and self.names <= known | {*device.brakes.values()}
 
 
 def force_pairs(device: Device) -> dict[str, tuple[str, str]]:
@@ -344,7 +332,7 @@ def force_pairs(device: Device) -> dict[str, tuple[str, str]]:
     }
 
 
-def _neighbours(device: Device) -> dict[str, tuple[str, str]]:
+def _list_neighbours(device: Device) -> dict[str, tuple[str, str]]:
     """Pairs of neighbouring joints of one kind, by what follows the colon: ``wrist-hand``."""
     if device.robot is None:
         return {}
@@ -427,7 +415,7 @@ def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = 
         choices = ", ".join(f"{effect.name}:{t}" if t else effect.name for t in targets)
         hint = did_you_mean(target, targets)
         kinds = {c.name: c.kind for c in device.coordinates}
-        if target in kinds and effect._lacks(kinds[target]):
+        if target in kinds and effect._lacks_kind(kinds[target]):
             hint = f": a parameter has no entry for a {kinds[target]} axis"
         raise InputError(
             f"effect {effect.name!r} has no target {target!r}{hint}"
@@ -435,7 +423,7 @@ def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = 
             else f"effect {effect.name!r} needs a target",
             remedy=f"choose from {choices}",
         )
-    axes = _axes_of(effect, target, device)
+    axes = _find_axes(effect, target, device)
     kind = device.coordinate(axes[0]).kind if axes else ""
     prefix = f"{effect.name}.{target}" if target else effect.name
     bound = []
@@ -459,7 +447,7 @@ def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = 
     return BoundEffect(effect, target, tuple(bound), axes)
 
 
-def _axes_of(effect: Effect, target: str, device: Device) -> tuple[str, ...]:
+def _find_axes(effect: Effect, target: str, device: Device) -> tuple[str, ...]:
     """The coordinates that ``target`` stands for."""
     if effect.scope == "axis_pair":
         return effect.pairs(device)[target]
@@ -477,13 +465,13 @@ def unit_of(unit: str, effect: Effect, target: str, device: Device) -> str:
         units["other"] = device.coordinate(effect.pairs(device)[target][1]).unit
     above: list[str] = []
     below: list[str] = []
-    for sign, part in _factors(unit):
-        for inner, piece in _factors(units[part]) if part in units else [("*", part)]:
+    for sign, part in _split_unit(unit):
+        for inner, piece in _split_unit(units[part]) if part in units else [("*", part)]:
             (above if sign == inner or (sign, inner) == ("/", "/") else below).append(piece)
     return (".".join(above) or ("1" if below else "")) + "".join(f"/{p}" for p in below)
 
 
-def _factors(unit: str) -> list[tuple[str, str]]:
+def _split_unit(unit: str) -> list[tuple[str, str]]:
     """Factors of a unit text, each with ``*`` or ``/``."""
-    found = re.findall(r"([./]?)([^./]+)", unit)
-    return [("/" if sign == "/" else "*", part) for sign, part in found if part != "1"]
+    results = re.findall(r"([./]?)([^./]+)", unit)
+    return [("/" if sign == "/" else "*", part) for sign, part in results if part != "1"]

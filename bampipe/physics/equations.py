@@ -36,8 +36,8 @@ class Equations:
             ``steps`` take part in it.
         of_bodies: parameters, by number, that stand in ``steps`` alone.
         compensation: per coordinate, the part of Q_other that balances gravity there: see
-            `roles.compensation`; zero where nothing does.
-        delays: parameters that shift measured forces in time: see `roles.delays`.
+            `roles.find_compensation`; zero where nothing does.
+        delays: parameters that shift measured forces in time: see `roles.find_delays`.
     """
 
     q: list[Any]

@@ -27,23 +27,10 @@ MAX_EXPANDED = 20_000
 """Most parts of an expression once definitions are put in and rates are taken: 65 times the
 kinetic energy of the BAM, 18 times that of a planar arm with six links; equations derived from as
 many take seconds."""
-FUNCTIONS = {
-    "sin": 1,
-    "cos": 1,
-    "tan": 1,
-    "atan": 1,
-    "exp": 1,
-    "log": 1,
-    "sqrt": 1,
-    "tanh": 1,
-    "abs": 1,
-    "sgn": 1,
-    "heaviside": 1,
-    "ddt": 1,
-    "min": 2,
-    "max": 2,
-    "clip": 3,
-}
+FUNCTIONS = dict.fromkeys(
+    ("sin", "cos", "tan", "atan", "exp", "log", "sqrt", "tanh", "abs", "sgn", "heaviside", "ddt"), 1
+) | {"min": 2, "max": 2, "clip": 3}
+"""Number of arguments, by name."""
 _OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
 
 
@@ -82,13 +69,13 @@ def parse(text: object, where: str) -> ast.expr:
         nodes = list(ast.walk(tree))
         if len(nodes) > MAX_NODES:
             raise InputError(f"expression has more than {MAX_NODES} parts", where=where)
-        _check(tree, where)
+        _check_node(tree, where)
     except RecursionError:
         raise InputError("expression is nested too deeply", where=where) from None
     return tree
 
 
-def _check(node: ast.AST, where: str, power: float = 1.0, rates: int = 0) -> None:
+def _check_node(node: ast.AST, where: str, power: float = 1.0, rates: int = 0) -> None:
     """Check ``node``, which stands under powers that multiply to ``power`` and ``rates`` ddt()."""
     match node:
         case ast.Constant(value=value):
@@ -101,10 +88,10 @@ def _check(node: ast.AST, where: str, power: float = 1.0, rates: int = 0) -> Non
         case ast.BinOp(left=left, op=op, right=right) if isinstance(op, _OPERATORS):
             if isinstance(op, ast.Pow):
                 power *= _check_power(right, where, power)
-            _check(left, where, power, rates)
-            _check(right, where)
+            _check_node(left, where, power, rates)
+            _check_node(right, where)
         case ast.UnaryOp(op=ast.USub() | ast.UAdd(), operand=operand):
-            _check(operand, where, power, rates)
+            _check_node(operand, where, power, rates)
         case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
             if name not in FUNCTIONS:
                 raise InputError(
@@ -121,7 +108,7 @@ def _check(node: ast.AST, where: str, power: float = 1.0, rates: int = 0) -> Non
             if rates > 2:
                 raise InputError("ddt() may be nested twice at most", where=where)
             for argument in args:
-                _check(argument, where, power, rates)
+                _check_node(argument, where, power, rates)
         case _:
             raise InputError(
                 f"{type(node).__name__} is not allowed in an expression",
@@ -135,7 +122,7 @@ def _check_power(exponent: ast.AST, where: str, outer: float) -> float:
     number = exponent.operand if isinstance(exponent, ast.UnaryOp) else exponent
     if not isinstance(number, ast.Constant):
         raise InputError("an exponent must be a plain number", where=where)
-    _check(number, where)
+    _check_node(number, where)
     size = max(1.0, abs(float(number.value)))  # type: ignore[arg-type]
     if size * outer > MAX_EXPONENT:
         raise InputError(
@@ -150,6 +137,12 @@ def names(tree: ast.AST) -> set[str]:
     """Names of quantities that an expression uses (function names left out)."""
     functions = {id(n.func) for n in ast.walk(tree) if isinstance(n, ast.Call)}
     return {n.id for n in ast.walk(tree) if isinstance(n, ast.Name) and id(n) not in functions}
+
+
+def calls(trees: Iterable[ast.expr], name: str) -> bool:
+    """Whether an expression calls the function ``name``."""
+    functions = (n.func for t in trees for n in ast.walk(t) if isinstance(n, ast.Call))
+    return any(isinstance(function, ast.Name) and function.id == name for function in functions)
 
 
 def reached_names(trees: Iterable[ast.expr], definitions: Mapping[str, ast.expr]) -> set[str]:
@@ -204,7 +197,7 @@ Name = Annotated[
 ]
 
 
-def _bounded(value: Any) -> bool:
+def _is_bounded(value: Any) -> bool:
     """Whether a number is real and below `MAX_NUMBER`."""
     if not (value.is_extended_real and value.is_finite):
         return False
@@ -215,15 +208,8 @@ def _bounded(value: Any) -> bool:
 def _builders() -> dict[str, Callable[..., Any]]:
     import sympy as sp
 
-    return {
-        "sin": sp.sin,
-        "cos": sp.cos,
-        "tan": sp.tan,
-        "atan": sp.atan,
-        "exp": sp.exp,
-        "log": sp.log,
-        "sqrt": sp.sqrt,
-        "tanh": sp.tanh,
+    same = {n: getattr(sp, n) for n in ("sin", "cos", "tan", "atan", "exp", "log", "sqrt", "tanh")}
+    return same | {
         "abs": sp.Abs,
         "min": sp.Min,
         "max": sp.Max,
@@ -254,7 +240,7 @@ def build(
 
     def walk(node: ast.AST) -> Any:
         value = sp.sympify(combine(node), strict=True)
-        if value.is_number and not _bounded(value):
+        if value.is_number and not _is_bounded(value):
             raise InputError(
                 f"{ast.unparse(node)[:60]!r} is not a real number below {MAX_NUMBER:g}",
                 where=where,

@@ -12,18 +12,8 @@ import sympy as sp
 from bampipe.errors import InputError
 from bampipe.physics.model import Model
 
-_PRINTABLE = (
-    sp.sin,
-    sp.cos,
-    sp.tan,
-    sp.exp,
-    sp.log,
-    sp.tanh,
-    sp.atan,
-    sp.Abs,
-    sp.sign,
-    sp.Heaviside,
-)
+_PRINTABLE: tuple[Any, ...] = (sp.sin, sp.cos, sp.tan, sp.exp, sp.log, sp.tanh, sp.atan)
+_PRINTABLE += (sp.Abs, sp.sign, sp.Heaviside)
 _INFINITE = (sp.nan, sp.oo, -sp.oo, sp.zoo, sp.I)
 
 

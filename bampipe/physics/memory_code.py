@@ -7,9 +7,9 @@ from typing import Any
 
 import sympy as sp
 
-from bampipe.physics.codegen import SCALAR_HEADER, compiled_function, print_block, unpack
+from bampipe.physics.codegen import SCALAR_HEADER, compiled_function, print_block, unpack_groups
 from bampipe.physics.equations import Equations
-from bampipe.physics.system import ACCURATE, STABLE, STIFF_STEPS
+from bampipe.physics.memory import ACCURATE, STABLE, STIFF_STEPS
 
 _FEWEST = 3
 """Exponential steps a sample where the decay of a state follows the motion."""
@@ -171,33 +171,39 @@ def memory_source(e: Equations) -> tuple[str, dict[str, list[int]]]:
     others = [set(e.z) - {z} for z in e.z]
     coupled = any(r.free_symbols & o for r, o in zip(e.rates, others, strict=True))
     groups = {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p}
-    used = set().union(*(sp.sympify(rate, strict=True).free_symbols for rate in e.rates))
-    uses = {g: [i for i, s in enumerate(some) if s in used] for g, some in groups.items()}
-    numbered = {
+    used_symbols = set().union(*(sp.sympify(rate, strict=True).free_symbols for rate in e.rates))
+    uses = {g: [i for i, s in enumerate(some) if s in used_symbols] for g, some in groups.items()}
+    column_symbols = {
         groups[g][i]: sp.Symbol(f"{g}_{k:03d}", real=True)
         for g, places in uses.items()
         for k, i in enumerate(places)
     }
-    numbered |= {z: sp.Symbol(f"z_{k:03d}", real=True) for k, z in enumerate(e.z)}
-    passed = {g: [numbered[groups[g][i]] for i in places] for g, places in uses.items()}
-    states = [numbered[z] for z in e.z]
+    column_symbols |= {z: sp.Symbol(f"z_{k:03d}", real=True) for k, z in enumerate(e.z)}
+    passed_symbols = {
+        g: [column_symbols[groups[g][i]] for i in places] for g, places in uses.items()
+    }
+    states = [column_symbols[z] for z in e.z]
 
-    def renamed(expressions: Sequence[Any]) -> list[Any]:
-        return [sp.sympify(x, strict=True).xreplace(numbered) for x in expressions]
+    def number_columns(expressions: Sequence[Any]) -> list[Any]:
+        return [sp.sympify(x, strict=True).xreplace(column_symbols) for x in expressions]
 
     if coupled or any(slope.free_symbols & set(e.z) for slope in slopes):
-        groups_of = {**passed, "z": states}
-        rate = _memory_function("memory_rate", groups_of, {"dz": renamed(e.rates)})
+        groups_of = {**passed_symbols, "z": states}
+        rate = _memory_function("memory_rate", groups_of, {"dz": number_columns(e.rates)})
         fastest = "np.inf" if coupled else repr(STIFF_STEPS * STABLE)
         head = f"import numpy as np\nFASTEST = {fastest}\nACCURATE = {ACCURATE}\n"
         head += f"COUPLED = {coupled}\n"
         source = SCALAR_HEADER + head + rate + BETWEEN + MEMORY_LOOP
         if not coupled:
-            slope = _memory_function("memory_slope", groups_of, {"slope": renamed(slopes)})
+            slope = _memory_function("memory_slope", groups_of, {"slope": number_columns(slopes)})
             source += slope + STIFF_MEMORY_LOOP
         return source, uses
-    still = [rate.subs(z, 0) for rate, z in zip(e.rates, e.z, strict=True)]
-    terms = _memory_function("memory_terms", passed, {"c": renamed(still), "b": renamed(slopes)})
+    rates_at_zero = [rate.subs(z, 0) for rate, z in zip(e.rates, e.z, strict=True)]
+    terms = _memory_function(
+        "memory_terms",
+        passed_symbols,
+        {"c": number_columns(rates_at_zero), "b": number_columns(slopes)},
+    )
     steady = not any(slope.free_symbols & {*e.q, *e.qd, *e.u} for slope in slopes)
     head = f"import numpy as np\nRAMP = {steady}\nFEWEST = {_FEWEST}\n"
     return SCALAR_HEADER + head + terms + BETWEEN + LINEAR_MEMORY_LOOP, uses
@@ -208,9 +214,7 @@ def _memory_function(
 ) -> str:
     """A compiled function of groups of columns that fills ``results``."""
     block = print_block([x for part in results.values() for x in part])
-    body = []
-    for group, symbols in groups.items():
-        body += unpack(group, symbols, block.used)
+    body = unpack_groups(groups, block.used)
     places = [f"{part}[{i}]" for part, parts in results.items() for i in range(len(parts))]
     body += block.lines
     body += [f"{place} = {v}" for place, v in zip(places, block.values, strict=True)]

@@ -75,12 +75,13 @@ class Model:
     @property
     def key(self) -> str:
         """Hash of everything that the generated code depends on."""
-        content: list[Any] = [code_version(), self.device.declaration]
+        content: list[Any] = [self.device.declaration]
         content += [[effect.name, effect.effect.declaration] for effect in self.effects]
-        text = json.dumps(content, sort_keys=True, default=str)
-        return hashlib.sha256(text.encode()).hexdigest()[:24]
+        return hash_content(content)
 
 
-def code_version() -> str:
-    """Hash of this package's source, so that generated code never outlives its generator."""
-    return hash_sources(Path(__file__).parent)
+def hash_content(content: list[Any]) -> str:
+    """Hash of declarations and of this package's source: no code outlives its generator."""
+    content = [hash_sources(Path(__file__).parent), *content]
+    text = json.dumps(content, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:24]

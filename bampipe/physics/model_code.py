@@ -30,8 +30,8 @@ Generation = tuple[dict[str, Any], dict[str, str]]
 
 def effects_code(model: Model) -> Generation:
     """What the generator says of a model, and the source of what effects add to a residual."""
-    equations = _derive(model)
-    bare = _derive(Model(model.device)) if model.effects else equations
+    equations = _derive_once(model)
+    bare = _derive_once(Model(model.device)) if model.effects else equations
     added = contribution(equations, bare)
     channels = dict(zip(equations.inputs, equations.u, strict=True))
     forces = [channels[name] for name in model.device.forces]
@@ -71,7 +71,7 @@ def effects_code(model: Model) -> Generation:
 
 def whole_code(model: Model) -> Generation:
     """Which slopes are the same everywhere, and the source of the whole mechanism's functions."""
-    equations = _derive(model)
+    equations = _derive_once(model)
     slopes, places = slopes_source(equations)
     along, here = bodies_along_motion(equations), bodies_at_state(equations)
     facts = {
@@ -99,7 +99,7 @@ _MOST_DERIVED = 4
 """The device without effects, which every candidate wants, and those at hand."""
 
 
-def _derive(model: Model) -> Equations:
+def _derive_once(model: Model) -> Equations:
     """Equations of a model; those asked for last are kept."""
     known = _derived.pop(model.key, None) or derive(model)
     _derived[model.key] = known

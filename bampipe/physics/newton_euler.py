@@ -96,7 +96,7 @@ class Algebra:
 
 
 @dataclass(frozen=True)
-class _Moving:
+class _LinkMotion:
     """A link in motion: its rotation into the frame before, and its motion in its own frame.
 
     Attributes:
@@ -138,41 +138,35 @@ def joint_forces(
         Those of the same joints.
     """
     a = algebra
-    moving = _motion(a, links, q, qd, qdd, gravity)
+    moving = _link_motions(a, links, q, qd, qdd, gravity)
     force, moment = [], []
     for at, (mass, *rest) in zip(moving, inertial, strict=True):
-        first, inertia = (rest[0], rest[1], rest[2]), _symmetric(rest[3:])
-        force.append(_named(a, _sum(_scaled(mass, at.acceleration), _times(at.change, first))))
-        spin = _named(a, _times(inertia, at.rate))
-        moment.append(
-            _named(
-                a,
-                _sum(
-                    _times(inertia, at.rate_change),
-                    _cross(at.rate, spin),
-                    _cross(first, at.acceleration),
-                ),
-            )
+        first, inertia = (rest[0], rest[1], rest[2]), _symmetric_matrix(rest[3:])
+        force.append(
+            _name_components(a, _add(_scale(mass, at.acceleration), _multiply(at.change, first)))
         )
-    found: list[Any] = [0] * len(links)
+        spin = _name_components(a, _multiply(inertia, at.rate))
+        turning = _multiply(inertia, at.rate_change), _cross(at.rate, spin)
+        moment.append(_name_components(a, _add(*turning, _cross(first, at.acceleration))))
+    results: list[Any] = [0] * len(links)
     for i in reversed(range(len(links))):
-        found[i] = a.name(_dot(links[i].axis, force[i] if links[i].slides else moment[i]))
+        results[i] = a.name(_dot(links[i].axis, force[i] if links[i].slides else moment[i]))
         parent = links[i].parent
         if parent >= 0:
-            onward = _named(a, moving[i].into_parent(force[i]))
-            force[parent] = _named(a, _sum(force[parent], onward))
+            onward = _name_components(a, moving[i].into_parent(force[i]))
+            force[parent] = _name_components(a, _add(force[parent], onward))
             turned = moving[i].into_parent(moment[i])
             lever = _cross(moving[i].offset, onward)
-            moment[parent] = _named(a, _sum(moment[parent], turned, lever))
+            moment[parent] = _name_components(a, _add(moment[parent], turned, lever))
     return [
-        a.name(sum(ratio * found[i] for i, ratio in turned))
+        a.name(sum(ratio * results[i] for i, ratio in turned))
         if len(turned) > 1
-        else found[turned[0][0]]
-        for turned in _turned_by_each(links)
+        else results[turned[0][0]]
+        for turned in _list_turned_links(links)
     ]
 
 
-def _turned_by_each(links: Sequence[Link]) -> list[list[tuple[int, float]]]:
+def _list_turned_links(links: Sequence[Link]) -> list[list[tuple[int, float]]]:
     """By joint that follows no other, the links that it moves, itself first, and how far."""
     return [
         [(i, 1.0), *((k, link.ratio) for k, link in enumerate(links) if link.follows == i)]
@@ -181,15 +175,15 @@ def _turned_by_each(links: Sequence[Link]) -> list[list[tuple[int, float]]]:
     ]
 
 
-def _of_all(links: Sequence[Link], values: Sequence[Any], position: bool) -> list[Any]:
+def _extend_to_links(links: Sequence[Link], values: Sequence[Any], position: bool) -> list[Any]:
     """Positions, or their derivatives, of all joints by those of joints that follow no other."""
-    found: list[Any] = [0] * len(links)
-    for turned, value in zip(_turned_by_each(links), values, strict=True):
+    results: list[Any] = [0] * len(links)
+    for turned, value in zip(_list_turned_links(links), values, strict=True):
         for i, ratio in turned:
-            found[i] = value if i == turned[0][0] else ratio * value
+            results[i] = value if i == turned[0][0] else ratio * value
             if position and links[i].follows >= 0:
-                found[i] = found[i] + links[i].zero
-    return found
+                results[i] = results[i] + links[i].zero
+    return results
 
 
 def columns(
@@ -205,43 +199,42 @@ def columns(
     Arguments as in `joint_forces`.
     """
     a = algebra
-    moving = _motion(a, links, q, qd, qdd, gravity)
-    found: list[list[list[Any]]] = [[[0] * INERTIAL for _ in links] for _ in links]
+    moving = _link_motions(a, links, q, qd, qdd, gravity)
+    results: list[list[list[Any]]] = [[[0] * INERTIAL for _ in links] for _ in links]
     felt: list[dict[int, tuple[Vector, Vector]]] = []
     for i, (link, at) in enumerate(zip(links, moving, strict=True)):
         # What a moment and a force at this joint are to each joint before it, in this frame.
         here: dict[int, tuple[Vector, Vector]] = {}
         for j, (turn, push) in felt[link.parent].items() if link.parent >= 0 else ():
-            onward = _sum(push, _cross(turn, at.offset))
-            here[j] = _named(a, at.from_parent(turn)), _named(a, at.from_parent(onward))
+            onward = _add(push, _cross(turn, at.offset))
+            here[j] = (
+                _name_components(a, at.from_parent(turn)),
+                _name_components(a, at.from_parent(onward)),
+            )
         here[i] = (ZERO, link.axis) if link.slides else (link.axis, ZERO)
         felt.append(here)
-        by_number = _wrenches(a, at)
+        by_number = _unit_wrenches(a, at)
         for j, (turn, push) in here.items():
-            found[j][i] = [
+            results[j][i] = [
                 a.name(_dot(turn, moment) + _dot(push, force)) for force, moment in by_number
             ]
-    return [
-        [
-            [
-                sum(ratio * found[i][link][number] for i, ratio in turned)
-                for number in range(INERTIAL)
-            ]
-            for link in range(len(links))
-        ]
-        if len(turned) > 1
-        else found[turned[0][0]]
-        for turned in _turned_by_each(links)
-    ]
+    table: list[list[list[Any]]] = []
+    for (first, _), *others in _list_turned_links(links):
+        rows = results[first]
+        for i, ratio in others:
+            pairs = [zip(*both, strict=True) for both in zip(rows, results[i], strict=True)]
+            rows = [[x + ratio * y for x, y in numbers] for numbers in pairs]
+        table.append(rows)
+    return table
 
 
-def _wrenches(a: Algebra, at: _Moving) -> list[tuple[Vector, Vector]]:
+def _unit_wrenches(a: Algebra, at: _LinkMotion) -> list[tuple[Vector, Vector]]:
     """Force and moment at the joint by each inertial number of the link."""
     x, y, z = at.rate
     dx, dy, dz = at.rate_change
     units: list[Vector] = [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
-    found: list[tuple[Vector, Vector]] = [(at.acceleration, ZERO)]
-    found += [(_times(at.change, e), _cross(e, at.acceleration)) for e in units]
+    results: list[tuple[Vector, Vector]] = [(at.acceleration, ZERO)]
+    results += [(_multiply(at.change, e), _cross(e, at.acceleration)) for e in units]
     moments: list[Vector] = [
         (dx, x * z, -x * y),
         (dy - x * z, dx + y * z, x * x - y * y),
@@ -250,7 +243,7 @@ def _wrenches(a: Algebra, at: _Moving) -> list[tuple[Vector, Vector]]:
         (y * y - z * z, dz - x * y, dy + x * z),
         (y * z, -x * z, dz),
     ]
-    return found + [(ZERO, _named(a, moment)) for moment in moments]
+    return results + [(ZERO, _name_components(a, moment)) for moment in moments]
 
 
 def potential_energy(
@@ -262,12 +255,12 @@ def potential_energy(
 ) -> Any:
     """Return the potential energy of gravity, J; zero where all moments are at the base."""
     still = [0] * len(q)
-    moving = _motion(algebra, links, q, still, still, gravity)
+    moving = _link_motions(algebra, links, q, still, still, gravity)
     heights: list[Any] = []
     total: Any = 0
     for link, at, (mass, *rest) in zip(links, moving, inertial, strict=True):
         below: Vector = (
-            moving[link.parent].acceleration if link.parent >= 0 else _scaled(-1, gravity)
+            moving[link.parent].acceleration if link.parent >= 0 else _scale(-1, gravity)
         )
         height = heights[link.parent] if link.parent >= 0 else 0
         heights.append(algebra.name(height + _dot(below, at.offset)))
@@ -292,53 +285,59 @@ def mass_matrix(
     return mass
 
 
-def _motion(
+def _link_motions(
     a: Algebra,
     links: Sequence[Link],
     q: Sequence[Any],
     qd: Sequence[Any],
     qdd: Sequence[Any],
     gravity: Vector,
-) -> list[_Moving]:
-    found: list[_Moving] = []
+) -> list[_LinkMotion]:
+    results: list[_LinkMotion] = []
     still: tuple[Vector, Vector, Vector] = (ZERO, ZERO, ZERO)
-    of_all = (_of_all(links, values, k == 0) for k, values in enumerate((q, qd, qdd)))
+    of_all = (_extend_to_links(links, values, k == 0) for k, values in enumerate((q, qd, qdd)))
     for link, x, v, w in zip(links, *of_all, strict=True):
         if link.parent >= 0:
-            before = found[link.parent]
+            before = results[link.parent]
             rate, rate_change, change = before.rate, before.rate_change, before.change
             acceleration = before.acceleration
         else:
             rate, rate_change, change = ZERO, ZERO, still
-            acceleration = _scaled(-1, gravity)
-        turn = _turn(a, link, x)
+            acceleration = _scale(-1, gravity)
+        turn = _joint_rotation(a, link, x)
 
         def into(vector: Vector, link: Link = link, turn: Any = turn) -> Vector:
-            return _times(link.rotation, _times(turn, vector))
+            return _multiply(link.rotation, _multiply(turn, vector))
 
         def out(vector: Vector, link: Link = link, turn: Any = turn) -> Vector:
-            middle = _named(a, _times(_transposed(link.rotation), vector))
-            return _times(_transposed(turn), middle)
+            middle = _name_components(a, _multiply(_transpose(link.rotation), vector))
+            return _multiply(_transpose(turn), middle)
 
-        axis_before = _times(link.rotation, link.axis)
+        axis_before = _multiply(link.rotation, link.axis)
         offset = link.position
         if link.slides:
-            offset = _named(a, _sum(offset, _scaled(x, axis_before)))
-        here = _named(a, out(_named(a, _sum(acceleration, _times(change, offset)))))
-        own, own_change = _named(a, out(rate)), out(rate_change)
+            offset = _name_components(a, _add(offset, _scale(x, axis_before)))
+        here = _name_components(
+            a, out(_name_components(a, _add(acceleration, _multiply(change, offset))))
+        )
+        own, own_change = _name_components(a, out(rate)), out(rate_change)
         if link.slides:
-            along = _scaled(2 * v, _cross(own, link.axis))
-            here = _named(a, _sum(here, _scaled(w, link.axis), along))
-            own_change = _named(a, own_change)
+            along = _scale(2 * v, _cross(own, link.axis))
+            here = _name_components(a, _add(here, _scale(w, link.axis), along))
+            own_change = _name_components(a, own_change)
         else:
-            twist = _scaled(v, _cross(own, link.axis))
-            own_change = _named(a, _sum(own_change, twist, _scaled(w, link.axis)))
-            own = _named(a, _sum(own, _scaled(v, link.axis)))
-        found.append(_Moving(into, out, offset, here, _change(a, own, own_change), own, own_change))
-    return found
+            twist = _scale(v, _cross(own, link.axis))
+            own_change = _name_components(a, _add(own_change, twist, _scale(w, link.axis)))
+            own = _name_components(a, _add(own, _scale(v, link.axis)))
+        results.append(
+            _LinkMotion(
+                into, out, offset, here, _acceleration_matrix(a, own, own_change), own, own_change
+            )
+        )
+    return results
 
 
-def _turn(a: Algebra, link: Link, x: Any) -> tuple[Vector, Vector, Vector]:
+def _joint_rotation(a: Algebra, link: Link, x: Any) -> tuple[Vector, Vector, Vector]:
     """Rotation about the joint's axis (Rodrigues); its columns are the turned axes."""
     if link.slides:
         return (1, 0, 0), (0, 1, 0), (0, 0, 1)
@@ -359,23 +358,25 @@ def _turn(a: Algebra, link: Link, x: Any) -> tuple[Vector, Vector, Vector]:
     return rows[0], rows[1], rows[2]
 
 
-def _change(a: Algebra, rate: Vector, rate_change: Vector) -> tuple[Vector, Vector, Vector]:
+def _acceleration_matrix(
+    a: Algebra, rate: Vector, rate_change: Vector
+) -> tuple[Vector, Vector, Vector]:
     x, y, z = rate
     dx, dy, dz = rate_change
     xx, yy, zz = a.name(x * x), a.name(y * y), a.name(z * z)
     xy, xz, yz = a.name(x * y), a.name(x * z), a.name(y * z)
     return (
-        _named(a, (-yy - zz, xy - dz, xz + dy)),
-        _named(a, (xy + dz, -xx - zz, yz - dx)),
-        _named(a, (xz - dy, yz + dx, -xx - yy)),
+        _name_components(a, (-yy - zz, xy - dz, xz + dy)),
+        _name_components(a, (xy + dz, -xx - zz, yz - dx)),
+        _name_components(a, (xz - dy, yz + dx, -xx - yy)),
     )
 
 
-def _named(a: Algebra, vector: Vector) -> Vector:
+def _name_components(a: Algebra, vector: Vector) -> Vector:
     return a.name(vector[0]), a.name(vector[1]), a.name(vector[2])
 
 
-def _symmetric(values: Sequence[Any]) -> tuple[Vector, Vector, Vector]:
+def _symmetric_matrix(values: Sequence[Any]) -> tuple[Vector, Vector, Vector]:
     xx, xy, xz, yy, yz, zz = values
     return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
 
@@ -384,20 +385,20 @@ def _dot(one: Vector, other: Vector) -> Any:
     return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
-def _times(matrix: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
+def _multiply(matrix: tuple[Vector, Vector, Vector], vector: Vector) -> Vector:
     return _dot(matrix[0], vector), _dot(matrix[1], vector), _dot(matrix[2], vector)
 
 
-def _transposed(matrix: tuple[Vector, Vector, Vector]) -> tuple[Vector, Vector, Vector]:
+def _transpose(matrix: tuple[Vector, Vector, Vector]) -> tuple[Vector, Vector, Vector]:
     first, second, third = zip(*matrix, strict=True)
     return first, second, third
 
 
-def _scaled(factor: Any, vector: Vector) -> Vector:
+def _scale(factor: Any, vector: Vector) -> Vector:
     return factor * vector[0], factor * vector[1], factor * vector[2]
 
 
-def _sum(*vectors: Vector) -> Vector:
+def _add(*vectors: Vector) -> Vector:
     first, second, third = (sum(parts[1:], parts[0]) for parts in zip(*vectors, strict=True))
     return first, second, third
 

@@ -7,8 +7,6 @@ nothing but the mathematics that comes with the language.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -71,13 +69,6 @@ void inverse_dynamics(const double *q, const double *qd, const double *qdd{more}
 """
 
 
-@dataclass(frozen=True)
-class _Words:
-    title: str
-    about: str
-    summary: str
-
-
 def portable_source(model: Model, parameters: Array, language: Language) -> str:
     """Return the source of ``inverse_dynamics(q, qd, qdd[, u])``.
 
@@ -104,13 +95,8 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
         e, dict(zip(e.p, map(float, parameters), strict=True))
     )
     names = [e.inputs[e.u.index(symbol)] for symbol in inputs]
-    known = {
-        **{symbol: f"q[{i}]" for i, symbol in enumerate(e.q)},
-        **{symbol: f"qd[{i}]" for i, symbol in enumerate(e.qd)},
-        **{symbol: f"qdd[{i}]" for i, symbol in enumerate(e.qdd)},
-        **{symbol: f"u[{i}]" for i, symbol in enumerate(inputs)},
-    }
-    places = {str(symbol): text for symbol, text in known.items()}
+    groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "u": inputs}
+    places = {str(s): f"{group}[{i}]" for group, some in groups.items() for i, s in enumerate(some)}
     pattern = re.compile(r"\b(" + "|".join(sorted(places, key=len, reverse=True)) + r")\b")
     lines, values = (
         [pattern.sub(lambda found: places[found[0]], text) for text in texts]
@@ -125,62 +111,37 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
     about = f"Coordinates: {of}." + (f" Inputs u: {', '.join(names)}." if names else "")
     if logged:
         about += f" Forces are those that act; what is logged differs by {logged}."
-    words = _Words(
-        f"{model.device.name}{f' with {effects}' if effects else ''}, identified by bampipe.",
-        about,
-        "Generalised forces that the motion requires, N.m or N, one a coordinate.",
-    )
-    return _print(language, words, [c.name for c in axes], names, lines, values)
-
-
-def _print(
-    language: Language,
-    words: _Words,
-    coordinates: Sequence[str],
-    inputs: Sequence[str],
-    lines: Sequence[str],
-    values: Sequence[str],
-) -> str:
-    if language == "python":
-        return _PYTHON.format(
-            **vars(words),
-            coordinates=tuple(coordinates),
-            inputs=tuple(inputs),
-            more=", u" if inputs else "",
-            body="\n    ".join(lines) or "pass",
-            values=", ".join(values),
-        )
-    return _C.format(
-        **vars(words),
-        more=", const double *u" if inputs else "",
-        body="\n    ".join(f"const double {_in_c(line)};" for line in lines),
-        values="\n    ".join(f"force[{i}] = {_in_c(v)};" for i, v in enumerate(values)),
+    if language == "c":
+        lines = [f"const double {_translate_powers(line)};" for line in lines]
+        values = [f"force[{i}] = {_translate_powers(v)};" for i, v in enumerate(values)]
+    python = language == "python"
+    return (_PYTHON if python else _C).format(
+        title=f"{model.device.name}{f' with {effects}' if effects else ''}, identified by bampipe.",
+        about=about,
+        summary="Generalised forces that the motion requires, N.m or N, one a coordinate.",
+        coordinates=tuple(c.name for c in axes),
+        inputs=tuple(names),
+        more="" if not names else ", u" if python else ", const double *u",
+        body="\n    ".join(lines) or ("pass" if python else ""),
+        values=(", " if python else "\n    ").join(values),
     )
 
 
-def _in_c(text: str) -> str:
+def _translate_powers(text: str) -> str:
     """Python's ``(a)**(b)`` as C's ``pow(a, b)``; all else is written alike in both."""
     while "**" in text:
         at = text.index("**")
-        start, end = _opening(text, at - 1), _closing(text, at + 2)
+        start, end = _find_partner(text, at - 1, -1), _find_partner(text, at + 2, 1)
         base, exponent = text[start:at], text[at + 2 : end + 1]
         text = f"{text[:start]}pow({base}, {exponent}){text[end + 1 :]}"
     return text
 
 
-def _opening(text: str, at: int) -> int:
-    depth = 0
-    while True:
-        depth += (text[at] == ")") - (text[at] == "(")
-        if depth == 0:
-            return at
-        at -= 1
-
-
-def _closing(text: str, at: int) -> int:
+def _find_partner(text: str, at: int, step: int) -> int:
+    """Place of the parenthesis that matches the one at ``at``, ``step`` by step from there."""
     depth = 0
     while True:
         depth += (text[at] == "(") - (text[at] == ")")
         if depth == 0:
             return at
-        at += 1
+        at += step

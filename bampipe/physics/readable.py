@@ -52,14 +52,14 @@ def describe_equations(device: Device) -> str:
     """
     if device.robot is not None:
         return _describe_robot(device, device.robot)
-    potential, equations = _equations(Model(device), {})
+    potential, equations = _print_equations(Model(device), {})
     lines = [f"{device.name}: {device.summary}", "", "Coordinates"]
     for c in device.coordinates:
         lines.append(f"  {c.symbol} = {c.name}, {c.unit}; generalised force in {c.torque_unit}")
     lines += ["", "Energies"]
     lines += ["  kinetic   = q'ᵀ M q' / 2", f"  potential = {potential}"]
     lines += ["", "M q'' + h = Q, where", *(f"  {line}" for line in equations)]
-    lines += ["", "Numbers", *_numbers(device)]
+    lines += ["", "Numbers", *_list_numbers(device)]
     return "\n".join(lines) + "\n"
 
 
@@ -73,10 +73,10 @@ def model_equations(model: Model, values: Mapping[str, float]) -> tuple[str, ...
     Raises:
         InputError: an expression is wrong, or deriving takes too long.
     """
-    return _equations(model, values)[1]
+    return _print_equations(model, values)[1]
 
 
-def _equations(model: Model, values: Mapping[str, float]) -> tuple[str, tuple[str, ...]]:
+def _print_equations(model: Model, values: Mapping[str, float]) -> tuple[str, tuple[str, ...]]:
     """The potential energy, and the lines of the equations of motion.
 
     With numbers in them they are derived once for each content of the model, then read from the
@@ -84,22 +84,24 @@ def _equations(model: Model, values: Mapping[str, float]) -> tuple[str, tuple[st
     """
     names = [p.name for p in model.parameters]
     if not values:
-        known = _templates(model, names)
+        known = _print_templates(model, names)
         return known["potential"], tuple("".join(line) for line in known["lines"])
     places = [f"#{number}#" for number in range(len(names))]
-    code = generated_code.load(f"{model.key}_equations", lambda: (_templates(model, places), {}))
-    labels = [_number(values[name]) if name in values else name for name in names]
+    code = generated_code.load(
+        f"{model.key}_print_equations", lambda: (_print_templates(model, places), {})
+    )
+    labels = [_format_number(values[name]) if name in values else name for name in names]
 
-    def filled(template: str) -> str:
+    def fill_template(template: str) -> str:
         text = re.sub(r"#(\d+)#", lambda found: labels[int(found[1])], template)
         # Else two numbers would read as one.
-        return re.sub(r"(?<=[\w)]) (?=\d)", " · ", _without_double_signs(text))
+        return re.sub(r"(?<=[\w)]) (?=\d)", " · ", _join_signs(text))
 
-    lines = (left + filled(right) for left, right in code.facts["lines"])
-    return filled(code.facts["potential"]), tuple(lines)
+    lines = (left + fill_template(right) for left, right in code.facts["lines"])
+    return fill_template(code.facts["potential"]), tuple(lines)
 
 
-def _templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
+def _print_templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
     """Potential energy and equations of motion as text, parameters by their ``labels``.
 
     Returns:
@@ -108,16 +110,13 @@ def _templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
     device = model.device
     e = derive(model, named_constants=True)
     marks = [c.symbol for c in device.coordinates]
-    names: dict[Any, Any] = {}
-    for group, suffix in ((e.q, ""), (e.qd, "'"), (e.qdd, "''")):
-        names |= {s: sp.Symbol(m + suffix, real=True) for s, m in zip(group, marks, strict=True)}
-    for symbol, label in [
-        *zip(e.u, e.inputs, strict=True),
-        *zip(e.z, e.z_names, strict=True),
-        *zip(e.p, labels, strict=True),
-    ]:
-        names[symbol] = sp.Symbol(label, real=True)
-    names |= {constant_symbol(c): sp.Symbol(c, real=True) for c in device.constants}
+    names: dict[Any, Any] = {constant_symbol(c): sp.Symbol(c, real=True) for c in device.constants}
+    rates, seconds = [f"{m}'" for m in marks], [f"{m}''" for m in marks]
+    for symbols, texts in (
+        (e.q, marks), (e.qd, rates), (e.qdd, seconds),
+        (e.u, e.inputs), (e.z, e.z_names), (e.p, labels),
+    ):  # fmt: skip
+        names |= {s: sp.Symbol(text, real=True) for s, text in zip(symbols, texts, strict=True)}
     quiet = dict.fromkeys(e.w, 0)
     sign = sp.Function("sgn")
 
@@ -148,7 +147,7 @@ def _templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
     return {"potential": text(e.potential), "lines": lines}
 
 
-def _without_double_signs(text: str) -> str:
+def _join_signs(text: str) -> str:
     """Return a sum in which a negative number that was put in has one sign."""
     negative = r"\(-([\d.]+)\)(?!\^)"
     text = re.sub(rf"(^|\()-{negative}", r"\1\2", text)
@@ -156,23 +155,14 @@ def _without_double_signs(text: str) -> str:
     return re.sub(rf"\+ {negative}", r"- \1", text)
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     """A number as it stands in a formula."""
     text = f"{value:.4g}"
     return f"({text})" if value < 0.0 or "e" in text else text
 
 
-_HEAD = (
-    "joint",
-    "kind",
-    "after",
-    "at, m",
-    "axis",
-    "range",
-    "mass, kg",
-    "centre, m",
-    "moments, kg.m2",
-)
+_HEAD = ["joint", "kind", "after", "at, m", "axis", "range"]
+_HEAD += ["mass, kg", "centre, m", "moments, kg.m2"]
 
 
 def _describe_robot(device: Device, robot: Robot) -> str:
@@ -181,45 +171,36 @@ def _describe_robot(device: Device, robot: Robot) -> str:
     for joint in robot.joints:
         unit = "rad" if joint.kind == "revolute" else "m"
         low, high = device.limits.get(joint.name, (None, None))
-        rows.append(
-            (
-                joint.name,
-                joint.kind,
-                (joint.after or robot.base or "base")
-                + (f", follows {joint.follows}" if joint.follows else ""),
-                _triple(joint.position),
-                _triple(joint.axis),
-                "" if low is None else f"{low:.4g} to {high:.4g} {unit}",
-                f"{joint.mass:.4g}",
-                _triple(joint.center),
-                _triple(joint.principal_moments),
-            )
-        )
-    widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
-    table = [
-        "  "
-        + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    ]
+        after = joint.after or robot.base or "base"
+        after += f", follows {joint.follows}" if joint.follows else ""
+        place, axis = _join_numbers(joint.position), _join_numbers(joint.axis)
+        limits = "" if low is None else f"{low:.4g} to {high:.4g} {unit}"
+        body = [
+            f"{joint.mass:.4g}",
+            _join_numbers(joint.center),
+            _join_numbers(joint.principal_moments),
+        ]
+        rows.append([joint.name, joint.kind, after, place, axis, limits, *body])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    padded = ([cell.ljust(n) for cell, n in zip(row, widths, strict=True)] for row in rows)
+    table = [f"  {'  '.join(row).rstrip()}" for row in padded]
     free = sum(not p.fixed for p in robot.parameters)
     lines = [f"{device.name}: {device.summary}".rstrip(": "), "", "Joints", *table, ""]
     if device.source:
         lines += [f"Source: {device.source}", ""]
-    lines += [
-        f"Of {len(robot.parameters)} inertial numbers {free} act on some joint, in"
-        f" {len(base_parameters(robot))} combinations."
-    ]
+    count, combined = len(robot.parameters), len(base_parameters(robot))
+    lines += [f"Of {count} inertial numbers {free} act on some joint, in {combined} combinations."]
     lines += [f"No body has this: {line}." for line in robot.impossible]
     own = {p.name for p in robot.parameters}
-    lines += ["", "Numbers", *_numbers(device, own)]
+    lines += ["", "Numbers", *_list_numbers(device, own)]
     return "\n".join(lines) + "\n"
 
 
-def _triple(values: Iterable[float]) -> str:
+def _join_numbers(values: Iterable[float]) -> str:
     return " ".join(f"{value:.4g}" for value in values)
 
 
-def _numbers(device: Device, hidden: Container[str] = ()) -> list[str]:
+def _list_numbers(device: Device, hidden: Container[str] = ()) -> list[str]:
     """One line a constant and a parameter: value, unit, where from."""
     rows: Mapping[str, tuple[str, str]] = {
         **{n: (f"{c.value:g} {c.unit}", c.source) for n, c in device.constants.items()},

@@ -12,37 +12,33 @@ from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.device import Device, device_from
 from bampipe.physics.effect import Effect, effect_from
 
-__all__ = [
-    "device",
-    "device_from",
-    "device_names",
-    "effect",
-    "effect_from",
-    "effect_names",
-]
+__all__ = ["device", "device_from", "device_names", "effect", "effect_from", "effect_names"]
 
 
-def _names(folder: str) -> tuple[str, ...]:
+@cache
+def _list_names(folder: str) -> tuple[str, ...]:
     entries = (files("bampipe.physics") / folder).iterdir()
     return tuple(sorted(e.name.removesuffix(".toml") for e in entries if e.name.endswith(".toml")))
 
 
-@cache
-def _declaration(folder: str, name: str) -> Mapping[str, Any]:
+def _read_declaration(folder: str, name: str, remedy: str) -> tuple[Mapping[str, Any], str]:
+    """Parsed file of that name, and where it is."""
+    known = _list_names(folder)
+    if name not in known:
+        what = f"unknown {folder.removesuffix('s')} {name!r}{did_you_mean(name, known)}"
+        raise InputError(what, remedy=remedy)
     text = (files("bampipe.physics") / folder / f"{name}.toml").read_text(encoding="utf-8")
-    return tomllib.loads(text)
+    return tomllib.loads(text), f"{folder}/{name}.toml"
 
 
-@cache
 def effect_names() -> tuple[str, ...]:
     """Names of the built-in effects, sorted."""
-    return _names("effects")
+    return _list_names("effects")
 
 
-@cache
 def device_names() -> tuple[str, ...]:
     """Names of the built-in devices, sorted."""
-    return _names("devices")
+    return _list_names("devices")
 
 
 @cache
@@ -52,12 +48,7 @@ def effect(name: str) -> Effect:
     Raises:
         InputError: there is none; suggests the closest.
     """
-    if name not in effect_names():
-        raise InputError(
-            f"unknown effect {name!r}{did_you_mean(name, effect_names())}",
-            remedy="see them all with: bampipe effects",
-        )
-    return effect_from(_declaration("effects", name), f"effects/{name}.toml")
+    return effect_from(*_read_declaration("effects", name, "see them all with: bampipe effects"))
 
 
 @cache
@@ -67,9 +58,5 @@ def device(name: str) -> Device:
     Raises:
         InputError: there is none; suggests the closest.
     """
-    if name not in device_names():
-        raise InputError(
-            f"unknown device {name!r}{did_you_mean(name, device_names())}",
-            remedy=f"built in: {', '.join(device_names())}; or give the path of a device file",
-        )
-    return device_from(_declaration("devices", name), f"devices/{name}.toml")
+    remedy = f"built in: {', '.join(device_names())}; or give the path of a device file"
+    return device_from(*_read_declaration("devices", name, remedy))

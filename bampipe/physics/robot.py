@@ -38,6 +38,7 @@ Array = NDArray[np.float64]
 _LARGEST = 1e9
 """Of a drawn body, kg, m or kg.m2: sums over the bodies stay below what a parameter can be."""
 Triple = Annotated[Several[Number], Field(min_length=3, max_length=3)]
+Sextuple = Annotated[Several[Number], Field(min_length=6, max_length=6)]
 INERTIAL_NAMES = (
     "mass",
     *(f"first_moment_{axis}" for axis in "xyz"),
@@ -75,7 +76,7 @@ class Joint(NamedDeclaration):
     zero: Number = Field(default=0.0, description="Its position where that is at zero, rad or m")
     mass: Number = Field(default=0.0, description="Of the body behind it, kg, as drawn")
     center: Triple = Field(default=(0.0, 0.0, 0.0), description="Its centre of mass, m")
-    inertia: Annotated[Several[Number], Field(min_length=6, max_length=6)] = Field(
+    inertia: Sextuple = Field(
         default=(0.0,) * 6,
         description="xx, xy, xz, yy, yz, zz about the centre of mass, kg.m2",
     )
@@ -122,7 +123,16 @@ class Joint(NamedDeclaration):
     @property
     def impossible(self) -> list[str]:
         """What no body can have among its drawn numbers, one sentence each."""
-        return list(_impossible(self))
+        faults = [f"a mass of {self.mass:g} kg"] if self.mass < 0.0 else []
+        moments = self.principal_moments
+        shown = f"(principal moments {', '.join(f'{m:.3g}' for m in moments)} kg.m2)"
+        if moments[0] < -_TRIANGLE * max(abs(moments[2]), 1e-12):
+            faults.append(f"a negative moment of inertia {shown}")
+        elif moments[2] > (moments[0] + moments[1]) * (1.0 + _TRIANGLE):
+            faults.append(f"an inertia whose largest moment exceeds the sum of the others {shown}")
+        elif self.mass == 0.0 and moments[2] > 0.0:
+            faults.append("an inertia without a mass")
+        return [f"{self.name}: {text}" for text in faults]
 
     @property
     def size(self) -> float:
@@ -160,7 +170,7 @@ class Row(NamedDeclaration):
     )
     mass: Number = Field(default=0.0, description="Of the body behind it, kg")
     center: Triple = Field(default=(0.0, 0.0, 0.0), description="In the frame of this row, m")
-    inertia: Annotated[Several[Number], Field(min_length=6, max_length=6)] = Field(
+    inertia: Sextuple = Field(
         default=(0.0,) * 6, description="As of a joint's body, in the frame of this row"
     )
 
@@ -243,9 +253,9 @@ class Robot(Declaration):
             Link(
                 place.get(joint.after, -1),
                 joint.kind == "prismatic",
-                _exact(np.array(joint.axis) / math.hypot(*joint.axis)),
-                _exact(np.array(joint.position)),
-                _rows(rotation_matrix(joint.rotation)),
+                _keep_integers(np.array(joint.axis) / math.hypot(*joint.axis)),
+                _keep_integers(np.array(joint.position)),
+                _matrix_rows(rotation_matrix(joint.rotation)),
                 place.get(joint.follows, -1),
                 joint.ratio,
                 joint.zero,
@@ -266,9 +276,9 @@ class Robot(Declaration):
         rng = np.random.default_rng(0)
         n, moving = len(self.joints), len(self.moving)
         samples = 40 * max(n, 1)
-        found = self.columns(*(rng.uniform(-2.0, 2.0, (moving, samples)).T for _ in range(3)))
+        entries = self.columns(*(rng.uniform(-2.0, 2.0, (moving, samples)).T for _ in range(3)))
         table = np.array(
-            [[np.broadcast_to(c, samples) for link in row for c in link] for row in found]
+            [[np.broadcast_to(c, samples) for link in row for c in link] for row in entries]
         )
         return np.ascontiguousarray(table.transpose(0, 2, 1).reshape(-1, INERTIAL * n))
 
@@ -323,7 +333,7 @@ class Robot(Declaration):
         """The inertial numbers of all bodies, those fixed that no motion of the joints shows."""
         heaviest = max(sum(max(joint.mass, 0.0) for joint in self.joints), 1e-3)
         longest = max((joint.size for joint in self.joints), default=0.0) or 0.1
-        found = []
+        entries = []
         for joint, matters in zip(self.joints, self.matters, strict=True):
             least = _LEAST_SHARE if joint.mass > 0.0 else _UNDRAWN_SHARE
             mass = max(joint.mass, least * heaviest)
@@ -337,8 +347,8 @@ class Robot(Declaration):
                     fixed=not bool(matters[k]),
                     weighed=True,
                 )
-                found.append(entry.renamed(f"{short}.{joint.name}"))
-        return tuple(found)
+                entries.append(entry.renamed(f"{short}.{joint.name}"))
+        return tuple(entries)
 
     @property
     def rotors_at_joints(self) -> dict[str, float]:
@@ -366,9 +376,7 @@ class Payload(Declaration):
 
     mass: Positive = Field(description="kg")
     center: Triple = Field(default=(0.0, 0.0, 0.0), description="In the frame of the tip, m")
-    inertia: Annotated[Several[Number], Field(min_length=6, max_length=6)] = Field(
-        default=(0.0,) * 6, description="As of a joint's body"
-    )
+    inertia: Sextuple = Field(default=(0.0,) * 6, description="As of a joint's body")
 
 
 Robot.model_rebuild()
@@ -388,23 +396,7 @@ def rotation_matrix(angles: tuple[float, ...]) -> Array:
 
 def gravity_vector(robot: Robot) -> Vector:
     """Gravity in the frame of the base, m/s2."""
-    return _exact(np.array(robot.gravity))
-
-
-def _impossible(joint: Joint) -> Iterator[str]:
-    if joint.mass < 0.0:
-        yield f"{joint.name}: a mass of {joint.mass:g} kg"
-    moments = joint.principal_moments
-    shown = ", ".join(f"{m:.3g}" for m in moments)
-    if moments[0] < -_TRIANGLE * max(abs(moments[2]), 1e-12):
-        yield f"{joint.name}: a negative moment of inertia (principal moments {shown} kg.m2)"
-    elif moments[2] > (moments[0] + moments[1]) * (1.0 + _TRIANGLE):
-        yield (
-            f"{joint.name}: an inertia whose largest moment exceeds the sum of the others"
-            f" (principal moments {shown} kg.m2)"
-        )
-    elif joint.mass == 0.0 and moments[2] > 0.0:
-        yield f"{joint.name}: an inertia without a mass"
+    return _keep_integers(np.array(robot.gravity))
 
 
 def _matrix(six: tuple[float, ...]) -> Array:
@@ -412,14 +404,14 @@ def _matrix(six: tuple[float, ...]) -> Array:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def _exact(vector: Array) -> Vector:
+def _keep_integers(vector: Array) -> Vector:
     """Numbers with 0, 1 and -1 as integers, so that products with them vanish from the text."""
-    found: list[Any] = []
+    entries: list[Any] = []
     for value in vector:
         near = round(float(value))
-        found.append(near if abs(value - near) < _ROUNDING and abs(near) <= 1 else float(value))
-    return found[0], found[1], found[2]
+        entries.append(near if abs(value - near) < _ROUNDING and abs(near) <= 1 else float(value))
+    return entries[0], entries[1], entries[2]
 
 
-def _rows(matrix: Array) -> tuple[Vector, Vector, Vector]:
-    return _exact(matrix[0]), _exact(matrix[1]), _exact(matrix[2])
+def _matrix_rows(matrix: Array) -> tuple[Vector, Vector, Vector]:
+    return _keep_integers(matrix[0]), _keep_integers(matrix[1]), _keep_integers(matrix[2])

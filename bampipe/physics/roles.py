@@ -11,37 +11,41 @@ from bampipe.physics.device import derivative
 from bampipe.physics.vocabulary import Vocabulary
 
 
-def compensation(d: Vocabulary, potential: Any) -> list[Any]:
+def find_compensation(
+    d: Vocabulary, potential: Any, logged: list[Any], side: list[Any]
+) -> list[Any]:
     """Generalised force of what the device has against gravity, one expression a coordinate.
 
     That is a torque of the device's own table, on a coordinate that the potential energy depends
     on, that itself depends on the pose; with the effects that name it, or a constant or
     definition that nothing but that torque uses (a compensator that lags or is mistuned).
+
+    Args:
+        potential: energy of the model; logged, side: generalised force and side load of the
+            logged inputs, by axis.
     """
     device = d.model.device
     torque = d.table(device.torque, "torque")
     balanced = [
         t.free_symbols & set(d.q) and potential.has(q) for t, q in zip(torque, d.q, strict=True)
     ]
-    found = [t if kept else sp.S.Zero for t, kept in zip(torque, balanced, strict=True)]
+    results = [t if kept else sp.S.Zero for t, kept in zip(torque, balanced, strict=True)]
     rest = [device.kinetic, device.potential, *device.applied.values(), *device.side_load.values()]
     of_torque, of_rest = (
         expression.reached_names(trees, device.definitions)
         for trees in (device.torque.values(), rest)
     )
     own = of_torque - of_rest
-    raw_applied, side = d.table(device.applied, "applied"), d.table(device.side_load, "side_load")
-    for item in (e for e in d.model.effects if e.effect.kind == "torque"):
+    for item in (e for e in d.model.effects if e.effect.kind == "torque" and any(balanced)):
         for key, tree in item.effect.expressions.items():
             place = d.axes.index(item.target_of(key))
             if balanced[place] and expression.names(tree) & own:
-                found[place] += d.rebuild_for(
-                    item, tree, d.effect_symbols(item, raw_applied, side), key
-                )
-    return found
+                symbols = d.effect_symbols(item, logged, side)
+                results[place] += d.rebuild_for(item, tree, symbols, key)
+    return results
 
 
-def delays(d: Vocabulary, applied: list[Any]) -> list[str]:
+def find_delays(d: Vocabulary, applied: list[Any]) -> list[str]:
     """Parameters that shift a measured force in time: small, they add its rate times themselves.
 
     To first order a shift by p seconds adds +-p times the rate of each force that it shifts,
@@ -50,7 +54,7 @@ def delays(d: Vocabulary, applied: list[Any]) -> list[str]:
     own = [p for item in d.model.effects for p in item.parameters]
     absent = {d.p[p.name]: 0 for p in own if not p.fixed}
     rates = {d.channel[derivative(force, 1)] for force in d.model.device.forces}
-    found = []
+    results = []
     for p in own:
         # Sympy is slow to find a slope zero.
         if not any(d.p[p.name] in e.free_symbols and rates & e.free_symbols for e in applied):
@@ -65,6 +69,6 @@ def delays(d: Vocabulary, applied: list[Any]) -> list[str]:
                 if b != 0
             }
             if len(ratio) == 1 and next(iter(ratio)).is_number and next(iter(ratio)) != 0:
-                found.append(p.name)
+                results.append(p.name)
                 break
-    return found
+    return results

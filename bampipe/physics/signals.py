@@ -95,8 +95,7 @@ class ActingInputs:
                 found[d.channel[name]] = self.put_in(d.rebuild_for(item, tree, symbols, key))
         for state in item.effect.states:
             z = d.z[item.prefix, state.name]
-            rate = d.rebuild_for(item, state.rate, symbols, f"states.{state.name}.rate")
-            initial = d.rebuild_for(item, state.initial, symbols, f"states.{state.name}.initial")
+            rate, initial = d.rebuild_state(item, state, symbols)
             self.rates[z], self.initial[z] = self.put_in(rate), self.put_in_initial(initial)
         self.acting |= found
 
@@ -106,12 +105,11 @@ class ActingInputs:
         Raises:
             InputError: it needs a derivative of what follows the rates, whose own is not known.
         """
-        d = self._d
-        values = {symbol: value for symbol, value in self.acting.items() if expr.has(symbol)}
-        for force in d.model.device.forces:
-            used = [
-                k for k in range(1, LAST_ORDER + 1) if expr.has(d.channel[derivative(force, k)])
-            ]
+        d, present = self._d, expr.free_symbols
+        values = {symbol: value for symbol, value in self.acting.items() if symbol in present}
+        for force in d.model.device.forces if self.acting else ():
+            rates = [d.channel[derivative(force, k)] for k in range(1, LAST_ORDER + 1)]
+            used = [k for k, rate in enumerate(rates, 1) if rate in present]
             value = self.acting.get(d.channel[force])
             for k in range(1, max(used) + 1) if used and value is not None else ():
                 value = d.rate_along(value, self.rates)

@@ -39,7 +39,7 @@ def require_sound(
     if not lost.any():
         return
     row = int(np.argmax(lost))
-    culprit = _culprit(system, q, qd, qdd, u, p, t)
+    culprit = _find_culprit(system, q, qd, qdd, u, p, t)
     raise InputError(
         f"{culprit} gives no number at {_pose(system, q[row])}, {t[row]:.3f} s",
         where=where,
@@ -64,7 +64,9 @@ def _require_inertia(system: System, q: Array, mass: Array, t: Array, where: str
     )
 
 
-def _culprit(system: System, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array) -> str:
+def _find_culprit(
+    system: System, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array
+) -> str:
     """The effect without which the others have numbers to give; else the device itself."""
     model = system.model
     for bound in model.effects:

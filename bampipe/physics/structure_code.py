@@ -13,67 +13,64 @@ from bampipe.physics.derivation import derive
 from bampipe.physics.equations import Equations
 from bampipe.physics.model import Model
 from bampipe.physics.readable import notation
-from bampipe.physics.structure import Combination, DeterminableNumber
 from bampipe.physics.vocabulary import constant_symbol
 
 
 def structure_code(model: Model) -> tuple[dict[str, Any], dict[str, str]]:
     """The groups and numbers of a model, as JSON holds them, and the source of the slopes."""
     equations = derive(model, named_constants=True)
-    groups, numbers, pivots = _split(model, equations)
-    facts = {
-        "together": [[list(g.members), list(g.combinations)] for g in groups],
-        "numbers": [[n.name, n.value, n.unit] for n in numbers],
-    }
-    return facts, {"slopes": ARRAY_HEADER + _slope_source(model, equations, pivots)}
+    groups, numbers, pivots = _separate_numbers(model, equations)
+    facts = {"together": groups, "numbers": numbers}
+    return facts, {"slopes": ARRAY_HEADER + _print_slopes(model, equations, pivots)}
 
 
-def _split(
-    model: Model, e: Equations
-) -> tuple[list[Combination], list[DeterminableNumber], list[str]]:
-    """Return groups, numbers that data could determine, and the constant that stands for each."""
+def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any], list[str]]:
+    """Return groups, numbers that data could determine, and the constant that stands for each.
+
+    Groups as lists of members and combinations, numbers of name, value and unit: see `Structure`.
+    """
     constants = {constant_symbol(c): c for c in model.device.constants}
     names = constants | dict(zip(e.p, (p.name for p in model.parameters), strict=True))
     motion = {*e.q, *e.qd, *e.z, *e.u}
     factors: list[Any] = []
-    quiet = dict.fromkeys(e.w, 0)
+    no_noise = dict.fromkeys(e.w, 0)
     # Where no motion is, there is no force. Of a robot's bodies, see `base_parameters`.
     for expr in (e.kinetic, e.potential) if model.device.robot is None else ():
-        factors += _factors(expr - expr.subs(dict.fromkeys(motion, 0)), motion, set(names))
+        factors += _collect_factors(expr - expr.subs(dict.fromkeys(motion, 0)), motion, set(names))
     for expr in (*e.applied, *e.other, *e.rates, *e.offset):
-        factors += _factors(sp.sympify(expr, strict=True).subs(quiet), motion, set(names))
-    known: set[Any] = set()
+        factors += _collect_factors(
+            sp.sympify(expr, strict=True).subs(no_noise), motion, set(names)
+        )
+    known_symbols: set[Any] = set()
     while True:
-        left = _distinct([_stripped(f, known) for f in factors])
-        new = {next(iter(f.free_symbols)) for f in left if len(f.free_symbols) == 1}
-        new = new or _determined(left)
-        if not new:
+        open_factors = _select_distinct([_strip_known(f, known_symbols) for f in factors])
+        new_symbols = {next(iter(f.free_symbols)) for f in open_factors if len(f.free_symbols) == 1}
+        new_symbols = new_symbols or _find_determined(open_factors)
+        if not new_symbols:
             break
-        known |= new
+        known_symbols |= new_symbols
     at = {symbol: model.device.constants[name].value for symbol, name in constants.items()}
-    numbers = [
-        DeterminableNumber(name, at[symbol], model.device.constants[name].unit)
+    numbers: list[Any] = [
+        [name, at[symbol], model.device.constants[name].unit]
         for symbol, name in constants.items()
-        if symbol in known
+        if symbol in known_symbols
     ]
-    pivots = [number.name for number in numbers]
+    pivots: list[str] = [name for name, *_ in numbers]
     groups = []
-    for members in _connected([f.free_symbols for f in left]):
-        own = [f for f in left if f.free_symbols <= members]
-        ordered = tuple(name for symbol, name in names.items() if symbol in members)
-        groups.append(Combination(ordered, tuple(notation(f, names) for f in own)))
+    for members in _join_overlapping([f.free_symbols for f in open_factors]):
+        own = [f for f in open_factors if f.free_symbols <= members]
+        ordered = [name for symbol, name in names.items() if symbol in members]
+        groups.append([ordered, [notation(f, names) for f in own]])
         for sum_ in own:
-            pivot = _pivot(sum_, own, constants)
+            pivot = _find_pivot(sum_, own, constants)
             if pivot is not None:
                 unit = model.device.constants[constants[pivot]].unit
-                numbers.append(
-                    DeterminableNumber(notation(sum_, names), float(sum_.subs(at)), unit)
-                )
+                numbers.append([notation(sum_, names), float(sum_.subs(at)), unit])
                 pivots.append(constants[pivot])
     return groups, numbers, pivots
 
 
-def _determined(factors: Sequence[Any]) -> set[Any]:
+def _find_determined(factors: Sequence[Any]) -> set[Any]:
     """Return the symbols that all factors together determine: no change of the others hides one."""
     symbols = sorted(set().union(*(f.free_symbols for f in factors)), key=sp.default_sort_key)
     if not symbols:
@@ -85,7 +82,7 @@ def _determined(factors: Sequence[Any]) -> set[Any]:
     return {s for i, s in enumerate(symbols) if np.all(np.abs(null[:, i]) < 1e-9)}
 
 
-def _pivot(combination: Any, group: Sequence[Any], constants: Mapping[Any, str]) -> Any:
+def _find_pivot(combination: Any, group: Sequence[Any], constants: Mapping[Any, str]) -> Any:
     """Return a constant that changes ``combination``, one for one, and no other of the group."""
     if not combination.free_symbols <= set(constants):
         return None
@@ -96,7 +93,7 @@ def _pivot(combination: Any, group: Sequence[Any], constants: Mapping[Any, str])
     return None
 
 
-def _factors(expr: Any, motion: set[Any], numbers: set[Any]) -> list[Any]:
+def _collect_factors(expr: Any, motion: set[Any], numbers: set[Any]) -> list[Any]:
     """Return the factor of each function of the motion in ``expr``, like terms collected.
 
     A number inside a function of the motion shapes that function and so enters on its own.
@@ -116,27 +113,33 @@ def _factors(expr: Any, motion: set[Any], numbers: set[Any]) -> list[Any]:
     return [*collected.values(), *shapes]
 
 
-def _stripped(factor: Any, known: set[Any]) -> Any:
+def _strip_known(factor: Any, known_symbols: set[Any]) -> Any:
     """Return the terms of ``factor`` that hold something unknown, without known multipliers."""
-    kept = [t for t in sp.Add.make_args(factor) if t.free_symbols - known]
-    if not kept:
+    terms_kept = [t for t in sp.Add.make_args(factor) if t.free_symbols - known_symbols]
+    if not terms_kept:
         return sp.S.Zero
-    total = sp.Add(*kept)
-    common = sp.gcd_terms(total).as_independent(*(total.free_symbols - known), as_Add=False)[0]
-    return sp.expand(total / common) if common.is_number or common.free_symbols <= known else total
+    total = sp.Add(*terms_kept)
+    common = sp.gcd_terms(total).as_independent(
+        *(total.free_symbols - known_symbols), as_Add=False
+    )[0]
+    return (
+        sp.expand(total / common)
+        if common.is_number or common.free_symbols <= known_symbols
+        else total
+    )
 
 
-def _distinct(factors: Sequence[Any]) -> list[Any]:
+def _select_distinct(factors: Sequence[Any]) -> list[Any]:
     """Return factors that are not multiples of each other, the shortest first."""
-    kept: list[Any] = []
+    terms_kept: list[Any] = []
     present = [f for f in factors if f != 0]
     for factor in sorted(present, key=lambda f: (len(sp.Add.make_args(f)), sp.default_sort_key(f))):
-        if all(not sp.cancel(factor / other).is_number for other in kept):
-            kept.append(-factor if str(factor).startswith("-") else factor)
-    return kept
+        if all(not sp.cancel(factor / other).is_number for other in terms_kept):
+            terms_kept.append(-factor if str(factor).startswith("-") else factor)
+    return terms_kept
 
 
-def _connected(sets: Sequence[set[Any]]) -> list[set[Any]]:
+def _join_overlapping(sets: Sequence[set[Any]]) -> list[set[Any]]:
     """Join sets that share an element."""
     joined: list[set[Any]] = []
     for one in map(set, sets):
@@ -145,17 +148,17 @@ def _connected(sets: Sequence[set[Any]]) -> list[set[Any]]:
     return joined
 
 
-def _slope_source(model: Model, e: Equations, pivots: Sequence[str]) -> str:
+def _print_slopes(model: Model, e: Equations, pivots: Sequence[str]) -> str:
     """Source of the slopes of the residual by the constants ``pivots``, axis by axis."""
     numbers: Mapping[Any, Any] = {
         constant_symbol(name): sp.Float(c.value) for name, c in model.device.constants.items()
     }
-    quiet = dict.fromkeys(e.w, 0)
+    no_noise = dict.fromkeys(e.w, 0)
     slopes = []
     for a, o, f in zip(e.applied, e.other, e.dynamics, strict=True):
         residual = a + o - f
         for name in pivots:
             slope = sp.diff(residual, constant_symbol(name))
-            slopes.append(sp.sympify(slope, strict=True).subs(quiet).subs(numbers))
+            slopes.append(sp.sympify(slope, strict=True).subs(no_noise).subs(numbers))
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u, "p": e.p}
     return function_source("slopes", groups, slopes, e.steps)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bampipe import generated_code
 from bampipe.physics.device import INPUT_ORDERS, derivative
+from bampipe.physics.memory import integrate_memory
 from bampipe.physics.model import Model
 from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.parameter import Parameter
@@ -21,26 +22,8 @@ if TYPE_CHECKING:  # it brings sympy, which few need
     from bampipe.physics.model_code import Generation
 
 Array = NDArray[np.float64]
-_MEMORY_STEPS = (1, 3, 12, 48, 192)
-"""Steps a sample tried in turn, until a stiff state is integrated without running away."""
-ACCURATE = 0.25
-"""Largest product of a step and a state's rate for which a single step a sample will do: what RK4
-leaves out of it is its fifth power over 120, 8e-6."""
-STIFF_STEPS = 24
-"""Exponential steps a sample, stable ones, in place of more than these, where no state depends on
-another. A hysteresis passed 600 times between two samples is 1 % off, 60 times 0.1 %."""
-STABLE = 2.5
-"""Largest product of a step and the rate at which a state decays for which RK4 is stable, with a
-margin: it is up to 2.78 (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.2)."""
-_RUNAWAY = 1e9
 _TOGETHER = 1024
 """Samples whose slopes by a robot's bodies are taken at once: as many as a processor keeps near."""
-_STEP_AGAINST_NEIGHBOURS = 8.0
-"""A command that changes between two samples this many times more than before and after has been
-switched. Ramps and sines change by at most twice as much from one sample to the next; noise of the
-reading makes neighbours large."""
-_STEP_SHARE = 0.02
-"""Least share of the command's range that counts as switching: not a quantised slow change."""
 
 
 class System:
@@ -110,12 +93,12 @@ class System:
     @cached_property
     def _delayed(self) -> set[str]:
         """The measured forces of which a delay is estimated."""
-        device, found = self.model.device, set[str]()
+        device, results = self.model.device, set[str]()
         forces = dict(zip(device.components, device.forces, strict=True))
         for item in self.model.effects:
             if any(not p.fixed and p.name in self.delays for p in item.parameters):
-                found |= {forces[item.target]} if item.target in forces else {*device.forces}
-        return found
+                results |= {forces[item.target]} if item.target in forces else {*device.forces}
+        return results
 
     @cached_property
     def forced(self) -> tuple[int, ...]:
@@ -174,40 +157,31 @@ class System:
         return self._whole.module("dynamics")
 
     @cached_property
-    def _compiled(self) -> ModuleType:
-        return self._whole.module("compiled")
-
-    @cached_property
     def _residual(self) -> Callable[..., None]:
         return self._whole.module("residual").residual
 
-    @property
+    @cached_property
     def derivative(self) -> Callable[..., None]:
         """f(x, u, p, w, dx): numba-compiled state derivative (eq 14)."""
-        return self._compiled.derivative
-
-    @property
-    def measure(self) -> Callable[..., None]:
-        """h(x, u, p, y): numba-compiled encoder readings, positions then rates."""
-        return self._compiled.measure
+        return self._whole.module("compiled").derivative
 
     @cached_property
-    def _rows(self) -> ModuleType:
-        return self._whole.module("rows")
+    def measure(self) -> Callable[..., None]:
+        """h(x, u, p, y): numba-compiled encoder readings, positions then rates."""
+        return self._whole.module("compiled").measure
 
-    @property
+    @cached_property
     def derivative_rows(self) -> Callable[..., None]:
         """f(count, x, u, p, w, dx): `derivative` of many states at once, in vector registers.
 
-        Quantity i of row r is at ``[i*ROWS + r]``; equal to `derivative` but for
-        rounding.
+        Quantity i of row r is at ``[i*ROWS + r]``; equal to `derivative` but for rounding.
         """
-        return self._rows.derivative_rows
+        return self._whole.module("rows").derivative_rows
 
-    @property
+    @cached_property
     def measure_rows(self) -> Callable[..., None]:
         """h(count, x, u, p, y): `measure` of many states at once; see `derivative_rows`."""
-        return self._rows.measure_rows
+        return self._whole.module("rows").measure_rows
 
     def encoder_readings(self, x: Array, u: Array, p: Array) -> Array:
         """What the encoders read of states ``x`` (T, n_x): positions, then rates, (T, 2 n_q).
@@ -220,7 +194,7 @@ class System:
             return x[:, : 2 * n].copy()
         from bampipe.model_functions import ROWS
 
-        found = np.empty((len(x), 2 * n))
+        results = np.empty((len(x), 2 * n))
         parameters = np.repeat(p, ROWS)
         for first in range(0, len(x), ROWS):
             part = slice(first, min(first + ROWS, len(x)))
@@ -229,8 +203,8 @@ class System:
             states[:, :count], inputs[:, :count] = x[part].T, u[part].T
             y = np.zeros(2 * n * ROWS)
             self.measure_rows(count, states.ravel(), inputs.ravel(), parameters, y)
-            found[part] = y.reshape(-1, ROWS)[:, :count].T
-        return found
+            results[part] = y.reshape(-1, ROWS)[:, :count].T
+        return results
 
     def offset(self, q: Array, u: Array, p: Array) -> Array:
         """How far the mechanism is from what the encoders read, (T, n_q), rad or m.
@@ -319,14 +293,14 @@ class System:
             wanted: numbers of parameters, all in `lasting`.
             q, qd, qdd, u: as in `residual`.
         """
-        found = np.zeros((len(q), len(self.coordinates), len(wanted)))
+        results = np.zeros((len(q), len(self.coordinates), len(wanted)))
         bodies = [(k, self.of_bodies[i]) for k, i in enumerate(wanted) if i in self.of_bodies]
         if len(bodies) < len(wanted):
             column = {i: k for k, i in enumerate(wanted)}
             written = self._whole.module("slopes").slopes(q.T, qd.T, qdd.T, u.T)
             for (i, axis), slope in zip(self._whole.facts["slopes"], written, strict=True):
                 if i in column:
-                    found[:, axis, column[i]] = slope
+                    results[:, axis, column[i]] = slope
         if bodies:
             robot = self.model.device.robot
             assert robot is not None
@@ -336,8 +310,8 @@ class System:
                 for k, number in bodies:
                     link, place = divmod(number, INERTIAL)
                     for axis, by_link in enumerate(forces):
-                        found[part, axis, k] -= by_link[link][place]
-        return found
+                        results[part, axis, k] -= by_link[link][place]
+        return results
 
     def contribution(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """What the model's effects add to the residual of the bare device, (T, n_q).
@@ -345,9 +319,13 @@ class System:
         Arguments as in `required`. Effects of kind ``measurement`` change the motion instead; see
         `offset`. Columns of axes that no effect touches are zero.
         """
-        out = np.zeros((len(q), len(self.coordinates)))
         columns = self._arrays.contribution(q.T, qd.T, qdd.T, z.T, u.T, p)
-        for axis, column in zip(self.touched, columns, strict=True):
+        return self._on_axes(self.touched, columns, len(q))
+
+    def _on_axes(self, axes: Sequence[int], columns: Sequence[Any], rows: int) -> Array:
+        """Columns of some axes as (rows, n_q), zero on the others."""
+        out = np.zeros((rows, len(self.coordinates)))
+        for axis, column in zip(axes, columns, strict=True):
             out[:, axis] = column
         return out
 
@@ -396,11 +374,8 @@ class System:
         Effects that change it (a carriage that lags) are included. Arguments as in `required`;
         columns of axes not in `compensated` are zero.
         """
-        out = np.zeros((len(q), len(self.coordinates)))
         columns = self._arrays.compensation(q.T, qd.T, z.T, u.T, p)
-        for axis, column in zip(self.compensated, columns, strict=True):
-            out[:, axis] = column
-        return out
+        return self._on_axes(self.compensated, columns, len(q))
 
     def initial_memory(self, q: Array, u: Array, p: Array) -> Array:
         """Internal states at the start of a trial, (n_z,), from the first q (n_q,) and u (n_u,)."""
@@ -420,50 +395,10 @@ class System:
         """
         if not self.memory_names:
             return np.zeros((len(q), 0))
-        z0 = self.initial_memory(q[0], u[0], p)
-        switched = self._switched(u)
-        at = np.flatnonzero(switched.any(axis=1))
-        if at.size:
-            # One more row at the time of the switch, with the values before it.
-            held = np.where(switched[at], u[at - 1], u[at])
-            u = np.insert(u, at, held, axis=0)
-            q, qd, qdd, t = (np.insert(x, at, x[at], axis=0) for x in (q, qd, qdd, t))
-        uses = self._memory_uses
-        columns = [
-            q[:, uses["q"]],
-            qd[:, uses["qd"]],
-            qdd[:, uses["qd"]],
-            u[:, uses["u"]],
-            p[uses["p"]],
-        ]
-        arrays = [np.ascontiguousarray(x, dtype=np.float64) for x in (*columns, t)]
-        out = np.empty((len(t), len(z0)))
-        module = self._code.module("memory")
-        least = 0.0
-        stiff = getattr(module, "stiff_memory", None)
-        for steps in _MEMORY_STEPS:
-            if stiff is not None and max(steps, least) > STIFF_STEPS:
-                stiff(*arrays, z0, STIFF_STEPS, out)
-                break
-            if steps < least and steps < _MEMORY_STEPS[-1]:
-                continue
-            fastest = module.memory(*arrays, z0, steps, out)
-            enough = STABLE if steps > 1 else ACCURATE
-            if fastest < enough and np.all(np.abs(out) < _RUNAWAY):
-                break
-            least = steps * fastest / STABLE
-        return np.delete(out, at + np.arange(at.size), axis=0) if at.size else out
-
-    def _switched(self, u: Array) -> NDArray[np.bool_]:
-        """Where an input other than a force has been switched since the sample before, (T, n_u)."""
-        switched = np.zeros(u.shape, dtype=bool)
-        for i in self._commands if len(u) > 3 else ():
-            change = np.abs(np.diff(u[:, i]))
-            around = np.maximum(change[:-2], change[2:])
-            least = max(_STEP_SHARE * float(np.ptp(u[:, i])), 1e-300)
-            middle = change[1:-1]
-            switched[2:-1, i] = (middle > least) & (middle > _STEP_AGAINST_NEIGHBOURS * around)
-        return switched
+        z0, module = self.initial_memory(q[0], u[0], p), self._code.module("memory")
+        return integrate_memory(
+            module, self._memory_uses, self._commands, (q, qd, qdd, u, p, t), z0
+        )
 
 
 def _stack(columns: tuple[Any, ...], rows: int) -> Array:

@@ -53,30 +53,30 @@ class Dimension:
 PURE = Dimension()
 
 
-def _of(kg: int = 0, m: int = 0, s: int = 0, ampere: int = 0, kelvin: int = 0) -> Dimension:
+def _dimension(kg: int = 0, m: int = 0, s: int = 0, ampere: int = 0, kelvin: int = 0) -> Dimension:
     return Dimension(tuple(Fraction(e) for e in (kg, m, s, ampere, kelvin)))
 
 
 _UNITS = {
     "1": PURE,
     "rad": PURE,
-    "m": _of(m=1),
-    "kg": _of(kg=1),
-    "s": _of(s=1),
-    "A": _of(ampere=1),
-    "K": _of(kelvin=1),
-    "Hz": _of(s=-1),
-    "N": _of(1, 1, -2),
-    "Pa": _of(1, -1, -2),
-    "J": _of(1, 2, -2),
-    "W": _of(1, 2, -3),
-    "V": _of(1, 2, -3, -1),
-    "Ohm": _of(1, 2, -3, -2),
-    "H": _of(1, 2, -2, -2),
-    "F": _of(-1, -2, 4, 2),
-    "C": _of(s=1, ampere=1),
-    "T": _of(1, 0, -2, -1),
-    "Wb": _of(1, 2, -2, -1),
+    "m": _dimension(m=1),
+    "kg": _dimension(kg=1),
+    "s": _dimension(s=1),
+    "A": _dimension(ampere=1),
+    "K": _dimension(kelvin=1),
+    "Hz": _dimension(s=-1),
+    "N": _dimension(1, 1, -2),
+    "Pa": _dimension(1, -1, -2),
+    "J": _dimension(1, 2, -2),
+    "W": _dimension(1, 2, -3),
+    "V": _dimension(1, 2, -3, -1),
+    "Ohm": _dimension(1, 2, -3, -2),
+    "H": _dimension(1, 2, -2, -2),
+    "F": _dimension(-1, -2, 4, 2),
+    "C": _dimension(s=1, ampere=1),
+    "T": _dimension(1, 0, -2, -1),
+    "Wb": _dimension(1, 2, -2, -1),
 }
 _FACTOR = re.compile(r"([A-Za-z]+|1)(-?\d{1,2})?\Z")
 
@@ -114,7 +114,7 @@ class _Mismatch(Exception):
 Found = Dimension | None
 
 
-def _number(value: float) -> Found:
+def _dimension_of_number(value: float) -> Found:
     return PURE if 4 * value == int(4 * value) and value != 0 else None
 
 
@@ -130,50 +130,54 @@ def dimension(tree: ast.expr, symbols: Mapping[str, Found]) -> Found:
             a function is given one that it cannot take.
     """
     try:
-        return _walk(tree, symbols)
+        return _find_dimension(tree, symbols)
     except _Mismatch as error:
         raise InputError(str(error)) from None
 
 
-def _walk(node: ast.expr, symbols: Mapping[str, Found]) -> Found:
+def _find_dimension(node: ast.expr, symbols: Mapping[str, Found]) -> Found:
     match node:
         case ast.Constant(value=value):
-            return _number(float(value))  # type: ignore[arg-type]
+            return _dimension_of_number(float(value))  # type: ignore[arg-type]
         case ast.Name(id=name):
             if name not in symbols:
                 raise _Mismatch(f"unknown symbol {name!r}{did_you_mean(name, symbols)}")
             return symbols[name]
         case ast.UnaryOp(operand=operand):
-            return _walk(operand, symbols)
+            return _find_dimension(operand, symbols)
         case ast.BinOp(left=left, op=ast.Pow(), right=right):
-            base = _walk(left, symbols)
+            base = _find_dimension(left, symbols)
             power = Fraction(ast.literal_eval(right)).limit_denominator(1000)
             return None if base is None else base**power
         case ast.BinOp(left=left, op=op, right=right):
-            a, b = _walk(left, symbols), _walk(right, symbols)
+            a, b = _find_dimension(left, symbols), _find_dimension(right, symbols)
             if isinstance(op, ast.Add | ast.Sub):
-                return _alike(node, [left, right], [a, b])
+                return _common_dimension(node, [left, right], [a, b])
             if a is None or b is None:
                 return None
             return a * b if isinstance(op, ast.Mult) else a / b
         case ast.Call(func=ast.Name(id=name), args=args):
-            return _call(node, name, args, [_walk(a, symbols) for a in args])
+            return _find_call_dimension(
+                node, name, args, [_find_dimension(a, symbols) for a in args]
+            )
     raise AssertionError(f"unchecked node {type(node).__name__}")
 
 
-def _alike(node: ast.expr, parts: list[ast.expr], found: list[Found]) -> Found:
+def _common_dimension(node: ast.expr, parts: list[ast.expr], found: list[Found]) -> Found:
     """Common dimension of ``parts``, which are added or compared in ``node``."""
     pairs = [(p, f) for p, f in zip(parts, found, strict=True) if f is not None]
     for part, other in pairs[1:]:
         if other != pairs[0][1]:
             raise _Mismatch(
-                f"{_short(node)} puts together {_short(pairs[0][0])} ({pairs[0][1]}) "
-                f"and {_short(part)} ({other})"
+                f"{_quote(node)} puts together {_quote(pairs[0][0])} ({pairs[0][1]}) "
+                f"and {_quote(part)} ({other})"
             )
     return pairs[0][1] if pairs else None
 
 
-def _call(node: ast.expr, name: str, args: list[ast.expr], found: list[Found]) -> Found:
+def _find_call_dimension(
+    node: ast.expr, name: str, args: list[ast.expr], found: list[Found]
+) -> Found:
     match name:
         case "abs":
             return found[0]
@@ -184,18 +188,18 @@ def _call(node: ast.expr, name: str, args: list[ast.expr], found: list[Found]) -
         case "ddt":
             return None if found[0] is None else found[0] / _UNITS["s"]
         case "min" | "max" | "clip":
-            return _alike(node, args, found)
+            return _common_dimension(node, args, found)
     if found[0] not in (None, PURE):
-        raise _Mismatch(f"{name}() takes a pure number, and {_short(args[0])} is in {found[0]}")
+        raise _Mismatch(f"{name}() takes a pure number, and {_quote(args[0])} is in {found[0]}")
     return PURE
 
 
-def _short(node: ast.expr) -> str:
+def _quote(node: ast.expr) -> str:
     text = ast.unparse(node)
     return repr(text if len(text) <= 60 else text[:57] + "...")
 
 
-class _Check:
+class _Findings:
     """Sentences about one file, collected while its expressions are gone through."""
 
     def __init__(self) -> None:
@@ -235,7 +239,7 @@ def _axes(device: Device) -> Iterator[tuple[str, Dimension, Dimension]]:
         yield c.name, parse_unit(c.unit, c.name), parse_unit(c.torque_unit, c.name)
 
 
-def _device_symbols(device: Device, check: _Check) -> dict[str, Found]:
+def _device_symbols(device: Device, check: _Findings) -> dict[str, Found]:
     """Dimension of every name that the device's expressions may use."""
     second = _UNITS["s"]
     symbols: dict[str, Found] = {"t": second}
@@ -246,8 +250,8 @@ def _device_symbols(device: Device, check: _Check) -> dict[str, Found]:
     force = check.unit(device.force_unit, "inputs.force_unit")
     for channel in device.forces:
         for order in range(len(INPUT_ORDERS)):
-            known = None if force is None else force / second**order
-            symbols[derivative(channel, order)] = known
+            rate_dimension = None if force is None else force / second**order
+            symbols[derivative(channel, order)] = rate_dimension
     for name, unit_text in device.channels.items():
         symbols[name] = check.unit(unit_text, f"inputs.channels.{name}")
     for name, constant in device.constants.items():
@@ -268,7 +272,7 @@ def check_device(device: Device) -> list[str]:
     Returns:
         One plain sentence a finding, the field first.
     """
-    check, joule = _Check(), _UNITS["J"]
+    check, joule = _Findings(), _UNITS["J"]
     symbols = _device_symbols(device, check)
     check.expression(device.kinetic, symbols, "energy.kinetic", joule)
     check.expression(device.potential, symbols, "energy.potential", joule)
@@ -292,27 +296,29 @@ def check_device(device: Device) -> list[str]:
     return list(dict.fromkeys(check.found))
 
 
-def _check_controller(device: Device, symbols: Mapping[str, Found], check: _Check) -> None:
+def _check_controller(device: Device, symbols: Mapping[str, Found], check: _Findings) -> None:
     """Hold the control law's expressions to the unit of the forces that they command."""
     if device.controller is None:
         return
-    known = {n: d for n, d in symbols.items() if n not in [p.name for p in device.parameters]}
+    known_symbols = {
+        n: d for n, d in symbols.items() if n not in [p.name for p in device.parameters]
+    }
     for name, unit in device.controller.channels.items():
-        known[name] = check.unit(unit, f"controller.channels.{name}")
+        known_symbols[name] = check.unit(unit, f"controller.channels.{name}")
     for name, state in device.controller.states.items():
-        known[name] = check.unit(state.unit, f"controller.states.{name}")
+        known_symbols[name] = check.unit(state.unit, f"controller.states.{name}")
     for name, state in device.controller.states.items():
-        kept, second = known[name], _UNITS["s"]
+        kept, second = known_symbols[name], _UNITS["s"]
         wanted = None if kept is None else kept / second
-        check.expression(state.rate, known, f"controller.states.{name}.rate", wanted)
+        check.expression(state.rate, known_symbols, f"controller.states.{name}.rate", wanted)
     for force, tree in device.controller.command.items():
-        check.expression(tree, known, f"controller.command.{force}", symbols[force])
+        check.expression(tree, known_symbols, f"controller.command.{force}", symbols[force])
 
 
-def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[str, Found]:
+def _effect_symbols(item: BoundEffect, device: Device, check: _Findings) -> dict[str, Found]:
     """Dimension of every name that the expressions of a bound effect may use."""
     second = _UNITS["s"]
-    symbols = _device_symbols(device, _Check())
+    symbols = _device_symbols(device, _Findings())
     for axis, unit, torque in _axes(device):
         terms = ("applied", "load", "coulomb", "weight", "pull")
         symbols |= dict.fromkeys((f"{term}_{axis}" for term in terms), torque)
@@ -331,15 +337,13 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Check) -> dict[st
                 f"qd_{letter}": unit / second,
                 f"middle_{letter}": unit,
             }
-    if item.effect.scope in ("force_component", "force_pair"):
-        for letter in "fg"[: 1 + (item.effect.scope == "force_pair")]:
-            for order in range(len(INPUT_ORDERS)):
-                symbols[derivative(letter, order)] = symbols[derivative(device.forces[0], order)]
     if item.effect.scope == "channel":
         symbols["f"] = symbols[item.target]
-    if any(key.endswith(f".{EACH}") for key in item.effect.expressions):
+    of_each = any(key.endswith(f".{EACH}") for key in item.effect.expressions)
+    letters = {"force_pair": "fg", "force_component": "f"}.get(item.effect.scope, "f" * of_each)
+    for letter in letters:
         for order in range(len(INPUT_ORDERS)):
-            symbols[derivative("f", order)] = symbols[derivative(device.forces[0], order)]
+            symbols[derivative(letter, order)] = symbols[derivative(device.forces[0], order)]
     for p in item.parameters:
         short = p.name.removeprefix(f"{item.prefix}.")
         symbols[short] = check.unit(p.unit, f"parameters.{short}.unit")
@@ -360,7 +364,7 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
     Raises:
         InputError: the target does not exist.
     """
-    check = _Check()
+    check = _Findings()
     item = bind(effect, target, device)
     symbols = _effect_symbols(item, device, check)
     kind = device.coordinate(item.axes[0]).kind if item.axes else ""

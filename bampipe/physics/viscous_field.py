@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 import ast
-import copy
+import re
+from collections.abc import Sequence
 
 from bampipe.errors import InputError
 from bampipe.physics.device import Device
 from bampipe.physics.effect import Effect, effect_from
 
 NAME = "viscous_field"
-
-
-class _Push(ast.NodeTransformer):
-    """Puts one for a force and nought for the others."""
-
-    def __init__(self, forces: tuple[str, ...], chosen: str) -> None:
-        self.forces, self.chosen = forces, chosen
-
-    def visit_Name(self, node: ast.Name) -> ast.expr:
-        if node.id not in self.forces:
-            return node
-        return ast.copy_location(ast.Constant(float(node.id == self.chosen)), node)
 
 
 def viscous_field(device: Device) -> Effect:
@@ -42,7 +31,7 @@ def viscous_field(device: Device) -> Effect:
             f"device {device.name!r} has no brakes that could render a field at a handle"
         )
     gain = {
-        (axis, force): ast.unparse(_Push(device.forces, force).visit(copy.deepcopy(tree)))
+        (axis, force): _put_unit(ast.unparse(tree), device.forces, force)
         for axis, tree in device.applied.items()
         for force in device.forces
     }
@@ -82,3 +71,8 @@ def viscous_field(device: Device) -> Effect:
         },
         NAME,
     )
+
+
+def _put_unit(text: str, forces: Sequence[str], chosen: str) -> str:
+    """Put one for a force and nought for the others."""
+    return re.sub(r"\w+", lambda m: str(float(m[0] == chosen)) if m[0] in forces else m[0], text)

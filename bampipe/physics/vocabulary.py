@@ -11,7 +11,7 @@ import sympy as sp
 from bampipe.errors import InputError
 from bampipe.physics import expression
 from bampipe.physics.device import INPUT_ORDERS, LAST_ORDER, derivative
-from bampipe.physics.effect import PAIR, BoundEffect, force_pairs
+from bampipe.physics.effect import PAIR, BoundEffect, State, force_pairs
 from bampipe.physics.model import Model
 from bampipe.physics.time_limit import OutOfTime
 
@@ -27,7 +27,7 @@ class Vocabulary:
     """The symbols of one model, and expressions of its device and effects built from them.
 
     Attributes:
-        model: the device and its effects.
+        model: the device and its effects; named_constants: whether constants stay symbols.
         axes: names of the coordinates.
         q, qd, qdd: their symbols and those of their rates.
         channels: every input there may be; channel: their symbols.
@@ -40,7 +40,7 @@ class Vocabulary:
     """
 
     def __init__(self, model: Model, named_constants: bool = False) -> None:
-        self.model = model
+        self.model, self.named_constants = model, named_constants
         device = model.device
         self.axes = [c.name for c in device.coordinates]
         # Symbols are numbered, so that no name from a file is ever printed into generated code.
@@ -119,11 +119,12 @@ class Vocabulary:
         """Sign, smoothed over the axes' widths where the argument is a rate or a sum of rates."""
         width, rest = sp.S.Zero, sp.sympify(argument, strict=True)
         for c, rate in zip(self.model.device.coordinates, self.qd, strict=True):
-            share = sp.diff(argument, rate)
-            if not share.is_number:
-                return sp.sign(argument)
-            width += abs(share) * sp.Float(c.sign_width)
-            rest -= share * rate
+            if rate in rest.free_symbols:
+                slope = sp.diff(argument, rate)
+                if not slope.is_number:
+                    return sp.sign(argument)
+                width += abs(slope) * sp.Float(c.sign_width)
+                rest -= slope * rate
         if width == 0 or sp.expand(rest) != 0:
             return sp.sign(argument)
         return sp.tanh(argument / width)
@@ -208,3 +209,8 @@ class Vocabulary:
 
     def rebuild_for(self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str) -> Any:
         return self.rebuild(tree, symbols, f"effect {item.name!r}: {what}")
+
+    def rebuild_state(self, item: BoundEffect, state: State, symbols: Symbols) -> tuple[Any, Any]:
+        """Rate and initial value of an internal state of ``item``."""
+        rate = self.rebuild_for(item, state.rate, symbols, f"states.{state.name}.rate")
+        return rate, self.rebuild_for(item, state.initial, symbols, f"states.{state.name}.initial")

@@ -10,7 +10,7 @@ from small_arm import ARM
 
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.effect import unit_of
-from bampipe.physics.system import STABLE, STIFF_STEPS
+from bampipe.physics.memory import STABLE, STIFF_STEPS
 from bampipe.physics.units import check_effect
 
 MACHINES = ("slider", "servo_pendulum", "magnetic_damper")
