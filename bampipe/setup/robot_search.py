@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from bampipe.estimate.heavier_body import HeavierBody
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
 from bampipe.physics.robot import Robot
 from bampipe.setup.drawn_bodies import Bounds, Comparison, Drive, JointMotion
 from bampipe.setup.finding import ALIKE, LEAST_GAIN, Finding, conclude, score_of
-from bampipe.setup.heavier import find_heavy, with_heavier_body
+from bampipe.setup.heavier import HeavierBody, find_heavy, with_heavier_body
 from bampipe.setup.hypotheses import (
     JOINT_SPANS,
     MOST_TRAVEL,

@@ -10,7 +10,6 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.heavier_body import HeavierBody
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.setup.finding import (
@@ -27,6 +26,7 @@ from bampipe.setup.finding import (
     score_of,
     spoils_sound_axes,
 )
+from bampipe.setup.heavier import HeavierBody
 from bampipe.setup.hypotheses import (
     JOINT_SPANS,
     MOST_TRAVEL,

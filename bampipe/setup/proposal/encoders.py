@@ -75,37 +75,26 @@ def _encoder(
             f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
             " the angle; put in the ratio of the gear"
         )
-    if axis.name in match.gears:
-        turns = match.gears[axis.name]
-        said = spelled(column.unit, _POSITION_UNITS) or guesses.likely_unit(
-            axis.unit, column.values
-        )
-        fields, how = _counting(axis, said or axis.unit, match, turns)
-        return entry(column.name, said or axis.unit, fields) + notes.guess(
-            f"{column.name} is the position of the motor of {axis.name}, in {said or axis.unit}"
-            + (f"; it {how}" if how else "")
-        )
-    velocity = _velocity_beside(axis, alone, match, notes)
-    known = column.conversion
-    if known is not None and known.si == axis.unit:
-        said = spelled(column.unit, _POSITION_UNITS) or axis.unit
-        counted, how = _counting(axis, said, match)
-        table = entry(column.name, said, counted + velocity)
-        if how:
-            return table + notes.guess(f"{column.name} {how}")
-        return table + ("" if column.stated else notes.guess(f"{column.name} in {column.unit}"))
-    if column.by_looks:
+    known, geared = column.conversion, axis.name in match.gears
+    right = known is not None and known.si == axis.unit
+    if column.by_looks and not right:
         note = notes.ask(
             f"the unit of {column.name}, which looks like the position of {axis.name}",
             "who wrote the logger, or by how far the machine moves; rad, deg, m and mm are usual",
         )
-        return entry(column.name, UNKNOWN, velocity) + note
-    by_size = guesses.likely_unit(axis.unit, column.values)
-    likely, why = (by_size, ", by its size") if by_size else (axis.unit, "")
-    counted, how = _counting(axis, likely, match)
-    return entry(column.name, likely, counted + velocity) + notes.guess(
-        f"{column.name} is the position of {axis.name}, in {likely}{why}"
-        + (f"; it {how}" if how else "")
+        return entry(column.name, UNKNOWN, _velocity_beside(axis, alone, match, notes)) + note
+    by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
+    said = (spelled(column.unit, _POSITION_UNITS) if right else by_size) or axis.unit
+    fields, how = _counting(axis, said, match, match.gears.get(axis.name, 1.0))
+    fields += "" if geared else _velocity_beside(axis, alone, match, notes)
+    guess = f"is the position of {axis.name}, in {said}" + (", by its size" if by_size else "")
+    if geared:
+        guess = f"is the position of the motor of {axis.name}, in {said}"
+    elif right:
+        guess = "" if column.stated or how else f"in {column.unit}"
+    guess += ("; it " if guess and how else "") + how
+    return entry(column.name, said, fields) + (
+        notes.guess(f"{column.name} {guess}") if guess else ""
     )
 
 

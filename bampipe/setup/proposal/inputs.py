@@ -9,6 +9,7 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.survey import SurveyedColumn, words
 from bampipe.data.units import spelled, unit
+from bampipe.lists import join_names
 from bampipe.physics.device import Device
 from bampipe.setup.proposal.device import ChosenDevice
 from bampipe.setup.proposal.matching import Match, Matcher
@@ -88,6 +89,12 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             f'unit = "{common}"'
             + ("" if stated else notes.guess(f"{names} is a {_QUANTITY[known.si]} in {common}"))
         ]
+    if len({unit(column.unit) for column in columns if column.unit}) > 1:
+        note = notes.ask(
+            f"one unit of {names}, which are logged in {join_names([c.unit for c in columns])}",
+            "export them in one, as a force has one unit; it goes here",
+        )
+        return [f'unit = "{UNKNOWN}"{note}']
     needs_gain = any(_needs_gain(column) for column in columns)
     if common == "V" or needs_gain:
         row = f"[{', '.join(['0.0'] * len(columns))}]"
