@@ -15,6 +15,8 @@ from bampipe.setup.proposal.positions import in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
 _MANY = 6
+_SURE = 2.0
+"""Standard errors within which a power of two, as most encoders count, is what a turn counts."""
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
 
 
@@ -75,7 +77,7 @@ def _encoder(
             f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
             " the angle; put in the ratio of the gear"
         )
-    known, geared = column.conversion, axis.name in match.gears
+    known, geared = column.conversion, axis.name in match.robot.gears
     right = known is not None and known.si == axis.unit
     if column.by_looks and not right:
         note = notes.ask(
@@ -85,7 +87,7 @@ def _encoder(
         return entry(column.name, UNKNOWN, _velocity_beside(axis, alone, match, notes)) + note
     by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
     said = (spelled(column.unit, _POSITION_UNITS) if right else by_size) or axis.unit
-    fields, how = _counting(axis, said, match, match.gears.get(axis.name, 1.0))
+    fields, how = _counting(axis, said, match, match.robot.gears.get(axis.name, 1.0))
     fields += "" if geared else _velocity_beside(axis, alone, match, notes)
     guess = f"is the position of {axis.name}, in {said}" + (", by its size" if by_size else "")
     if geared:
@@ -105,7 +107,7 @@ def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -
         axis: whose encoder it is; said: its unit; match: the columns.
         turns: of what the encoder sits on, for one of the axis.
     """
-    direction, zero = match.counting.get(axis.name, (1.0, 0.0))
+    direction, zero = match.robot.counting.get(axis.name, (1.0, 0.0))
     fields, ways = "", []
     if direction * turns != 1.0:
         fields = f", gear_ratio = {direction * turns:.10g}"
@@ -133,13 +135,16 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: No
     """The entry of an encoder that counts; the weight of a joint may show what a count is worth."""
     worth = match.turning.get(column.name)
     zero = worth.zero if worth is not None else float(np.median(column.values))
-    size = f"{worth.size:.5g}" if worth is not None else "0.0"
+    turn, sd = (2.0 * np.pi * x for x in ((worth.size, worth.sd) if worth is not None else (0, 0)))
+    power = 2.0 ** round(np.log2(turn)) if turn > 0.0 else 0.0
+    is_power = abs(turn - power) < _SURE * sd
+    size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}" if turn > 0.0 else "0.0"
     counting = f"counts_per_unit = {size}, zero_counts = {zero:.0f}"
     table = f'{{ column = {quoted(column.name)}, {counting}, unit = "{axis.unit}" }}'
     if worth is not None:
-        turn, sd = 2.0 * np.pi * worth.size, 2.0 * np.pi * worth.sd
+        taken = f" ({power:.0f}, a power of two, is taken)" if is_power else ""
         return table + notes.guess(
-            f"{column.name} counts {turn:.5g} ± {_rounded(sd)} a turn of {axis.name}, and"
+            f"{column.name} counts {turn:.5g} ± {_rounded(sd)} a turn of {axis.name}{taken}, and"
             f" {zero:.0f} where it hangs, by its weight, which goes with the sine of the angle; put"
             " in the encoder's counts a turn, times the gear, by 2 pi"
         )
