@@ -39,7 +39,7 @@ def init(
     proposal = propose(folder, device, [name for name in names.split(",") if name.strip()])
     written = [] if dry else write_proposal(folder, proposal)
     if json:
-        show.as_json(
+        show.print_json(
             {
                 "session": proposal.session,
                 "device": proposal.device,

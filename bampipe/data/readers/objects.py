@@ -17,11 +17,8 @@ import numpy as np
 from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import pick, recorded, split_index
 from bampipe.data.readers.nested import MISSING, as_number, find, leaves
-from bampipe.data.readers.trial import LARGEST_BYTES, RawTrial, Wanted, aligned, check_columns
+from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns
 from bampipe.errors import InputError
-
-_COSTS = {b"{": 184, b"[": 96, b",": 40, b"\n": 16}
-"""Bytes of memory that each of these characters stands for once parsed (CPython 3.11)."""
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
@@ -32,7 +29,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     Raises:
         InputError: not JSON, no such list, a column missing or not of numbers.
     """
-    samples, constants, notes = _samples(path, wanted.largest_bytes, name)
+    samples, constants, notes = _samples(path, name)
     if isinstance(samples, dict):
         return _from_arrays(samples, constants, wanted, notes, name)
     first = _first(samples, name)
@@ -67,7 +64,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
     Raises:
         InputError: as :func:`read`.
     """
-    samples, constants, _ = _samples(path, LARGEST_BYTES, name)
+    samples, constants, _ = _samples(path, name)
     if isinstance(samples, dict):
         shapes = {column: values.shape for column, values in samples.items()}
         moment = {column for column, values in samples.items() if values.dtype == object}
@@ -156,21 +153,10 @@ def _are_names(values: list[object]) -> bool:
 
 
 def _samples(
-    path: Path, largest_bytes: int, name: str
+    path: Path, name: str
 ) -> tuple[list[object] | dict[str, np.ndarray], Mapping[str, object], tuple[str, ...]]:
     """Samples of a file, or its arrays; the numbers beside them, and what was left out."""
-    size = 3 * path.stat().st_size
-    if size <= largest_bytes:
-        data = path.read_bytes()
-        size = (3 if data.isascii() else 10) * len(data)
-        size += sum(cost * data.count(character) for character, cost in _COSTS.items())
-    if size > largest_bytes:
-        raise InputError(
-            f"a JSON text that unpacks to {size >> 20} MB, where {largest_bytes >> 20} MB are"
-            " allowed",
-            where=name,
-            remedy="log to CSV or Parquet, or allow more (largest_trial_mb)",
-        )
+    data = path.read_bytes()
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -1,4 +1,4 @@
-"""A proposed trial held against what came of it, once it has been recorded."""
+"""A proposed trial compared with its outcome, once it has been recorded."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import AS_FORECAST, NOTHING, ExpectedSd, NextResult, split_rival
 
 _SHOWN = 3
-"""Parameters that are compared: those for which the forecast promised most."""
+"""Parameters that are compared: those with the largest predicted improvement."""
 
 
 def read_forecasts(root: Path, model: str) -> tuple[NextResult, ...]:
     """Return the forecasts of a model's trials: that of the last proposal first, then earlier ones.
 
-    What another version of bampipe forecast in other terms cannot be held against what came, and is
-    left out: a new proposal takes its place.
+    A forecast that another version of bampipe made in other terms cannot be compared and is left
+    out: a new proposal replaces it.
 
     Args:
-        root: the run folder; model: what was proposed for.
+        root: the run folder; model: the model of the proposals.
     """
     last, folder = root / NextResult.file(model), root / NextResult.EARLIER.format(model=model)
     paths = [*([last] if last.is_file() else []), *sorted(folder.glob("*.json"))]
@@ -37,29 +37,28 @@ def read_forecasts(root: Path, model: str) -> tuple[NextResult, ...]:
 def find_open(forecasts: Sequence[NextResult], proposed: NextResult) -> tuple[NextResult, ...]:
     """Return those of ``forecasts`` whose trial may still come, without the one now ``proposed``.
 
-    A forecast is open until a trial is at hand that it did not know; `bampipe run` and `bampipe
-    next` hold the two against each other before a new proposal closes it.
+    A forecast is open until a trial is recorded that it did not know; `bampipe run` and `bampipe
+    next` compare the two before a new proposal closes it.
     """
-    asked, found = {_proposal(proposed)}, []
+
+    def purpose(one: NextResult) -> tuple[str, str, str]:
+        return one.purpose, one.parameter, one.sentence
+
+    asked, found = {purpose(proposed)}, []
     for one in forecasts:
-        if _proposal(one) not in asked and set(proposed.trials) <= set(one.trials):
-            asked.add(_proposal(one))
+        if purpose(one) not in asked and set(proposed.trials) <= set(one.trials):
+            asked.add(purpose(one))
             found.append(one)
     return tuple(found)
-
-
-def _proposal(one: NextResult) -> tuple[str, str, str]:
-    """What tells one proposal from another: what it is for, and what is to be recorded."""
-    return one.purpose, one.parameter, one.sentence
 
 
 def compare_forecasts(
     forecasts: Sequence[NextResult], identified: IdentifyResult, diagnosed: DiagnoseResult | None
 ) -> tuple[str, ...]:
-    """Say what was forecast and what came, of every forecast that a new trial has followed.
+    """Compare each forecast that a new trial has followed with its outcome.
 
     Args:
-        forecasts: as of `read_forecasts`; the others as of `compare_forecast`.
+        forecasts: from `read_forecasts`; the others as for `compare_forecast`.
     """
     said: list[str] = []
     for one in forecasts:
@@ -72,11 +71,11 @@ def compare_forecasts(
 def compare_forecast(
     proposed: NextResult, identified: IdentifyResult, diagnosed: DiagnoseResult | None
 ) -> tuple[str, ...]:
-    """Say what was forecast of the best proposal and what came, a sentence each.
+    """Compare the forecast of the best proposal with its outcome, a sentence each.
 
     Args:
         proposed: made before the new trials; identified: with them.
-        diagnosed: the last diagnosis, None without one; heard where it knows the new trials.
+        diagnosed: the last diagnosis, None without one; used where it includes the new trials.
 
     Returns:
         Nothing where there is no new trial.
@@ -89,35 +88,35 @@ def compare_forecast(
     best, said = proposed.proposals[0], []
     trials = f"{'trial' if len(new) == 1 else 'trials'} {join_names(new, _SHOWN)}"
     falls = sorted(best.sd, key=lambda name: best.sd[name].after / (best.sd[name].before or 1.0))
-    names = [proposed.parameter] if proposed.parameter in best.sd else falls[:_SHOWN]
-    for name in names:
+    for name in [proposed.parameter] if proposed.parameter in best.sd else falls[:_SHOWN]:
         if name in identified.parameters:
-            forecast, came = best.sd[name], identified.parameters[name].sd
+            forecast, outcome = best.sd[name], identified.parameters[name].sd
             said.append(
                 f"`{name}`: ± {forecast.number} {forecast.unit} was forecast with {trials},"
-                f" ± {came:.2g} came (± {forecast.before:.2g} before)" + _verdict(forecast, came)
+                f" ± {outcome:.2g} resulted (± {forecast.before:.2g} before)"
+                f"{_judge(forecast, outcome)}"
             )
     for pair in best.confusion[:_SHOWN]:
         first, second = pair.between
         chance = f"of {100.0 * pair.after:.0f} %" if pair.after >= 0.01 else "below 1 %"
-        forecast_text = f"{first} or {second}: a chance {chance} was forecast of confusing them"
+        text = f"{first} or {second}: a probability {chance} was forecast of confusing them"
         if diagnosed is None:
-            said.append(f"{forecast_text}; `bampipe diagnose RUN` says what came.")
-            continue
-        said.append(f"{forecast_text}; {_decided(first, second, diagnosed)}.")
-    return (*said, *_shown(proposed, diagnosed))
+            said.append(f"{text}; `bampipe diagnose RUN` tells the outcome.")
+        else:
+            said.append(f"{text}; {_name_rival(first, second, diagnosed)}.")
+    return (*said, *_compare_revealed(proposed, diagnosed))
 
 
-def _decided(first: str, second: str, diagnosed: DiagnoseResult) -> str:
-    """Which of two rivals a diagnosis found, as a clause."""
+def _name_rival(first: str, second: str, diagnosed: DiagnoseResult) -> str:
+    """Say which of two rivals a diagnosis found, as a clause."""
     one, other = split_rival(first), split_rival(second)
-    doubted = {
+    open_effects = {
         name
         for axis in diagnosed.axes.values()
         if axis.verdict == "undecided"
         for name in axis.probabilities
     }
-    if doubted & (one ^ other):
+    if open_effects & (one ^ other):
         return "the trials still do not distinguish them"
     there = [name for name in (first, second) if split_rival(name) <= {*diagnosed.selected}]
     named = max(there, key=lambda name: len(split_rival(name)), default=NOTHING)
@@ -126,39 +125,35 @@ def _decided(first: str, second: str, diagnosed: DiagnoseResult) -> str:
     return "neither is found" if one and other else f"{first if one else second} is not found"
 
 
-def _shown(proposed: NextResult, diagnosed: DiagnoseResult | None) -> Iterator[str]:
-    """Say of the effects that a trial was to show whether they are there."""
+def _compare_revealed(proposed: NextResult, diagnosed: DiagnoseResult | None) -> Iterator[str]:
+    """Say of the effects that a trial was to reveal whether they are there."""
     if not proposed.shows:
         return
 
-    def promised(names: Sequence[str], one: str, more: str) -> str:
+    def compare(names: Sequence[str], outcome: str) -> str:
         table = proposed.sensitivity
         sizes = [f"{n} from {table[n].with_proposal:.2g} {table[n].unit}".rstrip() for n in names]
-        end = more if len(names) > 1 else one
-        return f"it was to show {join_names(sizes, _SHOWN)} on; {end}"
+        return f"it was to reveal {join_names(sizes, _SHOWN)} on; {outcome}."
 
     if diagnosed is None:
-        ask = "`bampipe diagnose RUN` says whether"
-        yield promised(proposed.shows, f"{ask} it is there.", f"{ask} they are there.")
+        they = "they are" if proposed.shows[1:] else "it is"
+        yield compare(proposed.shows, f"`bampipe diagnose RUN` tells whether {they} there")
         return
     there = [name for name in proposed.shows if name in diagnosed.selected]
     absent = [name for name in proposed.shows if name not in there]
     if there:
-        yield promised(there, "it is there.", "they are there.")
+        yield compare(there, "they are there" if there[1:] else "it is there")
     if absent:
-        yield promised(
-            absent,
-            "the diagnosis does not find it, so that it is hardly larger.",
-            "the diagnosis does not find them, so that they are hardly larger.",
-        )
+        they = "them, so that they are" if absent[1:] else "it, so that it is"
+        yield compare(absent, f"the diagnosis does not find {they} hardly larger")
 
 
-def _verdict(forecast: ExpectedSd, came: float) -> str:
-    """How an uncertainty that came stands to what was forecast, as the end of a sentence."""
+def _judge(forecast: ExpectedSd, outcome: float) -> str:
+    """Compare an uncertainty with its forecast, as the end of a sentence."""
     if forecast.is_sharp:
-        ratio = came / forecast.after if forecast.after > 0.0 else 1.0
+        ratio = outcome / forecast.after if forecast.after > 0.0 else 1.0
         kept = 1.0 / AS_FORECAST <= ratio <= AS_FORECAST
         return "." if kept else f": {ratio:.2g} times the forecast."
-    if came < forecast.low:
+    if outcome < forecast.low:
         return ": less than forecast."
-    return ": more than forecast." if came > forecast.high else ": within what was forecast."
+    return ": more than forecast." if outcome > forecast.high else ": within the forecast range."

@@ -1,4 +1,4 @@
-"""How a held-out error stands against its noise floor: the one judgement of "at the floor".
+"""The status of a held-out error against its noise floor, the one definition of "at the floor".
 
 Validate, diagnose and compare store it; reports, gates, the lab and the command line read it.
 """
@@ -8,32 +8,25 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-Standing = Literal["at_floor", "above_floor", "floor_implausible", "floor_missing"]
+FloorStatus = Literal["at_floor", "above_floor", "floor_implausible", "floor_missing"]
 
 AT_FLOOR = 1.2
 """Error over floor up to which a model leaves no more than its sensors do. No replay is perfect:
-clean axes stand at up to 1.08 floors, at up to 1.16 where friction truly stops the arm; the weakest
-effects that were found stood at 1.18."""
+clean axes reach 1.08 floors, and 1.16 where friction truly stops the arm; the weakest effects that
+were found had 1.18."""
 FLOOR_SDS = 3.0
-"""Standard deviations of the floor over replays that are allowed for. No axis of 39 sessions stood
-otherwise with 1.9 to 3.0."""
+"""Standard deviations of the floor over replays that are allowed for. The status of no axis of 39
+sessions changes from 1.9 to 3.0."""
 IMPLAUSIBLE = 0.7
 """Error over floor below which the floor is wrong: sensors noisier than the data, or a replay that
-does not resemble the machine. No axis of 39 sessions stood otherwise with 0.55 to 0.88."""
+does not resemble the machine. The status of no axis of 39 sessions changes from 0.55 to 0.88."""
 
 FLOOR_WRONG = ("floor_implausible", "floor_missing")
-"""Standings in which an error cannot be judged."""
-
-STANDINGS_IN_WORDS = {
-    "at_floor": "at the noise floor",
-    "above_floor": "above the noise floor",
-    "floor_implausible": "far below its noise floor, which is therefore wrong",
-    "floor_missing": "without a noise floor to be held against",
-}
+"""Statuses in which an error cannot be judged."""
 
 
-def standing(error: float, floor: float | None, floor_sd: float = 0.0) -> Standing:
-    """Hold a held-out error against its noise floor.
+def compare_with_floor(error: float, floor: float | None, floor_sd: float = 0.0) -> FloorStatus:
+    """Compare a held-out error with its noise floor.
 
     Args:
         error: held-out error of one axis.
