@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bampipe.data.chain import frame_of_tip
-from bampipe.data.robot_file import read_tree
+from bampipe.data.chain import frame_of_tip, read_tree
 from bampipe.estimate.heavier_body import find_heavier_body, fit_point_mass
 from bampipe.proposal.drawing import Comparison
 from bampipe.proposal.mounting import Mounting

@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.extras import need
 from bampipe.data.readers.nested import MISSING, as_number, find, items, leaves, names_in, spread
 from bampipe.data.readers.trial import (
     RawTrial,
@@ -34,6 +33,7 @@ from bampipe.data.readers.trial import (
     check_columns,
     check_size,
     interpolated,
+    need,
 )
 from bampipe.errors import InputError
 

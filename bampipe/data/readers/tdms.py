@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.extras import need
-from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
+from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size, need
 from bampipe.errors import InputError
 
 TIME = "@time"
