@@ -43,6 +43,7 @@ SHARED_CODE = (
     "physics",
     "estimate",
     "results",
+    "phrases",
     "data",
     "declarations",
     "trials",

@@ -35,6 +35,8 @@ _LEAST = 1e-3
 _DETERMINED = 1e-9
 """Of the largest eigenvalue of the scaled normal equations, below which a direction of the model's
 own parameters is not determined by the trials, and stays."""
+_SLOW = 3.0
+"""Sign widths: slow motion, in which dry friction is as large as it gets."""
 _MOST_STOPPING = 1.5
 """Largest factor of the residual of a replay that truly stops."""
 _RIDGE = 1e-10
@@ -229,6 +231,31 @@ class Likelihood:
             root.append(self.root[axis] * np.sqrt((tails + 1.0) / (tails + square / mean)))
         return replace(self, root=tuple(root))
 
+    def count_independent(self, problem: Problem, lags: int) -> tuple[Samples, ...]:
+        """Count the samples of each axis that are independent in what a fit of the model leaves.
+
+        What a model lacks comes back with the motion, sample after sample; noise does not, coloured
+        or white. For what goes with the motion, as the applied force does, there are fewer samples
+        by the sum of the products of both autocorrelations (Bartlett 1935, Journal of the Royal
+        Statistical Society 98, 536), over the largest that a replay has.
+
+        Args:
+            problem: the fit, its solution at zero; lags: the most that are summed.
+        """
+        solved, counted = problem.solve(), []
+        for axis, here in enumerate(self.samples):
+            root = self.root[axis]
+            force = _correlate(self.applied[axis] * root, here, lags)
+
+            def inflation(values: Array, at: Samples = here, force: Array = force) -> float:
+                return max(2.0 * float(_correlate(values, at, lags) @ force) - 1.0, 1e-3)
+
+            ours = inflation(problem.y[axis] + problem.base[axis] @ solved.base)
+            noise = (self.noise.residuals[axis] - self.noise.bias[axis]) * root
+            replays = max((inflation(values) for values in noise), default=1.0)
+            counted.append(replace(here, independent=here.independent * min(replays / ours, 1.0)))
+        return tuple(counted)
+
     def pose(
         self,
         evidence: Evidence,
@@ -257,10 +284,10 @@ class Problem:
         precision, moment: of what is known of these beforehand, (P, P) and (P,).
         to_parameters: (n_all, P) from these to the free parameters, nuisance parameters last.
         lower, upper: bounds of the change of those, (n_all,).
-        absence: of each effect of the model, by the place of each of its strengths among the free
-            parameters, the change that takes it away.
-        spread: of each, the standard deviations of these strengths before any data; shapes: how
-            many parameters it has beside them.
+        absence: of each effect of the model, by the place of each of its parameters among the free
+            ones, the change that takes it away.
+        spread: of each, the standard deviations of these strengths before any data; shapes: the
+            places of the parameters that it has beside them.
     """
 
     likelihood: Likelihood
@@ -273,7 +300,7 @@ class Problem:
     upper: Array
     absence: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     spread: Mapping[str, Array] = field(default_factory=dict)
-    shapes: Mapping[str, int] = field(default_factory=dict)
+    shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     @property
     def independent(self) -> Array:
@@ -298,24 +325,51 @@ class Problem:
         return solve_bounded(self, *self.sums())
 
 
+def _correlate(values: Array, samples: Samples, lags: int) -> Array:
+    """Autocorrelation of values (n,) within trials, (lags + 1,); one and zeros of nothing."""
+    total = np.zeros(lags + 1)
+    for trial in np.unique(samples.trial):
+        here = samples.trial == trial
+        rows = samples.rows[here]
+        series = np.zeros(int(np.ptp(rows)) + 1)
+        series[rows - rows[0]] = values[here]
+        size = 2 * len(series)
+        found = np.fft.irfft(np.abs(np.fft.rfft(series, size)) ** 2, size)
+        found = found[: min(len(series), lags + 1)]
+        total[: len(found)] += found
+    return np.asarray(total / total[0]) if total[0] > 0.0 else np.eye(1, lags + 1)[0]
+
+
 def _error_of_turning(evidence: Evidence) -> list[Array]:
     """What is not known of friction as a log does not say when between two samples a machine turns.
 
     By trial, each (T, n_q), N.m or N: the change of friction from sample to sample, times the
     standard deviation of a moment that lies evenly between two of them.
     """
-    dry, width = dry_friction(evidence)
+    width = sign_widths(evidence)
     jumps = [np.gradient(np.tanh(m.qd / width), axis=0) for m in evidence.motions]
-    return [dry * jump / np.sqrt(12.0) for jump in jumps]
+    return [d * j / np.sqrt(12.0) for d, j in zip(dry_friction(evidence), jumps, strict=True)]
 
 
-def dry_friction(evidence: Evidence) -> tuple[Array, Array]:
-    """Coulomb friction of each axis in a model and the width of its sign, both (n_q,)."""
-    coordinates = evidence.system.model.device.coordinates
-    values = zip(evidence.system.parameters, evidence.p.tolist(), strict=True)
-    known = {parameter.name: abs(value) for parameter, value in values}
-    dry = np.array([known.get(f"coulomb.{c.name}", 0.0) for c in coordinates])
-    return dry, np.array([c.sign_width for c in coordinates])
+def sign_widths(evidence: Evidence) -> Array:
+    """Width of the sign of each axis' velocity, (n_q,), rad/s or m/s."""
+    return np.array([c.sign_width for c in evidence.system.model.device.coordinates])
+
+
+def dry_friction(evidence: Evidence) -> list[Array]:
+    """What turns with the motion in a model, by trial, each (T, n_q), N.m or N.
+
+    Half the difference between moving slowly one way and the other, brakes included.
+    """
+    found, slow = [], _SLOW * sign_widths(evidence)
+    for at in evidence.fitted:
+        q, qd, qdd = at.mechanism.kinematics
+        back, on = (
+            at.system.residual(q, side * slow + np.zeros_like(qd), qdd, at.memory, at.inputs, at.p)
+            for side in (-1.0, 1.0)
+        )
+        found.append(0.5 * (back - on))
+    return found
 
 
 def _pose(
@@ -355,7 +409,7 @@ def _pose(
         to.T @ (precision[:, None] * to), to.T @ (precision * known), to, lower, upper,
         {item.name: _absence(evidence, item) for item in effects},
         {item.name: _spread(item) for item in effects},
-        {i.name: sum(q.shape for q in i.parameters) for i in effects},
+        {item.name: _shapes(evidence, item) for item in effects},
     )  # fmt: skip
 
 
@@ -363,13 +417,21 @@ def _spread(item: BoundEffect) -> Array:
     return np.array([q.sd for q in item.parameters if q.strength and not q.fixed])
 
 
+def _shapes(evidence: Evidence, item: BoundEffect) -> tuple[int, ...]:
+    names = {q.name for q in item.parameters if q.shape}
+    parameters = evidence.system.parameters
+    return tuple(k for k, number in enumerate(evidence.free) if parameters[number].name in names)
+
+
 def _absence(evidence: Evidence, item: BoundEffect) -> dict[int, float]:
     strengths = {q.name for q in item.parameters if q.strength}
-    return {
+    away = {
         place: -float(evidence.p[number])
         for place, number in enumerate(evidence.free)
         if evidence.system.parameters[number].name in strengths
     }
+    # Without its strength a shape says nothing: it does not move to where it was expected.
+    return away | dict.fromkeys(_shapes(evidence, item), 0.0)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ as many names stands beside them, they have these.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -76,6 +77,14 @@ def columns(path: Path, name: str) -> dict[str, str]:
         elif isinstance(cell, str) and moments.is_moment(cell):
             found[column] = "datetime"
     return found | {c: "" for c in constants if c not in found}
+
+
+def stated_units(path: Path, name: str) -> dict[str, str]:
+    """Units that stand beside the samples, as of ``"force units": "kip"``, by their quantity."""
+    content = _parsed(path.read_text(encoding="utf-8-sig"), name)
+    items = content.items() if isinstance(content, dict) else ()
+    parts = [(re.split(r"[ _]units?$", str(key), flags=re.I), value) for key, value in items]
+    return {key[0]: value for key, value in parts if len(key) > 1 and isinstance(value, str)}
 
 
 def _first(samples: list[object], name: str) -> dict[str, object]:
