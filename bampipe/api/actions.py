@@ -1,4 +1,4 @@
-"""The stages as functions: each runs what is stale, through the same cache as the command line."""
+"""The stages as functions, through the same cache as the command line."""
 
 from __future__ import annotations
 

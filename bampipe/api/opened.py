@@ -40,7 +40,7 @@ class Picture:
 
 
 class Run:
-    """The results of one session. Nothing here writes; results are read once, when first used.
+    """The results of one session. Nothing here writes; results are read once, at their first use.
 
     All values are in SI units. Models are named as in the run folder: ``base``,
     ``base+stribeck.yaw``; where a method takes a model, the default is the best confirmed one.
@@ -71,7 +71,7 @@ class Run:
 
     @property
     def session(self) -> dict[str, Any]:
-        """What ingest says of the session: axes, channels, units, sample rate."""
+        """The session as ingest read it: axes, channels, units, sample rate."""
         return self._results.session.model_dump(mode="json")
 
     @property
@@ -138,15 +138,15 @@ class Run:
         return self._table(f"models/{self._known(model)}/residuals.parquet", "validate")
 
     def diagnosis(self, model: str = "") -> dict[str, Any]:
-        """What the model lacks: verdict of each axis, ranking, residual maps, advice."""
+        """The diagnosis: verdict of each axis, ranking, residual maps, advice."""
         return self._read(DiagnoseResult, model).model_dump(mode="json")
 
     def drafts(self, model: str = "") -> dict[str, Any]:
-        """Formulas drafted for what no effect explains: curves, constants, chance level."""
+        """Formulas drafted for the unexplained residual: curves, constants, null distribution."""
         return self._read(DraftResult, model).model_dump(mode="json")
 
     def ranking(self, model: str = "") -> pd.DataFrame:
-        """The candidate effects, best first: error before and after, chance level."""
+        """The candidate effects, best first: error before and after, probability."""
         return pd.DataFrame(self.diagnosis(model)["ranking"])
 
     @property

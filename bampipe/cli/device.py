@@ -41,20 +41,12 @@ def list_(json: JsonOption = False) -> None:
     from bampipe.physics import registry
 
     found = [registry.device(name) for name in registry.device_names()]
+    rows = [(d.name, [c.name for c in d.coordinates], d.summary) for d in found]
     if json:
-        show.print_json(
-            [
-                {"name": d.name, "axes": [c.name for c in d.coordinates], "summary": d.summary}
-                for d in found
-            ]
-        )
+        show.print_json([dict(zip(("name", "axes", "summary"), row, strict=True)) for row in rows])
         return
-    show.print_table(
-        ["device", "axes", "summary"],
-        [[d.name, ", ".join(c.name for c in d.coordinates), d.summary] for d in found],
-    )
-    show.say("")
-    show.say("one in full: bampipe device show NAME")
+    show.print_table(["device", "axes", "summary"], rows)
+    show.say("\none in full: bampipe device show NAME")
 
 
 def show_(
@@ -82,15 +74,9 @@ def show_(
     inputs += [f"{name} (brake of {axis})" for axis, name in found.brakes.items()]
     inputs += [f"{name} ({unit or 'a pure number'})" for name, unit in found.channels.items()]
     if json:
-        show.print_json(
-            {
-                "declaration": dict(declaration),
-                "equations": equations.splitlines(),
-                "inputs": inputs,
-                "effects": names,
-                "faults": faults,
-            }
-        )
+        found_names = {"inputs": inputs, "effects": names, "faults": faults}
+        lines = equations.splitlines()
+        show.print_json({"declaration": dict(declaration), "equations": lines, **found_names})
         return
     show.say(equations)
     show.say(f"inputs: {', '.join(inputs) or 'none'}")

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.forecast import say_what_came
+from bampipe.cli.forecast import print_forecasts
 from bampipe.cli.next_step import after_loop
 from bampipe.cli.one_stage import one_stage, print_settings, whole_pipeline
 from bampipe.cli.options import (
@@ -49,7 +49,7 @@ def diagnose(
     chosen = models.choose_model(root, model)
     one_stage("diagnose", root, options, model=chosen)
     if not options.json:
-        say_what_came(root, chosen)
+        print_forecasts(root, chosen)
     _advise_next(RunFolder(root).read(DiagnoseResult, chosen).next, root, options)
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.forecast import say_what_came
+from bampipe.cli.forecast import print_forecasts
 from bampipe.cli.one_stage import one_stage, plain_stage, print_settings
 from bampipe.cli.options import (
     DEFAULTS,
@@ -156,7 +156,7 @@ def next_(
     more: dict[str, object] = {"sd": _share(sd)} if sd else {}
     if not options.list_settings and not options.json:
         # A new proposal closes those that a recorded trial has followed: say first what came.
-        say_what_came(places.find_run(run, options.runs), chosen)
+        print_forecasts(places.find_run(run, options.runs), chosen)
     plain_stage("next", run, options, chosen, purpose=purpose, seconds=seconds, plan=plan, **more)
     if plan and not (options.json or options.quiet or options.list_settings):
         show.say(f"sheet: {places.find_run(run, options.runs)}/models/{chosen}/protocol.pdf")

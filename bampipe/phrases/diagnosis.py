@@ -38,7 +38,8 @@ def share_of_force(entry: AxisVerdict) -> str:
 
 def times_floor(error: float, floor: float) -> str:
     """Return an error as a multiple of its noise floor."""
-    return f"{error / floor:.3g} times the noise floor" if floor > 0.0 else "without a noise floor"
+    ratio = f"{significant(error / floor)} times the noise floor" if floor > 0.0 else ""
+    return ratio or "without a noise floor"
 
 
 def list_effects(entry: AxisVerdict, effects: Iterable[str], mark: str = "") -> str:
@@ -94,6 +95,19 @@ def split_alternatives(
 def open_question(parts: Sequence[str]) -> str:
     """Return that trials do not decide between parts of `split_alternatives`."""
     return f"these trials do not decide {'between' if parts[1:] else 'on'} {join_names(parts)}"
+
+
+def advise_trial(entry: AxisVerdict) -> str:
+    """Return the trial to record if none was found that would distinguish effects of an axis."""
+    if all(any(kind in name for name in entry.likely) for kind in ("delay", "lag")):
+        return (
+            "A lag weakens fast changes, a delay does not: log at a higher rate, and record trials"
+            " in which the force changes faster."
+        )
+    return (
+        "No trial was found that would distinguish them; `bampipe next --for decision` looks for"
+        " one."
+    )
 
 
 def missing_effects(found: DiagnoseResult, axis: str, mark: str = "") -> str:

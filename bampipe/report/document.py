@@ -1,4 +1,4 @@
-"""What a report is made of, before it is typeset: sections of text, tables and figures.
+"""The document of a report before it is typeset: sections of text, tables and figures.
 
 Text may hold three kinds of inline mark: ``**strong**``, code between backticks, and a link to
 a page of our own, ``[words](../s01/report/report.html)``.

@@ -1,4 +1,4 @@
-"""What the page for exploring shows of a run: stored records as plain tables, columns packed."""
+"""Content of the page for exploring a run: stored records as plain tables, columns packed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Content = dict[str, Any]
 
 @dataclass(frozen=True)
 class _Span:
-    """Where a trial lies on the session's one axis of time: ``t`` of the trial plus ``offset``."""
+    """Place of a trial on the session's one axis of time: ``t`` of the trial plus ``offset``."""
 
     id: str
     kind: str
