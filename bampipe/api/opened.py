@@ -142,11 +142,11 @@ class Run:
         return self._read(DiagnoseResult, model).model_dump(mode="json")
 
     def drafts(self, model: str = "") -> dict[str, Any]:
-        """Formulas drafted for the unexplained residual: curves, constants, null distribution."""
+        """Formulas drafted for the unexplained residual: curves, constants, p-values."""
         return self._read(DraftResult, model).model_dump(mode="json")
 
     def ranking(self, model: str = "") -> pd.DataFrame:
-        """The candidate effects, best first: error before and after, probability."""
+        """The candidate effects, best first: error before and after, probability, p-value."""
         return pd.DataFrame(self.diagnosis(model)["ranking"])
 
     @property

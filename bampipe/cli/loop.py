@@ -65,7 +65,7 @@ def draft(
     ] = False,
     options: StageOptions = DEFAULTS,
 ) -> None:
-    """Draft a formula for what no effect explains, as an effect file, with its chance level.
+    """Draft a formula for what no effect explains, as an effect file, with its p-value.
 
     Example: bampipe draft 2026-10-03_s01
     """

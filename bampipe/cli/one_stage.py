@@ -21,17 +21,6 @@ from bampipe.stages import base
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Pipeline
 
-AFTER = {
-    "ingest": "filter",
-    "filter": "stiffness",
-    "stiffness": "identify",
-    "identify": "validate",
-    "viscous": "report",
-    "performance": "report",
-    "validate": "diagnose",
-    "compare": "report",
-}
-
 _OF_DIAGNOSIS = ("draft", "next")
 """Stages that go by what a diagnosis found."""
 
@@ -134,5 +123,5 @@ def plain_stage(
     elif stage == "next":
         command = after_proposal(root, outcome.steps[0].step.partition(":")[2], name)
     else:
-        command = f"bampipe {AFTER[stage]} {name}"
+        command = f"bampipe {base.AFTER[stage]} {name}"
     show.print_advice(command, options.quiet, options.json)

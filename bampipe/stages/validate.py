@@ -82,10 +82,9 @@ class Config:
 
     Attributes:
         model: which model version.
-        noise_floor: whether to compute what sensors and filters alone would leave.
-        repeats: replays for the noise floor; 0 takes as many as the length of the session asks
-            for, which is what `diagnose` does.
-        seed: of their sensor noise.
+        noise_floor: whether to compute the error that sensors and filters alone would leave.
+        repeats: replicates for the noise floor; 0 takes three to six, fewer for a long session.
+        seed: seed of their sensor noise.
         free_run: whether to run the model freely over every trial, and from many starts in it.
         hold_out_by: a channel that is constant in each trial, such as a gain or a supply voltage:
             trials at one value of it are held out together. Empty: one trial at a time.

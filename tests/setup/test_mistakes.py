@@ -195,3 +195,10 @@ def test_gravity_that_the_device_lacks_is_no_exchanged_column(tmp_path: Path) ->
     assert found.mistakes == ()
     (line,) = list_setup_faults(found)
     assert line.startswith("a torque that follows the position of joint, as of gravity or a spring")
+
+
+def test_a_gear_that_was_left_out_is_found_whatever_its_reduction(tmp_path: Path) -> None:
+    """The weight of the joint goes with the sine of its angle: 70 is none of a usual gain."""
+    (mistake,) = inspected(tmp_path, mistakes.scale_column("q", 70.0)).mistakes
+    assert (mistake.kind, mistake.signals) == ("scale", ("joint",))
+    assert mistake.factor == pytest.approx(1.0 / 70.0, rel=0.03)
