@@ -91,7 +91,7 @@ def check(
     json: JsonOption = False,
     quiet: FaultsOnlyOption = False,
 ) -> None:
-    """Check a device file: its equations of motion, and what is wrong with it.
+    """Check a device file, and print its equations of motion and its faults.
 
     Names, units, expressions and the derivation are checked. Exit 2 with one line a fault.
 
@@ -145,7 +145,7 @@ for _name, _command in COMMANDS.items():
 
 
 def _name_next_step(file: str) -> str:
-    """What to do once a device file is right: run the session it lies in, or name it in one."""
+    """Return the next step with a sound device file: run its session, or name it in one."""
     path = Path(file)
     if path.suffix != ".toml":
         return f'device = "{file}" in session.toml, then bampipe run SESSION'
@@ -162,7 +162,7 @@ def report_faults(faults: Sequence[str]) -> None:
 
 
 def check_effect_file(text: str, device_name: str, json: bool) -> None:
-    """Print what is wrong with the effect file ``text`` (``file.toml[:target]``), one line a fault.
+    """Print the faults of the effect file ``text`` (``file.toml[:target]``), a line each.
 
     Raises:
         InputError: there is no such file or device.

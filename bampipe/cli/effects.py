@@ -17,7 +17,7 @@ COLUMNS, ROWS = 61, 13
 
 
 def list_all(json: bool) -> None:
-    """Print every built-in effect: its name, what it may act on, what it is."""
+    """Print every built-in effect: name, target, kind and summary."""
     from bampipe.physics import registry
 
     found = [registry.effect(name) for name in registry.effect_names()]
@@ -33,7 +33,7 @@ def list_all(json: bool) -> None:
 
 
 def show_one(text: str, device_name: str, json: bool) -> None:
-    """Print one effect: formula, parameters, what it looks like, its signature.
+    """Print one effect: formula, parameters, looks and signature.
 
     Args:
         text: ``name[:target]`` or ``file.toml[:target]``.
@@ -107,13 +107,13 @@ def _describe_signature(found: Signature | None, target: str) -> dict[str, objec
 
 
 def _print_parameters(effect: Effect) -> None:
-    rows = list(list_parameters(effect))
+    rows = list(parameter_rows(effect))
     head = ["parameter", "axis", "unit", "prior", "sd", "lower", "upper", "typical", ""]
     used = [k for k in range(len(head)) if k < 1 or any(row[k] not in (None, "") for row in rows)]
     show.print_table([head[k] for k in used], [[row[k] for k in used] for row in rows])
 
 
-def list_parameters(effect: Effect) -> Iterator[list[object]]:
+def parameter_rows(effect: Effect) -> Iterator[list[object]]:
     """Name, kind of axis, unit, numbers and description of each parameter."""
     from bampipe.physics.effect import ParameterByKind
 

@@ -1,4 +1,4 @@
-"""`bampipe lab`: all runs side by side, and what is printed of them."""
+"""`bampipe lab`: all runs side by side."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def refresh(runs: Path, several: bool, quiet: bool) -> None:
 
 
 def table(found: Lab) -> None:
-    """Print the sessions that stand out, else that none does; then the trends."""
+    """Print the sessions, and the trends."""
     from bampipe.phrases import lab as phrases
 
     sessions = found.content.sessions
@@ -118,7 +118,7 @@ def table(found: Lab) -> None:
 
 
 def advice(found: Lab) -> str:
-    """Return the command to go on with."""
+    """Return the next command."""
     for one in found.content.sessions:
         if one.remedy:
             return one.remedy

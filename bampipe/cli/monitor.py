@@ -1,4 +1,4 @@
-"""`bampipe monitor`: the filter on samples as they come."""
+"""`bampipe monitor`: the filter on samples as they arrive."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def _compile_device(name: str) -> System:
 
 
 def follow(stream: Stream, watch: Monitor, output: _Output, wait: bool) -> None:
-    """Filter what comes until the end, or where ``wait``, until the user stops it."""
+    """Filter the stream to its end, or if ``wait``, until the user stops it."""
     try:
         while True:
             values = stream.read(last=not wait)
@@ -175,7 +175,7 @@ class _Output:
 
 
 def _draw_table(content: Mapping[str, Any], bad_lines: int) -> Any:
-    """Return the screen: state and parameters, and below them whether all is well."""
+    """Return the screen: state and parameters, and below them the consistency of the filter."""
     from rich.table import Table
 
     table = Table.grid(padding=(0, 2))

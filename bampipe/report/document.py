@@ -25,7 +25,7 @@ _MARK = re.compile(
 _COLUMN = re.compile(r"(?P<right>>?)(?P<title>.*?)(?: ~(?P<width>[\d.]+))?", re.DOTALL)
 
 
-def spans(text: str) -> list[Span]:
+def split_spans(text: str) -> list[Span]:
     """Split ``text`` at its inline marks, in order."""
     found: list[Span] = []
     end = 0
@@ -44,9 +44,9 @@ def spans(text: str) -> list[Span]:
     return found
 
 
-def plain_text(text: str) -> str:
+def strip_marks(text: str) -> str:
     """Return ``text`` as printed, without its marks."""
-    return "".join(body.partition("\n")[0] for _, body in spans(text))
+    return "".join(body.partition("\n")[0] for _, body in split_spans(text))
 
 
 @dataclass(frozen=True)
