@@ -134,15 +134,15 @@ def limits(found: DiagnoseResult) -> str:
 
 
 def null_distribution(null: NullDistribution | None) -> str:
-    """Return the gains of candidates on replays that lack nothing, in a sentence."""
+    """Return the gains of candidates on replicates that lack nothing, in a sentence."""
     if null is None:
         return (
-            "Replays of the model do not resemble the measurement, so that the gain of a candidate"
-            " by chance is not known."
+            "Replicates of the model do not resemble the measurement, so that the gain of a"
+            " candidate by chance is not known."
         )
     return (
-        f"On {null.replicates} replays of the final model, which lack nothing, the largest gain of"
-        f" any candidate is {min(null.largest):.3g} to {max(null.largest):.3g} nats; on"
+        f"On {null.replicates} replicates of the final model, which lack nothing, the largest gain"
+        f" of any candidate is {min(null.largest):.3g} to {max(null.largest):.3g} nats; on"
         f" the measured trials it is {null.measured:.3g} nats, of {null.effect}"
         f" (p = {null.p_value:.2g})."
     )
@@ -226,9 +226,9 @@ def _explain_refusal(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> s
         why = f"its held-out error of {error} is {STANDINGS[entry.standing]}{of}."
     else:
         why = (
-            "replays of the model do not resemble the measurement, so that the gain of a candidate"
-            f" by chance is not known; the held-out error is {error}, that of replays {floor}, and"
-            f" the model explains {share_of_force(entry)}."
+            "replicates of the model do not resemble the measurement, so that the gain of a"
+            f" candidate by chance is not known; the held-out error is {error}, that of replicates"
+            f" {floor}, and the model explains {share_of_force(entry)}."
         )
         windows = [one for one in result.worst_windows if one.axis == axis]
         if windows:

@@ -29,7 +29,7 @@ class AxisVerdict(Record):
     rmse_beyond_bias: Size = Field(
         description="With it, without the bias that filters leave where friction changes its sign"
     )
-    noise_floor: Size = Field(description="Error of replays of the final model")
+    noise_floor: Size = Field(description="Error of replicates of the final model")
     noise_floor_sd: Size
     standing: FloorStatus = Field(description="rmse_after against noise_floor")
     unit: str
@@ -67,7 +67,7 @@ class RankedEffect(Record):
     )
     unit: str
     probability: Share
-    p_value: Share = Field(description="Probability that replays give any candidate such a gain")
+    p_value: Share = Field(description="Probability that replicates give any candidate such a gain")
     score: float = Field(description="Gain in log evidence, nats")
     parameters: dict[str, float]
     indistinguishable_from: Names
@@ -83,10 +83,10 @@ class WeighedSet(Record):
 
 
 class NullDistribution(Record):
-    """Gains of candidates on replays of the final model, in which nothing is missing."""
+    """Gains of candidates on replicates of the final model, in which nothing is missing."""
 
     replicates: Count
-    largest: tuple[float, ...] = Field(description="Largest gain of any candidate by replay, nats")
+    largest: tuple[float, ...] = Field(description="Largest gain of any candidate, nats")
     measured: float = Field(description="Largest gain on the measured trials, final model")
     effect: str = Field(description="The candidate with that gain")
     p_value: Share
@@ -147,7 +147,7 @@ class DiagnoseResult(Result):
     selected: Names
     sets: tuple[WeighedSet, ...] = Field(description="The most probable first")
     chance: NullDistribution | None = Field(
-        default=None, description="null where replays do not resemble the measurement"
+        default=None, description="null where replicates do not resemble the measurement"
     )
     cut_short: bool = Field(
         default=False, description="Whether more effects were wanted than may be added"

@@ -52,10 +52,10 @@ class DraftedEffect(Record):
 
 
 class ChanceOfDraft(Record):
-    """Gains of the same search on replays of the model, in which nothing is missing."""
+    """Gains of the same search on replicates of the model, in which nothing is missing."""
 
     gain: float = Field(description="Of the best formula on the grid, log evidence in nats")
-    gains: tuple[float, ...] = Field(description="Of the best formula on each replay")
+    gains: tuple[float, ...] = Field(description="Of the best formula on each replicate")
     p_value: Share
 
 
@@ -87,7 +87,7 @@ class AxisDraft(Record):
     options: tuple[DraftOption, ...] = Field(description="Shortest first")
     rmse_before: Size = Field(description="On held-out trials")
     rmse_after: Size
-    noise_floor: Size = Field(description="Median error of replays of the final model")
+    noise_floor: Size = Field(description="Median error of replicates of the final model")
     unit: str
     nearest: tuple[NearestEffect, ...]
     sentence: str

@@ -320,7 +320,7 @@ def _make_candidates(diagnosis: DiagnoseResult, label: str) -> Content:
         "Indistinguishable from",
     ]
     note = (
-        "Held-out error without and with each effect; p: probability that replays give any "
+        "Held-out error without and with each effect; p: probability that replicates give any "
         "candidate as large a gain."
     )
     return {"title": f"Candidate effects, {label}", "note": note, "head": head, "rows": rows}
