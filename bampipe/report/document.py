@@ -13,6 +13,7 @@ from typing import Literal
 
 from bampipe.report.wording import format_prose
 
+Tone = Literal["good", "attention", "unknown", "note"]
 Span = tuple[Literal["plain", "strong", "code", "link"], str]
 """Kind and text; of a link its words and its target, with a line break between."""
 
@@ -88,7 +89,7 @@ class Callout:
         text: one to three sentences, or a line for each axis.
     """
 
-    tone: Literal["good", "attention", "unknown", "note"]
+    tone: Tone
     title: str
     text: str
 

@@ -196,7 +196,11 @@ class Results:
 
     def make_section(self, title: str, said: str, stage: str) -> Section:
         """Return the section of a stage that has not run, with the command that runs it."""
-        return Section(title, (Paragraph(f"{said}: `bampipe {stage} {self.root.name}` does it."),))
+        return Section(title, (self.state_undone(said, stage),))
+
+    def state_undone(self, said: str, stage: str) -> Paragraph:
+        """Return the paragraph on a stage that has not run, with the command that runs it."""
+        return Paragraph(f"{said}: `bampipe {stage} {self.root.name}` does it.")
 
     def state_next(self, advice: str) -> Paragraph:
         """Return the paragraph on what to do next: a command for ``RUN``, or words."""

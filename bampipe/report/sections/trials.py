@@ -42,7 +42,7 @@ def section(results: Results) -> Section:
         blocks += _describe_filter(results, filtered)
     else:
         said = "Velocities and accelerations have not been computed"
-        blocks += results.make_section("", said, "filter").blocks
+        blocks.append(results.state_undone(said, "filter"))
     return Section("Data", tuple(blocks))
 
 
