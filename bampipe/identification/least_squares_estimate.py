@@ -39,6 +39,9 @@ from bampipe.trials.residuals import problem_of
 Array = NDArray[np.float64]
 
 _REPLICATES = 6
+_LACKING = 3.0
+"""What is left over what sensors, filters and the discrepancy explain, from which on weights by
+these say nothing: a verdict has it that something unknown remains there."""
 _PASSES = 3
 """Most fits of a model that is nonlinear in its parameters, each with replicates of the last."""
 _SETTLED = 0.3
@@ -253,7 +256,9 @@ def fit_squares(
     at, found = plain.p, None
     with suppress(Runaway):
         for _ in range(1 if problem.linear else _PASSES):
-            again = _with_values(session.fit(recipe, at), trials, problem, block_s)
+            again = _with_values(
+                session.fit(recipe, at, lacking=_LACKING), trials, problem, block_s
+            )
             settled = found is not None and _is_settled(found, again)
             found, at = again, again.fit.evidence.p
             if settled:

@@ -167,6 +167,7 @@ class Likelihood:
         bias_variance: how far the bias may be off where the machine turns, by axis, each (n,).
         applied: the applied force, by axis, each (n,), N.m or N.
         slopes: its derivative by each measured force, by axis, each (n, n_forces).
+        factors: of what is measured where the weights are those of the residual; see `Evidence`.
     """
 
     samples: tuple[Samples, ...]
@@ -175,6 +176,7 @@ class Likelihood:
     bias_variance: tuple[Array, ...]
     applied: tuple[Array, ...]
     slopes: tuple[Array, ...]
+    factors: tuple[float, ...] = ()
 
     @classmethod
     def of(
@@ -211,7 +213,25 @@ class Likelihood:
         return cls(
             samples, noise, tuple(root), tuple(bias_variance), tuple(force),
             tuple(take_samples(plain, here, axis) for axis, here in enumerate(samples)),
+            e.factors,
         )  # fmt: skip
+
+    def with_equal_weights(self, problem: Problem, lacking: float) -> Likelihood:
+        """The same where all samples of an axis weigh alike on which the model lacks much.
+
+        Noise of replays says nothing of an error that is many times as large.
+
+        Args:
+            problem: the fit, its solution at zero; lacking: scale from which on an axis does.
+        """
+        scale = np.sqrt(problem.solve().left / problem.count)
+        return replace(
+            self,
+            root=tuple(
+                np.full(r.size, np.sqrt(np.mean(r**2))) if s > lacking and r.size else r
+                for r, s in zip(self.root, scale, strict=True)
+            ),
+        )
 
     def with_heavy_tails(self, problem: Problem, tails: float) -> Likelihood:
         """Weights of samples as under Student's t distribution, at a fit of the model.
@@ -322,6 +342,10 @@ def _pose(
     likelihood: Likelihood, evidence: Evidence, residual: Sequence[Array], bias: Sequence[Array]
 ) -> Problem:
     samples, n_q = likelihood.samples, len(likelihood.samples)
+    weights = likelihood.root
+    if evidence.factors:  # in units of what is measured: small factors explain nothing
+        ratio = np.array(likelihood.factors) / np.array(evidence.factors)
+        weights = tuple(root * by for root, by in zip(weights, ratio, strict=True))
     jacobian: Sequence[Array] = evidence.jacobian
     timing = evidence.timing if evidence.by_timing else ()
     if timing:
@@ -334,7 +358,7 @@ def _pose(
         columns[:, :n] = take_samples(jacobian, here, axis)
         columns[:, n + axis] = -bias[axis]
         columns[:, n + n_q + axis] = -likelihood.noise.stopping[axis]
-        full.append(columns * likelihood.root[axis][:, None])
+        full.append(columns * weights[axis][:, None])
     # What lies evenly between two bounds has a standard deviation of 0.29 of their distance.
     of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
     n_timing, none = len(of_timing), np.zeros(n_q)
@@ -342,7 +366,7 @@ def _pose(
     known = np.concatenate([evidence.known, np.zeros(n_timing), none + 1.0, none])
     lower = np.concatenate([evidence.lower, timing[:1], none - np.inf, none])
     upper = np.concatenate([evidence.upper, timing[1:], none + np.inf, none + _MOST_STOPPING])
-    y = [r * w for r, w in zip(residual, likelihood.root, strict=True)]
+    y = [r * w for r, w in zip(residual, weights, strict=True)]
     weight = [s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)]
     normal = sum(w * (x.T @ x) for w, x in zip(weight, full, strict=True)) + np.diag(precision)
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
