@@ -26,8 +26,9 @@ from scipy import stats
 from bampipe.identification.estimates import Estimate
 from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.lists import join_names
+from bampipe.phrases.results import METHODS
 from bampipe.physics import System
-from bampipe.results.identify import METHODS_IN_WORDS, Method, MethodTried, MethodValue
+from bampipe.results.identify import Method, MethodTried, MethodValue
 from bampipe.results.rounding import round_with_sd, significant
 from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.replay import steps_to_follow
@@ -120,9 +121,9 @@ def held_out_error(squares: SquaresFit, estimate: Estimate) -> Array:
 def describe_methods(methods: Mapping[Method, MethodTried]) -> list[str]:
     """Say what a method that is not published has against it, and what the published one has."""
     published, *others = methods
-    words = METHODS_IN_WORDS[published]
+    words = METHODS[published]
     return [f"Published by {words}, although {doubt}." for doubt in methods[published].doubts] + [
-        f"Published by {words}, not by {METHODS_IN_WORDS[other]}: {'; '.join(doubts)}."
+        f"Published by {words}, not by {METHODS[other]}: {'; '.join(doubts)}."
         for other in others
         if (doubts := methods[other].doubts)
     ]

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from bampipe.estimate.influence import RemovedStretch
 from bampipe.estimate.least_squares import Problem
 from bampipe.identification.filter_tables import as_filtered
+from bampipe.phrases.results import TIMING_AT_LIMIT, describe_unidentified
 from bampipe.physics import System
 from bampipe.physics.effect import BoundEffect
 from bampipe.results.identify import (
-    LACKS_TIMING,
     Covariance,
     EffectEstimate,
     IdentifiabilityReport,
@@ -167,7 +167,7 @@ def collect_result(
         trials=tuple(trials),
         identifiability=identifiability,
         notes=(
-            *filter(None, (found.describe(name) for name, found in effects.items())),
+            *filter(None, (describe_unidentified(*pair) for pair in effects.items())),
             *([_describe_limit(timing)] if timing.is_at_limit else []),
             *filter(None, [influence.worst_second.sentence]),
             *notes,
@@ -272,9 +272,9 @@ def _describe_limit(timing: InputTiming) -> str:
         return (
             f"The timing of the force lies at its limit, {1e3 * timing.limit:.3g} ms {way} than"
             f" logged, half a sample, and is uncertain by {1e3 * timing.sd:.2g} ms: these trials do"
-            f" not determine it, or {LACKS_TIMING}."
+            f" not determine it, or {TIMING_AT_LIMIT}."
         )
     return (
         f"The force acts {1e3 * timing.limit:.3g} ms or more {way} than logged, half a sample, all"
-        f" that the timing of the samples may be: {LACKS_TIMING}."
+        f" that the timing of the samples may be: {TIMING_AT_LIMIT}."
     )
