@@ -210,10 +210,8 @@ class Session:
             noise = describe_noise(replays, stopping, evidence, samples)
         likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
         evidence, problem = self._descend(recipe, evidence, likelihood)
-        if np.isfinite(lacking):
-            likelihood = likelihood.with_equal_weights(problem, lacking)
-            evidence, problem = self._descend(recipe, evidence, likelihood)
         likelihood = likelihood.with_heavy_tails(problem, c.tails)
+        likelihood = likelihood.with_equal_weights(problem, lacking)
         evidence, problem = self._descend(recipe, evidence, likelihood)
         return Fit(recipe, evidence, likelihood, problem)
 

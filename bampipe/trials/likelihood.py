@@ -301,6 +301,7 @@ class Problem:
             parameters, the change that takes it away.
         spread: of each, the standard deviations of these strengths before any data; shapes: how
             many parameters it has beside them.
+        prior_cost: negative log density of what is known beforehand, where nothing changes.
     """
 
     likelihood: Likelihood
@@ -314,6 +315,7 @@ class Problem:
     absence: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     spread: Mapping[str, Array] = field(default_factory=dict)
     shapes: Mapping[str, int] = field(default_factory=dict)
+    prior_cost: float = 0.0
 
     @property
     def independent(self) -> Array:
@@ -430,6 +432,7 @@ def _pose(
         {item.name: _absence(evidence, item) for item in effects},
         {item.name: _spread(item) for item in effects},
         {i.name: sum(q.shape for q in i.parameters) for i in effects},
+        0.5 * float(precision @ known**2),
     )  # fmt: skip
 
 
@@ -520,7 +523,7 @@ def solve_bounded(
         fixed_at |= {k: float(p.lower[k] if below[k] else p.upper[k]) for k in fresh}
     cost = float(independent @ (0.5 * np.log(left / p.count)))
     off = b[:nb]
-    cost += 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
+    cost += p.prior_cost + 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
     return Solved(b, held, left, weight, cost)
 
 
