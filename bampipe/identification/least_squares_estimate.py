@@ -328,7 +328,8 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
 
 def require_enough(squares: SquaresFit, where: str) -> None:
     """Raise :class:`InputError` where fewer than two independent samples a number would count."""
-    moving = int(sum(here.independent for here in squares.fit.likelihood.samples))
+    samples = lay_out_samples(squares.fit.evidence, squares.block_s)
+    moving = int(sum(here.independent for here in samples))
     if moving < 2 * squares.free.size:
         raise InputError(
             f"of the free trials, {moving} independent samples are clear of standstill, fewer than"

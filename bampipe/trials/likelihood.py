@@ -221,19 +221,19 @@ class Likelihood:
     def with_equal_weights(self, problem: Problem, lacking: float) -> Likelihood:
         """The same where all samples of an axis weigh alike on which the model lacks much.
 
-        Noise of replays says nothing of an error that is many times as large.
+        Noise of replays says nothing of an error that is many times as large. Nor is that noise: it
+        repeats with the path, and each sample counts against what is known beforehand.
 
         Args:
             problem: the fit, its solution at zero; lacking: scale from which on an axis does.
         """
         scale = np.sqrt(problem.solve().left / problem.count)
-        return replace(
-            self,
-            root=tuple(
-                np.full(r.size, np.sqrt(np.mean(r**2))) if s > lacking and r.size else r
-                for r, s in zip(self.root, scale, strict=True)
-            ),
-        )
+        root, samples = list(self.root), list(self.samples)
+        for axis in np.flatnonzero(scale > lacking):
+            rows = samples[axis].rows.size
+            root[axis] = np.full(rows, np.sqrt(np.mean(self.root[axis] ** 2)))
+            samples[axis] = replace(samples[axis], independent=float(rows))
+        return replace(self, root=tuple(root), samples=tuple(samples))
 
     def with_heavy_tails(self, problem: Problem, tails: float) -> Likelihood:
         """Weights of samples as under Student's t distribution, at a fit of the model.
