@@ -237,13 +237,14 @@ def fit_squares(
     system: System,
     start: Array,
     block_s: float,
+    remove_bias: bool = True,
 ) -> SquaresFit:
     """Fit a model under the likelihood.
 
     Args:
         trials: to be fitted, whose `timing` says how late inputs may be.
         recipe, system: the model; start: (n_p,) parameters to start from.
-        block_s: as of `SquaresFit`.
+        block_s: as of `SquaresFit`; remove_bias: whether replicates give weights and bias.
 
     Raises:
         ValueError: fewer samples are clear of standstill than there are parameters.
@@ -255,7 +256,7 @@ def fit_squares(
     problem = problem_of(system, trials.motions, trials.band, timing=trials.timed)
     at, found = plain.p, None
     with suppress(Runaway):
-        for _ in range(1 if problem.linear else _PASSES):
+        for _ in range(0 if not remove_bias else 1 if problem.linear else _PASSES):
             again = _with_values(
                 session.fit(recipe, at, lacking=_LACKING), trials, problem, block_s
             )
