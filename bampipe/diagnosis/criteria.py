@@ -25,6 +25,8 @@ class Criteria:
         block_s: length of the stretches of time that are taken as independent, s: one of them alone
             must not decide.
         beam: sets that are pursued side by side.
+        doubt: scale of what is left on an axis, in units of noise and discrepancy, from which on it
+            is something unknown for sure, which what takes less than it leaves may resemble.
     """
 
     probability: float = 0.9
@@ -38,6 +40,7 @@ class Criteria:
     tails: float = 4.0
     block_s: float = 2.0
     beam: int = 10
+    doubt: float = 6.0
 
     def __post_init__(self) -> None:
         for field in fields(self):

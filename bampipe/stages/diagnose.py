@@ -74,6 +74,7 @@ class Config:
         tails: degrees of freedom of Student's t distribution, as which errors are distributed.
         block_s: stretches of time that are independent, s: one alone must not decide.
         beam: sets of effects that are pursued side by side.
+        doubt: scale of what is left on an axis from which on effects may be mere resemblances.
         jobs: worker processes; 0 means one for each processor, eight at most.
         seed: of the noise in the replays.
         trust_setup: whether to diagnose in spite of a mistake that was named in the set-up.
@@ -92,6 +93,7 @@ class Config:
     tails: Positive = _DEFAULT.tails
     block_s: Positive = _DEFAULT.block_s
     beam: Annotated[int, Field(ge=1)] = _DEFAULT.beam
+    doubt: Positive = _DEFAULT.doubt
     jobs: Count = 0
     seed: Count = 0
     trust_setup: bool = False

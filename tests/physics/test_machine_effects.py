@@ -132,6 +132,8 @@ def test_units_are_consistent(machine, case):
         ("slider", "actuator_delay"),
         ("slider", "drive_sag:carriage"),
         ("slider", "flexible_load:carriage"),
+        ("slider", "loose_load:carriage"),
+        ("slider", "loose_drive:carriage"),
         ("slider", "force_delay"),
         ("magnetic_damper", "channel_lag:current"),
         ("magnetic_damper", "channel_saturation:current"),
@@ -167,7 +169,10 @@ def test_is_absent_at_zero_and_recovered_from_a_wrong_guess(machine, case):
 
 
 def test_motor_effects_are_offered_to_motors_only():
-    motors = ("torque_ripple", "actuator_lag", "actuator_delay", "drive_sag", "flexible_load")
+    motors = (
+        "torque_ripple", "actuator_lag", "actuator_delay", "drive_sag", "flexible_load",
+        "loose_load", "loose_drive",
+    )  # fmt: skip
     for name in motors:
         assert registry.effect(name).targets(registry.device("slider"))
         assert not registry.effect(name).targets(registry.device("bam"))
@@ -309,6 +314,36 @@ def test_a_flexible_load_is_rigid_below_its_frequency_and_left_behind_above_it()
         spring = 60.0**2 + 2j * 0.05 * 60.0 * w
         ratio = spring / (spring - w**2)
         assert mass == pytest.approx(70.0 + 25.0 * ratio.real, rel=2e-3)
+
+
+GAP, BEHIND, PUSH = 2e-3, 25.0, 50.0
+
+
+@pytest.mark.parametrize("effect", ["loose_load", "loose_drive"])
+def test_what_is_loose_flies_free_for_as_long_as_it_crosses_half_the_gap(effect):
+    system = compile_model(Model(registry.device("slider"), [f"{effect}:carriage"]))
+    p = {x.name: x.prior for x in system.parameters}
+    p |= dict.fromkeys(("viscous.carriage", "coulomb.carriage", "offset"), 0.0) | {"mass": 70.0}
+    own = {"inertia": BEHIND, "gap": GAP, "frequency": 120.0, "damping": 1.0}
+    p |= {f"{effect}.carriage.{name}": value for name, value in own.items()}
+    if effect == "loose_drive":
+        p["loose_drive.carriage.lightness"] = 1.0 / BEHIND
+    values = np.array([p[x.name] for x in system.parameters])
+    t = np.arange(0.0, 1.0, 1e-3)[:, None]
+    # The load is left behind by what the motor moves; or the motor leaves what is held.
+    acceleration = PUSH / BEHIND
+    moved = acceleration if effect == "loose_load" else 0.0
+    q, qd, qdd = 0.5 * moved * t**2, moved * t, moved + 0.0 * t
+    u = np.zeros((t.size, len(system.inputs)))
+    u[:, system.inputs.index("force_motor")] = PUSH
+    z = system.memory(q, qd, qdd, u, values, t[:, 0])
+    carried = PUSH - system.residual(q, qd, qdd, z, u, values)[:, 0] - 70.0 * moved
+    if effect == "loose_drive":
+        carried = system.residual(q, qd, qdd, z, u, values)[:, 0]
+    flies = t[:, 0] < np.sqrt(GAP / acceleration)
+    np.testing.assert_allclose(carried[flies], 0.0, atol=1e-9)
+    assert carried[np.flatnonzero(~flies)[1]] > 0.0
+    np.testing.assert_allclose(carried[-1], PUSH, rtol=1e-6)
 
 
 def delivered(current: np.ndarray, lag: float) -> np.ndarray:
