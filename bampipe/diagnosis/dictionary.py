@@ -89,7 +89,9 @@ class Dictionary:
         while np.prod(counts) > _MOST:
             dense = [(n - 1) / r.extent for n, r in zip(counts, ranges, strict=True)]
             counts[int(np.argmax(dense))] -= 1
-        axes = [np.linspace(0.0, 1.0, n) if n > 2 else np.arange(1, n + 1) / (n + 1) for n in counts]
+        axes = [
+            np.linspace(0.0, 1.0, n) if n > 2 else np.arange(1, n + 1) / (n + 1) for n in counts
+        ]
         return [(name, tuple(map(float, shape))) for shape in itertools.product(*axes)]
 
     def values(self, key: Key) -> Array:

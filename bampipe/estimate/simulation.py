@@ -390,7 +390,8 @@ def _integrate(
     _run(
         derivative, x, total, make_plant(p, n_noise, width, max_step),
         _Arm(
-            moved_first[:, 0].copy(), moved_first[:, 1].copy(), np.array(force, dtype=np.int64), np.array(rate, dtype=np.int64),
+            moved_first[:, 0].copy(), moved_first[:, 1].copy(),
+            np.array(force, dtype=np.int64), np.array(rate, dtype=np.int64),
             np.array(curvature, dtype=np.int64),
             arm.natural_frequency, arm.damping_ratio, arm.bandwidth,
         ),
