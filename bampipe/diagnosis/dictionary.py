@@ -23,7 +23,7 @@ _ALONE, _SEVERAL = 7, 5
 _WIDE = 300.0
 """Ratio of the ends of a range from which on its grid has `_MORE` values more."""
 _MORE = 6
-_MOST = 150
+_MOST = 300
 _DIVERGED = 1e30
 """An internal state that is too stiff to be integrated at the sampling rate ends above this."""
 _SEGMENT = 128

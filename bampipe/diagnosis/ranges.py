@@ -28,7 +28,7 @@ _GIVE = (1e-4, 0.1)
 samples where friction changes its sign."""
 _LOSS = (1e-2, 3.0)
 """Of the load, at the highest load."""
-_LIGHTEST = 10.0
+_LIGHTEST = 6.0
 """Inertia of an axis over that of the lightest part of it that matters."""
 _TIME = (2.0, 3.0)
 """In samples, in trials: the time in which something settles."""

@@ -37,7 +37,7 @@ def range_of(effect, parameter, scale=AXIS):
         ("actuator_delay", "delay", 2e-4, 0.08),
         ("thermal_damping:carriage", "time_constant", 1.0, 60.0),
         ("loose_drive:carriage", "gap", 25e-6, 0.0625),
-        ("loose_drive:carriage", "lightness", 0.02, 0.2),
+        ("loose_drive:carriage", "lightness", 0.02, 0.12),
     ],
 )
 def test_a_range_follows_travel_speed_load_and_sampling(effect, parameter, low, high):
