@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
+import runpy
 import textwrap
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -38,6 +39,12 @@ FILES: Mapping[str, tuple[type, str]] = {
     "model.toml": (ModelFile, "One model version in a run folder; bampipe writes it."),
     "accepted file": (Accepted, "What later runs are held against; `bampipe accept` writes it."),
 }  # fmt: skip
+RECORDS: Mapping[str, type] = {
+    kind.FILE.rpartition("/")[2]: kind
+    for kind in runpy.run_path(str(Path(__file__).with_name("write_schemas.py")))["FILES"].values()
+    if hasattr(kind, "FILE")
+}
+"""The JSON files that a run, a lab or a simulation writes, by name."""
 
 
 def pages() -> dict[str, str]:
@@ -46,6 +53,7 @@ def pages() -> dict[str, str]:
         "commands.md": commands(),
         "settings.md": settings(),
         "files.md": files(),
+        "results.md": results(),
         "effects.md": effects(),
         "devices.md": devices(),
         "python.md": python(),
@@ -152,13 +160,32 @@ def files() -> str:
         "from `schemas/`.\n",
     ]
     for name, (kind, about) in FILES.items():
-        schema = json_schema(kind)
-        text += [f"## {name} {{#{anchor(name)}}}\n", about + "\n", fields(schema, name)]
-        for key, node in schema.get("$defs", {}).items():
-            if "properties" in node:
-                text.append(f"### {name}: {key} {{#{anchor(name, key)}}}\n")
-                text += [node.get("description", "") + "\n", fields(node, name)]
+        text += file_tables(name, kind, about)
     return "\n".join(text)
+
+
+def results() -> str:
+    """The page of the JSON files of a run folder, field by field."""
+    text = [
+        "# Results\n",
+        "Every field of the JSON files that a run or a lab writes. `schemas/` holds the same as "
+        "JSON Schema; [The run folder](../run_folder.md) says which file is what. A field without "
+        "a meaning here is what its name says. Values are in SI units.\n",
+    ]
+    for name, kind in RECORDS.items():
+        text += file_tables(name, kind, (inspect.getdoc(kind) or "").partition("\n")[0])
+    return "\n".join(text)
+
+
+def file_tables(name: str, kind: type, about: str) -> list[str]:
+    """Heading and tables of one file: its own fields, then those of each table in it."""
+    schema = json_schema(kind)
+    text = [f"## {name} {{#{anchor(name)}}}\n", about + "\n", fields(schema, name)]
+    for key, node in schema.get("$defs", {}).items():
+        if "properties" in node:
+            text.append(f"### {name}: {key} {{#{anchor(name, key)}}}\n")
+            text += [node.get("description", "") + "\n", fields(node, name)]
+    return text
 
 
 def anchor(name: str, key: str = "") -> str:
@@ -175,7 +202,7 @@ def fields(node: Mapping[str, Any], name: str) -> str:
             "" if default in ("", None, []) or isinstance(default, dict) else json.dumps(default)
         )
         needed = "**required**" if key in node.get("required", ()) else shown and code(shown)
-        about = KIND if key == "schema" else entry["description"]
+        about = KIND if key == "schema" else entry.get("description", "")
         rows.append((code(key), kind_of(entry, name), needed, sentence(plain_text(about))))
     return table(("field", "type", "default", "meaning"), rows)
 

@@ -1,29 +1,17 @@
 """Write `schemas/<name>.schema.json` from the declarations: `python .ci/write_schemas.py`."""
 
+from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 
+from bampipe import results
 from bampipe.data.session import Session
 from bampipe.declarations.accepted import Accepted
 from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Pipeline
 from bampipe.physics.device import Device
 from bampipe.physics.effect import Effect
-from bampipe.results.compare import CompareResult
-from bampipe.results.diagnose import DiagnoseResult
-from bampipe.results.draft import DraftResult
-from bampipe.results.filter import FilterResult
-from bampipe.results.identify import IdentifyResult
-from bampipe.results.ingest import IngestResult
-from bampipe.results.lab import LabResult, TrendsResult
-from bampipe.results.next import NextResult
-from bampipe.results.performance import PerformanceResult
-from bampipe.results.run import RunResult
-from bampipe.results.setup import SetupResult
-from bampipe.results.stiffness import StiffnessResult
-from bampipe.results.terms import TermsResult
-from bampipe.results.truth import TruthResult
-from bampipe.results.validate import ValidateResult
-from bampipe.results.viscous import ViscousResult
+from bampipe.results.record import Result
 from bampipe.schema import Declaration, json_schema_text
 
 FOLDER = Path(__file__).parent.parent / "schemas"
@@ -34,26 +22,14 @@ FILES: dict[str, type[Declaration]] = {
     "model": ModelFile,
     "pipeline": Pipeline,
     "session": Session,
-    "compare": CompareResult,
-    "diagnose": DiagnoseResult,
-    "draft": DraftResult,
-    "filter": FilterResult,
-    "identify": IdentifyResult,
-    "ingest": IngestResult,
-    "lab": LabResult,
-    "next": NextResult,
-    "performance": PerformanceResult,
-    "run": RunResult,
-    "setup": SetupResult,
-    "stiffness": StiffnessResult,
-    "trends": TrendsResult,
-    "truth": TruthResult,
-    "validate": ValidateResult,
-    "terms": TermsResult,
-    "viscous": ViscousResult,
 }
+for module in iter_modules(results.__path__):
+    for kind in vars(import_module(f"bampipe.results.{module.name}")).values():
+        if isinstance(kind, type) and issubclass(kind, Result) and kind is not Result:
+            FILES[kind.__name__.removesuffix("Result").lower()] = kind
 
 
 if __name__ == "__main__":
-    for name, kind in FILES.items():
-        (FOLDER / f"{name}.schema.json").write_text(json_schema_text(kind), encoding="utf-8")
+    for name, declared in FILES.items():
+        text = json_schema_text(declared)
+        (FOLDER / f"{name}.schema.json").write_text(text, encoding="utf-8")

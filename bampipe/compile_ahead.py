@@ -3,9 +3,8 @@
 Where nothing is compiled yet, the first stage that wants compiled code would wait for it, and the
 next one again. Instead, processes beside the run import the modules with most to compile, and so
 leave their code on disk. No function is compiled twice, for what one process is at, the others wait
-for (`bampipe.compiled`). They start with the first stage, unless there is a folder of code compiled
-from these sources; then only if a function turns out to be missing all the same. A process that
-fails leaves its part to the run, which then says what is wrong.
+for (`bampipe.compiled`). They start unless there is a folder of code compiled from these sources. A
+process that fails leaves its part to the run, which then says what is wrong.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from bampipe.errors import InputError
@@ -32,55 +31,34 @@ _END_WITH_PARENT = (
 )
 """Standard input ends when the run does, killed or not."""
 
-_allowed: list[bool] = []
-_running: list[subprocess.Popen[bytes]] = []
-
 
 @contextmanager
 def compiling_ahead(processes: int) -> Iterator[None]:
-    """Compile ahead during the block, where that is wanted.
+    """Compile ahead during the block, where nothing is compiled yet.
 
     Args:
         processes: how many cores may be used, 0 for all; with one, nothing is started.
     """
-    if (processes or os.cpu_count() or 1) > 1:
-        _allowed.append(True)
+    running: list[subprocess.Popen[bytes]] = []
+    with suppress(InputError):  # no folder: the run itself says so, with what to do
+        compiled = compiled_folder(Path(__file__).with_name("estimate"))
+        if (processes or os.cpu_count() or 1) > 1 and not compiled.exists():
+            running = [_start(modules) for modules in _PARTS]
     try:
         yield
     finally:
-        _allowed.clear()
-        while _running:
-            process = _running.pop()
+        for process in running:
             process.terminate()
             process.wait()
 
 
-def begin() -> None:
-    """Called when a stage is about to run; the first time counts."""
-    try:
-        if _allowed and not compiled_folder(Path(__file__).with_name("estimate")).exists():
-            _start()
-    except InputError:  # the run itself says so, with what to do
-        return
-
-
-def report_missing() -> None:
-    """Called where a function of bampipe itself is not found compiled; the first time counts."""
-    if _allowed:
-        _start()
-
-
-def _start() -> None:
-    _allowed.clear()
-    for modules in _PARTS:
-        # The same places to import from, and nothing from the working folder.
-        code = f"{_END_WITH_PARENT}; sys.path[:] = {sys.path!r}; import {', '.join(modules)}"
-        _running.append(
-            subprocess.Popen(
-                [sys.executable, "-P", "-c", code],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,
-            )
-        )
+def _start(modules: tuple[str, ...]) -> subprocess.Popen[bytes]:
+    # The same places to import from, and nothing from the working folder.
+    code = f"{_END_WITH_PARENT}; sys.path[:] = {sys.path!r}; import {', '.join(modules)}"
+    return subprocess.Popen(
+        [sys.executable, "-P", "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )

@@ -3,8 +3,6 @@
     python benchmarks/calibration.py --clean 40 --hidden 40 --out scores.jsonl
     python benchmarks/calibration.py --runs runs.tsv --out scores.jsonl
     python benchmarks/calibration.py --from benchmarks/results/calibration.jsonl --probability 0.8
-    python benchmarks/calibration.py --from benchmarks/results/calibration.jsonl \\
-        --page docs/benchmarks_diagnosis.md
 
 Sessions come from simulators that share no code with bampipe (benchmarks/independent): the seed
 draws a machine, a day, up to five effects and their strengths. ``--runs`` diagnoses run folders
@@ -33,7 +31,7 @@ import numpy as np
 from independent import MACHINES, record
 from independent.sensors import Conditions
 from recovery import DAYS, PIPELINE, draw_effects
-from scores import Scores, read_scores, write_page, write_tables
+from scores import Scores, read_scores, write_tables
 
 import bampipe
 from bampipe.diagnosis.criteria import Criteria
@@ -136,11 +134,9 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--out", type=Path, help="add the scores as JSON, a line a session")
     parser.add_argument("--from", dest="read", type=Path, nargs="+", help="scores to read")
-    parser.add_argument("--page", type=Path, help="a page that takes the tables")
     parser.add_argument("--probability", type=float, default=Criteria.probability)
-    parser.add_argument("--significance", type=float, default=Criteria.significance)
     given = parser.parse_args(arguments)
-    criteria = Criteria(probability=given.probability, significance=given.significance)
+    criteria = Criteria(probability=given.probability)
     scores = [one for path in given.read or () for one in read_scores(path)]
     if not given.read:
         rows = list(csv.DictReader(given.runs.open(), delimiter="\t")) if given.runs else []
@@ -156,10 +152,7 @@ def main(arguments: Sequence[str]) -> None:
                 if given.out:
                     with given.out.open("a", encoding="utf-8") as log:
                         log.write(json.dumps(asdict(one)) + "\n")
-    tables = write_tables(scores, criteria)
-    print(tables)
-    if given.page:
-        write_page(given.page, tables)
+    print(write_tables(scores, criteria))
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from independent.sensors import Conditions
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
+from bampipe.phrases.diagnosis import verdict
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.filter import FilterResult
 from bampipe.results.identify import IdentifyResult
@@ -127,7 +128,7 @@ def run(folder: Path, diagnose: bool) -> Outcome:
 
 
 def _verdicts(found: DiagnoseResult) -> str:
-    return "; ".join(f"{axis}: {words}" for axis, words in found.verdicts_in_words.items())
+    return "; ".join(f"{axis}: {verdict(found, axis)}" for axis in found.axes)
 
 
 def compare(machine: str, effect: str, seed: int, diagnose: bool) -> list[str]:

@@ -18,7 +18,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from independent import MACHINES, arm, record
 from independent.sensors import Conditions
 
 import bampipe
-from bampipe.proposal import propose, write_proposal
+from bampipe.setup.proposal import propose, write_proposal
 
 PIPELINE = """schema = "bampipe.pipeline/1"
 name = "mistakes"
@@ -429,6 +429,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--sound", action="store_true", help="sound sessions, each with an effect")
+    parser.add_argument("--out", type=Path, help="add the outcomes as JSON, a line each")
     options = parser.parse_args(arguments)
     cases = []
     for machine in options.machine:
@@ -442,6 +443,9 @@ def main(arguments: Sequence[str]) -> None:
     for case in cases:
         outcomes.append(run_case(case))
         print(outcomes[-1].line(), flush=True)
+        if options.out:
+            with options.out.open("a", encoding="utf-8") as log:
+                log.write(json.dumps(asdict(outcomes[-1])) + "\n")
     print(write_table(outcomes))
 
 

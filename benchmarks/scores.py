@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
-from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.criteria import Criteria, most_probable
 
 TENTHS = np.linspace(0.0, 1.0, 11)
-BEGIN, END = "<!-- printed by benchmarks/calibration.py -->", "<!-- end -->"
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,10 @@ class Scores:
 
     def probabilities(self, criteria: Criteria) -> dict[str, float]:
         """Of each effect of any probable set; no surer than chance allows."""
-        doubtful = {e: p for e, (_, p) in self.drops.items() if p > criteria.significance}
-        return {e: min(p, 1.0 - doubtful.get(e, 0.0)) for e, p in self.effects_found.items()}
+        p_values = {e: p for e, (_, p) in self.drops.items()}
+        return {
+            e: min(p, most_probable(p_values.get(e, 0.0))) for e, p in self.effects_found.items()
+        }
 
     def finds_unknown(self, criteria: Criteria) -> bool:
         """Whether something is said to be missing that no effect of the library is."""
@@ -78,7 +79,7 @@ def write_tables(scores: Sequence[Scores], criteria: Criteria) -> str:
     return "\n".join(
         [
             f"{len(done)} sessions, {len(scores) - len(done)} refused; probability"
-            f" {criteria.probability:g}, significance {criteria.significance:g}",
+            f" {criteria.probability:g}",
             "",
             *_reliability([*hidden, *outside], criteria),
             "",
@@ -152,12 +153,3 @@ def read_scores(path: Path) -> Iterator[Scores]:
     """The scores of a file, a line each."""
     for line in path.read_text(encoding="utf-8").splitlines():
         yield Scores(**json.loads(line))
-
-
-def write_page(path: Path, tables: str) -> None:
-    """Put the tables in the place that a page marks for them."""
-    before, _, rest = path.read_text(encoding="utf-8").partition(BEGIN)
-    after = rest.partition(END)[2]
-    if not after:
-        raise SystemExit(f"{path} has no place for the tables: {BEGIN} ... {END}")
-    path.write_text(f"{before}{BEGIN}\n\n{tables}\n\n{END}{after}", encoding="utf-8")

@@ -20,10 +20,10 @@ from bampipe.errors import InputError
 from bampipe.lab.rows import of_run
 from bampipe.report.results import Results
 from bampipe.results.compare import CompareResult
+from bampipe.results.floor import compare_with_floor
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.run import GateVerdict
-from bampipe.results.standing import standing
 from bampipe.results.validate import ValidateResult
 from bampipe.run import accepted, gates, models, pipeline
 from bampipe.run.markdown import summary
@@ -160,7 +160,11 @@ def test_every_command_takes_the_best_confirmed_model(
         models.write(root, ModelFile(name=name, device="bam"))
         entries = {"mass": {"estimate": 2.0 if name == "base" else 3.0, "sd": 0.1, "unit": "kg"}}
         write_result(root, IdentifyResult, model=name, parameters=entries)
-        axis = {"held_out_rmse": error, "noise_floor": 0.1, "standing": standing(error, 0.1)}
+        axis = {
+            "held_out_rmse": error,
+            "noise_floor": 0.1,
+            "standing": compare_with_floor(error, 0.1),
+        }
         write_result(root, ValidateResult, model=name, axes={"yaw": axis})
     assert models.counting_model(root) == "base", "nothing has been compared"
     code, out, _ = command("accept", "s1")

@@ -431,11 +431,11 @@ def test_plot_keeps_its_frame() -> None:
     ],
 )
 def test_cells(value: object, text: str) -> None:
-    assert show.number(value) == text
+    assert show.format_cell(value) == text
 
 
 def test_summary_prints_tables(capsys: pytest.CaptureFixture[str]) -> None:
-    show.summary(
+    show.print_summary(
         {
             "headline": "two axes",
             "parameters": {"mass": {"unit": "kg", "estimate": 3.5, "sd": 0.1}},
@@ -449,7 +449,7 @@ def test_summary_prints_tables(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_long_names_of_models_are_broken(capsys: pytest.CaptureFixture[str]) -> None:
     name = "base+asymmetric_coulomb.carriage+thermal_damping.carriage+actuator_delay"
-    show.table(["model", "rmse", ""], [["base", 2.0, ""], [name, 1.0, "x " * 50]])
+    show.print_table(["model", "rmse", ""], [["base", 2.0, ""], [name, 1.0, "x " * 50]])
     lines = capsys.readouterr().out.splitlines()
     assert lines[2].split()[:2] == [name.removesuffix("actuator_delay"), "1"]
     assert lines[3] == "  actuator_delay" and lines[2].endswith("x x")
@@ -461,7 +461,7 @@ def test_summary_prints_the_ladder(capsys: pytest.CaptureFixture[str]) -> None:
     axis["velocity_relative_error_percent"] = 4.0
     free = {"free_run_mode": "open_loop", "free_run": {"yaw": axis}}
     ladder = [{"model": "base", **rung}, {"model": "base+x", "added": "x", **rung, **free}]
-    show.summary(filled(CompareResult, {"ladder": ladder}))
+    show.print_summary(filled(CompareResult, {"ladder": ladder}))
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["base", "0.5", "2"] in lines and ["base+x", "x", "0.5", "2"] in lines
     assert ["base+x", "open", "loop", "0.1", "0.2", "3"] in lines

@@ -37,35 +37,17 @@ def started(monkeypatch: pytest.MonkeyPatch) -> Started:
     return found
 
 
-def test_the_first_missing_function_starts_them_and_the_end_of_the_run_ends_them(
-    started: Started,
-) -> None:
-    with compile_ahead.compiling_ahead(2):
-        assert not started.codes, "nothing is missing yet"
-        compile_ahead.report_missing()
-        compile_ahead.report_missing()
-        assert len(started.codes) == len(compile_ahead._PARTS)
-        assert not started.ended
-    assert started.ended == len(started.codes)
-    compile_ahead.report_missing()
-    assert started.ended == len(started.codes), "none is started outside a run"
-
-
-def test_the_first_stage_starts_them_where_nothing_was_compiled_from_these_sources(
+def test_they_run_beside_a_run_where_nothing_was_compiled_from_these_sources(
     started: Started, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path))
     with compile_ahead.compiling_ahead(2):
-        compile_ahead.begin()
-        compile_ahead.begin()
-    assert len(started.codes) == len(compile_ahead._PARTS)
+        assert len(started.codes) == len(compile_ahead._PARTS) and not started.ended
+    assert started.ended == len(started.codes)
     started.codes.clear()
     generated_code.make_compiled_folder(Path(compile_ahead.__file__).with_name("estimate"))
     with compile_ahead.compiling_ahead(2):
-        compile_ahead.begin()
         assert not started.codes
-        compile_ahead.report_missing()
-    assert started.codes, "a function is missing all the same"
 
 
 def test_without_a_folder_the_run_itself_says_so(
@@ -74,14 +56,16 @@ def test_without_a_folder_the_run_itself_says_so(
     monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "file"))
     (tmp_path / "file").touch()
     with compile_ahead.compiling_ahead(2):
-        compile_ahead.begin()
+        pass
     assert not started.codes
 
 
-def test_one_core_is_left_to_the_run(started: Started) -> None:
+def test_one_core_is_left_to_the_run(
+    started: Started, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path))
     with compile_ahead.compiling_ahead(1):
-        compile_ahead.begin()
-        compile_ahead.report_missing()
+        pass
     assert not started.codes
 
 
@@ -93,7 +77,7 @@ def test_what_they_import_is_kept_and_nothing_comes_from_the_working_folder(
     names = ", ".join(name for part in compile_ahead._PARTS for name in part)
     noted = (
         "from bampipe import compiled; "
-        "compiled._CheckedCache.save_overload = lambda self, *_: print(self._impl.filename_base)"
+        "compiled._Cache.save_overload = lambda self, *_: print(self._impl.filename_base)"
     )
     for before in ("pass", noted):
         code = f"import sys; sys.path[:] = {sys.path!r}; {before}; import {names}"

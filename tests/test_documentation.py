@@ -1,6 +1,7 @@
 """What the documents say: their examples run, their names exist, their links lead somewhere."""
 
 import re
+import runpy
 import tomllib
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -78,6 +79,13 @@ def test_the_drawing_of_the_rooms_is_the_law_of_imports():
     assert {item.get("data-room") for item in items} - {None} == set(LAWS)
     arrows = {(item.get("data-from"), item.get("data-to")) for item in items} - {(None, None)}
     assert arrows == expected
+
+
+def test_the_tables_of_validation_are_those_of_the_stored_results():
+    validation = runpy.run_path(str(ROOT / "benchmarks" / "validation.py"))
+    page = (ROOT / "docs/validation.md").read_text(encoding="utf-8")
+    assert len(validation["BLOCK"].findall(page)) == len(validation["read_measured"]())
+    assert validation["fill"](page) == page
 
 
 def _is_room(name):

@@ -132,11 +132,11 @@ def test_a_file_that_changed_on_the_way_is_refused(tmp_path: Path, url: str) -> 
         ("files", {".//.bampipe/lock": "0"}, "is not that of a result"),
         ("files", {"./run.json": "0"}, "is not that of a result"),
         ("files", {".Bampipe/lock": "0"}, "is not that of a result"),
-        ("files", {"run.json": None}, "damaged"),
-        ("files", ["run.json"], "damaged"),
-        ("version", "../../s2/current", "damaged"),
-        ("version", None, "damaged"),
-        ("schema", "bampipe.published/2", "not a published run"),
+        ("files", {"run.json": None}, "expected text"),
+        ("files", ["run.json"], "expected a table"),
+        ("version", "../../s2/current", "expected a name that matches"),
+        ("version", None, "expected text"),
+        ("schema", "bampipe.published/2", 'expected "bampipe.published/1"'),
     ],
 )
 def test_what_a_hostile_store_says_stays_in_the_run_folder(

@@ -60,6 +60,13 @@ def test_every_field_of_a_file_has_its_row_and_its_meaning(name: str) -> None:
             assert re.search(rf"^\| `{key}` \| \S.* \|.*\| \S.* \|$", text, re.M), (heading, key)
 
 
+@pytest.mark.parametrize("name", REFERENCE["RECORDS"])
+def test_every_field_of_a_result_has_its_row(name: str) -> None:
+    text = part(PAGES["results.md"], name)
+    for key in json_schema(REFERENCE["RECORDS"][name])["properties"]:
+        assert re.search(rf"^\| `{key}` \| \S.* \|$", text, re.M), key
+
+
 def test_every_effect_and_device_has_its_part() -> None:
     for name in registry.effect_names():
         text = part(PAGES["effects.md"], name)

@@ -29,7 +29,7 @@ def test_notes_of_the_logs_and_a_second_that_stands_out_are_said(
         ],
         verdicts=[], model="",
     )  # fmt: skip
-    show.outcome(found)
+    show.print_outcome(found)
     printed = capsys.readouterr()
     notes = [line for line in (printed.out + printed.err).splitlines() if line.startswith("note:")]
     assert notes == [
@@ -41,7 +41,7 @@ def test_notes_of_the_logs_and_a_second_that_stands_out_are_said(
 
 def test_an_effect_that_is_not_identified_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     why = "`stribeck.joint.force` is 18 \u00b1 46 N.m, an interval larger than itself"
-    show.unidentified(
+    show.print_unidentified(
         {
             "play:joint": EffectEstimate(identified=True),
             "stribeck:joint": EffectEstimate(identified=False, reasons=(why,)),

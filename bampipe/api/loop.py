@@ -256,13 +256,15 @@ def follow(
     Returns:
         The name of the last model that is better than its parent.
     """
+    from bampipe.phrases import diagnosis as phrases
+
     options.run("identify", "validate", model)  # what a child is held against, and the ladder shows
     left_out: dict[str, dict[str, object]] = {}
     for _ in range(MOST_ROUNDS):
         options.run("diagnose", "diagnose", model, left_out)
         diagnosis = _diagnosis(options.root, model)
-        for axis, words in sorted(diagnosis.verdicts_in_words.items()):
-            tell(f"{model}, {axis}: {words}")
+        for axis in sorted(diagnosis.axes):
+            tell(f"{model}, {axis}: {phrases.verdict(diagnosis, axis)}")
         for line in _unsettled(diagnosis):
             tell(line)
         found = diagnosis.selected
@@ -286,15 +288,15 @@ def follow(
 
 def _unsettled(diagnosis: DiagnoseResult) -> list[str]:
     """Say where effects are about as likely as others which of them are added, and what decides."""
-    from bampipe.results import phrases
+    from bampipe.phrases import diagnosis as phrases
 
     said = []
-    trial = diagnosis.suggested_trial
+    trial, open_effects = diagnosis.suggested_trial, phrases.find_open_effects(diagnosis)
     for axis, entry in diagnosis.axes.items():
         if entry.verdict != "undecided":
             continue
-        known, parts = phrases.undecided(diagnosis, axis)
-        taken = join_names(n for n in entry.effects if n in diagnosis.doubted)
+        known, parts = phrases.split_alternatives(diagnosis, axis)
+        taken = join_names(n for n in entry.effects if n in open_effects)
         which = f"which of them is added is arbitrary, it is {taken}"
         beside = f" beside {known}" if known else ""
         asked = trial is not None and {*trial.between} & {*entry.probabilities}

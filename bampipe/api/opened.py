@@ -112,7 +112,7 @@ class Run:
         """One row a parameter: estimate, sd, unit, and what else identification says."""
         frame = _rows(self._read(IdentifyResult, model).parameters)
         first = [name for name in ("estimate", "sd", "unit") if name in frame]
-        order = self._results.in_order(frame.index)
+        order = self._results.order_parameters(frame.index)
         return frame.loc[list(order), first + [c for c in frame if c not in first]]
 
     def covariance(self, model: str = "") -> pd.DataFrame:
@@ -142,11 +142,11 @@ class Run:
         return self._read(DiagnoseResult, model).model_dump(mode="json")
 
     def drafts(self, model: str = "") -> dict[str, Any]:
-        """Formulas drafted for what no effect explains: curves, constants, chance level."""
+        """Formulas drafted for what no effect explains: curves, constants, p-values."""
         return self._read(DraftResult, model).model_dump(mode="json")
 
     def ranking(self, model: str = "") -> pd.DataFrame:
-        """The candidate effects, best first: error before and after, chance level."""
+        """The candidate effects, best first: error before and after, probability, p-value."""
         return pd.DataFrame(self.diagnosis(model)["ranking"])
 
     @property

@@ -43,6 +43,4 @@ def accept(
     show.say(f"{path}: the values of {root.name}, model {chosen}")
     for doubt in accepted.doubts(RunFolder(root), chosen):
         show.say(f"warning: {doubt}")
-    if not quiet:
-        show.say("")
-        show.say(f"next: put {path} under version control; later runs are compared with it")
+    show.print_advice(f"put {path} under version control; later runs are compared with it", quiet)

@@ -71,7 +71,7 @@ def effects(
 
         copy = adopt_effect(Path(str(file)), runs)
         if json:
-            show.as_json({"file": str(copy)})
+            show.print_json({"file": str(copy)})
         else:
             show.say(f"{copy}: every run in {runs} weighs it from its next diagnosis on")
     elif file is not None:

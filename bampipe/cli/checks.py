@@ -20,10 +20,10 @@ def status_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption =
     root = places.find_run(run, runs)
     found = status(root, pipelines.recorded(record.read(root)))
     if json:
-        show.as_json({"run": str(root), "steps": [vars(step) for step in found]})
+        show.print_json({"run": str(root), "steps": [vars(step) for step in found]})
         return
     show.say(str(root))
-    show.table(
+    show.print_table(
         ["step", "state", "last run", "seconds", ""],
         [[s.step, s.state, s.started_at, s.seconds, s.reason] for s in found],
     )
@@ -37,10 +37,10 @@ def verify_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption =
     root = places.find_run(run, runs)
     found = verify(root)
     if json:
-        show.as_json({"run": str(root), "touched": dict(found)})
+        show.print_json({"run": str(root), "touched": dict(found)})
     elif found:
         show.say(f"{root}: {len(found)} files are not as they were recorded")
-        show.table(["file", "state"], found)
+        show.print_table(["file", "state"], found)
     else:
         show.say(f"{root}: every file is as it was recorded")
     if found:

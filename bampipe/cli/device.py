@@ -42,14 +42,14 @@ def list_(json: JsonOption = False) -> None:
 
     found = [registry.device(name) for name in registry.device_names()]
     if json:
-        show.as_json(
+        show.print_json(
             [
                 {"name": d.name, "axes": [c.name for c in d.coordinates], "summary": d.summary}
                 for d in found
             ]
         )
         return
-    show.table(
+    show.print_table(
         ["device", "axes", "summary"],
         [[d.name, ", ".join(c.name for c in d.coordinates), d.summary] for d in found],
     )
@@ -82,7 +82,7 @@ def show_(
     inputs += [f"{name} (brake of {axis})" for axis, name in found.brakes.items()]
     inputs += [f"{name} ({unit or 'a pure number'})" for name, unit in found.channels.items()]
     if json:
-        show.as_json(
+        show.print_json(
             {
                 "declaration": dict(declaration),
                 "equations": equations.splitlines(),
@@ -120,7 +120,7 @@ def check(
     if picture is not None and not faults:
         _draw(declaration, where, picture)
     if json:
-        show.as_json({"file": where, "equations": equations.splitlines(), "faults": faults})
+        show.print_json({"file": where, "equations": equations.splitlines(), "faults": faults})
         if faults:
             raise typer.Exit(2)
         return
@@ -132,8 +132,7 @@ def check(
         show.say(f"{where}: names, units and equations fit together")
         if picture is not None:
             show.say(f"wrote {picture}")
-        show.say("")
-        show.say(f"next: {_after(file)}")
+        show.print_advice(_name_next_step(file))
 
 
 def _draw(declaration: Mapping[str, Any], where: str, path: Path) -> None:
@@ -159,7 +158,7 @@ for _name, _command in COMMANDS.items():
     app.command(_name, short_help=summary_of(_command))(_command)
 
 
-def _after(file: str) -> str:
+def _name_next_step(file: str) -> str:
     """What to do once a device file is right: run the session it lies in, or name it in one."""
     path = Path(file)
     if path.suffix != ".toml":
@@ -191,12 +190,11 @@ def check_effect_file(text: str, device_name: str, json: bool) -> None:
     device = registry.device_from(declaration, where)
     tried, faults = effect_faults(read_effect(file), file, device, target)
     if json:
-        show.as_json({"file": file, "device": device_name, "targets": tried, "faults": faults})
+        show.print_json({"file": file, "device": device_name, "targets": tried, "faults": faults})
         if faults:
             raise typer.Exit(2)
         return
     if faults:
         report_faults(faults)
     show.say(f"{file}: names and units fit on {device_name}, as {', '.join(tried)}")
-    show.say("")
-    show.say(f"next: bampipe effects {file}")
+    show.print_advice(f"bampipe effects {file}")

@@ -21,14 +21,14 @@ def list_all(json: bool) -> None:
 
     found = [registry.effect(name) for name in registry.effect_names()]
     if json:
-        show.as_json(
+        show.print_json(
             [
                 {"name": e.name, "scope": e.scope, "kind": e.kind, "summary": e.summary}
                 for e in found
             ]
         )
         return
-    show.table(
+    show.print_table(
         ["effect", "acts on", "kind", "summary"],
         [[e.name, e.scope.replace("_", " "), e.kind, e.summary] for e in found],
     )
@@ -74,7 +74,7 @@ def show_one(text: str, device_name: str, json: bool) -> None:
 
     found = signature(device, effect, chosen)
     if json:
-        show.as_json(
+        show.print_json(
             {
                 "declaration": dict(effect.declaration),
                 "targets": [item for item in targets if item],
@@ -103,7 +103,7 @@ def show_one(text: str, device_name: str, json: bool) -> None:
         for column in range(len(head))
         if column < 1 or any(row[column] not in (None, "") for row in rows)
     ]
-    show.table([head[c] for c in used], [[row[c] for c in used] for row in rows])
+    show.print_table([head[c] for c in used], [[row[c] for c in used] for row in rows])
     show.say("")
     names = [f"{effect.name}:{item}" if item else effect.name for item in targets]
     show.say(f"on {device_name}: {', '.join(names)}")

@@ -41,6 +41,4 @@ def fetch(
                 remedy=choose_from(session, known),
             )
         show.say(str(publish.fetch(url, session, runs, force)))
-    if not quiet:
-        show.say("")
-        show.say(f"next: bampipe lab {runs}")
+    show.print_advice(f"bampipe lab {runs}", quiet)

@@ -14,8 +14,8 @@ def say_what_came(root: Path, model: str) -> None:
     Args:
         root: the run folder; model: that counts.
     """
+    from bampipe.phrases.forecast import compare_forecasts, read_forecasts
     from bampipe.results.diagnose import DiagnoseResult
-    from bampipe.results.forecast import compare_forecasts, read_forecasts
     from bampipe.results.identify import IdentifyResult
 
     run = RunFolder(root)

@@ -34,12 +34,12 @@ def init(
 
     Example: bampipe init logs/2026-10-03 --names time_s,angle_deg,current_mA
     """
-    from bampipe.proposal import propose, write_proposal
+    from bampipe.setup.proposal import propose, write_proposal
 
     proposal = propose(folder, device, [name for name in names.split(",") if name.strip()])
     written = [] if dry else write_proposal(folder, proposal)
     if json:
-        show.as_json(
+        show.print_json(
             {
                 "session": proposal.session,
                 "device": proposal.device,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +13,6 @@ from bampipe.errors import InputError
 
 if TYPE_CHECKING:
     from bampipe.lab.collect import Lab
-    from bampipe.results.lab import ControlChart
 
 MOST_SESSIONS = 60
 
@@ -46,12 +44,10 @@ def lab(
         raise InputError("no such folder of runs", where=str(folder))
     found = gather(folder, out, quiet or json)
     if json:
-        show.as_json(found.content.model_dump(mode="json"))
+        show.print_json(found.content.model_dump(mode="json"))
         return
     table(found)
-    if not quiet:
-        show.say("")
-        show.say(f"next: {advice(found)}")
+    show.print_advice(advice(found), quiet)
 
 
 def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> Lab:
@@ -92,12 +88,13 @@ def refresh(runs: Path, several: bool, quiet: bool) -> None:
     if not quiet and several:
         show.say("")
         table(found)
-        show.say("")
-        show.say(f"next: open {found.folder / 'report.html'}, which links every session")
+        show.print_advice(f"open {found.folder / 'report.html'}, which links every session")
 
 
 def table(found: Lab) -> None:
     """Print the sessions that stand out, else that none does; then the trends."""
+    from bampipe.phrases import lab as phrases
+
     sessions = found.content.sessions
     odd = [one for one in sessions if one.verdict != "in control"]
     many = "session" if len(sessions) == 1 else "sessions"
@@ -109,32 +106,20 @@ def table(found: Lab) -> None:
             one.recorded[:16].replace("T", " "),
             one.model,
             f"{one.worst[0]:.3g} {one.worst[1]}" if one.worst else None,
-            found.content.verdict_in_words(one),
+            phrases.verdict(found.content, one),
             one.sentence,
         ]
         for one in (sessions if len(sessions) <= MOST_SESSIONS else odd)
     ]
     if rows:
-        show.table(["session", "recorded", "model", "error / floor", "verdict", ""], rows)
-    for line in _trend_lines(found.content.series):
+        show.print_table(["session", "recorded", "model", "error / floor", "verdict", ""], rows)
+    for line in phrases.list_trends(found.content.series):
         show.say(line)
     fewest = found.content.fewest_sessions
     if found.content.series and not any(chart.has_limits for chart in found.content.series):
         show.say(f"no control limits yet: they need {fewest} sessions of a device")
     for line in found.skipped:
         show.say(f"left out: {line}")
-
-
-def _trend_lines(series: Iterable[ControlChart]) -> list[str]:
-    lines = []
-    for chart in series:
-        if chart.drifts and chart.slope_per_session is not None:
-            percent = 100.0 * chart.slope_per_session / abs(chart.centre or 1.0)
-            lines.append(f"trend: {chart.name} {percent:+.2g} % a session")
-        if chart.run:
-            first, last = chart.run
-            lines.append(f"shift: {chart.name} on one side of its median, {first} to {last}")
-    return lines
 
 
 def advice(found: Lab) -> str:

@@ -10,7 +10,7 @@ import typer
 from bampipe.cli import places, show
 from bampipe.cli.forecast import say_what_came
 from bampipe.cli.next_step import after_loop
-from bampipe.cli.one_stage import advise, one_stage, print_settings, whole_pipeline
+from bampipe.cli.one_stage import one_stage, print_settings, whole_pipeline
 from bampipe.cli.options import (
     DEFAULTS,
     RUNS,
@@ -65,7 +65,7 @@ def draft(
     ] = False,
     options: StageOptions = DEFAULTS,
 ) -> None:
-    """Draft a formula for what no effect explains, as an effect file, with its chance level.
+    """Draft a formula for what no effect explains, as an effect file, with its p-value.
 
     Example: bampipe draft 2026-10-03_s01
     """
@@ -83,7 +83,7 @@ def draft(
 def _advise_next(command: str, root: Path, options: StageOptions) -> None:
     """Print the command that a result of the run folder ``root`` says comes next."""
     run = places.next_to(root, options.runs)
-    advise(options.quiet, options.json, command.replace("RUN", run))
+    show.print_advice(command.replace("RUN", run), options.quiet, options.json)
 
 
 def extend(
@@ -156,14 +156,14 @@ def extend(
             last = loop.extend(options, parent, effects)
     ladder = RunFolder(root).read(CompareResult).model_dump(mode="json")
     if json:
-        show.as_json(ladder)
+        show.print_json(ladder)
         return
     show.say(f"{root}: {last}")
-    show.summary(ladder)
-    show.unidentified(RunFolder(root).read(IdentifyResult, last).effects)
+    show.print_summary(ladder)
+    show.print_unidentified(RunFolder(root).read(IdentifyResult, last).effects)
     name = places.next_to(root, runs)
     asked = f"bampipe diagnose {name}{RunFolder(root).model_option(last)}"
-    advise(quiet, json, after_loop(root, last, name) if auto else asked)
+    show.print_advice(after_loop(root, last, name) if auto else asked, quiet, json)
 
 
 def _is_effect(argument: str) -> bool:

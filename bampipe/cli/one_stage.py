@@ -21,22 +21,11 @@ from bampipe.stages import base
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Pipeline
 
-AFTER = {
-    "ingest": "filter",
-    "filter": "stiffness",
-    "stiffness": "identify",
-    "identify": "validate",
-    "viscous": "report",
-    "performance": "report",
-    "validate": "diagnose",
-    "compare": "report",
-}
-
 _OF_DIAGNOSIS = ("draft", "next")
 """Stages that go by what a diagnosis found."""
 
 
-def assignments(given: Sequence[str] | None) -> dict[str, object]:
+def parse_settings(given: Sequence[str] | None) -> dict[str, object]:
     return dict(parse_assignment(text) for text in given or ())
 
 
@@ -48,12 +37,6 @@ def print_settings(stage: str) -> None:
         show.say((inspect.getdoc(kind) or "").partition("Attributes:\n")[2].rstrip())
     show.say("")
     show.say(f"defaults: {module.Config()}")
-
-
-def advise(quiet: bool, json: bool, command: str) -> None:
-    if not quiet and not json:
-        show.say("")
-        show.say(f"next: {command}")
 
 
 def whole_pipeline(root: Path, name: str) -> Pipeline:
@@ -82,7 +65,7 @@ def one_stage(
         more: settings from options of this stage alone.
     """
     batch.limit_threads(1)
-    settings = assignments(options.settings) | dict(more or {})
+    settings = parse_settings(options.settings) | dict(more or {})
     request = Request(
         root=root,
         pipeline=whole_pipeline(root, options.pipeline),
@@ -99,12 +82,12 @@ def one_stage(
     if options.json:
         one = len(outcome.steps) == 1
         results = {step.step: step.summary for step in outcome.steps}
-        show.as_json(outcome.steps[0].summary if one else results)
+        show.print_json(outcome.steps[0].summary if one else results)
         return outcome
     for step in outcome.steps:
         suffix = " (unchanged)" if step.state == "unchanged" else ""
         show.say(f"{root}: {step.step}{suffix}")
-        show.summary(step.summary)
+        show.print_summary(step.summary)
     if stage in _OF_DIAGNOSIS:
         _say_if_outdated(root, request.pipeline, model)
     return outcome
@@ -140,5 +123,5 @@ def plain_stage(
     elif stage == "next":
         command = after_proposal(root, outcome.steps[0].step.partition(":")[2], name)
     else:
-        command = f"bampipe {AFTER[stage]} {name}"
-    advise(options.quiet, options.json, command)
+        command = f"bampipe {base.AFTER[stage]} {name}"
+    show.print_advice(command, options.quiet, options.json)

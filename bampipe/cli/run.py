@@ -12,7 +12,7 @@ from bampipe.cli import places, show
 from bampipe.cli.forecast import say_what_came
 from bampipe.cli.lab import refresh
 from bampipe.cli.next_step import after_run
-from bampipe.cli.one_stage import advise, assignments
+from bampipe.cli.one_stage import parse_settings
 from bampipe.cli.options import (
     RUNS,
     ForceOption,
@@ -146,7 +146,7 @@ def run(
         say_what_came(outcomes[0].root, outcomes[0].model)
     if not several:
         name = places.next_to(requests[0].root, runs)
-        advise(quiet, json, after_run(outcomes[0].root, outcomes[0].model, name))
+        show.print_advice(after_run(outcomes[0].root, outcomes[0].model, name), quiet, json)
     code = max(outcome.exit_code for outcome in outcomes)
     if code:
         raise typer.Exit(code)
@@ -154,7 +154,7 @@ def run(
 
 def _stage_settings(given: Sequence[str] | None) -> dict[str, dict[str, object]]:
     found: dict[str, dict[str, object]] = {}
-    for name, value in assignments(given).items():
+    for name, value in parse_settings(given).items():
         stage, dot, setting = name.partition(".")
         if not dot:
             raise InputError(
@@ -190,7 +190,7 @@ def _report_runs(outcomes: Sequence[Outcome], several: bool, json: bool) -> None
         if outcome.traceback:
             show.note(outcome.traceback)
     if json:
-        show.as_json({"sessions": [outcome.content() for outcome in outcomes]})
+        show.print_json({"sessions": [outcome.content() for outcome in outcomes]})
     elif several:
         words = {0: "done", 1: "gate failed", 2: "bad input", 3: "crashed"}
         rows = [
@@ -207,6 +207,6 @@ def _report_runs(outcomes: Sequence[Outcome], several: bool, json: bool) -> None
             ]
             for outcome in outcomes
         ]
-        show.table(["session", "state", "seconds", ""], rows)
+        show.print_table(["session", "state", "seconds", ""], rows)
     else:
-        show.outcome(outcomes[0])
+        show.print_outcome(outcomes[0])

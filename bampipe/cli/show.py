@@ -1,4 +1,4 @@
-"""What the commands print: results on standard output, progress and errors on standard error."""
+"""Output of the commands: results on standard output, progress and errors on standard error."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FIRST_COLUMNS = (
 """In this order, whether a summary has just been made or is read from the run folder."""
 
 
-def number(value: object) -> str:
+def format_cell(value: object) -> str:
     """Return a cell: four significant digits for a number, plain words for the rest."""
     if value is None:
         return "–"
@@ -44,21 +44,21 @@ def number(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {number(item)}" for key, item in value.items())
+        return ", ".join(f"{key} {format_cell(item)}" for key, item in value.items())
     if isinstance(value, list | tuple):
-        return ", ".join(number(item) for item in value) or "–"
+        return ", ".join(format_cell(item) for item in value) or "–"
     return printable(str(value))
 
 
 class OutputClosedError(Exception):
-    """Whoever read our output has closed it; no OSError, of which typer makes a failed gate."""
+    """The reader of our output has closed it; not an OSError, which typer makes a failed gate."""
 
 
 def write_line(line: str) -> None:
     """Print a line on standard output, at once.
 
     Raises:
-        OutputClosedError: nobody reads it any more, as after ``| head``.
+        OutputClosedError: its reader has closed it, as ``| head`` does.
     """
     try:
         print(line, flush=True)
@@ -67,7 +67,7 @@ def write_line(line: str) -> None:
 
 
 def say(text: str) -> None:
-    """Print what a person reads on standard output, a line."""
+    """Print a line for a person on standard output."""
     write_line(printable(text))
 
 
@@ -76,7 +76,7 @@ def note(text: str) -> None:
     print(printable(text), file=sys.stderr, flush=True)
 
 
-def as_json(content: object) -> None:
+def print_json(content: object) -> None:
     """Print ``content`` as JSON on standard output."""
     write_line(json.dumps(content, sort_keys=True, indent=1, ensure_ascii=False))
 
@@ -94,7 +94,7 @@ def page(path: Path) -> None:
         raise InputError("no browser could be started", where=str(path), remedy=remedy)
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+def print_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Print a table: text to the left, in lines where it is long, numbers to the right, no rules.
 
     Args:
@@ -102,17 +102,14 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         rows: cells.
     """
     raw = [list(row) for row in rows]
-    cells = [[number(cell) for cell in row] for row in raw]
-    for column in range(len(head)):
-        if head[column] == "" and all(not row[column] for row in cells):
-            cells = [[*row[:column], "", *row[column + 1 :]] for row in cells]
-    last = len(head) - 1  # nothing stands behind it, so it may be as long as it likes
+    cells = [[format_cell(cell) for cell in row] for row in raw]
+    last = len(head) - 1  # nothing follows it, so it may be of any length
     lines = [
-        [[cell] if column == last else _broken(cell) for column, cell in enumerate(row)]
+        [[cell] if column == last else _break_name(cell) for column, cell in enumerate(row)]
         for row in cells
     ]
     widths = [
-        max([len(name), *(len(part) for row in lines for part in row[column])])
+        max(len(text) for text in (name, *(part for row in lines for part in row[column])))
         for column, name in enumerate(head)
     ]
     right = [
@@ -120,20 +117,20 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         for column in range(len(head))
     ]
 
-    def line(row: Sequence[str]) -> str:
+    def join(row: Sequence[str]) -> str:
         parts = [
             cell.rjust(width) if to_right else cell.ljust(width)
             for cell, width, to_right in zip(row, widths, right, strict=True)
         ]
         return "  " + "  ".join(parts).rstrip()
 
-    say(line(list(head)))
+    say(join(head))
     for row in lines:
         for parts in zip_longest(*row, fillvalue=""):
-            say(line(parts))
+            say(join(parts))
 
 
-def _broken(text: str) -> list[str]:
+def _break_name(text: str) -> list[str]:
     """Break the name of a model, or of several effects, into lines where it is long."""
     found = [""]
     for part in re.split(r"(?<=[+ ])", text):
@@ -147,19 +144,17 @@ def _is_scalar(value: object) -> bool:
     return value is None or isinstance(value, str | int | float | bool)
 
 
-def _records(value: object) -> list[dict[str, Any]] | None:
-    """Return a table of named records, or a list of records, as rows; None if it is neither."""
-    if isinstance(value, Mapping) and value:
-        if not all(isinstance(item, Mapping) for item in value.values()):
-            return None
+def _read_rows(value: object) -> list[dict[str, Any]]:
+    """Return a table of named records, or a list of records, as rows; none if it is neither."""
+    if isinstance(value, Mapping) and all(isinstance(item, Mapping) for item in value.values()):
         return [{"": name, **item} for name, item in sorted(value.items())]
-    if isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
+    if isinstance(value, list) and all(isinstance(item, Mapping) for item in value):
         return [dict(item) for item in value]
-    return None
+    return []
 
 
-def _flat(row: Mapping[str, Any], deep: bool) -> dict[str, Any]:
-    """Return the columns a record shows: scalars and, if ``deep``, tables of them key by key."""
+def _flatten(row: Mapping[str, Any], deep: bool) -> dict[str, Any]:
+    """Return the columns of a record: scalars and, if ``deep``, tables of them key by key."""
     shown: dict[str, Any] = {name: row[name] for name in FIRST_COLUMNS if name in row}
     for name, value in row.items():
         if _is_scalar(value):
@@ -168,196 +163,175 @@ def _flat(row: Mapping[str, Any], deep: bool) -> dict[str, Any]:
             shown.update({f"{name} {key}": item for key, item in value.items()})
         elif isinstance(value, list) and all(isinstance(item, str) for item in value):
             shown[name] = ", ".join(value)
+    shown.pop("sentence", None)
     return shown
 
 
-def summary(content: Mapping[str, object]) -> None:
-    """Print what a stage found: its headline, then its tables.
+def print_summary(content: Mapping[str, object]) -> None:
+    """Print the findings of a stage: its headline, then its tables.
 
     Args:
         content: the summary of a stage. ``headline`` is a line; ``axes``, ``parameters``,
             ``directions``, ``trials``, ``ranking`` and ``ladder`` are tables; ``notes`` are lines.
     """
-    setup(content)
+    _print_lines(content, "setup", "set-up")
     if isinstance(content.get("headline"), str):
         say(str(content["headline"]))
     for name in ("axes", "parameters", "directions", "trials", "ranking"):
-        rows = _records(content.get(name))
-        if rows is None or len(rows) > LARGEST_TABLE:
-            continue
-        flat = [_flat(row, name == "ranking") for row in rows]
-        for row in flat:
-            row.pop("sentence", None)
-        head = list(dict.fromkeys(column for row in flat for column in row))
-        if len(head) < 2:
-            continue
-        say("")
-        say(name)
-        table(
-            [column.replace("_", " ") for column in head],
-            [[row.get(column) for column in head] for row in flat],
-        )
+        rows = [_flatten(row, name == "ranking") for row in _read_rows(content.get(name))]
+        head = list(dict.fromkeys(column for row in rows for column in row))
+        if len(head) > 1 and len(rows) <= LARGEST_TABLE:
+            say(f"\n{name}")
+            titles = [column.replace("_", " ") for column in head]
+            print_table(titles, [[row.get(column) for column in head] for row in rows])
     if "ladder" in content:
         from bampipe.results.compare import CompareResult
 
         compared = CompareResult.model_validate(content)
-        _ladder(compared.ladder)
-        _counting(compared.best)
-    for row in [*(_records(content.get("axes")) or []), *(_records(content.get("moved")) or [])]:
+        _print_ladder(compared.ladder)
+        _print_model(compared.best)
+    for row in (*_read_rows(content.get("axes")), *_read_rows(content.get("moved"))):
         if isinstance(row.get("sentence"), str):
             say(str(row["sentence"]))
-    trials(content)
-    _lines(content, "failed_checks", "check failed")
+    _print_trials(content)
+    _print_lines(content, "failed_checks", "check failed")
     if content.get("notes"):
         say("")
-    _lines(content, "notes", "note")
+    _print_lines(content, "notes", "note")
 
 
-def _lines(content: Mapping[str, object], name: str, word: str) -> None:
+def _print_lines(content: Mapping[str, object], name: str, word: str) -> None:
     found = content.get(name)
     for line in found if isinstance(found, list) else ():
         say(f"{word}: {line}")
 
 
-def setup(content: Mapping[str, object]) -> None:
-    """Print what is wrong or doubtful in the session and device files, a line each."""
-    lines = content.get("setup")
-    for line in lines if isinstance(lines, list) else []:
-        say(f"set-up: {line}")
-
-
-def trials(content: Mapping[str, object]) -> None:
-    """Print which trials were set aside, and what was repaired or noted in others, a line each."""
+def _print_trials(content: Mapping[str, object]) -> None:
+    """Print which trials were set aside, and the repairs and notes of others, a line each."""
     for name, word, reason in (
         ("set_aside", "set aside", "reason"),
         ("repaired", "note", "repairs"),
     ):
-        rows = _records(content.get(name)) or []
+        rows = _read_rows(content.get(name))
         for row in rows[:MOST_TRIALS]:
             say(f"{word}: {row['trial_id']}: {row[reason]}")
         if len(rows) > MOST_TRIALS:
             say(f"{word}: {len(rows) - MOST_TRIALS} trials more; `bampipe ingest --json` lists all")
 
 
-def _ladder(rungs: Sequence[Rung]) -> None:
+def _print_ladder(rungs: Sequence[Rung]) -> None:
     """Print one row a model version: its held-out error over the noise floor, axis by axis."""
+    from bampipe.results.compare import horizons_of
+
     axes = list(dict.fromkeys(axis for rung in rungs for axis in rung.held_out_rmse))
-    body = []
+    rows = []
     for rung in rungs:
         cells = [rung.model, rung.added or ""]
         for axis in axes:
             error, floor = rung.sound_error(axis), rung.sound_floor(axis)
-            shown = "refused" if axis in rung.refused else number(error)
-            cells += [shown, number(error / floor) if error and floor else ""]
-        body.append(cells)
-    head = ["model", "added"]
-    for axis in axes:
-        head += [f"{axis}, {rungs[0].unit.get(axis, '')}", "/ floor"]
-    say("")
-    say("ladder: error on held-out trials, and over its noise floor")
-    table(head, body)
+            shown = "refused" if axis in rung.refused else format_cell(error)
+            cells += [shown, format_cell(error / floor) if error and floor else ""]
+        rows.append(cells)
+    units = rungs[0].unit
+    heads = (head for axis in axes for head in (f"{axis}, {units.get(axis, '')}", "/ floor"))
+    say("\nladder: error on held-out trials, and over its noise floor")
+    print_table(["model", "added", *heads], rows)
     if any(rung.free_run for rung in rungs):
-        _free_runs(rungs)
-    from bampipe.results.compare import horizons_of
-
+        _print_free_runs(rungs)
     if horizons := horizons_of(rungs):
-        _drift(rungs, horizons)
+        _print_drift(rungs, horizons)
 
 
-def _free_runs(rungs: Sequence[Rung]) -> None:
+def _print_free_runs(rungs: Sequence[Rung]) -> None:
     """Print how far each model version, left to itself, ends up from the measured positions."""
     units = {axis: found.unit for rung in rungs for axis, found in rung.free_run.items()}
-    body = []
+    rows = []
     for rung in rungs:
         cells = [rung.model, (rung.free_run_mode or "").replace("_", " ")]
-        for axis in units:
-            found = rung.free_run.get(axis)
-            shown = (found.mean_absolute, found.rmse, found.relative_error_percent) if found else ()
-            cells += [number(value) for value in shown] or [""] * 3
-        body.append(cells)
-    head = ["model", "loop"]
-    for axis, unit in units.items():
-        head += [f"{axis}, mean abs., {unit}", f"RMS, {unit}", "%"]
-    say("")
-    say("free run: position error of the model left to itself over held-out trials")
-    table(head, body)
+        for one in map(rung.free_run.get, units):
+            shown = (one.mean_absolute, one.rmse, one.relative_error_percent) if one else ()
+            cells += [format_cell(value) for value in shown] or [""] * 3
+        rows.append(cells)
+    heads = (
+        head
+        for axis, unit in units.items()
+        for head in (f"{axis}, mean abs., {unit}", f"RMS, {unit}", "%")
+    )
+    say("\nfree run: position error of the model left to itself over held-out trials")
+    print_table(["model", "loop", *heads], rows)
     for rung in rungs:
         if not rung.free_run and rung.free_run_reason:
             say(f"  {rung.model}: {rung.free_run_reason}")
 
 
-def _drift(rungs: Sequence[Rung], horizons: Sequence[float]) -> None:
+def _print_drift(rungs: Sequence[Rung], horizons: Sequence[float]) -> None:
     """Print how far each model version drifts within each horizon."""
     units = {axis: found.unit for rung in rungs for axis, found in rung.drift.items()}
-    within = " / ".join(f"{horizon:g}" for horizon in horizons)
-    body = []
+    rows = []
     for rung in rungs:
         cells = [rung.model]
-        for axis in units:
-            found = rung.median_drift(axis)
+        for found in map(rung.median_drift, units):
             values = (found.get(horizon) for horizon in horizons)
             cells.append(" / ".join("–" if value is None else f"{value:.2g}" for value in values))
-        body.append(cells)
-    say("")
-    say(f"drift: distance from the measured position after {within} s left to itself, median")
-    if any("–" in cell for row in body for cell in row):
+        rows.append(cells)
+    within = " / ".join(f"{horizon:g}" for horizon in horizons)
+    say(f"\ndrift: distance from the measured position after {within} s left to itself, median")
+    if any("–" in cell for row in rows for cell in row):
         say("–: runs away, drifts further than the axis itself moves, or the axis hardly moves")
-    table(["model", *(f"{axis}, {unit}" for axis, unit in units.items())], body)
+    print_table(["model", *(f"{axis}, {unit}" for axis, unit in units.items())], rows)
 
 
-def outcome(result: Outcome) -> None:
-    """Print the steps of a run and its gates, what is wrong with the set-up first."""
+def print_outcome(result: Outcome) -> None:
+    """Print the steps of a run and its gates, after the mistakes of the set-up."""
     for step in result.steps:
-        setup(step.summary)
+        _print_lines(step.summary, "setup", "set-up")
     rows = []
     for step in result.steps:
         took = f"{step.seconds:.1f} s" if step.state == "done" else ""
-        rows.append([step.step, step.state, took, _first_line(step.summary)])
+        headline = step.summary.get("headline")
+        rows.append([step.step, step.state, took, headline if isinstance(headline, str) else ""])
     if rows:
-        table(["step", "state", "time", ""], rows)
+        print_table(["step", "state", "time", ""], rows)
     for step in result.steps:
-        trials(step.summary)
+        _print_trials(step.summary)
         if step.step in ("ingest", "filter"):
-            _lines(step.summary, "notes", "note")
-        _standing_out(step.summary)
+            _print_lines(step.summary, "notes", "note")
+        influence = step.summary.get("influence")
+        worst = influence.get("worst_second") if isinstance(influence, dict) else None
+        if worst and worst.get("sentence"):
+            say(f"note: {worst['sentence']}")
     shown = [verdict for verdict in result.verdicts if verdict.state != "absent"]
     if shown:
         say("")
-        table(
+        print_table(
             ["gate", "model", "", "verdict", ""],
             [[one.gate, one.model, one.key, one.state, one.message] for one in shown],
         )
     if result.model and any(":" in step.step for step in result.steps):
-        _counting(result.model)
+        _print_model(result.model)
 
 
-def _standing_out(content: Mapping[str, object]) -> None:
-    """Print which second of a trial moves an identified parameter as none should, if one does."""
-    influence = content.get("influence")
-    worst = influence.get("worst_second") if isinstance(influence, dict) else None
-    if worst and worst.get("sentence"):
-        say(f"note: {worst['sentence']}")
-
-
-def unidentified(effects: Mapping[str, EffectEstimate]) -> None:
+def print_unidentified(effects: Mapping[str, EffectEstimate]) -> None:
     """Print which effects of a model do not count as identified, and why."""
+    from bampipe.phrases.results import describe_unidentified
+
     for name, found in effects.items():
         if not found.identified:
-            say(f"note: {found.describe(name)}")
+            say(f"note: {describe_unidentified(name, found)}")
 
 
-def _counting(model: str) -> None:
-    say("")
-    say(f"model that counts: {model}; --model takes another")
+def print_advice(command: str, quiet: bool = False, json: bool = False) -> None:
+    """Print the command to go on with, unless the output is quiet or JSON."""
+    if not quiet and not json:
+        say(f"\nnext: {command}")
 
 
-def _first_line(content: Mapping[str, object]) -> str:
-    line = content.get("headline")
-    return line if isinstance(line, str) else ""
+def _print_model(model: str) -> None:
+    say(f"\nmodel that counts: {model}; --model takes another")
 
 
 class _Line:
-    """What was last written of a step that is under way."""
+    """The last line written about a step that is under way."""
 
     def __init__(self, now: float) -> None:
         self.started = self.written = now
@@ -444,7 +418,7 @@ class Watcher:
         self.write_late_lines()
 
     def write_late_lines(self) -> None:
-        """Write a line on each step of which none was written for some time."""
+        """Write a line on each step about which none was written for some time."""
         with self.lock:
             for name, line in self.lines.items():
                 now = time.monotonic()

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import show
-from bampipe.cli.one_stage import advise, assignments
+from bampipe.cli.one_stage import parse_settings
 from bampipe.cli.options import JsonOption, QuietOption
 from bampipe.errors import InputError
 from bampipe.run import batch
@@ -54,7 +54,7 @@ def simulate(
     from bampipe.simulator.session import Config, simulate_session
 
     parameters: dict[str, float] = {}
-    for key, value in assignments(settings).items():
+    for key, value in parse_settings(settings).items():
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise InputError(f"--set {key} needs a number, not {value!r}")
         parameters[key] = float(value)
@@ -79,7 +79,7 @@ def simulate(
 
         content = simulate_session(out, config, progress)
     if json:
-        show.as_json(content)
+        show.print_json(content)
         return
-    show.summary(content)
-    advise(quiet, json, f"bampipe run {out}")
+    show.print_summary(content)
+    show.print_advice(f"bampipe run {out}", quiet, json)

@@ -9,7 +9,7 @@ import typer
 
 from bampipe.cli import places, show
 from bampipe.cli.forecast import say_what_came
-from bampipe.cli.one_stage import advise, one_stage, plain_stage, print_settings
+from bampipe.cli.one_stage import one_stage, plain_stage, print_settings
 from bampipe.cli.options import (
     DEFAULTS,
     ModelOption,
@@ -35,7 +35,9 @@ def ingest(session: SessionArgument, options: StageOptions = DEFAULTS) -> None:
     folder = places.find_sessions([session])[0]
     root = options.runs / session_id(folder)
     one_stage("ingest", root, options, session=folder)
-    advise(options.quiet, options.json, f"bampipe filter {places.next_to(root, options.runs)}")
+    show.print_advice(
+        f"bampipe filter {places.next_to(root, options.runs)}", options.quiet, options.json
+    )
 
 
 @with_stage_options

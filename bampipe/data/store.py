@@ -6,7 +6,8 @@ They have fixed options and no metadata that varies. A file that cannot be read 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -17,7 +18,6 @@ from typing import BinaryIO, Self, TypeAlias
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from bampipe.errors import InputError
@@ -128,30 +128,24 @@ def read_arrays(path: Path, columns: Sequence[str], trial: str) -> dict[str, np.
 
 def _read_table(path: Path, columns: Sequence[str] | None, trial: str | None) -> pa.Table:
     path = Path(path)
-    if not path.is_file():
-        raise InputError("no such file", where=str(path))
-    try:
-        footer = _footer(path) if trial is not None else None
-        with pq.ParquetFile(
-            path, metadata=None if footer is None else footer.metadata, memory_map=False
-        ) as file:
-            names = file.schema_arrow.names
-            wanted = list(columns) if columns is not None else names
-            for name in [*wanted, *(["trial_id"] if trial is not None else [])]:
-                if name not in names:
-                    raise InputError(
-                        f"no column '{name}'", where=str(path), remedy=f"it has {', '.join(names)}"
-                    )
-            if trial is None or footer is None:
-                return file.read(columns=wanted).select(wanted)
-            table = _read_trial(file, wanted, trial, footer)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(
-            "not a sound Parquet file", where=str(path), remedy="make it again (--force)"
-        ) from error
-    if table.num_rows == 0:
-        raise InputError(f"no trial '{trial}'", where=str(path))
-    return table
+    footer = _footer(path)
+    with (
+        _damage_named(path),
+        pq.ParquetFile(path, metadata=footer.metadata, memory_map=False) as file,
+    ):
+        names = file.schema_arrow.names
+        wanted = list(columns) if columns is not None else names
+        for name in [*wanted, *(["trial_id"] if trial is not None else [])]:
+            if name not in names:
+                raise InputError(
+                    f"no column '{name}'", where=str(path), remedy=f"it has {', '.join(names)}"
+                )
+        if trial is None:
+            return file.read(columns=wanted).select(wanted)
+        if trial not in footer.groups:
+            raise InputError(f"no trial '{trial}'", where=str(path))
+        groups = footer.groups[trial]
+        return file.read_row_groups(groups, columns=wanted, use_threads=False).select(wanted)
 
 
 def column_names(path: Path) -> tuple[str, ...]:
@@ -160,7 +154,7 @@ def column_names(path: Path) -> tuple[str, ...]:
     Raises:
         InputError: no such file, or not a sound Parquet file.
     """
-    return tuple(_sound_footer(path).metadata.schema.names)
+    return tuple(_footer(Path(path)).metadata.schema.names)
 
 
 def trial_ids(path: Path) -> frozenset[str]:
@@ -169,7 +163,7 @@ def trial_ids(path: Path) -> frozenset[str]:
     Raises:
         InputError: no such file, or not a sound Parquet file with ``trial_id``.
     """
-    footer = _sound_footer(path)
+    footer = _footer(Path(path))
     if "trial_id" not in footer.metadata.schema.names:
         raise InputError("no column 'trial_id'", where=str(path))
     return frozenset(footer.groups)
@@ -181,21 +175,9 @@ def row_count(path: Path, trials: Collection[str]) -> int:
     Raises:
         InputError: no such file, or not a sound Parquet file.
     """
-    footer = _sound_footer(path)
+    footer = _footer(Path(path))
     groups = {group for name in trials for group in footer.groups.get(name, ())}
     return sum(footer.metadata.row_group(group).num_rows for group in groups)
-
-
-def _sound_footer(path: Path) -> _Footer:
-    path = Path(path)
-    if not path.is_file():
-        raise InputError("no such file", where=str(path))
-    try:
-        return _footer(path)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(
-            "not a sound Parquet file", where=str(path), remedy="make it again (--force)"
-        ) from error
 
 
 def _table(frame: Frame) -> pa.Table:
@@ -242,57 +224,45 @@ def _trial_bounds(table: pa.Table) -> list[int]:
 
 @dataclass(frozen=True)
 class _Footer:
-    """What is known of a Parquet file before its data.
-
-    Attributes:
-        metadata: of the file.
-        groups: row groups by the trial they hold; mixed: those with rows of more than one, or none.
-    """
+    """What is known of a Parquet file before its data: metadata, and row groups by their trial."""
 
     metadata: pq.FileMetaData
-    groups: Mapping[str, tuple[int, ...]]
-    mixed: frozenset[int]
+    groups: Mapping[str, Sequence[int]]
 
 
 def _footer(path: Path) -> _Footer:
     """The footer of a file, read once as long as it is the same file.
 
     Reading it takes time in proportion to the number of trials: once a trial would be too often.
+
+    Raises:
+        InputError: no such file, or not a sound Parquet file.
     """
+    if not path.is_file():
+        raise InputError("no such file", where=str(path))
     status = path.stat()
-    return _read_footer(path, status.st_ino, status.st_size, status.st_mtime_ns)
+    with _damage_named(path):
+        return _read_footer(path, status.st_ino, status.st_size, status.st_mtime_ns)
 
 
 @lru_cache(maxsize=8)
 def _read_footer(path: Path, inode: int, size: int, changed_ns: int) -> _Footer:
+    metadata = pq.read_metadata(path, memory_map=False)
     groups: dict[str, list[int]] = {}
-    mixed = set()
-    with pq.ParquetFile(path, memory_map=False) as file:
-        metadata = file.metadata
-        if "trial_id" in metadata.schema.names:
-            column = metadata.schema.names.index("trial_id")
-            for group in range(metadata.num_row_groups):
-                limits = metadata.row_group(group).column(column).statistics
-                if limits is not None and limits.has_min_max and limits.min == limits.max:
-                    held = [str(limits.min)]
-                    if limits.null_count != 0:
-                        mixed.add(group)
-                else:
-                    mixed.add(group)
-                    table = file.read_row_group(group, columns=["trial_id"])
-                    held = [str(name) for name in table.column("trial_id").unique().to_pylist()]
-                for name in held:
-                    groups.setdefault(name, []).append(group)
-    return _Footer(
-        metadata, {name: tuple(found) for name, found in groups.items()}, frozenset(mixed)
-    )
+    if "trial_id" in metadata.schema.names:
+        column = metadata.schema.names.index("trial_id")
+        for group in range(metadata.num_row_groups):
+            limits = metadata.row_group(group).column(column).statistics
+            if limits is not None and limits.has_min_max:  # the same: a group has one trial
+                groups.setdefault(str(limits.min), []).append(group)
+    return _Footer(metadata, groups)
 
 
-def _read_trial(file: pq.ParquetFile, wanted: list[str], trial: str, footer: _Footer) -> pa.Table:
-    groups = footer.groups.get(trial, ())
-    if not groups:
-        return file.schema_arrow.empty_table().select(wanted)
-    if footer.mixed.isdisjoint(groups):
-        return file.read_row_groups(groups, columns=wanted, use_threads=False).select(wanted)
-    table = file.read_row_groups(groups, columns=list(dict.fromkeys([*wanted, "trial_id"])))
-    return table.filter(pc.equal(table.column("trial_id"), trial)).select(wanted)
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(
+            "not a sound Parquet file", where=str(path), remedy="make it again (--force)"
+        ) from error

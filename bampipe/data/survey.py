@@ -11,7 +11,7 @@ import numpy as np
 
 from bampipe.data.looks import describe, find_roles
 from bampipe.data.parts import are_axes, join_parts
-from bampipe.data.readers import EXTENSIONS, TEXTS, RawTrial, columns_of, read_trial
+from bampipe.data.readers import EXTENSIONS, TEXTS, RawTrial, columns_of, objects, read_trial
 from bampipe.data.readers.trial import Dialect
 from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
@@ -167,6 +167,9 @@ def survey(folder: Path, names: Sequence[str] = ()) -> Survey:
     if not read:
         raise logs.fault()
     columns, guessed = _by_looks(_with_commands(list(read)), folder)
+    if guessed and sound[0].file.lower().endswith(".json"):
+        beside = objects.stated_units(folder / sound[0].file, sound[0].file)
+        columns = tuple(_with_unit_beside(c, columns, beside) for c in columns)
     return Survey(tuple(sound), columns, (*logs.remarks, *guessed), tuple(logs.passed))
 
 
@@ -442,6 +445,16 @@ def _by_looks(
     return tuple(
         replace(c, role=roles[c.name], by_looks=True) if c.name in roles else c for c in columns
     ), [guessed]
+
+
+def _with_unit_beside(
+    column: SurveyedColumn, columns: Sequence[SurveyedColumn], beside: Mapping[str, str]
+) -> SurveyedColumn:
+    """A column that is known by its looks with the first unit ``beside`` of its quantity."""
+    first = next((c for c in columns if c.role == column.role), None)
+    said = next((u for name, u in beside.items() if _role(name, u) == column.role), "")
+    known = column.by_looks and column is first and unit(said) is not None
+    return replace(column, unit=said, by_looks=False) if known else column
 
 
 def _is_numbered(name: str) -> bool:

@@ -2,47 +2,62 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
+from scipy.special import lambertw
+
+from bampipe.schema import STRICT, Positive
+
+Fraction = Annotated[float, Field(gt=0, lt=1)]
 
 
-@dataclass(frozen=True)
+@checked_dataclass(frozen=True, config=STRICT)
 class Criteria:
     """What it takes for an effect to be called missing; each described in docs/method_selection.
 
     Attributes:
-        probability: from which an effect is called missing, and below one minus which it is not
-            mentioned.
-        size: least share of the applied force of an axis, root mean square, that an effect must add
-            beyond what the other parameters could take over: no load cell is more linear.
-        significance: chance of a false alarm in a session where nothing is missing, by replicates.
-        replicates: replays of a fitted model, as in a parametric bootstrap.
-        expected_effects: how many effects a model is expected to lack: the prior of each is this
-            over their number.
-        most_effects: beyond those of the model.
-        bias_error: share by which the common bias of the replicates may be off, sample by sample.
-        discrepancy: root mean square error of any model, as a share of the applied force.
-        tails: degrees of freedom of Student's t distribution, as which errors are distributed.
-        block_s: length of the stretches of time that are taken as independent, s: one of them alone
-            must not decide.
-        beam: sets that are pursued side by side.
+        probability: the probability from which an effect is called missing; one that has less than
+            one minus that is not mentioned.
+        size: the smallest share of the applied force of an axis, root mean square, that an effect
+            must add to matter, beyond what other parameters could take over.
+        replicates: number of replicates of the fitted model, as in a parametric bootstrap.
+        expected_effects: number of effects that a model is expected to lack.
+        most_effects: largest number of effects that a set adds to the model.
+        bias_error: relative error of the bias that filters cause where friction reverses.
+        discrepancy: error of any model, root mean square, as a share of the applied force.
+        tails: degrees of freedom of Student's t distribution of the errors.
+        block_s: length of stretches of time that count as independent, s: one must not decide.
+        beam: number of sets of effects that are pursued side by side.
         doubt: scale of what is left on an axis, in units of noise and discrepancy, from which on it
-            is something unknown for sure, which what takes less than it leaves may resemble.
+            is something unknown, which effects that take less than it leaves may resemble.
     """
 
-    probability: float = 0.9
-    size: float = 0.001
-    significance: float = 0.01
-    replicates: int = 12
-    expected_effects: float = 1.0
-    most_effects: int = 8
-    bias_error: float = 0.2
-    discrepancy: float = 0.003
-    tails: float = 4.0
-    block_s: float = 2.0
-    beam: int = 10
-    doubt: float = 6.0
+    probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.9
+    size: Fraction = 0.001
+    replicates: Annotated[int, Field(ge=4)] = 12
+    expected_effects: Positive = 1.0
+    most_effects: Annotated[int, Field(ge=1)] = 8
+    bias_error: Positive = 0.2
+    discrepancy: Positive = 0.003
+    tails: Positive = 4.0
+    block_s: Positive = 2.0
+    beam: Annotated[int, Field(ge=1)] = 10
+    doubt: Positive = 6.0
 
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            if not getattr(self, field.name) > 0:
-                raise ValueError(f"{field.name} must be positive")
+    @property
+    def largest_p_value(self) -> float:
+        """The p-value from which on `most_probable` is below ``probability``."""
+        odds_against = (1.0 - self.probability) / self.probability
+        return float(np.exp(lambertw(-odds_against / np.e, -1).real))
+
+
+def most_probable(p_value: float) -> float:
+    """The highest probability that an effect can have which chance imitates with a p-value.
+
+    At even odds before (Sellke, Bayarri and Berger 2001, The American Statistician 55, 62).
+    """
+    p = min(max(p_value, 1e-300), 1.0 / np.e)
+    return float(1.0 / (1.0 - np.e * p * np.log(p)))

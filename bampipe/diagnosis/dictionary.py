@@ -104,7 +104,9 @@ class Dictionary:
         """Least and largest strength of each column of a candidate."""
         c = self.candidates[name]
         if not c.linear_indices:
-            return [_MULTIPLE]
+            # What may have either sign is as good as linear below the least on the grid.
+            least = 0.0 if any(r.low < 0.0 for r in self.ranges[name]) else _MULTIPLE[0]
+            return [(least, _MULTIPLE[1])]
         return [(c.parameters[i].lower, c.parameters[i].upper) for i in c.linear_indices]
 
     def spreads(self, name: str) -> list[float]:

@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import softmax
 
+from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Pool, Search, added, gone
+from bampipe.diagnosis.session import Fit
 from bampipe.diagnosis.unknown import Unknown, spline_columns, weigh_unknown
 
 Array = NDArray[np.float64]
@@ -67,13 +69,21 @@ class Weighed:
     drops: Mapping[str, float]
 
 
-def weigh_sets(search: Search, pool: Pool, given: Sequence[str], seed: int) -> Weighed:
+def weigh_sets(
+    by_noise: Search, fit: Fit, pool: Pool, given: Sequence[str], criteria: Criteria, seed: int
+) -> Weighed:
     """Weigh the sets of a pool, each member's absence, and unknown functions beside them.
 
+    Whether something unknown remains is weighed by the noise; which effects there are, by the
+    samples that are independent in what remains.
+
     Args:
-        search: over sets beside the most probable model; pool: sets near it.
-        given: effects of the model diagnosed, which are not in question; seed: of the bootstrap.
+        by_noise: the search over sets beside the most probable model; fit: that model.
+        pool: sets near it; given: effects of the model diagnosed, which are not in question.
+        seed: of the bootstrap.
     """
+    search = by_noise.with_independent(fit.count_independent(criteria))
+    pool = {n: (search.cost(k), k) for n, (_, k) in pool.items()}
     none, evidence = search.cost(()), search.dictionary.evidence
     own = [e for e in search.p.absence if e not in given]
     near = sorted((c, k) for c, k in pool.values() if c < none + _NEAR and k)[:_MOST]
@@ -88,16 +98,21 @@ def weigh_sets(search: Search, pool: Pool, given: Sequence[str], seed: int) -> W
     unknown, functions = np.zeros(len(search.p.y)), []
     for axis in range(len(unknown)):
         columns = spline_columns(evidence, axis)
-        here = weigh_unknown(search, axis, columns)
-        functions.append(here)
-        if here is None or here.size < search.criteria.size or here.cost > none + _NEAR:
+        by_all, here = (weigh_unknown(s, axis, columns) for s in (by_noise, search))
+        functions.append(by_all)
+        if by_all is None or here is None or by_all.size < criteria.size:
             continue
+        more = by_noise.cost(()) - by_all.cost - (none - here.cost) + search.log_prior
+        if none - here.cost + more < search.log_prior - _NEAR:
+            continue
+        more_by_block = _by_block(by_noise, (), by_all) - _by_block(search, (), here)
         beside = [
             _Listed(
-                keys, axis, none - found.cost + search.log_prior, _by_block(search, keys, found)
+                keys, axis, none - found.cost + more,
+                _by_block(search, keys, found) + more_by_block,
             )
             for keys, found in _beside_unknown(search, axis, columns, here, own)
-        ]
+        ]  # fmt: skip
         # What one axis lacks is independent of what another one does.
         with_unknown = _share(search, [*named, *beside], given, seed)
         here_too = _by_effect(with_unknown)
@@ -105,11 +120,11 @@ def weigh_sets(search: Search, pool: Pool, given: Sequence[str], seed: int) -> W
         for effect in own:
             if axis in touched_axes(search, effect):
                 effects[effect] = min(effects[effect], here_too.get(effect, 0.0))
-                if unknown[axis] >= search.criteria.probability:
+                if unknown[axis] >= criteria.probability:
                     drops[effect] = _losses(with_unknown).get(effect, 0.0)
         if unknown[axis] == unknown.max():
             sets = with_unknown
-    far = np.sqrt(_squares(search, ()) / np.maximum(search.p.count, 1)) > search.criteria.doubt
+    far = np.sqrt(_squares(search, ()) / np.maximum(search.p.count, 1)) > criteria.doubt
     unknown[far] = 1.0
     for effect in own if far.any() else ():
         effects[effect] = min(effects[effect], _share_explained(search, effect, far))

@@ -11,13 +11,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
-from bampipe.trials.likelihood import Problem, hold_parameters, solve_bounded, solve_scaled
+from bampipe.trials.likelihood import (
+    Problem,
+    Samples,
+    hold_parameters,
+    solve_bounded,
+    solve_scaled,
+)
 
 Array = NDArray[np.float64]
 
@@ -143,6 +150,14 @@ class Search:
         other._weight = p.independent / np.maximum(other.yy, 1e-300)
         return other
 
+    def with_independent(self, samples: tuple[Samples, ...]) -> Search:
+        """The same search with other numbers of independent samples."""
+        other = copy(self)
+        other.p = replace(self.p, likelihood=replace(self.p.likelihood, samples=samples))
+        other._solved, other._own_penalties = {}, {}
+        other._weight = other._bare_weight = other.p.independent / np.maximum(self.yy, 1e-300)
+        return other
+
     def largest_gain(self) -> tuple[float, str]:
         """Log evidence of the candidate that gains most beside the model, nats, and its name.
 
@@ -193,33 +208,20 @@ class Search:
         keys = added(all_keys)
         if any(self.atoms.get(key) is None for key in keys):
             return Solution(np.inf)
-        parts = [self._products(key) for key in keys]
-        widths = [self._atom(key).width for key in keys]
-        at = np.concatenate([[nb], nb + np.cumsum(widths)]).astype(int)
-        n = int(at[-1])
-        xx, xy = np.zeros((self.n_q, n, n)), np.zeros((self.n_q, n))
-        xx[:, :nb, :nb], xy[:, :nb] = self.bb, self.by
-        for axis in range(self.n_q):
-            here = [(k, part[axis]) for k, part in enumerate(parts) if axis in part]
-            for place, (k, (x, xb, xy_)) in enumerate(here):
-                i = slice(at[k], at[k + 1])
-                xx[axis, :nb, i], xx[axis, i, :nb], xy[axis, i] = xb, xb.T, xy_
-                for j, (other, _, _) in here[: place + 1]:
-                    block = x.T @ other
-                    xx[axis, i, at[j] : at[j + 1]], xx[axis, at[j] : at[j + 1], i] = block, block.T
+        xx, xy, places = self._sums(keys)
         bounds = np.array([x for key in keys for x in self.dictionary.bounds(key[0])]).reshape(
             -1, 2
         )
         solved = solve_bounded(p, xx, xy, self.yy, bounds[:, 0], bounds[:, 1], absent, self._weight)
-        b, weight = solved.unknowns, solved.weight
-        held = [slice(at[k] - nb, at[k + 1] - nb) for k in range(len(keys))]
+        b, weight, n = solved.unknowns, solved.weight, xx.shape[1]
+        held = [slice(i.start - nb, i.stop - nb) for i in places]
         if any(solved.held[h].all() for h in held):
             return Solution(np.inf)
         strengths = tuple(b[nb:][h] for h in held)
         volume = self._volume(keys, strengths)
         if volume is None:
             return Solution(np.inf)
-        scale, k = solved.left / p.count, int(at[-1])
+        scale = solved.left / p.count
         sizes: tuple[float, ...] = ()
         # What an effect of the model costs is not in the cost of the model as it is.
         penalty = self.penalty_of(all_keys)
@@ -233,7 +235,7 @@ class Search:
                 normal = free.T @ normal @ free
             inside = _schur(normal, nb - (n - len(normal)))[np.ix_(used, used)]
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
-            member = np.repeat(np.arange(len(keys)), widths)[used]
+            member = np.repeat(np.arange(len(keys)), [h.stop - h.start for h in held])[used]
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)
             if min(sizes) < self.least_size:
                 return Solution(np.inf)
@@ -242,6 +244,26 @@ class Search:
             penalty += float(penalise(inside, spread[used], b[nb:][used], shapes))
         cost = solved.cost - float(volume.sum()) + penalty
         return Solution(cost, strengths, b[:nb], scale, volume, penalty, sizes, weight)
+
+    def _sums(self, keys: Sequence[Key]) -> tuple[Array, Array, list[slice]]:
+        """Products by axis of the base and the columns of a set, with each other and with y.
+
+        Returns:
+            (n_q, n, n), (n_q, n), and the places of each member among the n.
+        """
+        nb, parts = self.bb.shape[1], [self._products(key) for key in keys]
+        ends = nb + np.cumsum([0, *(self._atom(key).width for key in keys)], dtype=int)
+        n, places = int(ends[-1]), [slice(*map(int, pair)) for pair in pairwise(ends)]
+        xx, xy = np.zeros((self.n_q, n, n)), np.zeros((self.n_q, n))
+        xx[:, :nb, :nb], xy[:, :nb] = self.bb, self.by
+        for k, (i, part) in enumerate(zip(places, parts, strict=True)):
+            for axis, (x, xb, with_y) in part.items():
+                xx[axis, :nb, i], xx[axis, i, :nb], xy[axis, i] = xb, xb.T, with_y
+                for j, other in zip(places[: k + 1], parts, strict=False):
+                    if axis in other:
+                        xx[axis, i, j] = x.T @ other[axis][0]
+                        xx[axis, j, i] = xx[axis, i, j].T
+        return xx, xy, places
 
     def _sizes(
         self,
@@ -346,28 +368,18 @@ class Search:
         pinned = [k for name, _ in keys if name[0] == "-" for k in p.absence[name[1:]]]
         keys = added(tuple(sorted(keys)))
         weight = known.weight
-        parts = [self._products(key) for key in keys]
-        widths = [self._atom(key).width for key in keys]
-        at = np.concatenate([[nb], nb + np.cumsum(widths)]).astype(int)
-        n = int(at[-1])
-        normal = np.zeros((n, n))
+        xx, _, places = self._sums(keys)
+        n = xx.shape[1]
+        normal = np.tensordot(weight, xx, 1)
+        normal[:nb, :nb] += p.precision
         cross, moment = np.zeros((n, self.m)), np.zeros(self.m)
-        normal[:nb, :nb] = np.tensordot(weight, self.bb, 1) + p.precision
         for axis in range(self.n_q):
             w, cols = weight[axis], self.at[axis]
             cross[:nb, cols] += w * self.xb[axis]
             moment[cols] -= w * self.xy[axis]
-            here = [(k, part[axis]) for k, part in enumerate(parts) if axis in part]
-            for place, (k, (x, xb, _)) in enumerate(here):
-                i = slice(at[k], at[k + 1])
-                normal[:nb, i] += w * xb
-                normal[i, :nb] += w * xb.T
-                cross[i, cols] += w * (x.T @ self.columns[axis])
-                for j, (other, _, _) in here[: place + 1]:
-                    block = w * (x.T @ other)
-                    normal[i, at[j] : at[j + 1]] += block
-                    if j != k:
-                        normal[at[j] : at[j + 1], i] += block.T
+            for i, key in zip(places, keys, strict=True):
+                if axis in (part := self._products(key)):
+                    cross[i, cols] += w * (part[axis][0].T @ self.columns[axis])
         # As the set has been solved within bounds, from there.
         b = np.concatenate([known.base, *known.strengths])
         moment = moment - cross.T @ b
@@ -477,9 +489,7 @@ class Search:
             return None
         count = sum(len(shape) for _, shape in keys)
         more = {a: c * self.p.likelihood.root[a][:, None] for a, c in slopes.items()}
-        solved = self._solve_with_shapes(keys, more, found)
-        if solved is None:
-            return None
+        solved = self._solve_with_shapes(keys, more, found, self.residual_rows(all_keys))
         moved, place = [], 0
         for name, shape in keys:
             step = np.clip(solved[place : place + len(shape)], -_FARTHEST, _FARTHEST)
@@ -496,35 +506,38 @@ class Search:
         return (*(key for key in all_keys if key[0][0] == "-"), *moved)
 
     def _solve_with_shapes(
-        self, keys: tuple[Key, ...], more: Mapping[int, Array], known: Solution
-    ) -> Array | None:
-        """Steps of the shapes, (d,), strengths and the model's own parameters moving along."""
-        extra = next(iter(more.values())).shape[1]
-        p, nb = self.p, self.bb.shape[1]
-        parts = [self._products(key) for key in keys]
-        weight = known.weight
-        widths = [self._atom(key).width for key in keys]
-        at = np.concatenate([[nb], nb + np.cumsum(widths)]).astype(int)
-        n = int(at[-1]) + extra
-        normal, right = np.zeros((n, n)), np.zeros(n)
-        normal[:nb, :nb] = p.precision
+        self,
+        keys: tuple[Key, ...],
+        more: Mapping[int, Array],
+        known: Solution,
+        left: Sequence[Array],
+    ) -> Array:
+        """Steps of the shapes, (d,), strengths and the model's own parameters moving along.
+
+        Args:
+            keys: the set; known: its solution; left: weighted rows that it leaves, by axis.
+            more: weighted slopes by the shapes, by axis, each (n, d).
+        """
+        p, nb, weight = self.p, self.bb.shape[1], known.weight
+        xx, xy, places = self._sums(keys)
+        m, extra = xx.shape[1], next(iter(more.values())).shape[1]
         b = np.concatenate([known.base, *known.strengths])
-        right[:nb] = p.moment - p.precision @ known.base
-        normal[range(n - extra, n), range(n - extra, n)] = 1.0 / _FARTHEST**2
-        for axis in range(self.n_q):
-            x = np.concatenate(
-                [p.base[axis]]
-                + [
-                    part[axis][0] if axis in part else np.zeros((len(p.y[axis]), w))
-                    for part, w in zip(parts, widths, strict=True)
-                ]
-                + [more[axis] if axis in more else np.zeros((len(p.y[axis]), extra))],
-                axis=1,
-            )
-            left = p.y[axis] + x[:, : n - extra] @ b
-            normal += weight[axis] * (x.T @ x)
-            right -= weight[axis] * (x.T @ left)
-        return solve_scaled(normal, right)[n - extra :]
+        normal, right = np.zeros((m + extra, m + extra)), np.zeros(m + extra)
+        normal[:m, :m] = np.tensordot(weight, xx, 1)
+        right[:m] = -weight @ (xy + xx @ b)
+        normal[:nb, :nb] += p.precision
+        right[:nb] += p.moment - p.precision @ known.base
+        normal[m:, m:] = np.eye(extra) / _FARTHEST**2
+        for axis, slopes in more.items():
+            w = weight[axis]
+            normal[:nb, m:] += w * (p.base[axis].T @ slopes)
+            for i, key in zip(places, keys, strict=True):
+                if axis in (part := self._products(key)):
+                    normal[i, m:] += w * (part[axis][0].T @ slopes)
+            normal[m:, m:] += w * (slopes.T @ slopes)
+            right[m:] -= w * (slopes.T @ left[axis])
+        normal[m:, :m] = normal[:m, m:].T
+        return solve_scaled(normal, right)[m:]
 
     def shape_slopes(
         self, keys: Sequence[Key], strengths: Sequence[Array]

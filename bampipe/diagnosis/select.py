@@ -180,14 +180,35 @@ def select_effects(
                 progress(0.9, "holding the model against chance")
                 replays = range(session.criteria.replicates)
                 chance = tuple(search.of_replay(k).largest_gain()[0] for k in replays)
-                weighed = weigh_sets(search, pool, recipe.effects, session.seed)
-                return Selection(
-                    initial, current, weighed, chance, search.largest_gain(), gains,
-                    tuple(steps), number == _MOST_ROUNDS - 1 or room <= 0,
-                )  # fmt: skip
+                weighed = weigh_sets(
+                    search, current, pool, recipe.effects, session.criteria, session.seed
+                )
+                moved = (
+                    None
+                    if number == _MOST_ROUNDS - 1
+                    else _leave_out(session, current, weighed, recipe.effects)
+                )
+                if moved is None:
+                    return Selection(
+                        initial, current, weighed, chance, search.largest_gain(), gains,
+                        tuple(steps), number == _MOST_ROUNDS - 1 or room <= 0,
+                    )  # fmt: skip
+                last = True
         current = moved
         steps.append(current)
     raise AssertionError("the last round returns")
+
+
+def _leave_out(session: Session, fit: Fit, weighed: Weighed, given: Collection[str]) -> Fit | None:
+    """The model without the effects that came out improbable; None where there are none."""
+    least = 1.0 - session.criteria.probability
+    added = [e for e in fit.recipe.effects if e not in given]
+    out = [e for e in added if weighed.effects.get(e, 0.0) < least]
+    if not out:
+        return None
+    less = without_members(fit.recipe, out)
+    known = {q.name: v for q, v in zip(fit.evidence.system.parameters, fit.evidence.p, strict=True)}
+    return session.try_fit(less, np.array([known[q.name] for q in system_of(less).parameters]))
 
 
 def is_better(before: Fit, after: Fit, promised: Solution) -> bool:
@@ -249,8 +270,11 @@ def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
     for key, strength in zip(added(tuple(sorted(keys))), solution.strengths, strict=True):
         item = search.dictionary.candidates[key[0]]
         values = search.dictionary.values(key)
+        share = 1.0 if item.linear_indices else float(strength[0])
         known |= {
-            item.parameters[i].name: v for i, v in zip(item.searched_indices, values, strict=True)
+            q.name: share * v if q.strength else v
+            for i, v in zip(item.searched_indices, values, strict=True)
+            for q in [item.parameters[i]]
         }
         known |= {
             item.parameters[i].name: v for i, v in zip(item.linear_indices, strength, strict=False)

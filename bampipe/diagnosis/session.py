@@ -28,10 +28,12 @@ from bampipe.trials.likelihood import (
     Likelihood,
     Noise,
     Problem,
+    Samples,
     Solved,
     describe_noise,
     dry_friction,
     lay_out_samples,
+    sign_widths,
     solve_bounded,
     take_samples,
 )
@@ -331,6 +333,12 @@ class Fit:
         rows = zip(self.problem.y, self.problem.base, self.likelihood.root, strict=True)
         return tuple((y + x @ self.solved.base) / root for y, x, root in rows)
 
+    def count_independent(self, criteria: Criteria) -> tuple[Samples, ...]:
+        """The samples of each axis, with the number that are independent in what is left."""
+        band = self.evidence.band
+        lags = int(criteria.block_s * band.rate_hz / band.step)
+        return self.likelihood.count_independent(self.problem, lags)
+
     @property
     def rmse_beyond_bias(self) -> Array:
         """Its root mean square, (n_q,)."""
@@ -382,11 +390,12 @@ def _residuals_of_replay(seed: tuple[int, ...]) -> list[Array]:
 def _narrower_friction(evidence: Evidence) -> list[Array]:
     """What Coulomb friction leaves whose sign is narrower than the model's, by trial, (K, n_q)."""
     e = evidence
-    dry, width = dry_friction(e)
+    width = sign_widths(e)
     rows = [
-        dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width)) for m in e.motions
+        dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width))
+        for dry, m in zip(dry_friction(e), e.motions, strict=True)
     ]
-    thin = e.band.thin_trials(rows, range(len(dry)))
+    thin = e.band.thin_trials(rows, range(len(width)))
     return [values * used for values, used in zip(thin, e.used, strict=True)]
 
 

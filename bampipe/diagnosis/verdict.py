@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.diagnosis.criteria import most_probable
 from bampipe.diagnosis.probability import chance_of
 from bampipe.diagnosis.select import Selection
 from bampipe.diagnosis.session import Fit, Session, candidates_of, rms
@@ -18,7 +19,7 @@ from bampipe.results.diagnose import (
     Verdict,
     WeighedSet,
 )
-from bampipe.results.standing import standing
+from bampipe.results.floor import compare_with_floor
 
 Array = NDArray[np.float64]
 
@@ -47,8 +48,7 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
     p_values = {e: chance_of(drop, selection.chance) for e, drop in weighed.drops.items()}
     # Of what chance gives as well, nothing is sure.
     probability = {
-        e: min(share, 1.0 if p_values.get(e, 0.0) <= c.significance else 1.0 - p_values[e])
-        for e, share in weighed.effects.items()
+        e: min(share, most_probable(p_values.get(e, 0.0))) for e, share in weighed.effects.items()
     }
     where = {e: effect_axes(initial, final, e) for e in probability}
     selected = tuple(e for e in selection.effects if probability.get(e, 0.0) >= 1.0 - c.probability)
@@ -84,7 +84,7 @@ def _judge(
     floor = final.noise_floor
     before, after = float(initial.held_out_rmse[axis]), float(final.held_out_rmse[axis])
     level, scatter = float(floor.level[axis]), float(floor.sd[axis])
-    against_floor = standing(after, level, scatter)
+    against_floor = compare_with_floor(after, level, scatter)
     named = tuple(e for e in listed if e in selection.effects)
     sure = [e for e, p in listed.items() if p >= c.probability]
     open_question = [e for e, p in listed.items() if p < c.probability]

@@ -79,7 +79,8 @@ def _close(  # type: ignore[no-untyped-def]
             u[k, columns[j]] = out[j]
         if k + 1 == x.shape[0]:
             break
-        x[k + 1] = x[k]
+        for i in range(x.shape[1]):  # a slice that is assigned takes seconds to compile
+            x[k + 1, i] = x[k, i]
         for tick in range(ticks):
             for j in range(nu):
                 start[j] = u[k, j] + (u[k + 1, j] - u[k, j]) * tick / ticks

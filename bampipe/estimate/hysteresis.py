@@ -39,7 +39,7 @@ _LARGEST_SLOPE_CHANGE = 0.02
 
 _SYSTEMATIC = 0.25
 """Share of the change of the slope by which the stiffness may be off: with it, 95 to 100 % of the
-intervals hold the truth for loops that turn round in seven ways (docs/benchmarks_estimates.md)."""
+intervals hold the truth for loops that turn in seven ways (benchmarks/notebook/estimates.md)."""
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from bampipe.estimate.bounded import invert_scaled
-from bampipe.estimate.least_squares import LeastSquares, Problem
 
 Array = NDArray[np.float64]
 
@@ -22,9 +20,9 @@ class RemovedStretch:
 
     Attributes:
         trial: its number among those fitted; start_s: since the start of the trial, s.
-        move: (n_free,) change of the parameters without it, in the standard deviations that the
-            rest leaves them.
-        typical: (n_free,) what a stretch changes that tells as much, by the median over all.
+        move: (n,) change of the parameters without it, in the standard deviations that the rest
+            leaves them.
+        typical: (n,) what a stretch changes that tells as much, by the median over all.
     """
 
     trial: int
@@ -34,7 +32,10 @@ class RemovedStretch:
 
 
 def find_worst_stretch(
-    problem: Problem, found: LeastSquares, length_s: float = 1.0
+    rows: Sequence[tuple[Array, Array]],
+    stretches: Sequence[NDArray[np.int64]],
+    places: Mapping[int, tuple[int, float]],
+    sd: Array,
 ) -> RemovedStretch:
     """Return the stretch without which some parameter would move most.
 
@@ -43,36 +44,27 @@ def find_worst_stretch(
     one of its deviations; so its own part is taken off, down to what typical stretches scatter.
 
     Args:
-        problem: as fitted; found: the fit to its trials; length_s: of a stretch, s.
+        rows: by axis, (n, k) how far the parameters move by each weighted sample, and the weighted
+            residual there, (n,).
+        stretches: by axis, (n,) numbers of the stretches of its samples.
+        places: trial and start, s, of each stretch; sd: (k,) of the parameters.
     """
-    band = problem.band
-    samples = max(1, round(length_s * band.rate_hz / band.step))
-    weight = 1.0 / np.maximum(found.residual_sd, 1e-150)
-    information = np.diag(problem.precision)
-    for stacked in found.measured:
-        slope = stacked.slope * weight[None, :, None]
-        information += np.einsum("tqi,tqj->ij", slope, slope)
-    inverse = invert_scaled(information)
-    sd = np.sqrt(np.diag(found.covariance))
-    parts: list[Array] = []
-    shares: list[Array] = []
-    places: list[tuple[int, int]] = []
-    for trial, stacked in enumerate(found.measured):
-        slope = stacked.slope * weight[None, :, None] @ inverse
-        starts = np.arange(0, len(slope), samples)
-        part = np.einsum("tqi,tq->ti", slope, stacked.residual * weight)
-        parts.append(np.add.reduceat(part, starts, axis=0))
-        shares.append(np.add.reduceat(np.sum(slope**2, axis=1), starts, axis=0))
-        places += [(trial, int(start)) for start in starts]
+    count = 1 + max(places)
+    parts, shares = np.zeros((2, count, sd.size))
+    for (move, left), number in zip(rows, stretches, strict=True):
+        np.add.at(parts, number, move * left[:, None])
+        np.add.at(shares, number, move**2)
     # What white noise of its size would make of each stretch, as the typical one scatters.
     with np.errstate(divide="ignore", invalid="ignore"):
-        moves = np.nan_to_num(np.concatenate(parts) / sd, posinf=0.0, neginf=0.0)
-        expected = np.nan_to_num(np.sqrt(np.concatenate(shares)) / sd, posinf=0.0)
+        moves = np.nan_to_num(parts / sd, posinf=0.0, neginf=0.0)
+        expected = np.nan_to_num(np.sqrt(shares) / sd, posinf=0.0)
         size = np.where(expected > 0.0, np.abs(moves) / expected, np.nan)
-        typical = _SD_OF_MEDIAN * np.nanmedian(size, axis=0) * expected
+        known = np.isfinite(size).any(axis=0)
+        typical = np.zeros_like(expected)
+        typical[:, known] = (
+            _SD_OF_MEDIAN * np.nanmedian(size[:, known], axis=0) * expected[:, known]
+        )
         rest = np.sqrt(np.maximum(1.0 - moves**2, np.minimum(np.sum(typical**2, axis=0), 1.0)))
         moves, typical = (np.nan_to_num(each / rest, posinf=0.0) for each in (moves, typical))
     worst = int(np.argmax(np.abs(moves).max(axis=1)))
-    trial, start = places[worst]
-    start_s = band.margin_s + start * band.step / band.rate_hz
-    return RemovedStretch(trial, start_s, moves[worst], typical[worst])
+    return RemovedStretch(*places.get(worst, (0, 0.0)), moves[worst], typical[worst])

@@ -20,7 +20,7 @@ from math import factorial
 from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float64, void
+from numba import boolean, float64, int64, void
 from scipy.optimize import minimize_scalar
 
 from bampipe.compiled import njit, record_type
@@ -354,31 +354,35 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
 
 
-@njit(
-    "Tuple((float64[:, ::1], float64[:, :, ::1], float64[::1]))"
-    "(int64, float64[:, ::1], float64[:, ::1], float64[:, ::1])",
-    cache=True,
-)
-def _settle(most: int, step: Array, noise: Array, p: Array) -> tuple[Array, Array, Array]:
-    """Gains (K, n), covariances (K, n, n) and variances (K,) until they settle, ``most`` at most.
+@njit(int64(_M, _M, _M, _M, float64[:, :, ::1], _V, _M), cache=True)
+def _settle(
+    step: Array,
+    noise: Array,
+    p: Array,
+    gains: Array,
+    covariances: Array,
+    spreads: Array,
+    work: Array,
+) -> int:
+    """Write gains (K, n), covariances (K, n, n) and variances (K,) until they settle; count them.
 
     They do not depend on the samples. ``p`` (n, n) is the covariance of the first state; it is
-    changed.
+    changed, as is ``work`` (n + 1, n).
     """
-    n = step.shape[0]
-    x, work = np.zeros(n), np.empty((n, n))
-    gains, covariances, spreads = np.empty((most, n)), np.empty((most, n, n)), np.empty(most)
-    count = 0
-    for t in range(most):
+    n, x = step.shape[0], work[step.shape[0]]
+    for t in range(gains.shape[0]):
         if t > 0:
             _predict(x, p, step, noise, work)
         _, spreads[t] = _update(x, p, 0.0, gains[t])
-        covariances[t] = p
-        count = t + 1
         # They swing as they settle: one that stands still for a moment says nothing.
-        if t > 0 and np.all(np.abs(gains[t] - gains[t - 1]) < _SETTLED * gains[t]):
-            break
-    return gains[:count].copy(), covariances[:count].copy(), spreads[:count].copy()
+        settled = t > 0
+        for i in range(n):
+            settled = settled and abs(gains[t, i] - gains[t - 1, i]) < _SETTLED * gains[t, i]
+            for j in range(n):
+                covariances[t, i, j] = p[i, j]
+        if settled:
+            return t + 1
+    return gains.shape[0]
 
 
 @njit(void(_V, _M, _M, float64[:, :, ::1], _V, _M, _V, _V), cache=True)
@@ -433,7 +437,10 @@ def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
     step, noise = transition(order)
     # A state settles at about the cut-off, in rad a sample, to the power of its order.
     wide = np.diag(_WIDE * ratio ** (np.arange(order) / order))
-    return _settle(most, step, ratio * noise, wide)
+    gains, covariances = np.empty((most, order)), np.empty((most, order, order))
+    spreads, work = np.empty(most), np.zeros((order + 1, order))
+    count = _settle(step, ratio * noise, wide, gains, covariances, spreads, work)
+    return gains[:count].copy(), covariances[:count].copy(), spreads[:count].copy()
 
 
 def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]:

@@ -23,11 +23,7 @@ from bampipe.estimate.standstill import find_moving_samples
 
 Array = NDArray[np.float64]
 
-_A_PERIOD = 5
-"""Thinned samples in a period of the band; see `Band.step`."""
-_PERIODS = 10
-"""Periods of the band in the shortest block that is taken as independent of the next."""
-_BLOCKS_A_PARAMETER = 3
+BLOCKS_A_PARAMETER = 3
 """Fewer blocks a parameter, and their scatter knows a standard deviation to a third only. Of 320
 parameters of a joint (five trials of 1.2 s, `benchmarks/independent`, seeds 9931 to 9942) their
 intervals held 89 %; with this, of 163 on seeds that did not choose it (9971 to 9982), 93 %."""
@@ -127,22 +123,6 @@ class Minimum:
     at_bound: NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class LeastSquares(Minimum):
-    """Fitted parameters and what they rest on.
-
-    Attributes:
-        measured: ``stacked`` with the slopes that the fit went by, see `as_measured`.
-        covariance: (n_free, n_free) sandwich estimate: blocks of time are independent, samples
-            within one are not; no less than what independent samples would have.
-        residual_sd: (n_q,) root mean square of the low-passed residual.
-    """
-
-    measured: tuple[Stacked, ...]
-    covariance: Array
-    residual_sd: Array
-
-
 def residual_and_slopes(
     problem: Problem, trial: int, p: Array, columns: Sequence[int] | None = None
 ) -> tuple[Array, Array]:
@@ -205,32 +185,6 @@ def stacked_residual(
         slope[:, :, fresh] = 0.0
     slope[:, axes, fresh[numbers]] = thin[:, n_q:] * used[:, axes]
     return Stacked(thin[:, :n_q] * used, slope, used)
-
-
-def fit(
-    problem: Problem,
-    start: Array,
-    trials: Sequence[int] | None = None,
-    most_iterations: int = 30,
-    block_s: float = 2.0,
-) -> LeastSquares:
-    """Estimate the free parameters as `minimise` does, and how far they are to be trusted.
-
-    Args:
-        problem, start, trials, most_iterations: as for `minimise`.
-        block_s: length of the blocks of the covariance, s.
-
-    Raises:
-        ValueError, InputError: as `minimise`.
-    """
-    found = minimise(problem, start, trials, most_iterations)
-    measured = as_measured(problem, found.p, found.stacked)
-    return LeastSquares(
-        **vars(found),
-        measured=tuple(measured),
-        covariance=_covariance(problem, measured, block_s),
-        residual_sd=_scatter(found.stacked),
-    )
 
 
 def minimise(
@@ -382,72 +336,45 @@ def _scatter(stacked: Sequence[Stacked]) -> Array:
     return np.asarray(np.sqrt(square / np.maximum(count, 1)))
 
 
-def _covariance(problem: Problem, stacked: Sequence[Stacked], block_s: float) -> Array:
-    """The scatter of blocks; of few, no less than what white noise of that size would do.
+def covariance_by_blocks(
+    rows: Sequence[tuple[Array, Array]],
+    precision: Array,
+    blocks: Sequence[NDArray[np.int64]],
+    independent: Sequence[float],
+) -> Array:
+    """Covariance (P, P) by the scatter of the scores of blocks of time (White; Newey and West).
 
     At the minimum the scores of all blocks add up to nothing: beside as many parameters as blocks,
-    some combination of them does not scatter at all.
+    some combination of them does not scatter at all. So of few blocks it is no less than what
+    independent samples give.
+
+    Args:
+        rows: by axis, slopes (n, P) and residual (n,), in standard deviations of that.
+        precision: (P, P) of what is known beforehand.
+        blocks: by axis, (n,) numbers of the blocks, which are independent of each other.
+        independent: by axis, how many samples are independent.
     """
-    found, blocks = _sandwich(problem, stacked, block_s)
-    if blocks >= _BLOCKS_A_PARAMETER * _fitted(problem):
+    normal = precision + sum(x.T @ x for x, _ in rows)
+    inverse = invert_scaled(normal)
+    fitted = float(np.trace(inverse @ (normal - precision)))
+    count = 1 + max((int(number.max()) for number in blocks if number.size), default=0)
+    scores, size = np.zeros((count, len(normal))), np.zeros((count, 1))
+    white = np.array(precision)
+    for (x, left), number, alone in zip(rows, blocks, independent, strict=True):
+        np.add.at(scores, number, x * left[:, None])
+        np.add.at(size, number, 1.0)
+        white = white + alone / max(len(x), 1) * (x.T @ x)
+    # Priors and bounds pull at the fit: what all blocks have in common is no scatter.
+    scores -= scores.sum(axis=0) * size / size.sum()
+    filled = int(np.count_nonzero(size))
+    meat = scores.T @ scores * (filled / max(filled - fitted, 1.0)) + precision
+    found = np.asarray(inverse @ meat @ inverse)
+    if filled >= BLOCKS_A_PARAMETER * fitted:
         return found
-    white, variance = np.diag(_white(problem, stacked)), np.diag(found)
+    whole = float(sum(independent))
+    least = np.diag(invert_scaled(white)) * whole / max(whole - fitted, 1.0)
+    variance = np.diag(found)
     none = variance <= 0.0
-    widen = np.sqrt(np.maximum(white / np.where(none, 1.0, variance), 1.0))
+    widen = np.sqrt(np.maximum(least / np.where(none, 1.0, variance), 1.0))
     widen[none] = 1.0
-    return np.asarray(found * np.outer(widen, widen) + np.diag(np.where(none, white, 0.0)))
-
-
-def _fitted(problem: Problem) -> int:
-    """How many parameters the trials alone determine."""
-    return problem.free.size - int(np.count_nonzero(problem.precision))
-
-
-def independent_samples(band: Band, stacked: Sequence[Stacked]) -> float:
-    """How many independent samples count, over all trials and axes."""
-    used = np.sum([np.sum(s.used, axis=0) for s in stacked], axis=0)
-    return float(used @ band.independent_share)
-
-
-def _white(problem: Problem, stacked: Sequence[Stacked]) -> Array:
-    """Covariance where the residual is white below the cut-off, (n_free, n_free)."""
-    share = problem.band.independent_share
-    weight = np.sqrt(share) / np.maximum(_scatter(stacked), 1e-300)
-    information = np.diag(problem.precision)
-    for s in stacked:
-        slope = s.slope * weight[None, :, None]
-        information = information + np.einsum("tqi,tqj->ij", slope, slope)
-    held = problem.lower == problem.upper
-    information[held], information[:, held] = 0.0, 0.0
-    count = independent_samples(problem.band, stacked)
-    inverse = invert_scaled(information)
-    return np.asarray(inverse * count / max(count - _fitted(problem), 1.0))
-
-
-def _sandwich(problem: Problem, stacked: Sequence[Stacked], block_s: float) -> tuple[Array, int]:
-    """Covariance from the scatter of the scores of blocks of time (White; Newey and West).
-
-    And how many blocks those are.
-    """
-    weight = 1.0 / np.maximum(_scatter(stacked), 1e-300)
-    n_free = problem.free.size
-    band = problem.band
-    samples = max(1, round(block_s * band.rate_hz / band.step))
-    fitted = _fitted(problem)
-    # Fewer blocks than parameters leave no scatter to see: shorter ones, of some periods at least.
-    most = sum(len(s.slope) for s in stacked) // (2 * max(fitted, 1))
-    samples = max(min(samples, most), min(samples, _PERIODS * _A_PERIOD))
-    bread, meat, blocks = np.diag(problem.precision), np.zeros((n_free, n_free)), 0
-    for s in stacked:
-        slope = s.slope * weight[None, :, None]
-        bread += np.einsum("tqi,tqj->ij", slope, slope)
-        score = np.einsum("tqi,tq->ti", slope, s.residual * weight)
-        for start in range(0, len(score), samples):
-            part = score[start : start + samples].sum(axis=0)
-            meat += np.outer(part, part)
-            blocks += 1
-    held = problem.lower == problem.upper
-    bread[held], bread[:, held], meat[held], meat[:, held] = 0.0, 0.0, 0.0, 0.0
-    inverse = invert_scaled(bread)
-    meat = meat * (blocks / max(blocks - fitted, 1)) + np.diag(problem.precision)
-    return np.asarray(inverse @ meat @ inverse), blocks
+    return np.asarray(found * np.outer(widen, widen) + np.diag(np.where(none, least, 0.0)))

@@ -24,11 +24,11 @@ _TOGETHER = 4
 side by side take hardly longer than one."""
 
 
-@njit(void(_M, _V, _V, int64[::1], _M, _M), cache=True)
-def _run(values, section, start, kept, y, out):  # type: ignore[no-untyped-def]
+@njit(void(_M, _V, _V, int64[::1], _M, _M, _M), cache=True)
+def _run(values, section, start, kept, y, states, out):  # type: ignore[no-untyped-def]
     count, columns = values.shape
     b0, b1, b2, a1, a2 = section[0], section[1], section[2], section[4], section[5]
-    s0, s1 = np.empty(_TOGETHER), np.empty(_TOGETHER)
+    s0, s1 = states[0], states[1]
     for first in range(0, columns, _TOGETHER):
         width = min(_TOGETHER, columns - first)
         for i in range(count):
@@ -85,7 +85,8 @@ def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: NDArray[n
     section, start = _design(cutoff_hz, rate_hz)
     values = np.ascontiguousarray(values)
     out = np.empty((len(kept), values.shape[1]))
-    _run(values, section, start, kept, np.zeros((len(values), _TOGETHER)), out)
+    y, states = np.zeros((len(values), _TOGETHER)), np.empty((2, _TOGETHER))
+    _run(values, section, start, kept, y, states, out)
     return out
 
 

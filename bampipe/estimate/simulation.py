@@ -429,6 +429,27 @@ def make_plant(p: Array, n_noise: int, width: Array, max_step: float) -> Plant:
     )  # fmt: skip
 
 
+def count_steps(
+    derivative: Any,
+    x: Array,
+    u: Array,
+    p: Array,
+    dt: float,
+    *,
+    width: Array,
+    n_noise: int,
+    max_step: float = 2.5e-4,
+) -> float:
+    """Steps that the integration takes from one sample to the next, on average over some states.
+
+    Args:
+        x: (K, nx) states; u: (K, nu) inputs there; the others as in `simulate`.
+    """
+    plant, work = make_plant(p, n_noise, width, max_step), np.zeros((9, x.shape[1]))
+    rows = zip(np.ascontiguousarray(x), np.ascontiguousarray(u), strict=True)
+    return float(np.mean([stable_steps(derivative, a, b, plant, dt, work) for a, b in rows]))
+
+
 def require_finite(x: Array, dt: float) -> None:
     """Raise Runaway where a simulated motion (T, nx), sampled every ``dt`` s, has diverged."""
     bad = np.flatnonzero(~np.isfinite(x).all(axis=1))

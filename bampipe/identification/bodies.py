@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.estimate.bounded import invert_scaled
 from bampipe.estimate.possible_bodies import is_possible, nearest_possible
+from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.physics.base_parameters import base_parameters
 from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.robot import Robot
 from bampipe.results.identify import BaseEstimate
-from bampipe.trials.bias import UnbiasedFit
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -23,7 +24,7 @@ _SHOWN = 0.5
 """Share of the drawing's uncertainty below which the trials are said to show a combination."""
 
 
-def make_possible(system: System, squares: UnbiasedFit) -> tuple[UnbiasedFit, list[str]]:
+def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list[str]]:
     """Return the fit with inertial numbers that some body can have, the nearest to its own.
 
     Nearest is what explains the trials and the drawing least badly: the normal equations of the
@@ -51,7 +52,7 @@ def make_possible(system: System, squares: UnbiasedFit) -> tuple[UnbiasedFit, li
     p[places] = found.ravel()
     others, slope = follow
     p[others] += slope @ (found - value).ravel()
-    free = squares.problem.free
+    free = squares.free
     inside = np.isin(free, others)
     p[free[inside]] = np.clip(
         p[free[inside]], squares.problem.lower[inside], squares.problem.upper[inside]
@@ -64,7 +65,7 @@ def make_possible(system: System, squares: UnbiasedFit) -> tuple[UnbiasedFit, li
 
 
 def _weight(
-    squares: UnbiasedFit, robot: Robot, places: Indices
+    squares: SquaresFit, robot: Robot, places: Indices
 ) -> tuple[Array, tuple[Indices, Array]]:
     """Weight of a change of the inertial numbers, all others refitted, and how these follow.
 
@@ -72,27 +73,21 @@ def _weight(
         (10 b, 10 b); the places of the other free parameters, and their change (n, 10 b) for one
         of each inertial number.
     """
-    problem, raw = squares.problem, squares.raw
-    scale = 1.0 / np.maximum(raw.residual_sd, 1e-300)
-    normal = np.diag(problem.precision)
-    for s in raw.measured:
-        slope = (s.slope * scale[None, :, None]).reshape(-1, problem.free.size)
-        normal += slope.T @ slope
-    column = {int(place): k for k, place in enumerate(problem.free)}
+    normal, count = squares.information, squares.free.size
+    column = {int(place): k for k, place in enumerate(squares.free)}
     size = np.array([p.sd for p in robot.parameters])
     weight = np.diag(1.0 / size**2)
     own = [k for k, place in enumerate(places) if int(place) in column]
     inner = [column[int(places[k])] for k in own]
-    free = [k for k in range(problem.free.size) if k not in inner and not raw.at_bound[k]]
+    free = [k for k in range(count) if k not in inner and not squares.at_bound[k]]
+    others = [*free, *range(count, len(normal))]
+    cross = normal[np.ix_(others, inner)]
+    follow = -invert_scaled(normal[np.ix_(others, others)]) @ cross
+    block = normal[np.ix_(inner, inner)] + cross.T @ follow
     slope = np.zeros((len(free), len(places)))
-    block = normal[np.ix_(inner, inner)]
-    if free:
-        cross = normal[np.ix_(free, inner)]
-        part = -np.linalg.lstsq(normal[np.ix_(free, free)], cross, rcond=1e-12)[0]
-        slope[:, own] = part
-        block = block + cross.T @ part
+    slope[:, own] = follow[: len(free)]
     weight[np.ix_(own, own)] = 0.5 * (block + block.T)
-    return weight, (problem.free[free], slope)
+    return weight, (squares.free[free], slope)
 
 
 def base_estimates(system: System, p: Array, covariance: Array) -> tuple[BaseEstimate, ...] | None:

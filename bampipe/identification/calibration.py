@@ -10,9 +10,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.bounded import invert_scaled
-from bampipe.estimate.least_squares import as_measured, stacked_residual
 from bampipe.identification.estimates import Estimate
+from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.results.ingest import IngestResult
@@ -36,53 +35,36 @@ def propagate_calibration(
     recipe: Recipe,
     session: IngestResult,
     motions: Sequence[Motion],
-    estimate: Estimate,
+    squares: SquaresFit,
 ) -> Mapping[str, Array]:
     """Return by how much one standard uncertainty of each source moves the estimates, (n,) each.
 
     Sources are gains and cross-talk of sensors and scales of encoders and channels as the session
     file states them, zeros of encoders, and constants of the device file with an ``sd``; they are
-    independent. A
-    parameter moves as least squares would near the estimate (law of propagation of uncertainty,
-    JCGM 100:2008, 5.1), whichever method made it; one at its bound stays.
+    independent. A parameter moves as least squares do (law of propagation of uncertainty, JCGM
+    100:2008, 5.1), whichever method made it; one at its bound stays.
 
     Args:
         system: the model; recipe: the same as data; session: as ingested.
-        motions: that were fitted, with every input of the device; estimate: of their parameters.
+        motions: that were fitted, with every input of the device; squares: the fit to them.
     """
-    sources = list(_sources(system, recipe, session))
-    if not sources:
-        return {}
-    problem, band, count = estimate.problem, estimate.problem.band, len(estimate.free)
-    n_q = len(system.coordinates)
-    normal, square, used = np.zeros((n_q, count, count)), np.zeros(n_q), np.zeros(n_q)
-    moments = {source.name: np.zeros((n_q, count)) for source in sources}
-    for trial, motion in enumerate(motions):
-        here = [stacked_residual(problem, trial, estimate.p)]
-        (stacked,) = as_measured(problem, estimate.p, here)
-        slope = stacked.slope[:, :, :count]
-        normal += np.einsum("kqi,kqj->qij", slope, slope)
-        square += np.sum(stacked.residual**2, axis=0)
-        used += np.sum(stacked.used, axis=0)
-        for source in sources:
-            theirs = _residual(source.system, source.change(motion), estimate.p)
-            residual = band.thin(theirs) * stacked.used
-            moments[source.name] += np.einsum("kqn,kq->qn", slope, stacked.residual - residual)
-    weight = used / np.maximum(square, np.finfo(float).tiny)
-    inside = np.flatnonzero(~estimate.at_bound)
-    inverse = np.zeros((count, count))
-    part = np.ix_(inside, inside)
-    inverse[part] = invert_scaled(np.einsum("q,qij->ij", weight, normal)[part])
-    return {name: np.asarray(inverse @ (weight @ moment)) for name, moment in moments.items()}
+    count = int(np.sum(squares.free < len(system.parameters)))
+    held = [int(k) for k in np.flatnonzero(squares.at_bound)]
+    found = {}
+    for source in _sources(system, recipe, session):
+        changed = [_residual(source, motion, squares) for motion in motions]
+        found[source.name] = squares.respond(squares.residual_change(changed), held)[:count]
+    return found
 
 
-def _residual(system: System, motion: Motion, p: Array) -> Array:
+def _residual(source: _Source, motion: Motion, squares: SquaresFit) -> Array:
     """Residual (T, n_q) of a trial, of functions that are not compiled: they serve once."""
-    timed, p = motion.with_input_timing(p[-1]), p[:-1]
-    u = timed.inputs(system.inputs)
-    at = timed.of_mechanism(system, u, p).kinematics
-    z = system.memory(*at, u, p, timed.t)
-    return system.applied(*at, z, u, p) - system.required(*at, z, u, p)
+    p = squares.fit.evidence.p
+    timed = source.change(motion).with_input_timing(squares.trials.late_s)
+    u = timed.inputs(source.system.inputs)
+    at = timed.of_mechanism(source.system, u, p).kinematics
+    z = source.system.memory(*at, u, p, timed.t)
+    return source.system.applied(*at, z, u, p) - source.system.required(*at, z, u, p)
 
 
 def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate:

@@ -18,6 +18,7 @@ from bampipe.estimate.simulation import Runaway, simulate
 from bampipe.physics import System
 from bampipe.results.validate import AxisDrift, Drift
 from bampipe.trials.motion import Motion
+from bampipe.trials.replay import is_stiff
 
 Array = NDArray[np.float64]
 
@@ -84,8 +85,8 @@ def find_drift(
         By axis: the drift at each horizon, and why some horizons are absent.
     """
     axes = list(zip(system.coordinates, system.coordinate_units, strict=True))
-    if system.model.device.prescribed:
-        why = "A machine prescribes the motion, and the force is what that takes."
+    why = why_not_free(system, motions, parameters)
+    if why:
         return {axis: AxisDrift(unit=unit, horizons=(), reason=why) for axis, unit in axes}
     chosen = [k for k, counts in enumerate(judged) if counts] or range(len(motions))
     starts = _STARTS_OF_ROBOT if system.model.device.robot is not None else _STARTS
@@ -111,6 +112,19 @@ def find_drift(
                     update=_drift(reached, i, horizon, found[axis])
                 )
     return found
+
+
+def why_not_free(system: System, motions: Sequence[Motion], parameters: Sequence[Array]) -> str:
+    """Why a model does not run by the measured force alone; "" where it may."""
+    if system.model.device.prescribed:
+        return "A machine prescribes the motion, and the force is what that takes."
+    robot = system.model.device.robot is not None
+    if not robot and is_stiff(system, parameters[0][: len(system.parameters)], motions[0]):
+        return (
+            "Friction would stop the machine within a small part of a sample: its drive gives the"
+            " motion, and the force is what that takes."
+        )
+    return ""
 
 
 def _windows(

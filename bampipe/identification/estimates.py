@@ -4,22 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bampipe.estimate.influence import find_worst_stretch
-from bampipe.estimate.least_squares import LeastSquares, Problem
-from bampipe.estimate.output_error import OutputError
+from bampipe.estimate.influence import RemovedStretch
+from bampipe.estimate.least_squares import Problem
 from bampipe.identification.filter_tables import as_filtered
+from bampipe.phrases.results import TIMING_AT_LIMIT, describe_unidentified
 from bampipe.physics import System
 from bampipe.physics.effect import BoundEffect
 from bampipe.results.identify import (
-    LACKS_TIMING,
-    BaseEstimate,
-    Convergence,
     Covariance,
     EffectEstimate,
     IdentifiabilityReport,
@@ -27,22 +24,17 @@ from bampipe.results.identify import (
     Influence,
     InputTiming,
     Method,
-    MethodTried,
     ParameterEstimate,
-    StateBound,
     WorstSecond,
 )
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd
-from bampipe.trials.motion import Motion, trial_names, trial_sizes
+from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
 MOST_SHOWN = 24
 """Parameters that a headline lists."""
-_STRETCH_S = 1.0
-_STATES = 500_000
-"""Samples, spread over all, that the typical uncertainty of a state is taken from."""
 _MOVES, _OUTLYING = 2.0, 15.0
 """Standard deviations by which the worst second moves a parameter, and times what noise makes of a
 second that tells as much, from which on it is said. Of 32 sound sessions none reaches the first,
@@ -61,16 +53,11 @@ class Estimate:
         covariance: (n, n) of the estimated parameters of the model.
         at_bound: (n,) which lie at the limit of their range.
         held_out: by trial, (n_p + 1,) the parameters without the trials that it is left out with.
-        doubts: why it may not be believed, a clause each; none where nothing speaks against it.
         details: by parameter, further fields of its record.
         report: further fields of the result.
         tabulate: makes the tables of the states and of the parameters along the data.
-        moved_by: from another system of the same parameters to how far its equations move the
-            estimates, (n,), nothing where they make the readings less likely; None for a method
-            that does not say.
-        width: with which the method smooths the sign of a velocity, times the model's.
-        spread: (n,) how far the estimates move between widths that are nearly as likely; None
-            where only one was asked.
+        doubts: why it may not be believed, a clause each; none where nothing speaks against it.
+        notes: what else to know before believing it, a sentence each.
     """
 
     method: Method
@@ -79,13 +66,11 @@ class Estimate:
     covariance: Array
     at_bound: NDArray[np.bool_]
     held_out: Sequence[Array]
-    doubts: tuple[str, ...]
     details: Sequence[dict[str, float]]
     report: dict[str, Any]
     tabulate: Callable[[], tuple[pd.DataFrame, pd.DataFrame]]
-    moved_by: Callable[[System], Array] | None = None
-    width: float = 1.0
-    spread: Array | None = None
+    doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def evidence(self) -> dict[str, Any]:
@@ -123,87 +108,34 @@ def input_timing(p: Array, problem: Problem, covariance: Array) -> InputTiming:
     )
 
 
-def trace_row(
-    system: System, problem: Problem, fit: LeastSquares | OutputError, bias: Array | float = 0.0
-) -> dict[str, float]:
-    """Return the parameters and their standard deviations as ``trace.parquet`` has them."""
-    found, sd = fit.p[problem.free] - bias, np.sqrt(np.diag(fit.covariance))
-    row: dict[str, float] = {}
-    for k, place in enumerate(problem.free):
-        if place < len(system.parameters):
-            name = system.parameters[place].name
-            row |= {name: found[k], f"{name}_sd": sd[k]}
-    return row
-
-
-def estimate_of_fit(
-    method: Method,
-    system: System,
-    motions: Sequence[Motion],
-    problem: Problem,
-    fit: LeastSquares | OutputError,
-    p: Array,
-    held_out: Sequence[Array],
-    details: Sequence[dict[str, float]],
-    rows: Callable[[], Sequence[Mapping[str, object]]],
-    **report: object,
-) -> Estimate:
-    """Return the estimate of a method that leaves the motion as the filter stage did.
+def filtered_states(
+    system: System, motions: Sequence[Motion], p: Array, trace: Sequence[Mapping[str, object]]
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Tables of a method that leaves the motion as the filter stage did.
 
     Args:
-        method: its name; system: the model; motions: the trials; problem: what was fitted.
-        fit: the outcome; p: (n_p + 1,) the estimate, without bias.
-        held_out, details, report: as of `Estimate`; rows: makes those of its trace.
+        system: the model; motions: the trials; p: (n_p,) its parameters; trace: rows of its trace.
     """
-    count = int(np.sum(problem.free < len(system.parameters)))
-    stride = -(-sum(trial_sizes(motions)) // _STATES)
-    sd = 3.0 * np.median(np.concatenate([motion.qd_sd[::stride] for motion in motions]), axis=0)
-
-    def tabulate() -> tuple[pd.DataFrame, pd.DataFrame]:
-        frames = [as_filtered(system, motion, p[:-1]) for motion in motions]
-        return pd.concat(frames, ignore_index=True), pd.DataFrame(rows())
-
-    return Estimate(
-        method=method,
-        p=p,
-        problem=problem,
-        covariance=fit.covariance[:count, :count],
-        at_bound=fit.at_bound[:count],
-        held_out=held_out,
-        doubts=() if fit.converged else ("its search has not converged",),
-        details=details[:count],
-        report={
-            "input_timing": input_timing(p, problem, fit.covariance),
-            "convergence": Convergence(iterations=fit.iterations, converged=fit.converged),
-            "state_3sigma": {
-                axis: StateBound(velocity=sd[i]) for i, axis in enumerate(system.coordinates)
-            },
-            **report,
-        },
-        tabulate=tabulate,
-    )
+    frames = [as_filtered(system, motion, p) for motion in motions]
+    return pd.concat(frames, ignore_index=True), pd.DataFrame(trace)
 
 
 def collect_result(
     system: System,
     estimate: Estimate,
     identifiability: IdentifiabilityReport,
-    motions: Sequence[Motion],
-    model: str,
-    raw: LeastSquares,
+    trials: Sequence[str],
+    worst: RemovedStretch,
     late: tuple[float, float],
-    engine: Literal["compiled", "filterpy"],
-    methods: Mapping[Method, MethodTried],
-    notes: Sequence[str],
-    base_parameters: tuple[BaseEstimate, ...] | None = None,
+    **further: Any,
 ) -> IdentifyResult:
     """Return what identify.json says.
 
     Args:
         system: the model; estimate: the published one; identifiability: of its parameters.
-        motions: the trials; model: its name; raw: the least-squares fit to the same trials.
+        trials: names of the trials; worst: the second that moves least squares most.
         late: timing of the inputs that residuals go by, and its standard deviation, s.
-        engine: of the filter; methods: all that were tried; notes: on how it came about.
+        further: fields of the result as they are; notes among them on how it came about.
     """
     free, sd = estimate.free, estimate.sd
     names = tuple(system.parameters[i].name for i in free)
@@ -223,28 +155,30 @@ def collect_result(
     warning = f"not identified: {', '.join(unknown)}; " if unknown else ""
     timing = estimate.report["input_timing"]
     timing = timing.model_copy(update={"of_residual": _timing_of_residual(timing, *late)})
-    influence = _assess_influence(names, estimate, motions, raw)
+    influence = _assess_influence(names, estimate, trials, worst)
+    notes = further.pop("notes")
     return IdentifyResult(
-        model=model,
         headline=warning + _headline(parameters),
         method=estimate.method,
-        engine=engine,
-        methods=dict(methods),
         parameters=parameters,
         effects=effects,
         influence=influence,
         covariance=Covariance(names=names, matrix=estimate.covariance.tolist()),
-        trials=tuple(trial_names(motions)),
+        trials=tuple(trials),
         identifiability=identifiability,
-        base_parameters=base_parameters,
         notes=(
-            *filter(None, (found.describe(name) for name, found in effects.items())),
+            *filter(None, (describe_unidentified(*pair) for pair in effects.items())),
             *([_describe_limit(timing)] if timing.is_at_limit else []),
             *filter(None, [influence.worst_second.sentence]),
             *notes,
             *identifiability.sentences,
+            *(
+                f"`{name}` lies at the limit of its range: its interval is no guide."
+                for name, there in zip(names, estimate.at_bound, strict=True)
+                if there
+            ),
         ),
-        **{**estimate.report, "input_timing": timing},
+        **{**further, **estimate.report, "input_timing": timing},
     )
 
 
@@ -260,17 +194,15 @@ def _headline(parameters: Mapping[str, ParameterEstimate]) -> str:
 
 
 def _assess_influence(
-    names: Sequence[str], estimate: Estimate, motions: Sequence[Motion], raw: LeastSquares
+    names: Sequence[str], estimate: Estimate, trials: Sequence[str], worst: RemovedStretch
 ) -> Influence:
     """Return how far each trial, and the worst second, move the parameters."""
     moved = [
         (p[estimate.free] - estimate.value) / np.maximum(estimate.sd, np.finfo(float).tiny)
         for p in estimate.held_out
     ]
-    worst = find_worst_stretch(estimate.problem, raw, _STRETCH_S)
     count = len(names)
     place = int(np.argmax(np.abs(worst.move[:count])))
-    trials = trial_names(motions)
     trial, move = trials[worst.trial], float(worst.move[place])
     stands_out = abs(move) > max(_MOVES, _OUTLYING * float(worst.typical[place]))
     return Influence(
@@ -340,9 +272,9 @@ def _describe_limit(timing: InputTiming) -> str:
         return (
             f"The timing of the force lies at its limit, {1e3 * timing.limit:.3g} ms {way} than"
             f" logged, half a sample, and is uncertain by {1e3 * timing.sd:.2g} ms: these trials do"
-            f" not determine it, or {LACKS_TIMING}."
+            f" not determine it, or {TIMING_AT_LIMIT}."
         )
     return (
         f"The force acts {1e3 * timing.limit:.3g} ms or more {way} than logged, half a sample, all"
-        f" that the timing of the samples may be: {LACKS_TIMING}."
+        f" that the timing of the samples may be: {TIMING_AT_LIMIT}."
     )

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.estimate.filter_uncertainty import choose_block, leave_out, sandwich_covariance
-from bampipe.estimate.least_squares import Problem
 from bampipe.estimate.unscented import (
     FilterFailure,
     FilterModel,
@@ -29,7 +28,6 @@ from bampipe.identification.filter_run import (
     build_filter_model,
     choose_stride,
     clear_of_reversal_mask,
-    likelier,
     load_filter_trial,
     run_filter,
 )
@@ -41,7 +39,7 @@ from bampipe.identification.filter_tables import (
     tabulate_trace,
 )
 from bampipe.identification.innovations import innovation_tests
-from bampipe.identification.least_squares_estimate import bias_details
+from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.identification.sensor_noise import (
     Noise,
     choose_tuning_trials,
@@ -49,236 +47,293 @@ from bampipe.identification.sensor_noise import (
     tune_noise,
     untuned_settings,
 )
-from bampipe.physics import System
+from bampipe.lists import join_names
+from bampipe.physics import System, compile_model
+from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
-from bampipe.trials.bias import UnbiasedFit
+from bampipe.results.rounding import significant
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.disturbances import part_trials
-from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion, trial_names, trial_sizes
 
 Array = NDArray[np.float64]
 
-_RESTARTS = 5
-"""Further searches, each with four times the process noise of the one before."""
-_REGIONS = (30.0, 8.0)
-"""Standard deviations of least squares around its answer in which a model nonlinear in its
-parameters is searched: a prior as wide as a range leads such a filter astray."""
-_LEAST_REGION = 3e-4
-"""Least width of that, in standard deviations of the prior, times the number above."""
-_REPEATS, _AROUND = 4, 10.0
-"""Most passes more of such a model; how far around the last answer, in its standard deviations."""
+_RESTARTS = 3
+"""Searches from least squares, each with four times the process noise of the one before."""
+_LEAST_REGION = 1e-3
+"""Least deviation of least squares of a nonlinear model, in standard deviations of the prior."""
+_AROUND = 10.0
+"""Standard deviations around an answer, from which on a start adds a hundredth to what is known."""
 _PARTS, _LIKELIER = (1, 2, 4), 30.0
-"""By what the Runge-Kutta step is divided for it, and what that must add to the logarithm of a
-trial's likelihood: three times what it adds where friction is smooth on the scale of a step."""
+"""By what the Runge-Kutta step is divided, and what that must add to the logarithm of the
+likelihood: three times what it adds where friction is smooth on the scale of a step."""
 _NARROWER = (0.5, 0.25, 0.0625)
 """Widths of the smoothed sign, times the device's, that are tried."""
 _MOVED_TRIALS, _MOVED_SAMPLES = 5, 10_000
 """Trials, and samples of all, by which other equations move the answer or make it likelier."""
+_MOST, _SHOWN = 0.5, 6
+"""Share of the variance of a parameter from which on what the smoothing adds is said in words,
+and how many are named."""
 _SOUND_NIS = (0.5, 2.0)
 """Mean normalised innovation squared of a filter whose noise levels fit: 0.9 to 1.3 on sound
 sessions, 0.06 to 0.2 and 2.8 to 3.7 on those whose motion it lost."""
-_CLEAR = 2.0
-"""Joint standard deviations from which on least squares is clear of a bound of the filter's."""
-_AGREE = 6.0
-"""Joint standard deviations within which filter and least squares are at one place."""
 
 
-def estimate_by_filter(
-    run: RunFolder,
-    system: System,
-    narrowed: Callable[[float], System],
-    motions: Sequence[Motion],
-    start: Array,
-    squares: UnbiasedFit,
-    noise: Noise,
-    choice: FilterChoice,
-    folds: Folds,
-    model_name: str,
-    progress: Progress,
-) -> Estimate:
-    """Tune the noise, converge on the first trial, then filter all trials.
+@dataclass(frozen=True)
+class FilterTask:
+    """What the filter is asked.
 
-    Args:
-        run: the run folder; system: the model; motions: the trials.
-        narrowed: the model with the widths of its smoothed signs times a factor.
+    Attributes:
+        run: the run folder; system: the model; recipe: the same as data; name: for messages.
         start: (n_p,) starting values.
-        squares: least squares, which gives the region of the answer and checks it.
-        noise: of the sensors; choice: of the filter; folds: which trials are left out together.
-        model_name: for messages.
-        progress: called with the share done.
+        squares: least squares, which give the region of the answer.
+        known: (n,) their standard deviations, of parameters that the trials leave open the prior's.
+        noise: of the sensors; choice: of the filter.
+    """
+
+    run: RunFolder
+    system: System
+    recipe: Recipe
+    name: str
+    start: Array
+    squares: SquaresFit
+    known: Array
+    noise: Noise
+    choice: FilterChoice
+
+    def narrowed(self, factor: float) -> System:
+        """The model with the widths of its smoothed signs times a factor."""
+        return compile_model(self.recipe.with_sign_widths(factor).model())
+
+
+class _Filtering:
+    """The trials as the filter reads them, its model and its noise levels.
+
+    Attributes:
+        motions: parts of trials between disturbances; of_trial: the trial of each.
+        trials: raw samples of these; model, settings, choice: of the filter.
+        late_sd: (1,) or (0,) of the timing of the inputs.
+    """
+
+    def __init__(self, task: FilterTask, report_progress: Progress) -> None:
+        self.task, self.report_progress = task, report_progress
+        motions: Sequence[Motion] = task.squares.trials.motions
+        interval = float(np.median(np.diff(motions[0].t)))
+        self.motions, self.of_trial = part_trials(motions, 1.0 / interval)
+        self.sizes = trial_sizes(self.motions)
+        stride, squares, choice = choose_stride(self.motions), task.squares, task.choice
+        self.count = task.known.size
+        near = squares.p[:-1]
+        self.trials: Sequence[Trial] = TrialCache(
+            lambda k: load_filter_trial(
+                task.run, self.motions[k], task.system, near, task.noise, stride, choice
+            ),
+            len(self.motions),
+            lambda trial: int(trial.t.size),
+        )
+        timing = squares.free.size > self.count
+        self.model = build_filter_model(task.system, self.trials, task.start, timing, squares.p[-1])
+        self.late_sd = self.model.upper[self.count :] / np.sqrt(3.0)
+        seconds = [size * interval for size in self.sizes]
+        block_s = choose_block(seconds, self.model.free.size, choice.block_s)
+        self.choice = replace(choice, block_s=block_s)
+        report_progress(0.15, "noise levels")
+        self.settings = replace(self._tuned(), stride=stride)
+
+    @property
+    def answer(self) -> Array:
+        """(nt,) least squares, the inputs not late."""
+        late = np.zeros(self.late_sd.size)
+        return np.append(self.task.squares.p[self.task.squares.free[: self.count]], late)
+
+    @property
+    def known(self) -> Array:
+        """(nt,) how well that is known."""
+        return np.append(self.task.known, self.late_sd)
+
+    def clear(self, place: int) -> NDArray[np.bool_]:
+        """Which samples of a trial are clear of reversals, (T, n_q)."""
+        return clear_of_reversal_mask(self.motions[place], self.task.system, self.trials[place].t)
+
+    def _tuned(self) -> FilterSettings:
+        task = self.task
+        settings = untuned_settings(task.system, task.noise, task.choice)
+        walk = np.append(settings.walk_sd, np.zeros(self.late_sd.size))
+        places, samples = choose_tuning_trials(self.sizes)
+        return tune_noise(
+            replace(settings, walk_sd=walk),
+            self.model,
+            [self.trials[place].first(samples) for place in places],
+            [np.asarray(self.clear(place)[:samples].all(axis=1)) for place in places],
+            (self.answer, self.known),
+            task.noise,
+            task.choice,
+        )
+
+    @property
+    def attempts(self) -> list[Attempt]:
+        """Where to start: the prior, then least squares with more and more process noise.
+
+        A model that is nonlinear in its parameters starts around least squares: a prior as wide as
+        a range leads such a filter astray.
+        """
+        task, count = self.task, self.count
+        places, late = task.squares.free[:count], np.zeros(self.late_sd.size)
+        free = [task.system.parameters[k] for k in places]
+        prior_sd = np.append([item.sd for item in free], self.late_sd)
+        first = np.append(task.start[places], late)
+        spread = np.hypot(prior_sd, first - np.append(task.system.prior[places], late))
+        if task.squares.problem.linear:
+            around, attempts = prior_sd, [(first, spread, 1.0)]
+        else:
+            least = np.hypot(self.known, _LEAST_REGION * prior_sd)
+            around, attempts = np.minimum(_AROUND * least, spread), []
+        return attempts + [(self.answer, around, 4.0**k) for k in range(_RESTARTS)]
+
+    def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
+        """Filter all trials from the first of some starts that holds on to the motion."""
+        names = trial_names(self.motions)
+
+        def report_progress(done: int, place: int) -> None:
+            self.report_progress(0.35 + 0.6 * done / (len(names) + 1), names[place])
+
+        def lost_error(what: str, place: int) -> MotionLost:
+            remedy = (
+                "try --method least-squares, or set the trial aside if its sensors jumped there"
+            )
+            message = what.format(names[place])
+            return MotionLost(message, where=f"model {self.task.name}", remedy=remedy)
+
+        return run_filter(
+            self.model, self.trials, attempts, settings, self.choice, report_progress, lost_error,
+            self.task.system.coordinates,
+        )  # fmt: skip
+
+    def find(self) -> tuple[FilterRun, _Width | None]:
+        """The run that counts, and the narrower width of the sign if readings ask for one."""
+        found = self.run(self.attempts, self.settings)
+        if self.task.system.model.device.prescribed:
+            return found, None
+        narrowed, step = self.task.narrowed, self.choice.longest_step_s
+        width = _choose_width(found, self.model, self.trials, narrowed, step)
+        if width is None:
+            return found, None
+        declared, self.model = self.model, _with_equations(self.model, narrowed(width.factor))
+        value, slope = self.model.to_physical(found.theta)
+        around = _AROUND * slope * np.sqrt(np.diag(found.covariance))
+        with suppress(MotionLost):  # a narrow sign may throw it off at one reversal of many
+            again = self.run([(value, around, 1.0)], width.settings)
+            if again.log_likelihood > found.log_likelihood + _LIKELIER:
+                first = found.first or found.passes
+                return replace(again, restarts=found.restarts, repeats=1, first=first), width
+        self.model = declared
+        return found, None
+
+
+def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
+    """Tune the noise, converge on the first trial, then filter all trials.
 
     Raises:
         MotionLost: the filter does not follow the motion.
     """
-    interval = float(np.median(np.diff(motions[0].t)))
-    motions, of_trial = part_trials(motions, 1.0 / interval)
-    sizes = trial_sizes(motions)
-    stride = choose_stride(motions)
-    near = squares.raw.p[: len(start)]
-    trials = TrialCache(
-        lambda place: load_filter_trial(run, motions[place], system, near, noise, stride, choice),
-        len(motions),
-        lambda trial: int(trial.t.size),
-    )
-    problem = squares.problem
-    free = [item for item in system.parameters if not item.fixed]
-    count = len(free)
-    timing = problem.free.size > count
-    model = build_filter_model(system, trials, start, timing, squares.p[-1])
-    progress(0.15, "noise levels")
-    late_sd = model.upper[count:] / np.sqrt(3.0)
-    late = np.zeros(late_sd.size)
-    nonlinear = not problem.linear
-    answer = np.append(squares.p[problem.free[:count]], late)
-    settled = answer if nonlinear else np.append(squares.raw.p[problem.free[:count]], late)
-    known = np.append(np.sqrt(np.diag(squares.raw.covariance))[:count], late_sd)
-    settings = untuned_settings(system, noise, choice)
-    settings = replace(settings, walk_sd=np.append(settings.walk_sd, late))
-
-    def clear(place: int) -> NDArray[np.bool_]:
-        return clear_of_reversal_mask(motions[place], system, trials[place].t)
-
-    places, samples = choose_tuning_trials(sizes)
-    settings = tune_noise(
-        settings,
-        model,
-        [trials[place].first(samples) for place in places],
-        [np.asarray(clear(place)[:samples].all(axis=1)) for place in places],
-        settled,
-        known,
-        noise,
-        choice,
-    )
-    settings = replace(settings, stride=stride)
-    block_s = choose_block([size * interval for size in sizes], model.free.size, choice.block_s)
-    choice = replace(choice, block_s=block_s)
-    prior_sd = np.append([item.sd for item in free], late_sd)
-    first = np.append(start[problem.free[:count]], late)
-    spread = np.hypot(prior_sd, first - np.append(system.prior[problem.free[:count]], late))
-    # If the prior does not lead to the answer, the search starts from least squares, then with
-    # more and more process noise, as a model that lacks much needs.
-    attempts: list[Attempt] = [(first, spread, 1.0)]
-    attempts += [(settled, prior_sd, 4.0**k) for k in range(_RESTARTS)]
-    if nonlinear:
-        around = [
-            np.minimum(size * np.hypot(known, _LEAST_REGION * prior_sd), spread)
-            for size in _REGIONS
-        ]
-        attempts = [*((settled, region, 1.0) for region in around), *attempts]
-
-    def agrees(found: FilterRun) -> bool:
-        """Whether the filter is where least squares are, the timing left out.
-
-        Where the model is linear they have one answer at most, and no need to be asked.
-        """
-        if not nonlinear:
-            return True
-        value, slope = model.to_physical(found.theta)
-        sd = np.hypot(slope * np.sqrt(np.diag(found.covariance)), known)
-        return bool(np.all(np.abs(value - answer)[:count] < _AGREE * sd[:count]))
-
-    trial_ids = trial_names(motions)
-
-    def report_progress(done: int, place: int) -> None:
-        progress(0.35 + 0.6 * done / (len(trials) + 1), trial_ids[place])
-
-    def lost_error(what: str, place: int) -> MotionLost:
-        remedy = "try --method least-squares, or set the trial aside if its sensors jumped there"
-        message = what.format(trial_ids[place])
-        return MotionLost(message, where=f"model {model_name}", remedy=remedy)
-
-    def run_from(attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
-        return run_filter(
-            model, trials, attempts, settings, choice, report_progress, lost_error,
-            system.coordinates, agrees, 1 + len(_REGIONS),
-        )  # fmt: skip
-
-    found = run_from(attempts, settings)
-    if nonlinear:
-        finer = _choose_longest_step(found, model, trials[0])
-        found = _repeat_until_settled(found, model, finer, run_from)
-    declared, width = model, None
-    if not system.model.device.prescribed:
-        width = _choose_width(found, model, trials, narrowed, choice.longest_step_s)
-    if width is not None:
-        model = _with_equations(declared, narrowed(width.factor))
-        narrower = _repeat_until_settled(found, model, width.settings, run_from)
-        # A narrow sign may throw the filter off at one reversal of many.
-        if likelier(found, narrower) is found:
-            model, width = declared, None
-        else:
-            found = narrower
-    covariance, blocks = sandwich_covariance(
+    filtering = _Filtering(task, progress)
+    found, width = filtering.find()
+    model, count, system = filtering.model, filtering.count, task.system
+    problem, motions = task.squares.problem, filtering.motions
+    sandwich, blocks = sandwich_covariance(
         found.ends, model.n_states, found.search_theta, found.search_covariance
     )
-    value, slope = model.to_physical(constrain(model, found.theta, covariance))
-    scaled = covariance * np.outer(slope, slope)
-    p = np.append(start, squares.p[-1])
+    value, slope = model.to_physical(constrain(model, found.theta, sandwich))
+    scaled = sandwich * np.outer(slope, slope)
+    off, spread = _find_smoothing(found, width, filtering)
+    p = np.append(task.start, task.squares.p[-1])
     p[problem.free] = value
     tight = slope * np.sqrt(np.diag(found.covariance))
     at_bound = (value - model.lower < tight) | (model.upper - value < tight)
-    names = [item.name for item in free]
-    details = [
-        {"filter_sd": tight[k], **bias} for k, bias in enumerate(bias_details(squares)[:count])
-    ]
+    names = [system.parameters[k].name for k in problem.free[:count]]
     nis = tabulate_nis(found, motions)
     report = {
         "nis": nis,
-        "innovations": innovation_tests(system, found, clear),
-        "noise": noise_levels(system, found.settings, noise),
+        "innovations": innovation_tests(system, found, filtering.clear),
+        "noise": noise_levels(system, found.settings, task.noise),
         "input_timing": input_timing(p, problem, scaled),
         "blocks": blocks,
         "restarts": found.restarts,
         "repeats": found.repeats,
         "state_3sigma": state_3sigma(system, found.trials),
-        "convergence": convergence(names, model, found, covariance),
+        "convergence": convergence(names, model, found, sandwich),
     }
+    covariance = (scaled + np.outer(off, off) + np.diag(spread**2))[:count, :count]
+    smoothing = np.hypot(off, spread)[:count]
+    rows = filtering.choice.trace_rows
     return Estimate(
         method="ukf",
         p=p,
         problem=problem,
-        covariance=scaled[:count, :count],
+        covariance=covariance,
         at_bound=at_bound[:count],
-        held_out=_leave_out(p, found, model, problem, covariance, folds, of_trial),
-        doubts=_doubts(names, value[:count], at_bound[:count], scaled, squares, nis.mean),
-        details=details,
+        held_out=_leave_out(p, found, filtering, sandwich),
+        details=[{"filter_sd": tight[k], "smoothing_sd": smoothing[k]} for k in range(count)],
         report=report,
         tabulate=lambda: (
-            tabulate_states(system, motions, found, p[:-1], choice.trace_rows),
-            tabulate_trace(names, model, motions, found, choice.trace_rows),
+            tabulate_states(system, motions, found, p[:-1], rows),
+            tabulate_trace(names, model, motions, found, rows),
         ),
-        moved_by=lambda other: _moved_by(other, found, model, trials)[:count],
-        width=width.factor if width is not None else 1.0,
-        spread=width.spread[:count] if width is not None else None,
+        doubts=_doubts(nis.mean),
+        notes=_describe_smoothing(names, smoothing, np.sqrt(np.diag(covariance)), width),
     )
 
 
-def _leave_out(
-    p: Array,
-    found: FilterRun,
-    model: FilterModel,
-    problem: Problem,
-    covariance: Array,
-    folds: Folds,
-    of_trial: Sequence[int],
-) -> list[Array]:
-    """Return the parameters (n_p + 1,) without the trials that each is left out with.
+def _find_smoothing(
+    found: FilterRun, width: _Width | None, filtering: _Filtering
+) -> tuple[Array, Array]:
+    """How far the answer is from that without smoothing, and between likely widths, both (nt,).
 
-    Args:
-        of_trial: numbers of the trials of `folds` that those filtered are parts of.
+    A machine with dry friction truly stands still, where the model creeps within the width of its
+    smoothed sign. The filter errs in proportion to that width: it is off by twice what half the
+    width that it took moves it. A machine that does creep shows that by readings that the narrower
+    sign comes less close to. What widths that are nearly as likely disagree on is as uncertain.
     """
+    factor = 1.0 if width is None else width.factor
+    narrower = filtering.task.narrowed(_NARROWER[0] * factor)
+    off = _moved_by(narrower, found, filtering.model, filtering.trials) / (1.0 - _NARROWER[0])
+    return off, np.zeros(off.size) if width is None else width.spread
+
+
+def _describe_smoothing(
+    names: Sequence[str], smoothing: Array, sd: Array, width: _Width | None
+) -> tuple[str, ...]:
+    """Sentences on a narrower sign, and on uncertainty that is for the most part of smoothing."""
+    said = []
+    if width is not None:
+        said.append(
+            f"The filter smooths the sign of the velocity over {significant(width.factor)} of the"
+            " device's `sign_width`, which makes the readings likelier."
+        )
+    most = smoothing**2 > _MOST * np.maximum(sd**2, np.finfo(float).tiny)
+    if most.any():
+        listed = [f"`{name}`" for name, here in zip(names, most, strict=True) if here]
+        said.append(
+            f"Most of the uncertainty of {join_names(listed, _SHOWN)} is that the sign of the"
+            " velocity is smoothed, where a machine stands still."
+        )
+    return tuple(said)
+
+
+def _leave_out(p: Array, found: FilterRun, filtering: _Filtering, covariance: Array) -> list[Array]:
+    """Return the parameters (n_p + 1,) without the trials that each is left out with."""
+    folds, model = filtering.task.squares.trials.folds, filtering.model
     if folds.nothing_held_out:
         return [p] * len(folds.groups)
-    groups = [folds.groups[of_trial[place]] for place in found.order]
+    groups = [folds.groups[filtering.of_trial[place]] for place in found.order]
     without = leave_out(
         found.ends, groups, model.n_states, found.search_theta, found.search_covariance
     )
     parameters = {}
     for group, theta in without.items():
-        value, _ = model.to_physical(constrain(model, theta, covariance))
         parameters[group] = p.copy()
-        parameters[group][problem.free] = value
+        value, _ = model.to_physical(constrain(model, theta, covariance))
+        parameters[group][filtering.task.squares.free] = value
     return [parameters[group] for group in folds.groups]
 
 
@@ -390,80 +445,11 @@ def _choose_width(
     return _Width(chosen[0], replace(found.settings, longest_step=step / chosen[1]), spread)
 
 
-def _doubts(
-    names: Sequence[str],
-    value: Array,
-    at_bound: NDArray[np.bool_],
-    covariance: Array,
-    squares: UnbiasedFit,
-    nis: float,
-) -> tuple[str, ...]:
-    """Say what speaks against the filter: its noise levels, a bound that least squares avoid."""
-    doubts = []
-    if not _SOUND_NIS[0] < nis < _SOUND_NIS[1]:
-        doubts.append(
-            f"its normalised innovations squared are {nis:.2g} on average, 1 where its noise "
-            "levels are right"
-        )
-    count = len(names)
-    other = squares.p[squares.problem.free[:count]]
-    joint = np.sqrt(np.diag(covariance)[:count] + np.diag(squares.raw.covariance)[:count])
-    stuck = at_bound & (np.abs(value - other) > _CLEAR * joint)
-    doubts += [
-        f"it holds `{name}` at its bound, which least squares is clear of"
-        for name, is_stuck in zip(names, stuck, strict=True)
-        if is_stuck
-    ]
-    return tuple(doubts)
-
-
-def _choose_longest_step(found: FilterRun, model: FilterModel, trial: Trial) -> FilterSettings:
-    """Return the settings with a step that makes a trial as likely as finer ones do.
-
-    Friction that falls within millimetres a second has changed before a step is over.
-    """
-
-    def log_likelihood(step: float) -> float:
-        wide = np.diag(_AROUND**2 * np.diag(found.covariance))
-        chosen = replace(found.settings, longest_step=step)
-        filtered = filter_trials(model, [trial], found.theta, wide, chosen)
-        return float(np.nansum(filtered.trials[0].log_likelihood))
-
-    step = found.settings.longest_step
-    # Where the filter fails, so will the passes that follow, which say why.
-    with suppress(FilterFailure):
-        tried = {part: log_likelihood(step / part) for part in _PARTS}
-        enough = max(tried.values()) - _LIKELIER
-        step /= min(part for part, likely in tried.items() if likely > enough)
-    return replace(found.settings, longest_step=step)
-
-
-def _repeat_until_settled(
-    found: FilterRun,
-    model: FilterModel,
-    settings: FilterSettings,
-    run_from: Callable[[Sequence[Attempt], FilterSettings], FilterRun],
-) -> FilterRun:
-    """Filter again around the answer until that no longer moves it.
-
-    One pass takes the model as straight across all that it did not know when it began; where the
-    model is nonlinear, that leaves its mark on the answer, and on the likelihood, which therefore
-    does not say which of two passes to believe. Passes from different starts settle at one place.
-    Where none does, the likeliest counts. A start this wide of an answer adds a hundredth to what
-    is known of it.
-    """
-    best = last = found
-    for repeats in range(1, 1 + _REPEATS):
-        value, slope = model.to_physical(last.theta)
-        sd = np.sqrt(np.diag(last.covariance))
-        try:
-            again = run_from([(value, _AROUND * slope * sd, 1.0)], settings)
-        except MotionLost:
-            break
-        again = replace(
-            again, restarts=found.restarts, repeats=repeats, first=found.first or found.passes
-        )
-        if np.all(np.abs(again.theta - last.theta) < sd):
-            return again
-        best, last = likelier(best, again), again
-    return best
+def _doubts(nis: float) -> tuple[str, ...]:
+    """Say whether the noise levels speak against the filter."""
+    if _SOUND_NIS[0] < nis < _SOUND_NIS[1]:
+        return ()
+    return (
+        f"its normalised innovations squared are {nis:.2g} on average, 1 where its noise levels"
+        " are right",
+    )

@@ -38,10 +38,6 @@ _COARSE = 300.0
 _LARGEST_NIS = 10.0
 """Mean normalised innovation squared from which on the filter is taken to have lost the motion."""
 
-_AS_LIKELY = 30.0
-"""Difference of log-likelihoods up to which two runs are as likely: so much the width of a start
-costs a run, a few for each parameter, and rounding may decide between them."""
-
 STRETCH_S = 0.05
 """Innovations are averaged over this long: from sample to sample the counts of an encoder are no
 noise, and what a model lacks acts at the pace of a hand."""
@@ -288,16 +284,12 @@ def run_filter(
     report_progress: Callable[[int, int], None],
     lost_error: Callable[[str, int], MotionLost],
     axes: Sequence[str],
-    agrees: Callable[[FilterRun], bool] = lambda found: True,
-    rivals: int = 1,
 ) -> FilterRun:
     """Converge on the first trial, then filter all trials; the first attempt that holds counts.
 
     A filter that trusts its model far from the truth does not find back. The first trial is
     filtered with much process noise, which adds next to no information, and filtered again at
-    the end in its own right. Where the model is nonlinear in its parameters, a filter can
-    follow the motion with wrong parameters: then the likeliest of several attempts counts, the
-    first of those that are as likely.
+    the end in its own right.
 
     Args:
         model, trials, settings: as `filter_trials` takes them.
@@ -306,8 +298,6 @@ def run_filter(
         report_progress: called with the number of trials done and the index of the next.
         lost_error: makes the error from what happened and the index of the trial.
         axes: names of the readings, for messages.
-        agrees: whether an attempt that follows the motion is where other evidence has it.
-        rivals: with so many that follow and do not agree, the likeliest of them counts.
 
     Raises:
         MotionLost: no attempt followed the motion.
@@ -316,8 +306,6 @@ def run_filter(
     order = (*range(1, len(trials)), 0)
     failure: tuple[int, FilterFailure] | None = None
     found: FilterRun | None = None
-    kept: FilterRun | None = None
-    following = 0
     for restarts, (value, sd, factor) in enumerate(attempts):
         mean, spread = model.to_estimated(value, sd)
         level = replace(settings, noise_sd=factor * settings.noise_sd)
@@ -346,14 +334,7 @@ def run_filter(
             theta, covariance, level, order, restarts,
         )  # fmt: skip
         if not _is_lost(passes[-1]):
-            if agrees(found):
-                return found
-            kept = found if kept is None else likelier(kept, found)
-            following += 1
-            if following == rivals:
-                break
-    if kept is not None:
-        return kept
+            return found
     if found is not None:
         raise _not_followed_error(found, lost_error, axes)
     if failure is None:
@@ -363,11 +344,6 @@ def run_filter(
     raise lost_error(
         f"the filter lost the motion of trial {{}} at {t:.2f} s: {error.reason}", place
     )
-
-
-def likelier(one: FilterRun, other: FilterRun) -> FilterRun:
-    """Return the other run where it is likelier by more than starts and rounding, else the one."""
-    return other if other.log_likelihood > one.log_likelihood + _AS_LIKELY else one
 
 
 def _is_lost(one: Pass) -> bool:

@@ -20,6 +20,7 @@ from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.estimate.closed_loop import simulate_controlled
 from bampipe.estimate.simulation import simulate
+from bampipe.identification.drift import why_not_free
 from bampipe.physics import System
 from bampipe.physics.control_law import ControlLaw, compile_law
 from bampipe.physics.device import INPUT_ORDERS, derivative
@@ -68,6 +69,9 @@ def free_runs(
         Errors in closed loop, else in open loop; only a ``reason`` where no free run is possible
         or meaningful.
     """
+    why_not = why_not_free(system, motions, parameters)
+    if why_not and not system.model.device.prescribed:
+        return FreeRun(reason=why_not)
     law = compile_law(system.model.device)
     reason = "the device file declares no [controller]"
     if law is not None:

@@ -58,7 +58,6 @@ def assess_identifiability(
     problem: Problem,
     p: Array,
     noise: Noise,
-    at_bound: NDArray[np.bool_],
 ) -> tuple[IdentifiabilityReport, Array]:
     """Say what sensor noise alone leaves open about the parameters at ``p``.
 
@@ -67,7 +66,6 @@ def assess_identifiability(
             the inputs last where it is estimated.
         p: (n_p + 1,) estimates, the timing last.
         noise: of the sensors.
-        at_bound: (n_parameters,) which estimates lie at the limit of their range.
 
     Returns:
         The report, and the covariance (n_parameters, n_parameters) that their priors leave where
@@ -132,7 +130,6 @@ def assess_identifiability(
             *(_together(group.members, group.combinations) for group in known.together),
             *(_moving(w, names, value, covariance) for w in parted),
             *_unsaid([names[i] for i in separable], sd[separable], assumed[separable]),
-            *_limits([names[i] for i in estimated], at_bound),
             *_idle(trials),
             *_leaning(numbers),
         ),
@@ -299,14 +296,6 @@ def _unsaid(names: Sequence[str], sd: Array, prior: Array) -> list[str]:
         "assumed before."
         for name, bound_sd, assumed in zip(names, sd, prior, strict=True)
         if not bound_sd < _LITTLE * assumed
-    ]
-
-
-def _limits(names: Sequence[str], at_bound: NDArray[np.bool_]) -> list[str]:
-    return [
-        f"`{name}` lies at the limit of its range: its interval is no guide."
-        for name, there in zip(names, at_bound, strict=True)
-        if there
     ]
 
 

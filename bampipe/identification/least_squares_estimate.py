@@ -1,80 +1,333 @@
-"""Least squares on the inverse dynamics, freed of the bias that filtered motions give it."""
+"""Least squares on the inverse dynamics under the likelihood by which models are judged.
+
+Weights of samples, the bias of filters and of friction that stops, and the timing of the inputs
+are those of `bampipe.trials.likelihood`: what is a nuisance there is one here.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.least_squares import fit
-from bampipe.estimate.normal_equations import NormalEquations
-from bampipe.identification.estimates import Estimate, estimate_of_fit, trace_row
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.session import Fit, Session
+from bampipe.errors import InputError
+from bampipe.estimate.bounded import invert_scaled
+from bampipe.estimate.influence import RemovedStretch, find_worst_stretch
+from bampipe.estimate.least_squares import BLOCKS_A_PARAMETER, Problem, covariance_by_blocks
+from bampipe.estimate.simulation import Runaway
+from bampipe.identification.estimates import Estimate, filtered_states, input_timing
 from bampipe.physics import System
-from bampipe.trials.bias import UnbiasedFit
-from bampipe.trials.folds import Folds
+from bampipe.physics.recipe import Recipe
+from bampipe.results.identify import Convergence, StateBound
+from bampipe.trials.evidence import gather_evidence
+from bampipe.trials.likelihood import (
+    hold_parameters,
+    lay_out_samples,
+    solve_bounded,
+    take_samples,
+)
+from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import problem_of
 
 Array = NDArray[np.float64]
 
+_REPLICATES = 6
+_PASSES = 3
+"""Most fits of a model that is nonlinear in its parameters, each with replicates of the last."""
+_SETTLED = 0.3
+"""Standard deviations by which such a fit moves at most."""
 _FARTHEST = 3.0
 """Standard deviations that a nonlinear fit moves at most where a trial is left out."""
+_PERIODS = 10
+"""Periods of the band in the shortest block that is taken as independent of the next."""
+_STRETCH_S = 1.0
+_STATES = 500_000
+"""Samples, spread over all, that the typical uncertainty of a state is taken from."""
 
 
-def estimate_by_least_squares(
-    system: System, motions: Sequence[Motion], squares: UnbiasedFit, folds: Folds
-) -> Estimate:
-    """Return the least-squares estimate; its trace is the fit to the trials so far."""
-    problem, raw = squares.problem, squares.raw
-    unbiased = replace(raw, covariance=squares.covariance)
-    shift = 0.0 if squares.bias is None else squares.bias
+@dataclass(frozen=True)
+class SquaresFit:
+    """A model fitted to trials under the likelihood.
 
-    def rows() -> list[dict[str, object]]:
-        trace: list[dict[str, object]] = []
-        clock = 0.0
-        for number, motion in enumerate(motions):
-            clock += float(motion.t[-1])
-            so_far = fit(problem, raw.p, trials=range(number + 1))
-            row = trace_row(system, problem, so_far, shift)
-            trace.append({"t_total": clock, "trial_id": motion.trial_id, **row})
-        return trace
-
-    residual_sd = dict(zip(system.coordinates, raw.residual_sd, strict=True))
-    return estimate_of_fit(
-        "least-squares", system, motions, problem, unbiased, squares.p,
-        _leave_out(squares, folds), bias_details(squares), rows, residual_sd=residual_sd,
-    )  # fmt: skip
-
-
-def _leave_out(squares: UnbiasedFit, folds: Folds) -> list[Array]:
-    """Return the parameters (n_p + 1,) without the trials that each is left out with.
-
-    A step of Gauss and Newton from the fit to all, no longer than a few standard deviations where
-    the model is nonlinear: farther away the slopes are others.
+    Attributes:
+        fit: the fit; trials: fitted; problem: their inverse dynamics, for other estimators.
+        replayed: whether the model could be replayed; else its samples weigh alike.
+        p: (n_p + 1,) parameters, the timing of the inputs last, s, from what ``trials`` have.
+        block_s: longest of the blocks of time that are taken as independent, s.
     """
-    raw, problem = squares.raw, squares.problem
-    free = problem.free
-    lower, upper = problem.lower - raw.p[free], problem.upper - raw.p[free]
-    if not problem.linear:
-        sd = np.sqrt(np.diag(raw.covariance))
-        lower, upper = np.maximum(lower, -_FARTHEST * sd), np.minimum(upper, _FARTHEST * sd)
-    stacked = raw.measured
-    sums = NormalEquations.from_samples(
-        [s.slope for s in stacked], [s.residual for s in stacked], [s.used for s in stacked],
-        problem.precision, problem.known - raw.p[free],
-    )  # fmt: skip
-    weight = 1.0 / np.maximum(raw.residual_sd, 1e-150) ** 2
-    found = []
-    for step in folds.solve(sums, weight, lower, upper):
-        p = squares.p.copy()
-        p[free] = np.clip(p[free] + step, problem.lower, problem.upper)
-        found.append(p)
+
+    fit: Fit
+    trials: MeasuredTrials
+    problem: Problem
+    replayed: bool
+    p: Array
+    block_s: float
+
+    @property
+    def free(self) -> NDArray[np.int64]:
+        """(n,) places in ``p`` of what is estimated, the timing last where it is."""
+        return self.problem.free
+
+    @property
+    def at_bound(self) -> NDArray[np.bool_]:
+        """(n,) which of them lie at the limit of their range."""
+        value, slack = self.p[self.free], 1e-9 * (self.problem.upper - self.problem.lower)
+        slack = np.where(np.isfinite(slack), slack, 0.0)
+        low, high = self.problem.lower + slack, self.problem.upper - slack
+        return np.asarray((value <= low) | (value >= high))
+
+    @cached_property
+    def rows(self) -> tuple[tuple[Array, Array], ...]:
+        """By axis: slopes (n, P) by the determined unknowns, what is left (n,); both weighted."""
+        pose, solved = self.fit.problem, self.fit.solved
+        found = []
+        for y, x in zip(pose.y, pose.base, strict=True):
+            left = y + x @ solved.base
+            scale = max(float(np.sqrt(np.mean(left**2))), 1e-300) if left.size else 1.0
+            found.append((x / scale, left / scale))
+        return tuple(found)
+
+    @cached_property
+    def weights(self) -> tuple[Array, ...]:
+        """By axis: what a residual in N.m or N is multiplied by in `rows`, (n,)."""
+        scale = [
+            np.sqrt(np.mean((y + x @ self.fit.solved.base) ** 2)) if y.size else 1.0
+            for y, x in zip(self.fit.problem.y, self.fit.problem.base, strict=True)
+        ]
+        pairs = zip(self.fit.likelihood.root, scale, strict=True)
+        return tuple(root / max(float(s), 1e-300) for root, s in pairs)
+
+    @cached_property
+    def normal(self) -> Array:
+        """Normal equations by the determined unknowns, priors among them, (P, P)."""
+        products = sum(x.T @ x for x, _ in self.rows)
+        return np.asarray(products + self.fit.problem.precision)
+
+    @cached_property
+    def information(self) -> Array:
+        """The same by the free parameters, then the nuisance parameters, (m, m)."""
+        back = np.linalg.pinv(self.fit.problem.to_parameters)
+        return np.asarray(back.T @ self.normal @ back)
+
+    def respond(self, changes: Sequence[Array], held: Iterable[int] = ()) -> Array:
+        """How far the parameters (n,) follow changes of what was measured, to first order.
+
+        Args:
+            changes: of the residual, by axis, each (n,), N.m or N.
+            held: places of parameters that stay, nuisance parameters behind the others.
+        """
+        score = sum(
+            x.T @ (w * c) for (x, _), w, c in zip(self.rows, self.weights, changes, strict=True)
+        )
+        to, count = self.fit.problem.to_parameters, self.free.size
+        _, chosen = hold_parameters(to, dict.fromkeys(held, 0.0), to.shape[1])
+        step = chosen @ invert_scaled(chosen.T @ self.normal @ chosen) @ (chosen.T @ score)
+        return np.asarray(-(to @ step)[:count])
+
+    def residual_change(self, residual: Sequence[Array]) -> list[Array]:
+        """What unfiltered residuals (T, n_q) of the trials add to its own, by axis, each (n,)."""
+        evidence, samples = self.fit.evidence, self.fit.likelihood.samples
+        thin = evidence.band.thin_trials(residual, range(len(samples)))
+        change = [there - here for there, here in zip(thin, evidence.residual, strict=True)]
+        return [take_samples(change, here, axis) for axis, here in enumerate(samples)]
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(n, n) by the scatter of blocks of time; see `covariance_by_blocks`."""
+        pose = self.fit.problem
+        inverse = invert_scaled(self.normal)
+        fitted = float(np.trace(inverse @ (self.normal - pose.precision)))
+        samples = lay_out_samples(self.fit.evidence, self._block_length(fitted))
+        found = covariance_by_blocks(
+            self.rows, pose.precision, [s.block for s in samples], [s.independent for s in samples]
+        )
+        to = pose.to_parameters[: self.free.size]
+        return np.asarray(to @ found @ to.T)
+
+    def _block_length(self, fitted: float) -> float:
+        """Length of blocks, s: shorter where there are fewer than three a parameter."""
+        band = self.trials.band
+        seconds = sum(self.fit.evidence.sizes) / band.rate_hz
+        least = _PERIODS / min(band.cutoff_hz)
+        return min(self.block_s, max(seconds / (BLOCKS_A_PARAMETER * max(fitted, 1.0)), least))
+
+    @cached_property
+    def sd(self) -> Array:
+        """(n,) standard deviations."""
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
+
+    def refit(self, kept: Sequence[NDArray[np.bool_]]) -> Array:
+        """Parameters (n_p + 1,) by some of the samples, to first order within the bounds.
+
+        Args:
+            kept: which samples, by axis, each (n,).
+        """
+        pose, count = self.fit.problem, self.free.size
+        lower, upper = pose.lower.copy(), pose.upper.copy()
+        if not self.problem.linear:
+            step = (pose.to_parameters @ self.fit.solved.base)[:count]
+            reach = _FARTHEST * np.maximum(self.sd, 1e-300)
+            lower[:count] = np.maximum(lower[:count], step - reach)
+            upper[:count] = np.minimum(upper[:count], step + reach)
+        rows = [(b[k], y[k]) for b, y, k in zip(pose.base, pose.y, kept, strict=True)]
+        found = solve_bounded(
+            replace(pose, lower=lower, upper=upper),
+            np.array([b.T @ b for b, _ in rows]),
+            np.array([b.T @ y for b, y in rows]),
+            np.array([max(float(y @ y), 1e-300) for _, y in rows]),
+            weight=self.fit.solved.weight,
+        )
+        moved = pose.to_parameters @ (found.base - self.fit.solved.base)
+        p = self.p.copy()
+        p[self.free] = np.clip(p[self.free] + moved[:count], self.problem.lower, self.problem.upper)
+        return p
+
+    @cached_property
+    def held_out(self) -> list[Array]:
+        """By trial, (n_p + 1,) the parameters without the trials that it is left out with."""
+        groups = np.array(self.trials.folds.groups)
+        if self.trials.folds.nothing_held_out:
+            return [self.p] * len(groups)
+        samples = self.fit.likelihood.samples
+        found = {
+            group: self.refit([groups[here.trial] != group for here in samples])
+            for group in np.unique(groups)
+        }
+        return [found[group] for group in groups]
+
+    def find_worst_second(self) -> RemovedStretch:
+        """The second of a trial without which some parameter would move most."""
+        evidence = self.fit.evidence
+        samples = lay_out_samples(evidence, _STRETCH_S)
+        to = self.fit.problem.to_parameters[: self.free.size] @ invert_scaled(self.normal)
+        steps = [(x @ to.T, left) for x, left in self.rows]
+        band, sizes = evidence.band, [len(r) for r in evidence.residual]
+        first = np.concatenate([[0], np.cumsum(sizes)])
+        places: dict[int, tuple[int, float]] = {}
+        for here in samples:
+            for block, trial in set(zip(here.block.tolist(), here.trial.tolist(), strict=True)):
+                row = int(here.rows[np.argmax(here.block == block)]) - int(first[trial])
+                second = np.floor(row * band.step / band.rate_hz / _STRETCH_S) * _STRETCH_S
+                places[block] = min(
+                    places.get(block, (trial, np.inf)), (trial, float(band.margin_s + second))
+                )
+        return find_worst_stretch(steps, [here.block for here in samples], places, self.sd)
+
+    @property
+    def bias(self) -> Array:
+        """What filters and friction that stops would move the parameters by, (n,), if left in."""
+        unknowns = self.fit.problem.to_parameters.shape[0]
+        factors = range(unknowns - 2 * len(self.rows), unknowns)
+        return self.respond(self.fit.bias, factors)
+
+
+def fit_squares(
+    trials: MeasuredTrials,
+    recipe: Recipe,
+    system: System,
+    start: Array,
+    block_s: float,
+) -> SquaresFit:
+    """Fit a model under the likelihood.
+
+    Args:
+        trials: to be fitted, whose `timing` says how late inputs may be.
+        recipe, system: the model; start: (n_p,) parameters to start from.
+        block_s: as of `SquaresFit`.
+
+    Raises:
+        ValueError: fewer samples are clear of standstill than there are parameters.
+    """
+    session = Session(trials, Criteria(replicates=_REPLICATES))
+    plain = gather_evidence(
+        system, trials.motions, trials.band, start, trials.folds, most_iterations=30
+    )
+    problem = problem_of(system, trials.motions, trials.band, timing=trials.timed)
+    at, found = plain.p, None
+    with suppress(Runaway):
+        for _ in range(1 if problem.linear else _PASSES):
+            again = _with_values(session.fit(recipe, at), trials, problem, block_s)
+            settled = found is not None and _is_settled(found, again)
+            found, at = again, again.fit.evidence.p
+            if settled:
+                break
+    if found is None:
+        alike = session.fit_plainly(recipe, plain.p)
+        found = replace(_with_values(alike, trials, problem, block_s), replayed=False)
     return found
 
 
-def bias_details(squares: UnbiasedFit) -> list[dict[str, float]]:
-    """Return, for each free parameter, the bias that was taken off."""
-    if squares.bias is None:
-        return [{} for _ in squares.problem.free]
-    return [{"least_squares_bias": bias} for bias in squares.bias]
+def _is_settled(one: SquaresFit, other: SquaresFit) -> bool:
+    moved = np.abs(other.p - one.p)[other.free]
+    return bool(np.all(moved <= _SETTLED * np.maximum(other.sd, 1e-300)))
+
+
+def _with_values(fit: Fit, trials: MeasuredTrials, problem: Problem, block_s: float) -> SquaresFit:
+    """The fit with its parameters, the last small step of its linear problem among them."""
+    change = (fit.problem.to_parameters @ fit.solved.base)[: problem.free.size]
+    p = np.append(fit.evidence.p, 0.0)
+    p[problem.free] = np.clip(p[problem.free] + change, problem.lower, problem.upper)
+    return SquaresFit(fit, trials, problem, True, p, block_s)
+
+
+def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
+    """Return the least-squares estimate; its trace is the fit to the trials so far."""
+    motions: Sequence[Motion] = squares.trials.motions
+    count = int(np.sum(squares.free < len(system.parameters)))
+    stride = -(-sum(squares.fit.evidence.sizes) // _STATES)
+    bound = 3.0 * np.median(np.concatenate([m.qd_sd[::stride] for m in motions]), axis=0)
+
+    def trace() -> list[Mapping[str, object]]:
+        rows: list[Mapping[str, object]] = []
+        clock = 0.0
+        for number, motion in enumerate(motions):
+            clock += float(motion.t[-1])
+            kept = [here.trial <= number for here in squares.fit.likelihood.samples]
+            p = squares.refit(kept)
+            share = sum(int(k.sum()) for k in kept) / max(sum(k.size for k in kept), 1)
+            row: dict[str, object] = {"t_total": clock, "trial_id": motion.trial_id}
+            for k, place in enumerate(squares.free[:count]):
+                name = system.parameters[place].name
+                sd = squares.sd[k] / np.sqrt(share) if share else system.parameters[place].sd
+                row |= {name: p[place], f"{name}_sd": sd}
+            rows.append(row)
+        return rows
+
+    residual = squares.fit.evidence.rmse()
+    return Estimate(
+        method="least-squares",
+        p=squares.p,
+        problem=squares.problem,
+        covariance=squares.covariance[:count, :count],
+        at_bound=squares.at_bound[:count],
+        held_out=squares.held_out,
+        details=[{"least_squares_bias": bias} for bias in squares.bias[:count]],
+        report={
+            "input_timing": input_timing(squares.p, squares.problem, squares.covariance),
+            "convergence": Convergence(converged=True),
+            "state_3sigma": {
+                axis: StateBound(velocity=bound[i]) for i, axis in enumerate(system.coordinates)
+            },
+            "residual_sd": dict(zip(system.coordinates, residual, strict=True)),
+        },
+        tabulate=lambda: filtered_states(system, motions, squares.p[:-1], trace()),
+    )
+
+
+def require_enough(squares: SquaresFit, where: str) -> None:
+    """Raise :class:`InputError` where fewer than two independent samples a number would count."""
+    moving = int(sum(here.independent for here in squares.fit.likelihood.samples))
+    if moving < 2 * squares.free.size:
+        raise InputError(
+            f"of the free trials, {moving} independent samples are clear of standstill, fewer than"
+            f" twice the {squares.free.size} numbers to be found",
+            where=where,
+            remedy="record faster motion at a higher rate, or more of it",
+        )

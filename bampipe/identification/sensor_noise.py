@@ -136,8 +136,7 @@ def tune_noise(
     model: FilterModel,
     records: Sequence[Trial],
     clear: Sequence[NDArray[np.bool_]],
-    value: Array,
-    sd: Array,
+    near: tuple[Array, Array],
     noise: Noise,
     choice: FilterChoice,
 ) -> FilterSettings:
@@ -151,13 +150,14 @@ def tune_noise(
         settings: with the levels to start from.
         model: the filter's; records: the beginnings of trials.
         clear: (T,) of each, its samples at which no axis reverses; all count where none is clear.
-        value: (nt,) parameters near the answer, physical; sd: (nt,) how well they are known.
+        near: (nt,) parameters near the answer, physical, and (nt,) how well they are known.
         noise: of the sensors.
         choice: fixes levels that are not to be found.
     """
     quick = replace(settings, longest_step=max(settings.longest_step, _TUNING_STEP_S))
     counts = np.concatenate(clear)
     counts = counts if counts.any() else np.ones(counts.size, dtype=bool)
+    value, sd = near
     spread = np.maximum(sd, 1e-6 * np.abs(value))
     mean, sd = model.to_estimated(value, np.maximum(spread, np.finfo(float).tiny))
 

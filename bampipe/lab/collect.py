@@ -1,4 +1,4 @@
-"""Collect the runs of a lab: tables, trends and a report, from whatever has been run."""
+"""Collect the runs of a lab: tables, trends and a report, from all stages that have run."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from urllib.parse import quote
 from bampipe.data import lab_tables
 from bampipe.errors import InputError
 from bampipe.files import atomic_writer, refuse_links, write_text
-from bampipe.lab import rows, trends
+from bampipe.lab import rows
 from bampipe.lab.folders import LOCK, is_foreign, run_folders
+from bampipe.lab.trends import build_trends
 from bampipe.progress import Progress, silent
 from bampipe.results.lab import LabResult, TrendsResult
 from bampipe.run.lock import hold
@@ -24,11 +25,11 @@ _EARLIEST = datetime.min.replace(tzinfo=UTC)
 
 @dataclass(frozen=True)
 class Lab:
-    """What was collected.
+    """A lab's folder, and its content.
 
     Attributes:
         folder: the lab's folder.
-        content: what ``trends.json`` holds.
+        content: of ``trends.json``.
         sessions: ids of the sessions, in the order of recording.
         skipped: one line on each run folder that could not be read.
         tables: number of rows of each table.
@@ -64,7 +65,7 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
     for number, root in enumerate(roots):
         progress(0.6 * number / len(roots), root.name)
         try:
-            found.append(rows.of_run(root))
+            found.append(rows.read_run(root))
         except InputError as error:
             skipped.append(f"{root.name}: {error}")
     if not found:
@@ -74,18 +75,17 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         name: [row for one in found for row in one.tables.get(name, ())]
         for name in lab_tables.TABLES
     }
-    charts = trends.series(tables)
-    content = trends.build_trends(charts, trends.judge_sessions(tables, charts))
+    content = build_trends(tables)
     if is_foreign(folder):
         raise InputError(
             "holds other files", where=str(folder), remedy="choose another folder with --out"
         )
-    with _alone(folder):
+    with _lock(folder):
         counts = lab_tables.write(folder, tables)
         content.write(folder)
         if report:
             progress(0.7, "report")
-            _report(folder, _pages(folder, roots))
+            _write_report(folder, _find_pages(folder, roots))
         sessions = tuple(str(one.key["session_id"]) for one in found)
         LabResult(
             schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
@@ -93,8 +93,8 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
     return Lab(folder, content, sessions, tuple(skipped), counts)
 
 
-def _pages(folder: Path, roots: Sequence[Path]) -> dict[str, str]:
-    """Return the folders of the sessions' reports as seen from the lab's."""
+def _find_pages(folder: Path, roots: Sequence[Path]) -> dict[str, str]:
+    """Return the folders of the sessions' reports, relative to the lab's."""
     reports = {root.name: root.resolve() / "report" for root in roots}
     return {
         name: quote(os.path.relpath(report, folder.resolve()).replace(os.sep, "/"))
@@ -103,11 +103,11 @@ def _pages(folder: Path, roots: Sequence[Path]) -> dict[str, str]:
     }
 
 
-def _report(folder: Path, pages: Mapping[str, str]) -> None:
+def _write_report(folder: Path, pages: Mapping[str, str]) -> None:
     # matplotlib is slow to import: only here
-    from bampipe.report.lab import build
+    from bampipe.report.lab import build_report
 
-    made = build(folder, pages)
+    made = build_report(folder, pages)
     with atomic_writer(folder / "report.pdf") as stream:
         stream.write(made.pdf)
     write_text(folder / "report.html", made.html)
@@ -119,7 +119,7 @@ def _report(folder: Path, pages: Mapping[str, str]) -> None:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _lock(folder: Path) -> Iterator[None]:
     """Hold the lab's folder: two collections at once take turns."""
     with ExitStack() as stack:
         try:

@@ -1,12 +1,12 @@
 """Control charts of estimates that each come with a standard deviation of their own.
 
 An individuals chart (Shewhart) whose scatter is estimated from moving ranges, after which a slow
-drift or a step between two levels hardly widens the limits. The moving range holds both the
+drift or a step between two values hardly widens the limits. The moving range holds both the
 scatter between sessions, tau, and the uncertainty within each, s_i; limits of session i are
 
     centre +/- factor(n) * sqrt(tau^2 + s_i^2),    tau^2 = max(0, sigma_MR^2 - median(s^2)),
 
-so that a session known only roughly is given its room. sigma_MR is the median moving range over
+so that a session known only roughly has wider limits. sigma_MR is the median moving range over
 0.954 (Montgomery, Introduction to Statistical Quality Control, section 6.4; the median is that of
 Clifford 1959): up to a quarter of the sessions may be off without hiding one another.
 """
@@ -74,15 +74,15 @@ class Chart:
         return self.slope_p < FALSE_ALARM
 
 
-def factor(sessions: int) -> float:
-    """Return the half width of the limits in standard deviations, for so many sessions."""
+def find_factor(sessions: int) -> float:
+    """Return half the width of the limits in standard deviations, for so many sessions."""
     counts, values = zip(*_FACTORS, strict=True)
     if sessions > counts[-1]:
         return float(3.0 + (values[-1] - 3.0) * counts[-1] / sessions)
     return float(np.interp(sessions, counts, values))
 
 
-def chart(estimates: Sequence[float] | Array, sds: Sequence[float] | Array) -> Chart:
+def make_chart(estimates: Sequence[float] | Array, sds: Sequence[float] | Array) -> Chart:
     """Return the control chart of ``estimates``.
 
     Args:
@@ -97,15 +97,15 @@ def chart(estimates: Sequence[float] | Array, sds: Sequence[float] | Array) -> C
         return Chart(centre, float("nan"), unknown, unknown, np.zeros(n, bool), None, 0.0, 1.0)
     sigma = float(np.median(np.abs(np.diff(x)))) / MEDIAN_RANGE
     between = float(np.sqrt(max(0.0, sigma**2 - float(np.median(s**2)))))
-    half = factor(n) * np.sqrt(between**2 + s**2)
+    half = find_factor(n) * np.sqrt(between**2 + s**2)
     outside_limits = np.abs(x - centre) > half
-    slope, chance = _trend(x)
+    slope, chance = _find_trend(x)
     return Chart(
-        centre, between, centre - half, centre + half, outside_limits, _run(x), slope, chance
+        centre, between, centre - half, centre + half, outside_limits, _find_run(x), slope, chance
     )
 
 
-def _run(x: Array) -> tuple[int, int] | None:
+def _find_run(x: Array) -> tuple[int, int] | None:
     """Return the longest run of RUN_LENGTH or more on one side of the median."""
     side = np.sign(x - np.median(x))
     best: tuple[int, int] | None = None
@@ -119,7 +119,7 @@ def _run(x: Array) -> tuple[int, int] | None:
     return best
 
 
-def _trend(x: Array) -> tuple[float, float]:
+def _find_trend(x: Array) -> tuple[float, float]:
     from scipy.stats import kendalltau, theilslopes
 
     order = np.arange(len(x), dtype=float)

@@ -12,7 +12,7 @@ from bampipe.data import lab_tables, store
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.files import refuse_links
-from bampipe.results import phrases
+from bampipe.phrases import diagnosis as phrases
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
@@ -23,7 +23,7 @@ from bampipe.run import models, record
 
 _OF_SESSION = ("ingest/session.json", "ingest/trials.parquet", "stiffness/stiffness.json")
 _OF_MODELS = ("identify.json", "validate.json", "diagnose.json")
-"""What is read of a run, and of each of its models."""
+"""Files that are read of a run, and of each of its models."""
 
 
 @dataclass
@@ -31,7 +31,7 @@ class SessionRows:
     """Rows of one session, by table.
 
     Attributes:
-        key: what every row begins with: session_id, recorded_at, device.
+        key: the first columns of every row: session_id, recorded_at, device.
         tables: rows by table.
     """
 
@@ -43,8 +43,8 @@ class SessionRows:
         self.tables.setdefault(table, []).append({**self.key, **columns})
 
 
-def of_run(root: Path) -> SessionRows:
-    """Return the rows of the run folder ``root``: of whatever stages have run.
+def read_run(root: Path) -> SessionRows:
+    """Return the rows of the run folder ``root``, of all stages that have run.
 
     Raises:
         InputError: ingest has not run, or a result is damaged or was changed since it was written.
@@ -66,22 +66,18 @@ def of_run(root: Path) -> SessionRows:
     rows = SessionRows({"session_id": root.name, "device": session.device, "recorded_at": recorded})
     nis: Mapping[str, float] = {}
     for model in made:
-        found = _model(run, rows, model, tuple(session.axes))
+        found = _add_model(run, rows, model, tuple(session.axes))
         nis = nis or found
-    _trials(run, rows, nis)
+    _add_trials(run, rows, nis)
     if run.exists(StiffnessResult.FILE):
         for axis, entry in run.read(StiffnessResult).axes.items():
-            rows.add(
-                "stiffness",
-                axis=axis,
-                **entry.model_dump(),
-                **_interval(entry.stiffness, entry.sd),
-            )
-    _session(root, rows, session, made)
+            interval = _make_interval(entry.stiffness, entry.sd)
+            rows.add("stiffness", axis=axis, **entry.model_dump(), **interval)
+    _add_session(root, rows, session, made)
     return rows
 
 
-def _model(
+def _add_model(
     run: RunFolder, rows: SessionRows, model: str, axes: tuple[str, ...]
 ) -> Mapping[str, float]:
     """Add the rows of one model; return its consistency (NIS) by trial."""
@@ -100,7 +96,7 @@ def _model(
                 axis=axis,
                 method=identified.method,
                 **found.model_dump(),
-                **_interval(found.estimate, found.sd),
+                **_make_interval(found.estimate, found.sd),
             )
     if run.exists(ValidateResult.file(model)):
         for axis, error in run.read(ValidateResult, model).axes.items():
@@ -110,7 +106,7 @@ def _model(
         diagnosis = run.read(DiagnoseResult, model)
         for axis, said in diagnosis.axes.items():
             plain = said.model_dump(mode="json") | {
-                "named": phrases.missing(diagnosis, axis),
+                "named": phrases.missing_effects(diagnosis, axis),
                 "likely": said.likely,
                 "probabilities": [said.probabilities[name] for name in said.likely],
             }
@@ -118,7 +114,7 @@ def _model(
     return nis
 
 
-def _trials(run: RunFolder, rows: SessionRows, nis: Mapping[str, float]) -> None:
+def _add_trials(run: RunFolder, rows: SessionRows, nis: Mapping[str, float]) -> None:
     if not run.exists("ingest/trials.parquet"):
         return
     frame = store.read_parquet(run.path("ingest/trials.parquet"))
@@ -129,11 +125,13 @@ def _trials(run: RunFolder, rows: SessionRows, nis: Mapping[str, float]) -> None
             n_samples=int(trial["n_samples"]),
             nis=nis.get(str(trial["trial_id"])),
             **{name: str(trial[name]) for name in ("kind", "status", "reason", "repairs")},
-            **{name: _finite(trial[name]) for name in ("duration_s", "sample_rate_hz")},
+            **{name: _drop_infinite(trial[name]) for name in ("duration_s", "sample_rate_hz")},
         )
 
 
-def _session(root: Path, rows: SessionRows, session: IngestResult, made: tuple[str, ...]) -> None:
+def _add_session(
+    root: Path, rows: SessionRows, session: IngestResult, made: tuple[str, ...]
+) -> None:
     run_record = record.read(root)
     states = [trial["status"] for trial in rows.tables.get("quality", ())]
     verdicts = [gate.state for gate in run_record.gates]
@@ -155,10 +153,10 @@ def _session(root: Path, rows: SessionRows, session: IngestResult, made: tuple[s
     )
 
 
-def _finite(value: float) -> float | None:
+def _drop_infinite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _interval(value: float, sd: float) -> dict[str, float]:
+def _make_interval(value: float, sd: float) -> dict[str, float]:
     """Return the 95 % interval of an estimate."""
     return {"lower": value - NORMAL_95 * sd, "upper": value + NORMAL_95 * sd}

@@ -43,13 +43,8 @@ class Report:
             if isinstance(block, Figure)
         }
         titles = tuple(section.title for section in document.sections)
-        return cls(
-            typeset.pdf(document, recorded),
-            page.page(document, "explore.html" if explorer else ""),
-            explorer,
-            figures,
-            titles,
-        )
+        html = page.page(document, "explore.html" if explorer else "")
+        return cls(typeset.pdf(document, recorded), html, explorer, figures, titles)
 
 
 def build(results: Results, progress: Callable[[float, str], None]) -> Report:
@@ -66,75 +61,60 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
     for number, name in enumerate(SECTIONS):
         progress(0.7 * number / len(SECTIONS), name)
         module = importlib.import_module(f"bampipe.report.sections.{name}")
-        with style.look():
+        with style.use_style():
             section: Section | None = module.section(results)
         if section is not None:
             sections.append(section)
-    sections[0] = replace(sections[0], blocks=(*_warnings(results), *sections[0].blocks))
-    document = Document(
-        f"Session {results.session.session_id}", _subtitle(results), tuple(sections)
-    )
+    sections[0] = replace(sections[0], blocks=(*_list_warnings(results), *sections[0].blocks))
+    title = f"Session {results.session.session_id}"
+    document = Document(title, _make_subtitle(results), tuple(sections))
     progress(0.7, "page for exploring")
     explorer = explorer_page(results, document.subtitle)
     progress(0.85, "typesetting")
-    return Report.of(document, _recorded(results), explorer)
+    return Report.of(document, _count_seconds(_read_moment(results)), explorer)
 
 
-def _warnings(results: Results) -> tuple[Block, ...]:
-    """Return what must be known before anything else is read."""
-    return (*_setup(results), *_outdated(results))
-
-
-def _setup(results: Results) -> tuple[Block, ...]:
-    setup = results.read(SetupResult)
-    if setup is None:
-        return ()
+def _list_warnings(results: Results) -> tuple[Block, ...]:
+    """Return the mistakes of the set-up, and which results are outdated."""
     blocks: list[Block] = []
-    for mistake in setup.mistakes:
+    setup = results.read(SetupResult)
+    for mistake in setup.mistakes if setup else ():
         text = f"Set right, {mistake.evidence}."
         if mistake.alternatives:
             others = "; ".join(other.sentence for other in mistake.alternatives)
             text += f" The trials cannot tell it from: {others}."
         text += " Nothing below counts before the session file is corrected."
         blocks.append(Callout("attention", f"Set-up: {mistake.sentence}", text))
-    if setup.warnings:
+    if setup and setup.warnings:
         text = " ".join(f"{line}." for line in setup.warnings)
         blocks.append(Callout("note", "Doubtful set-up", text))
+    if results.outdated:
+        steps = ", ".join(f"`{step}`" for step in results.outdated)
+        text = f"Run these again before relying on their results: {steps}."
+        title = "Some results are older than what they were made from"
+        blocks.append(Callout("attention", title, text))
     return tuple(blocks)
 
 
-def _outdated(results: Results) -> tuple[Block, ...]:
-    if not results.outdated:
-        return ()
-    steps = ", ".join(f"`{step}`" for step in results.outdated)
-    text = f"Run these again before relying on what they say: {steps}."
-    return (Callout("attention", "Some results are older than what they were made from", text),)
-
-
-def _subtitle(results: Results) -> str:
-    session = results.session
-    serial = f" {session.device_serial}" if session.device_serial else ""
+def _make_subtitle(results: Results) -> str:
+    session, when = results.session, _read_moment(results)
     parts = ["simulated"] if session.simulated else []
-    parts.append(f"device {session.device}{serial}")
-    recorded = results.session.recorded_at
-    if recorded:
-        when = datetime.datetime.fromisoformat(recorded)
-        parts.append(f"recorded {when:%Y-%m-%d %H:%M}{' UTC' if _is_utc(when) else ''}")
+    parts.append(f"device {session.device} {session.device_serial}".rstrip())
+    if when:
+        is_utc = when.utcoffset() == datetime.timedelta(0)
+        parts.append(f"recorded {when:%Y-%m-%d %H:%M}{' UTC' if is_utc else ''}")
     if session.operator:
         parts.append(f"by {session.operator}")
     return ", ".join(parts)
 
 
-def _is_utc(when: datetime.datetime) -> bool:
-    return when.utcoffset() == datetime.timedelta(0)
-
-
-def _recorded(results: Results) -> int:
-    """Return when the session was recorded, in seconds since 1970; 0 where that is not known."""
+def _read_moment(results: Results) -> datetime.datetime | None:
     recorded = results.session.recorded_at
-    if not recorded:
+    return datetime.datetime.fromisoformat(recorded) if recorded else None
+
+
+def _count_seconds(when: datetime.datetime | None) -> int:
+    """Return a moment in seconds since 1970; 0 where it is not known."""
+    if when is None:
         return 0
-    when = datetime.datetime.fromisoformat(recorded)
-    if when.tzinfo is None:
-        when = when.replace(tzinfo=datetime.UTC)
-    return max(0, int(when.timestamp()))
+    return max(0, int((when if when.tzinfo else when.replace(tzinfo=datetime.UTC)).timestamp()))

@@ -7,10 +7,11 @@ a page of our own, ``[words](../s01/report/report.html)``.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from bampipe.report.wording import prose
+from bampipe.report.wording import format_prose
 
 Span = tuple[Literal["plain", "strong", "code", "link"], str]
 """Kind and text; of a link its words and its target, with a line break between."""
@@ -21,22 +22,25 @@ _MARK = re.compile(
 )
 
 
+_COLUMN = re.compile(r"(?P<right>>?)(?P<title>.*?)(?: ~(?P<width>[\d.]+))?", re.DOTALL)
+
+
 def spans(text: str) -> list[Span]:
     """Split ``text`` at its inline marks, in order."""
     found: list[Span] = []
     end = 0
     for match in _MARK.finditer(text):
         if match.start() > end:
-            found.append(("plain", prose(text[end : match.start()])))
+            found.append(("plain", format_prose(text[end : match.start()])))
         if match["strong"] is not None:
-            found.append(("strong", prose(match["strong"])))
+            found.append(("strong", format_prose(match["strong"])))
         elif match["code"] is not None:
             found.append(("code", match["code"]))
         else:
             found.append(("link", f"{match['words']}\n{match['page']}"))
         end = match.end()
     if end < len(text):
-        found.append(("plain", prose(text[end:])))
+        found.append(("plain", format_prose(text[end:])))
     return found
 
 
@@ -90,35 +94,46 @@ class Callout:
 
 
 @dataclass(frozen=True)
+class Column:
+    """A column of a table: its title with unit, its side, and its relative width or 0."""
+
+    title: str
+    side: Literal["l", "r"]
+    width: float
+
+
+@dataclass(frozen=True)
 class Table:
     """A table.
 
     Attributes:
         caption: what it shows.
-        head: title of each column, units included.
+        columns: titles, units included, joined by `` | ``. ``>`` before a title stands for a
+            column of numbers; ``~2`` after it is the relative width of a column whose text wraps.
         rows: the cells, formatted.
-        align: one letter a column: "l" text, "r" numbers, "c" centred.
-        widths: relative widths of columns whose text may wrap; 0 for as wide as needed.
         note: a sentence below, or "".
     """
 
     caption: str
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    align: str
-    widths: tuple[float, ...] = ()
+    columns: str
+    rows: Sequence[tuple[str, ...]]
     note: str = ""
 
-    def without_empty_columns(self) -> Table:
-        """Return it without the columns in which no row has anything to say."""
-        full = [k for k in range(len(self.head)) if any(row[k] for row in self.rows)]
-        return replace(
-            self,
-            head=tuple(self.head[k] for k in full),
-            rows=tuple(tuple(row[k] for k in full) for row in self.rows),
-            align="".join(self.align[k] for k in full),
-            widths=tuple(self.widths[k] for k in full) if self.widths else (),
-        )
+    def read_columns(self) -> list[Column]:
+        """Return the columns."""
+        found = map(_COLUMN.fullmatch, self.columns.split(" | "))
+        return [
+            Column(one["title"], "r" if one["right"] else "l", float(one["width"] or 0.0))
+            for one in found
+            if one
+        ]
+
+    def drop_empty_columns(self) -> Table:
+        """Return the table without the columns that are empty in every row."""
+        titles = self.columns.split(" | ")
+        full = [k for k in range(len(titles)) if any(row[k] for row in self.rows)]
+        rows = tuple(tuple(row[k] for k in full) for row in self.rows)
+        return replace(self, columns=" | ".join(titles[k] for k in full), rows=rows)
 
 
 @dataclass(frozen=True)
@@ -167,3 +182,16 @@ class Document:
     subtitle: str
     sections: tuple[Section, ...]
     scale: float = 1.0
+
+
+def number_blocks(document: Document) -> Iterator[tuple[Section, list[tuple[Block, str]]]]:
+    """Yield each section with its blocks, each with ``Figure 3`` or ``Table 2``, else ""."""
+    counts = {Figure: 0, Table: 0}
+    for section in document.sections:
+        blocks: list[tuple[Block, str]] = []
+        for block in section.blocks:
+            kind = type(block)
+            if kind in counts:
+                counts[kind] += 1
+            blocks.append((block, f"{kind.__name__} {counts[kind]}" if kind in counts else ""))
+        yield section, blocks

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from string import Template
 
@@ -18,9 +19,9 @@ from bampipe.report.document import (
     Paragraph,
     Subheading,
     Table,
+    number_blocks,
     spans,
 )
-from bampipe.report.typeset import next_number, numbering
 
 _TEMPLATE = Path(__file__).parent / "templates" / "page.html"
 _TAGS = {"strong": "strong", "code": "code"}
@@ -33,14 +34,13 @@ def page(document: Document, beside: str = "") -> str:
         document: what to show.
         beside: name of the page for exploring in the same folder, which the contents then link.
     """
-    numbers = numbering()
     contents, body = [], []
     if beside:
         contents.append(f'<li><a href="{beside}"><strong>Explore the data</strong></a></li>')
-    for section in document.sections:
+    for section, numbered in number_blocks(document):
         anchor = re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")
         contents.append(f'<li><a href="#{anchor}">{html.escape(section.title)}</a></li>')
-        blocks = "\n".join(_block(block, next_number(numbers, block)) for block in section.blocks)
+        blocks = "\n".join(_block(*pair) for pair in numbered)
         body.append(
             f'<section aria-labelledby="{anchor}">\n'
             f'<h2 id="{anchor}">{html.escape(section.title)}</h2>\n{blocks}\n</section>'
@@ -92,28 +92,24 @@ def _block(block: Block, number: str) -> str:
 
 
 def _table(table: Table, number: str) -> str:
+    columns = table.read_columns()
     head = "".join(
-        f'<th scope="col" class="{side}">{_rich(cell)}</th>'
-        for side, cell in zip(table.align, table.head, strict=True)
+        f'<th scope="col" class="{column.side}">{_rich(column.title)}</th>' for column in columns
     )
-    widths = table.widths or (0.0,) * len(table.head)
-    looks = [
-        side if width else f"{side} whole" for side, width in zip(table.align, widths, strict=True)
-    ]
-    rows = "\n".join(
-        "<tr>"
-        + "".join(
-            f'<td class="{look}">{_rich(cell, breaking=True)}</td>'
-            for look, cell in zip(looks, row, strict=True)
-        )
-        + "</tr>"
-        for row in table.rows
-    )
+    looks = [column.side if column.width else f"{column.side} whole" for column in columns]
+    rows = "\n".join(f"<tr>{_cells(looks, row)}</tr>" for row in table.rows)
     note = f'<p class="remark">{_rich(table.note)}</p>' if table.note else ""
     return (
         f'<div class="scroll"><table><caption class="caption"><strong>{number}</strong> '
         f"{_rich(table.caption)}</caption><thead><tr>{head}</tr></thead>\n"
         f"<tbody>{rows}</tbody></table></div>{note}"
+    )
+
+
+def _cells(looks: Sequence[str], row: Sequence[str]) -> str:
+    return "".join(
+        f'<td class="{look}">{_rich(cell, breaking=True)}</td>'
+        for look, cell in zip(looks, row, strict=True)
     )
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bampipe.report import typeset, wording
+from bampipe.report import typeset
 from bampipe.report.document import Block, Bullets, Document, Paragraph, Section, Table
-from bampipe.report.sections.next_trial import confusion_table, sd_table
+from bampipe.report.sections.next_trial import tabulate_confusion, tabulate_sds
+from bampipe.report.wording import format_decimals
 from bampipe.results.next import Plan, PlannedSd
 
 _BY_HAND = "Tare the force sensor with the hand off the handle."
@@ -20,8 +21,7 @@ _AFTER = (
     "Then run the session again.",
 )
 _VERSIONS = ((1.0, 100), (0.9, 30), (0.9, 12), (0.8, 12), (0.8, 6), (0.7, 3))
-"""Scale of the type, and how many parameters are listed: the first that fits on a page is printed.
-What to do goes before what it is expected to give."""
+"""Scale of the type, and number of parameters listed: the first that fits on a page is printed."""
 
 
 def protocol_sheet(plan: Plan, session: str, model: str, by_hand: bool) -> bytes:
@@ -41,16 +41,16 @@ def _sheet(plan: Plan, session: str, model: str, by_hand: bool, listed: int) -> 
     """The sheet with at most so many parameters ``listed``."""
     blocks: list[Block] = [Paragraph(plan.sentence)]
     if plan.trials:
-        rows = tuple(
+        rows = [
             (f"{trial.times} times" if trial.times > 1 else "once", trial.sentence, "")
             for trial in plan.trials
-        )
-        blocks.append(Table("Trials", ("", "What to do", "Files"), rows, "lll", (0.0, 4.0, 1.0)))
+        ]
+        blocks.append(Table("Trials", " | Motion ~4 | Files ~1", rows))
     if plan.sd:
-        blocks.append(_uncertainties(plan, model, listed))
+        blocks.append(_tabulate_uncertainties(plan, model, listed))
     if plan.confusion:
-        heads = ("Effects", "now", "expected")
-        blocks.append(confusion_table("Chance of confusion", heads, plan.confusion))
+        title = "Probability of confusion"
+        blocks.append(tabulate_confusion(title, ">now | >expected", plan.confusion))
     before = (_BY_HAND if by_hand else _BY_DRIVE, *_BEFORE)
     sections = [Section("The trials", tuple(blocks))]
     if plan.trials:
@@ -61,23 +61,23 @@ def _sheet(plan: Plan, session: str, model: str, by_hand: bool, listed: int) -> 
         sections = [first, *sections, last]
     return Document(
         f"Trials to record: {session}",
-        f"Model {model}, {wording.plain(plan.seconds, 0)} s in all",
+        f"Model {model}, {format_decimals(plan.seconds, 0)} s in all",
         tuple(sections),
     )
 
 
-def _uncertainties(plan: Plan, model: str, listed: int) -> Table:
-    """Standard deviations of the parameters that stay farthest from what is asked."""
+def _tabulate_uncertainties(plan: Plan, model: str, listed: int) -> Table:
+    """Tabulate the standard deviations farthest above the limit that is asked."""
 
     def left(entry: PlannedSd) -> float:
         return entry.after / entry.asked if entry.asked > 0.0 else 0.0
 
     far = set(sorted(plan.sd, key=lambda name: -left(plan.sd[name]))[:listed])
-    table = sd_table("Standard deviations", {n: e for n, e in plan.sd.items() if n in far})
+    table = tabulate_sds("Standard deviations", {n: e for n, e in plan.sd.items() if n in far})
     if len(far) == len(plan.sd):
         return table
     rest = (
-        f"Of {len(plan.sd)} parameters, those farthest from what is asked;"
-        f" models/{model}/next.json has them all."
+        f"Of {len(plan.sd)} parameters, those farthest above the limit asked;"
+        f" models/{model}/next.json lists all."
     )
     return replace(table, note=f"{rest} {table.note}".rstrip())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +13,7 @@ import pandas as pd
 from bampipe.declarations.model import read_model_file
 from bampipe.errors import InputError, MissingResultError
 from bampipe.files import read_json_table, read_toml
+from bampipe.lists import join_names
 from bampipe.report.document import Paragraph, Section
 from bampipe.results.compare import CompareResult
 from bampipe.results.ingest import IngestResult
@@ -63,10 +64,7 @@ class Results:
         return self._json[relative]
 
     def table(
-        self,
-        relative: str,
-        columns: Sequence[str] | None = None,
-        trial: str | None = None,
+        self, relative: str, columns: Sequence[str] | None = None, trial: str | None = None
     ) -> pd.DataFrame | None:
         """Return a Parquet file, or the rows of one trial; None where there is no such file.
 
@@ -78,17 +76,11 @@ class Results:
             return None
         filters = [("trial_id", "==", trial)] if trial is not None else None
         try:
-            return pd.read_parquet(
-                path,
-                columns=None if columns is None else list(columns),
-                filters=filters,
-            )
+            chosen = None if columns is None else list(columns)
+            return pd.read_parquet(path, columns=chosen, filters=filters)
         except (OSError, ValueError) as error:
-            raise InputError(
-                "not a sound Parquet file",
-                where=str(path),
-                remedy="make it again (--force)",
-            ) from error
+            remedy = "make it again (--force)"
+            raise InputError("not a sound Parquet file", where=str(path), remedy=remedy) from error
 
     def columns(self, relative: str) -> tuple[str, ...]:
         """Return the names of the columns of a Parquet file; none where there is no file."""
@@ -117,7 +109,7 @@ class Results:
 
     @cached_property
     def session(self) -> IngestResult:
-        """What ingest says of the session.
+        """The result of ingest.
 
         Raises:
             InputError: ingest has not run.
@@ -165,7 +157,7 @@ class Results:
 
     @property
     def pusher(self) -> str:
-        """What the measured force is that of: ``hand``, ``motor``, or else ``input``."""
+        """The source of the measured force: ``hand``, ``motor``, or else ``input``."""
         if self.session.driven:
             return "motor"
         return "hand" if self.session.brakes else "input"
@@ -173,6 +165,10 @@ class Results:
     def is_rotary(self, axis: str) -> bool:
         """Return whether ``axis`` turns."""
         return self.unit(axis) == "rad"
+
+    def name_force(self, axis: str) -> str:
+        """Return ``torque`` for an axis that turns, else ``force``."""
+        return "torque" if self.is_rotary(axis) else "force"
 
     @cached_property
     def models(self) -> tuple[str, ...]:
@@ -198,18 +194,25 @@ class Results:
         compared = self.read(CompareResult)
         return compared.best if compared and compared.best in self.models else "base"
 
-    def not_done(self, title: str, said: str, stage: str) -> Section:
-        """Return the section of what a stage would do, with the command that does it."""
+    def make_section(self, title: str, said: str, stage: str) -> Section:
+        """Return the section of a stage that has not run, with the command that runs it."""
         return Section(title, (Paragraph(f"{said}: `bampipe {stage} {self.root.name}` does it."),))
 
+    def state_next(self, advice: str) -> Paragraph:
+        """Return the paragraph on what to do next: a command for ``RUN``, or words."""
+        advice = advice.replace("RUN", self.root.name)
+        return Paragraph(
+            f"Next: `{advice}`" if advice.startswith("bampipe ") else f"Next: {advice}."
+        )
+
     @property
-    def diagnose(self) -> str:
+    def diagnose_command(self) -> str:
         """The command that diagnoses the model shown."""
         option = f" --model {self.model}" if len(self.models) > 1 else ""
         return f"bampipe diagnose {self.root.name}{option}"
 
     def require_model(self, name: str) -> str:
-        """Return ``name``.
+        """Return ``name`` of a model with results.
 
         Raises:
             InputError: that model has no results.
@@ -222,7 +225,11 @@ class Results:
             remedy=f"choose from {', '.join(self.models) or 'none: identify first'}",
         )
 
-    def in_order(self, parameters: Iterable[str]) -> tuple[str, ...]:
+    def order_axes(self, by_axis: Collection[str]) -> tuple[str, ...]:
+        """Return the axes in ``by_axis`` in the order of the session."""
+        return tuple(axis for axis in self.axes if axis in by_axis)
+
+    def order_parameters(self, parameters: Iterable[str]) -> tuple[str, ...]:
         """Return names of parameters: those of every axis first, axis by axis, effects last."""
         kinds = ("viscous", "coulomb")
 
@@ -243,13 +250,18 @@ class Results:
         path = self.root / "models" / model / "model.toml"
         return read_model_file(path).effects if path.is_file() else ()
 
+    def list_effects(self) -> str:
+        """Return " with ..." and the effects of the model shown; "" where it has none."""
+        names = join_names(f"`{name}`" for name in self.effects(self.model))
+        return f" with {names}" if names else ""
+
     @cached_property
     def paper(self) -> dict[str, Any] | None:
-        """What the device's paper published, or None where there is none for this device."""
+        """The numbers that the device's paper published, or None for a device without one."""
         path = Path(__file__).parent / "templates" / f"paper-{self.session.device}.toml"
         return read_toml(path) if path.is_file() else None
 
-    def in_paper(self, item: str) -> str:
+    def cite_paper(self, item: str) -> str:
         """Return " (the paper's <item>)" where the device has a paper, else ""."""
         return f" (the paper's {item})" if self.paper else ""
 

@@ -14,11 +14,13 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from bampipe.report import wording
+from bampipe.report import document
+from bampipe.report.wording import choose_scale, format_unit
 
 INK = "#1c2024"
 FAINT = "#b4b8bd"
@@ -100,13 +102,13 @@ _SETTINGS: dict[str, Any] = {
 }
 
 
-def look() -> AbstractContextManager[None]:
+def use_style() -> AbstractContextManager[None]:
     """Return the context in which figures are drawn: nothing of a user's own settings counts."""
     settings: dict[Any, Any] = {**mpl.rcParamsDefault, **_SETTINGS, "backend": "svg"}
     return mpl.rc_context(settings)
 
 
-def panels(
+def make_panels(
     rows: int,
     columns: int,
     height: float,
@@ -131,15 +133,47 @@ def panels(
     return figure, axes
 
 
-def beside(rows: int, height: float) -> tuple[Figure, list[Axes]]:
+def make_grid(
+    count: int, columns: int, row_height: float, *, extra: float = 0.35, column_width: float = 0.0
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure of ``count`` panels in rows of at most ``columns``, and the panels in order.
+
+    Args:
+        row_height: of each row, inches; extra: added to the height for a legend below.
+        column_width: of each column, inches; the whole text width if 0.
+    """
+    columns = min(columns, count)
+    rows = -(-count // columns)
+    width = min(WIDTH, 1.0 + column_width * columns) if column_width else WIDTH
+    figure, axes = make_panels(rows, columns, extra + row_height * rows, width=width)
+    for unused in axes.flat[count:]:
+        unused.set_axis_off()
+    return figure, list(axes.flat[:count])
+
+
+def split_figure(rows: int, height: float) -> tuple[Figure, list[Axes]]:
     """Return a figure of one panel on the left and ``rows`` panels on the right, left one first."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
-    grid = figure.add_gridspec(rows, 2, width_ratios=(1.0, 1.7))
-    left = figure.add_subplot(grid[:, 0])
-    return figure, [left, *(figure.add_subplot(grid[row, 1]) for row in range(rows))]
+    cells = figure.add_gridspec(rows, 2, width_ratios=(1.0, 1.7))
+    left = figure.add_subplot(cells[:, 0])
+    return figure, [left, *(figure.add_subplot(cells[row, 1]) for row in range(rows))]
 
 
-def svg(figure: Figure) -> str:
+def finish(
+    figure: Figure, name: str, caption: str, legend_from: Sequence[Axes] = ()
+) -> document.Figure:
+    """Return the block of a figure, with one legend of these panels below all of it."""
+    handles, names = [], []
+    for axes in legend_from:
+        more_handles, more_names = axes.get_legend_handles_labels()
+        handles += more_handles
+        names += more_names
+    if names:
+        _add_legend(figure, handles, names)
+    return document.Figure(name.replace(":", "."), caption, render_svg(figure))
+
+
+def render_svg(figure: Figure) -> str:
     """Return the figure as SVG: the same figure gives the same text."""
     _part_labels(figure)
     figure.set_layout_engine("none")  # it is laid out, which takes half of the drawing
@@ -171,12 +205,12 @@ def _touch(axes: Axes) -> bool:
     return any(b.x0 - a.x1 < between for a, b in pairwise(boxes))
 
 
-def label(quantity: str, unit: str, most: int = _LABEL) -> str:
-    """Return the label of an axis: quantity and unit, the latter as printed; long ones in lines."""
-    return lines(f"{quantity} ({unit})" if unit else quantity, most)
+def label_axis(quantity: str, unit: str, most: int = _LABEL) -> str:
+    """Return the label of an axis: quantity and unit as printed, in lines if it is long."""
+    return break_lines(f"{quantity} ({format_unit(unit)})" if unit else quantity, most)
 
 
-def lines(text: str, most: int) -> str:
+def break_lines(text: str, most: int) -> str:
     """Return ``text`` in lines of ``most`` letters, broken at spaces and behind underscores."""
     found = [""]
     for part in re.findall(r"[^ _]*[ _]|[^ _]+", text):
@@ -186,25 +220,32 @@ def lines(text: str, most: int) -> str:
     return "\n".join(line.rstrip() for line in found)
 
 
-def heading(name: str, columns: int) -> str:
+def break_heading(name: str, columns: int) -> str:
     """Return the name above a panel, one of ``columns`` beside each other, in lines that fit."""
-    return lines(name, round(_HEADING / columns))
+    return break_lines(name, round(_HEADING / columns))
 
 
-def pick(length: int, most: int) -> slice:
+def thin(length: int, most: int) -> slice:
     """Return every n-th sample, so that at most about ``most`` are drawn."""
     return slice(0, length, max(1, -(-length // most)))
 
 
-def series(
+def draw_series(
     axes: Axes, x: np.ndarray, y: np.ndarray, colour: str, name: str, **more: object
 ) -> None:
     """Draw a time series, thinned to what a printed line can show."""
-    keep = pick(len(x), 2000)
+    keep = thin(len(x), 2000)
     axes.plot(x[keep], y[keep], color=colour, label=name, **more)  # type: ignore[arg-type]
 
 
-def limits(axes: Axes, values: Sequence[np.ndarray], *, zero: bool = False) -> None:
+def mark_trials(axes: Axes, trace: pd.DataFrame, clock: str) -> None:
+    """Mark where each trial but the first starts in a trace, by its column of times."""
+    starts = trace.loc[trace["trial_id"].ne(trace["trial_id"].shift()), clock].to_numpy()
+    for start in starts[1:]:
+        axes.axvline(start, color=FAINT, lw=0.6, ls=(0, (1, 2)), zorder=0)
+
+
+def set_limits(axes: Axes, values: Sequence[np.ndarray], *, zero: bool = False) -> None:
     """Set the vertical range to hold all finite ``values`` with a margin, zero too if asked."""
     joined = np.concatenate([np.asarray(item, dtype=float).ravel() for item in values])
     joined = joined[np.isfinite(joined)]
@@ -217,7 +258,7 @@ def limits(axes: Axes, values: Sequence[np.ndarray], *, zero: bool = False) -> N
     axes.set_ylim(low if zero and low == 0.0 else low - margin, high + margin)
 
 
-def decades(axes: Axes, values: Sequence[float] | np.ndarray) -> None:
+def use_decades(axes: Axes, values: Sequence[float] | np.ndarray) -> None:
     """Make the vertical axis logarithmic: plain numbers over a few decades, none crowded.
 
     Args:
@@ -232,21 +273,15 @@ def decades(axes: Axes, values: Sequence[float] | np.ndarray) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def legend_below(figure: Figure, axes: Axes) -> None:
-    """Put one legend below all panels: nothing is covered."""
-    legend_of(figure, *axes.get_legend_handles_labels())
-
-
-def legend_of(figure: Figure, handles: list[Any], names: list[str]) -> None:
-    """Put a legend of these entries below all panels, in as many columns as the figure is wide."""
-    longest = max(map(len, names), default=0)
-    columns = int(figure.get_figwidth() / (_LETTER * longest + _HANDLE))
+def _add_legend(figure: Figure, handles: list[Any], names: list[str]) -> None:
+    """Put a legend below all panels, in as many columns as the figure is wide."""
+    columns = int(figure.get_figwidth() / (_LETTER * max(map(len, names)) + _HANDLE))
     columns = max(1, min(_MOST_LEGEND_COLUMNS, columns, len(names)))
     figure.legend(handles, names, loc="outside lower center", ncols=columns)
 
 
-def scaled(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
+def scale_values(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
     """Return the values and the unit with a prefix that suits them."""
     finite = values[np.isfinite(values)]
-    factor, shown = wording.scale([float(np.max(np.abs(finite)))] if finite.size else [], unit)
+    factor, shown = choose_scale([float(np.max(np.abs(finite)))] if finite.size else [], unit)
     return values * factor, shown

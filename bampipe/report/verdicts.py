@@ -1,16 +1,16 @@
-"""What a session's results amount to, in words: as stored by the stages, worst axis first."""
+"""The verdict on a session, from what the stages stored, worst axis first."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 from bampipe.lists import join_names
-from bampipe.report import wording
+from bampipe.phrases import diagnosis as phrases
+from bampipe.phrases.results import STANDINGS
 from bampipe.report.document import Callout
 from bampipe.report.results import Results
-from bampipe.results import phrases
+from bampipe.report.wording import count_noun, format_digits
 from bampipe.results.diagnose import DiagnoseResult
-from bampipe.results.standing import STANDINGS_IN_WORDS
 from bampipe.results.validate import ValidateResult
 
 _MOST_NAMED = 3
@@ -22,15 +22,11 @@ def error_over_floor(results: Results, model: str) -> dict[str, float] | None:
     validated = results.read(ValidateResult, model)
     if validated is None:
         return None
-    axes = validated.axes
-    return {
-        axis: axes[axis].held_out_rmse / floor
-        for axis in ordered(results, axes)
-        if (floor := axes[axis].noise_floor)
-    }
+    found = {axis: validated.axes[axis] for axis in results.order_axes(validated.axes)}
+    return {axis: e.held_out_rmse / e.noise_floor for axis, e in found.items() if e.noise_floor}
 
 
-def held_out_in_words(validated: ValidateResult) -> str:
+def describe_held_out(validated: ValidateResult) -> str:
     """Return which trials were held out, and from what."""
     names = [name for name, trial in validated.trials.items() if trial.held_out]
     if not names:
@@ -45,48 +41,44 @@ def held_out_in_words(validated: ValidateResult) -> str:
     return f"{trials} {join_names(names)}, which no parameter has seen"
 
 
-def ordered(results: Results, by_axis: Collection[str]) -> tuple[str, ...]:
-    """Return the axes in ``by_axis`` in the order of the session."""
-    return tuple(axis for axis in results.axes if axis in by_axis)
-
-
-def overall(results: Results) -> Callout:
+def judge_session(results: Results) -> Callout:
     """Return the verdict on the session: good where no check failed and nothing is outdated."""
     validated = results.read(ValidateResult, results.model)
+    failed = validated.failed_checks if validated else ()
     if validated is not None and validated.is_refused:
+        command = f"`bampipe identify {results.root.name} --method least-squares`"
         return Callout(
             "attention",
             "The published parameters are refused",
-            f"`bampipe identify {results.root.name} --method least-squares` takes another "
-            f"estimator.\n{_failures(validated.failed_checks)}",
+            f"{command} uses another estimator.\n{_list_failures(failed)}",
         )
-    found = _explained(results, validated)
-    failed = validated.failed_checks if validated else ()
+    found = _judge_model(results, validated)
     if found.tone == "good" and failed:
-        count = wording.count(len(failed), "check")
-        return Callout("attention", f"{found.title}, but {count} failed", _failures(failed))
+        title = f"{found.title}, but {count_noun(len(failed), 'check')} failed"
+        return Callout("attention", title, _list_failures(failed))
     if found.tone == "good" and results.outdated:
         return Callout("attention", f"{found.title}, but some results are outdated", found.text)
-    return Callout(found.tone, found.title, f"{found.text}\n{_failures(failed)}".rstrip())
+    return Callout(found.tone, found.title, f"{found.text}\n{_list_failures(failed)}".rstrip())
 
 
-def _failures(failed: Sequence[str]) -> str:
+def _list_failures(failed: Sequence[str]) -> str:
     """Return the checks that failed, a line each."""
-    sentences = (f"{one[:1].upper()}{one[1:]}".rstrip(".") for one in failed)
-    return "\n".join(f"{one}." for one in sentences)
+    return "\n".join(f"{one[:1].upper()}{one[1:]}".rstrip(".") + "." for one in failed)
 
 
-def _explained(results: Results, validated: ValidateResult | None) -> Callout:
-    if validated is not None and (wrong := _wrong_floors(results, validated)):
+def _judge_model(results: Results, validated: ValidateResult | None) -> Callout:
+    axes = validated.axes if validated else {}
+    wrong = [a for a in results.order_axes(axes) if axes[a].standing == "floor_implausible"]
+    if wrong:
         return Callout(
             "attention",
             f"No verdict on {join_names(wrong)}: the noise floor is wrong",
-            f"The held-out error is {join_names(f'{a}: {w}' for a, w in wrong.items())}. "
-            "Look at the noise and resolution of the sensors, under Data.",
+            f"The held-out error is {STANDINGS['floor_implausible']}."
+            " Check the noise and resolution of the sensors, under Data.",
         )
     diagnosis = results.read(DiagnoseResult)
     if diagnosis is not None:
-        return _diagnosed(results, diagnosis)
+        return _judge_diagnosis(results, diagnosis)
     if validated is None:
         done = "identified" if results.models else "read"
         return Callout(
@@ -99,59 +91,44 @@ def _explained(results: Results, validated: ValidateResult | None) -> Callout:
         return Callout(
             "note",
             "No held-out error",
-            "The parameters have seen every trial, or no noise floor could be found, so nothing "
-            "can be said about what the model would do on a new trial.",
+            "The parameters have seen every trial, or no noise floor could be computed, so that "
+            "the error of the model on a new trial is not known.",
         )
-    high = {a: r for a, r in ratios.items() if validated.axes[a].standing == "above_floor"}
+    high = {a: r for a, r in ratios.items() if axes[a].standing == "above_floor"}
+    parts = join_names(f"{a} {format_digits(r)} ×" for a, r in (high or ratios).items())
     if not high:
         return Callout(
             "good",
             "The model explains this session down to its noise floor",
             "On trials that the parameters never saw, the error is what sensor noise, quantisation "
-            f"and filtering alone would leave ({_ratios(ratios)}).",
+            f"and filtering alone would leave ({parts} the noise floor).",
         )
     return Callout(
         "attention",
         f"The model leaves something unexplained on {join_names(high)}",
-        f"Error on trials that the parameters never saw: {_ratios(high)}. "
-        f"`{results.diagnose}` says which effect is missing.",
+        f"Error on trials that the parameters never saw: {parts} the noise floor. "
+        f"`{results.diagnose_command}` finds which effect is missing.",
     )
 
 
-def _wrong_floors(results: Results, validated: ValidateResult) -> dict[str, str]:
-    """Axes whose noise floor is implausible, in words."""
-    return {
-        axis: STANDINGS_IN_WORDS[validated.axes[axis].standing]
-        for axis in ordered(results, validated.axes)
-        if validated.axes[axis].standing == "floor_implausible"
-    }
-
-
-def _ratios(ratios: dict[str, float]) -> str:
-    parts = (f"{axis} {wording.significant(ratio)} ×" for axis, ratio in ratios.items())
-    return f"{join_names(parts)} the noise floor"
-
-
-def _diagnosed(results: Results, diagnosis: DiagnoseResult) -> Callout:
-    axes = {axis: diagnosis.axes[axis] for axis in ordered(results, diagnosis.axes)}
-    effects = results.effects(results.model)
-    with_effects = f" with {join_names(f'`{name}`' for name in effects)}" if effects else ""
+def _judge_diagnosis(results: Results, diagnosis: DiagnoseResult) -> Callout:
+    axes = {axis: diagnosis.axes[axis] for axis in results.order_axes(diagnosis.axes)}
     sentence = "\n".join(entry.sentence for entry in axes.values())
+    model = f"The model{results.list_effects()}"
 
-    def found(verdict: str) -> list[str]:
-        return [axis for axis, entry in axes.items() if entry.verdict == verdict]
+    def find(verdict: str) -> dict[str, str]:
+        found = [axis for axis, entry in axes.items() if entry.verdict == verdict]
+        return {axis: phrases.missing_effects(diagnosis, axis, "`") for axis in found}
 
-    if lacking := found("missing"):
-        what = (f"{phrases.missing(diagnosis, axis, '`')} on {axis}" for axis in lacking)
-        title = f"The model{with_effects} lacks {'; '.join(what)}"
-        return Callout("attention", title, sentence)
-    if unknown := found("unknown_effect"):
+    if lacking := find("missing"):
+        parts = "; ".join(f"{words} on {axis}" for axis, words in lacking.items())
+        return Callout("attention", f"{model} lacks {parts}", sentence)
+    if unknown := find("unknown_effect"):
         title = f"Something that no known effect explains acts on {join_names(unknown)}"
         return Callout("unknown", title, sentence)
-    if unjudged := found("no_verdict"):
+    if unjudged := find("no_verdict"):
         return Callout("attention", f"No verdict on {join_names(unjudged)}", sentence)
-    if undecided := found("undecided"):
-        which = (f"{axis}: {phrases.missing(diagnosis, axis, '`')}" for axis in undecided)
-        return Callout("attention", f"Undecided on {'; '.join(which)}", sentence)
-    title = f"The model{with_effects} explains this session: nothing is missing"
-    return Callout("good", title, sentence)
+    if undecided := find("undecided"):
+        parts = "; ".join(f"{axis}: {words}" for axis, words in undecided.items())
+        return Callout("attention", f"Undecided on {parts}", sentence)
+    return Callout("good", f"{model} explains this session: nothing is missing", sentence)

@@ -8,8 +8,8 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from bampipe.results.floor import FloorStatus
 from bampipe.results.record import Names, Record, Result, Size
-from bampipe.results.standing import Standing
 from bampipe.results.validate import AxisDrift, FreeRunError
 
 NOTICEABLE = 0.01
@@ -25,7 +25,7 @@ class Rung(Record):
     effects: Names
     held_out_rmse: dict[str, Size]
     noise_floor: dict[str, Size | None] = Field(description="null where none was computed")
-    standing: dict[str, Standing]
+    standing: dict[str, FloorStatus]
     refused: Names = Field(
         default=(), description="Axes whose published parameters are refused: their error is none"
     )

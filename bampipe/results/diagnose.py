@@ -6,9 +6,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results import phrases
+from bampipe.results.floor import FloorStatus
 from bampipe.results.record import Names, Record, Result, Share, Size
-from bampipe.results.standing import Standing
 from bampipe.results.terms import EffectText
 from bampipe.schema import Count
 
@@ -34,7 +33,7 @@ class AxisVerdict(Record):
     )
     noise_floor: Size = Field(description="The error of replays of the final model")
     noise_floor_sd: Size
-    standing: Standing = Field(description="rmse_after against noise_floor")
+    standing: FloorStatus = Field(description="rmse_after against noise_floor")
     unit: str
     force_rms: Size = Field(description="Of the applied force, root mean square")
     explained: UpToOne = Field(
@@ -167,18 +166,6 @@ class DiagnoseResult(Result):
     worst_windows: tuple[WorstWindow, ...]
 
     @property
-    def limits(self) -> str:
-        """What the search left out, in a sentence; "" where it weighed the whole library."""
-        if not self.not_weighed:
-            return ""
-        return f"Not weighed (setting `without`): {', '.join(self.not_weighed)}."
-
-    @property
-    def verdicts_in_words(self) -> dict[str, str]:
-        """By axis, in a few words, with what is missing there."""
-        return {axis: phrases.verdict(self, axis) for axis in self.axes}
-
-    @property
     def lacking(self) -> Names:
         """Axes whose verdict is another one than that nothing is missing."""
         return tuple(a for a, entry in self.axes.items() if entry.verdict != "nothing_missing")
@@ -190,13 +177,6 @@ class DiagnoseResult(Result):
             here = tuple(name for name in known if name in one.effects)
             found[here] = found.get(here, 0.0) + one.probability
         return sorted(found.items(), key=lambda pair: -pair[1])
-
-    @property
-    def doubted(self) -> frozenset[str]:
-        """Effects that these trials do not decide on: not all probable sets hold them."""
-        open_axes = [axis for axis, e in self.axes.items() if e.verdict == "undecided"]
-        known = {n for axis in open_axes for n in phrases.split_sets(self, axis)[0]}
-        return frozenset(n for a in open_axes for n in self.axes[a].probabilities) - known
 
     @property
     def alternatives(self) -> dict[str, Names]:

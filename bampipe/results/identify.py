@@ -12,17 +12,6 @@ from bampipe.schema import Count
 Method = Literal["ukf", "least-squares", "output-error"]
 """How parameters are estimated."""
 
-LACKS_TIMING = (
-    "the model lacks something that shifts the force in time, such as a delay, a lag, a command"
-    " held from sample to sample or friction that builds up"
-)
-"""What a timing at its limit points to."""
-METHODS_IN_WORDS: dict[Method, str] = {
-    "ukf": "the unscented filter",
-    "least-squares": "least squares",
-    "output-error": "output error",
-}
-
 
 class ParameterEstimate(Record):
     """One parameter."""
@@ -121,12 +110,6 @@ class EffectEstimate(Record):
 
     identified: bool
     reasons: Names = Field(default=(), description="Why it does not count as identified")
-
-    def describe(self, name: str) -> str:
-        """Say that it does not count as identified, and why; "" where it does."""
-        if self.identified:
-            return ""
-        return f"`{name}` does not count as identified: {'; '.join(self.reasons)}."
 
 
 NEAR_LIMIT = 0.95

@@ -75,14 +75,6 @@ class MainsHum(Record):
     amplitude: Size = Field(description="Median over the trials")
     trials: int = Field(ge=1, description="How many trials had it")
 
-    @property
-    def sentence(self) -> str:
-        """Channel, amplitude and frequency in words."""
-        return (
-            f"{self.channel}: mains hum of {self.amplitude:.2g} {self.unit} at {self.hz:g} Hz"
-            f" taken off (trials with it: {self.trials})"
-        )
-
 
 class DeadStretch(Record):
     """Where a sensor reads one value while the machine moves, or is at the end of its range."""
@@ -91,13 +83,6 @@ class DeadStretch(Record):
     start_s: Size = Field(description="Since the start of the trial")
     end_s: Size
     rail: float | None = Field(default=None, description="That value, where the range ends with it")
-
-    @property
-    def sentence(self) -> str:
-        """What is the matter with which column."""
-        if self.rail is not None:
-            return f"'{self.column}' stands at a rail"
-        return f"'{self.column}' reads one and the same value while the machine moves"
 
 
 class IngestResult(Result):

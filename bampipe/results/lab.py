@@ -11,7 +11,7 @@ from bampipe.schema import Count
 
 
 class LabResult(Result):
-    """What the lab's data set was made of."""
+    """The sessions and tables of a lab's data set."""
 
     FILE: ClassVar[str] = "lab.json"
     STAGE: ClassVar[str] = "lab"
@@ -68,7 +68,7 @@ class MovedParameter(Record):
 
 
 class SessionVerdict(Record):
-    """What is said of one session."""
+    """The verdict on one session."""
 
     session: str
     device: str
@@ -97,8 +97,3 @@ class TrendsResult(Result):
     fewest_sessions: int = Field(ge=1, description="Fewer have no limits")
     series: tuple[ControlChart, ...]
     sessions: tuple[SessionVerdict, ...]
-
-    def verdict_in_words(self, session: SessionVerdict) -> str:
-        """Its verdict; where its device has no control limits yet, nothing is in control either."""
-        limited = any(c.has_limits for c in self.series if c.device == session.device)
-        return session.verdict if limited or session.verdict != "in control" else "no limits yet"

@@ -4,9 +4,40 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from bampipe.files import is_normal
 from bampipe.results.record import Names, Record, Result, Size
+from bampipe.schema import Declaration, Text, fault
+
+_PRIVATE, _OF_SESSION = ".bampipe", "session:"
+"""As in `bampipe.run.record`, which imports nothing heavy."""
+
+
+def is_result(name: object) -> bool:
+    """Whether ``name`` can be that of a result: normal, and none of the runner's own files."""
+    own = str(name).partition("/")[0].casefold() == _PRIVATE
+    return is_normal(name) and name != RunResult.FILE and not own
+
+
+def _result(name: str) -> str:
+    if not is_result(name):
+        raise fault(f"the name {name!r} is not that of a result")
+    return name
+
+
+def _input(name: str) -> str:
+    if not name.startswith(_OF_SESSION) and not is_normal(name):
+        raise fault(f"the name {name!r} leads out of the run folder")
+    return name
+
+
+def _published(name: str) -> str:
+    return name if name == RunResult.FILE else _result(name)
+
+
+ResultName = Annotated[str, AfterValidator(_result)]
+InputName = Annotated[str, AfterValidator(_input)]
 
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$", description="SHA-256")]
 InputDigest = Annotated[
@@ -40,9 +71,9 @@ class StepRecord(Record):
     key: Digest = Field(description="Hash of everything the step depends on")
     config: dict[str, Any] = Field(description="Every setting, defaults included")
     settings: dict[str, Any] = Field(description="Settings as given")
-    declared_inputs: Names
-    inputs: dict[str, InputDigest]
-    outputs: dict[str, Digest]
+    declared_inputs: tuple[InputName, ...]
+    inputs: dict[InputName, InputDigest]
+    outputs: dict[ResultName, Digest]
     code: Digest = Field(description="Of the sources that the stage uses")
     versions: dict[str, str]
     summary: dict[str, Any]
@@ -53,6 +84,15 @@ class Timing(Record):
 
     started_at: str
     seconds: Size
+
+
+class Commit(Record):
+    """What a step has made that is not yet in its place; ``remove``: what it no longer has."""
+
+    step: str
+    record: StepRecord
+    timing: Timing
+    remove: tuple[ResultName, ...]
 
 
 class GateVerdict(Record):
@@ -83,3 +123,12 @@ class RunResult(Result):
         default={}, description="Of Python, bampipe and what it rests on, at the last run"
     )
     gates: tuple[GateVerdict, ...] = ()
+
+
+class Published(Declaration):
+    """Which version of a published run counts, and the SHA-256 of each of its files."""
+
+    schema_: Literal["bampipe.published/1"] = Field(alias="schema")
+    session: Text
+    version: Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
+    files: dict[Annotated[str, AfterValidator(_published)], str]

@@ -66,12 +66,3 @@ class SetupResult(Result):
     warnings: Names = Field(description="What makes results doubtful without being a mistake")
     tested: Count = Field(description="Set-ups that were held against the one stated")
     axes: dict[str, AxisSetup] = Field(min_length=1)
-
-    @property
-    def lines(self) -> tuple[str, ...]:
-        """The mistakes, then the warnings, a line each."""
-        found = []
-        for mistake in self.mistakes:
-            either = "".join(f"; or {other.sentence}" for other in mistake.alternatives)
-            found.append(f"{mistake.sentence}{either} ({mistake.evidence})")
-        return (*found, *self.warnings)

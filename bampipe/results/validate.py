@@ -6,8 +6,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
+from bampipe.results.floor import FloorStatus
 from bampipe.results.record import Names, Record, Result, Size
-from bampipe.results.standing import Standing
 from bampipe.schema import Count, Positive
 
 
@@ -41,7 +41,7 @@ class JudgedError(AxisError):
         "null where none was computed"
     )
     noise_floor_sd: Size = Field(description="Scatter of one replay")
-    standing: Standing
+    standing: FloorStatus
     expected_ratio: Annotated[float, Field(ge=1)] = Field(
         default=1.0,
         description="published_rmse over held_out_rmse if the published parameters were true, from "

@@ -116,7 +116,7 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
 
 def doubts(run: RunFolder, model: str) -> list[str]:
     """Return what speaks against holding later sessions against ``model``, a line each."""
-    from bampipe.results.standing import STANDINGS_IN_WORDS
+    from bampipe.phrases.results import STANDINGS
     from bampipe.results.validate import ValidateResult
 
     if not run.exists(ValidateResult.file(model)):
@@ -126,6 +126,6 @@ def doubts(run: RunFolder, model: str) -> list[str]:
     for axis, error in found.axes.items():
         if error.standing == "above_floor" and error.noise_floor:
             ratio = error.held_out_rmse / error.noise_floor
-            words = STANDINGS_IN_WORDS[error.standing]
+            words = STANDINGS[error.standing]
             lines.append(f"{axis}: the error is {words}, {ratio:.2g} times: something is missing")
     return lines

@@ -23,6 +23,7 @@ from bampipe.files import (
     read_toml,
 )
 from bampipe.run.record import SESSION
+from bampipe.stages import base
 
 PACKAGES = (
     "h5py",
@@ -42,6 +43,7 @@ SHARED_CODE = (
     "physics",
     "estimate",
     "results",
+    "phrases",
     "data",
     "declarations",
     "trials",
@@ -51,9 +53,6 @@ SHARED_CODE = (
     "next_trial",
 )
 """Sub-packages that stages call, beside the single files; a change in one reruns every stage."""
-
-PRINTING = ("report", "next")
-"""Stages that call the report, too."""
 
 ABSENT = "absent"
 
@@ -174,7 +173,7 @@ def digest_code(stage: str) -> str:
     package = Path(bampipe.__file__).parent
     parts = [package / name for name in SHARED_CODE]
     parts += [*sorted(package.glob("*.py")), package / "stages/base.py"]
-    if stage in PRINTING:
+    if stage in base.PRINTING:
         parts.append(package / "report")
     spec = importlib.util.find_spec(f"bampipe.stages.{stage}")
     if spec is not None and spec.origin is not None:

@@ -16,10 +16,9 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bampipe.errors import InputError
 from bampipe.files import (
@@ -32,6 +31,9 @@ from bampipe.files import (
 )
 from bampipe.run import record
 from bampipe.run.session_name import is_name
+
+if TYPE_CHECKING:
+    from bampipe.results.run import Published
 
 SCHEMA = "bampipe.published/1"
 CURRENT = "current.json"
@@ -65,7 +67,7 @@ def publish(root: Path, url: str) -> str:
     here = f"{base}/{root.name}"
     with _driver("cannot be published", url):
         current = _current(system, here)
-        if current is not None and current["version"] == version:
+        if current is not None and current.version == version:
             return version
         for name, path in files.items():
             target = f"{here}/{version}/{name}"
@@ -119,7 +121,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
         current = _current(system, here)
         if current is None:
             raise InputError(f"no session {session!r} is published", where=url)
-        if root.exists() and _is_same(root, current["files"]):
+        if root.exists() and _is_same(root, current.files):
             return root
         if root.exists() and not force:
             raise InputError(
@@ -128,20 +130,19 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
                 remedy="fetch into another folder with --runs, or replace it with --force",
             )
         runs.mkdir(parents=True, exist_ok=True)
-        draft = Path(tempfile.mkdtemp(prefix=f".{session}.", dir=runs))
+        draft, old = (runs / f".{session}.{os.getpid()}.{word}" for word in ("new", "old"))
+        draft.mkdir()
         try:
-            for name, known in current["files"].items():
-                source, target = f"{here}/{current['version']}/{name}", draft / name
+            for name, known in current.files.items():
+                source, target = f"{here}/{current.version}/{name}", draft / name
                 if system.info(source)["type"] != "file":
                     raise InputError(f"{name} is not a file", where=f"{url}/{session}")
                 target.parent.mkdir(parents=True, exist_ok=True)
                 system.get_file(source, str(target))
                 if digest_file(target) != known:
                     raise InputError(f"{name} is not as it was published", where=f"{url}/{session}")
-            draft.chmod(0o777 & ~_umask())
             if root.exists():
-                old = Path(tempfile.mkdtemp(prefix=f".{session}.", dir=runs))
-                root.replace(old / session)
+                root.replace(old)
                 draft.replace(root)
                 shutil.rmtree(old)
             else:
@@ -184,29 +185,19 @@ def _driver(what: str, url: str) -> Iterator[None]:
         raise InputError(f"{what}: {_first_line(error)}", where=url) from error
 
 
-def _current(system: Any, here: str) -> dict[str, Any] | None:
+def _current(system: Any, here: str) -> Published | None:
+    from bampipe.results.run import Published
+    from bampipe.schema import read
+
+    place = f"{here}/{CURRENT}"
     try:
         system.invalidate_cache(here)
-        about = system.info(f"{here}/{CURRENT}")
+        about = system.info(place)
         if about["type"] != "file" or int(about["size"]) > LARGEST_JSON_BYTES:
-            raise InputError("not a file of this size", where=f"{here}/{CURRENT}")
-        content = parse_json(system.cat_file(f"{here}/{CURRENT}"), f"{here}/{CURRENT}")
+            raise InputError("not a file of this size", where=place)
+        return read(Published, parse_json(system.cat_file(place), place), place)
     except FileNotFoundError:
         return None
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        raise InputError("not a published run", where=f"{here}/{CURRENT}")
-    version, files = content.get("version"), content.get("files")
-    if (
-        not isinstance(version, str)
-        or not is_name(version)
-        or not isinstance(files, dict)
-        or not all(isinstance(known, str) for known in files.values())
-    ):
-        raise InputError("damaged", where=f"{here}/{CURRENT}", remedy="publish anew")
-    for name in files:
-        if name != record.FILE and not record.are_results([name]):
-            raise InputError(f"the name {name!r} is not that of a result", where=here)
-    return content
 
 
 def _size(system: Any, path: str) -> int | None:
@@ -221,12 +212,6 @@ def _is_same(root: Path, files: dict[str, str]) -> bool:
         (root / name).is_file() and digest_file(root / name) == known
         for name, known in files.items()
     )
-
-
-def _umask() -> int:
-    value = os.umask(0)
-    os.umask(value)
-    return value
 
 
 def _first_line(error: BaseException) -> str:

@@ -6,25 +6,23 @@ import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from bampipe.errors import InputError
 from bampipe.files import (
     STORAGE_FAULTS,
     digest_file,
     is_inside,
-    is_normal,
     json_text,
-    read_json_table,
     refuse_links,
 )
 from bampipe.run.events import Event, Listener, unheard
 from bampipe.run.lock import hold
 
 if TYPE_CHECKING:
-    from bampipe.results.run import RunResult, StepRecord
+    from bampipe.results.run import RunResult
 
-SCHEMA = "bampipe.run/1"
+SCHEMA: Final = "bampipe.run/1"
 FILE = "run.json"
 PRIVATE = ".bampipe"
 SESSION = "session:"
@@ -34,81 +32,25 @@ SESSION = "session:"
 def read(root: Path) -> RunResult:
     """Return what ``run.json`` in ``root`` says; of an empty run where there is none.
 
-    What is damaged counts as not there: its stages run again, and the file is rebuilt.
+    One that is damaged counts as not there: all stages run again, and the file is rebuilt.
     """
-    from bampipe.results.run import RunResult, Timing
+    from bampipe.results.run import RunResult
 
-    found = _content(root) or {}
-    by_name: dict[str, Callable[[object], object]] = {
-        "stages": sound_step,
-        "timings": lambda value: _sound(Timing, value),
-        "failures": lambda value: _sound(str, value),
-    }
-    sound: dict[str, Any] = {"schema": SCHEMA, "stages": {}}
-    for name, field in RunResult.model_fields.items():
-        value = found.get(name)
-        if name in by_name:
-            entries = value.items() if isinstance(value, dict) else ()
-            checked = {key: by_name[name](entry) for key, entry in entries}
-            sound[name] = {key: entry for key, entry in checked.items() if entry is not None}
-        elif value is not None and (checked := _sound(field.annotation, value)) is not None:
-            sound[name] = checked
-    return RunResult(**sound)
+    return _sound(root) or RunResult(schema=SCHEMA, stages={})
 
 
 def is_damaged(root: Path) -> bool:
     """Whether there is a ``run.json`` in ``root`` that is damaged."""
-    if not (root / FILE).exists():
-        return False
-    found = _content(root)
-    return found is None or found.get("stages", {}).keys() != read(root).stages.keys()
+    return (root / FILE).exists() and _sound(root) is None
 
 
-def _content(root: Path) -> dict[str, Any] | None:
+def _sound(root: Path) -> RunResult | None:
+    from bampipe.results.run import RunResult
+
     try:
-        content = read_json_table(root / FILE)
+        return RunResult.read(root / FILE)
     except InputError:
         return None
-    if content.get("schema") != SCHEMA:
-        return None
-    return content if isinstance(content.get("stages"), dict) else None
-
-
-def _sound(kind: Any, value: object) -> Any:
-    """Return ``value`` as a ``kind``; None where it is none."""
-    from pydantic import TypeAdapter, ValidationError
-
-    try:
-        return TypeAdapter(kind).validate_python(value)
-    except ValidationError:
-        return None
-
-
-def is_timing(value: object) -> bool:
-    """Whether ``value`` says when a step ran, and for how long."""
-    from bampipe.results.run import Timing
-
-    return _sound(Timing, value) is not None
-
-
-def sound_step(value: object) -> StepRecord | None:
-    """Return the record of a step; None where it is none, or names what leads out of the run."""
-    from bampipe.results.run import StepRecord
-
-    made: StepRecord | None = _sound(StepRecord, value)
-    if made is None:
-        return None
-    inputs = [name for name in made.inputs if not name.startswith(SESSION)]
-    normal = all(is_normal(name) for name in (*inputs, *made.declared_inputs))
-    return made if normal and are_results(made.outputs) else None
-
-
-def are_results(names: Iterable[object]) -> bool:
-    """Whether all ``names`` can be those of results: normal, and none of the runner's own files."""
-    return all(
-        is_normal(name) and name != FILE and str(name).partition("/")[0].casefold() != PRIVATE
-        for name in names
-    )
 
 
 def require_untouched(root: Path, names: Iterable[str]) -> None:

@@ -8,7 +8,7 @@ import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from bampipe import compile_ahead
+from bampipe.compile_ahead import compiling_ahead
 from bampipe.errors import InputError, MissingResultError, NothingToDoError
 from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, unheard
@@ -31,11 +31,10 @@ class _Runner:
         self.root = request.root
 
     def execute(self, step: Step, reason: str) -> StepResult:
-        from bampipe.results.run import StepRecord, Timing
+        from bampipe.results.run import Commit, StepRecord, Timing
 
         name = self.root.name
         self.listen(Event(name, step.name, "start", 0.0, "" if reason == FIRST_TIME else reason))
-        compile_ahead.begin()
         started = datetime.now(UTC)
         clock = time.perf_counter()
         state = self.state
@@ -66,8 +65,10 @@ class _Runner:
         )
         seconds = time.perf_counter() - clock
         timing = Timing(started_at=started.isoformat(timespec="seconds"), seconds=round(seconds, 3))
-        staging.seal(out, step, made, timing, sorted(previous.keys() - written.keys()))
-        staging.commit(state, out)
+        remove = tuple(sorted(previous.keys() - written.keys()))
+        sealed = Commit(step=step.name, record=made, timing=timing, remove=remove)
+        staging.seal(out, sealed)
+        staging.commit(state, out, sealed)
         self.listen(Event(name, step.name, "done", 1.0))
         return StepResult(step.name, "done", reason, seconds, made.summary)
 
@@ -160,7 +161,7 @@ def run_session(request: Request, listen: Listener = unheard) -> Outcome:
         runner = _Runner(request, listen)
         staging.recover(runner.state)
         try:
-            with compile_ahead.compiling_ahead(request.processes):
+            with compiling_ahead(request.processes):
                 return runner.run()
         except InputError:
             if fresh and not runner.state.records:

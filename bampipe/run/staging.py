@@ -17,7 +17,7 @@ from bampipe.run.request import Step
 from bampipe.run.state import RunState
 
 if TYPE_CHECKING:
-    from bampipe.results.run import StepRecord, Timing
+    from bampipe.results.run import Commit
 
 COMMIT = ".commit.json"
 
@@ -70,41 +70,23 @@ def written(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, s
     return {name: digest_file(path) for name, path in files.items()}
 
 
-def seal(staging: Path, step: Step, made: StepRecord, timing: Timing, remove: list[str]) -> None:
-    """Write the commit file: from here on the step counts as done.
-
-    Args:
-        staging: the staging folder of the step.
-        step: the step.
-        made: its record for ``run.json``.
-        timing: when it ran and how long.
-        remove: outputs of its last run that it no longer has.
-    """
-    entry = {
-        "step": step.name,
-        "record": made.model_dump(mode="json"),
-        "timing": timing.model_dump(mode="json"),
-        "remove": remove,
-    }
-    record.replace_json(staging / COMMIT, entry)
+def seal(staging: Path, sealed: Commit) -> None:
+    """Write the commit file: from here on the step counts as done."""
+    record.replace_json(staging / COMMIT, sealed.model_dump(mode="json"))
 
 
-def commit(state: RunState, staging: Path) -> None:
+def commit(state: RunState, staging: Path, sealed: Commit) -> None:
     """Move the outputs of a sealed step into the run folder; may be repeated."""
-    from bampipe.results.run import StepRecord, Timing
-
-    entry = read_json_table(staging / COMMIT)
-    made = StepRecord.model_validate(entry["record"])
-    for relative in made.outputs:
+    for relative in sealed.record.outputs:
         source, target = staging / relative, state.root / relative
         if source.is_file():
             target.parent.mkdir(parents=True, exist_ok=True)
             source.replace(target)
-    for relative in entry["remove"]:
+    for relative in sealed.remove:
         (state.root / relative).unlink(missing_ok=True)
-    state.records[entry["step"]] = made
-    state.failures.pop(entry["step"], None)
-    state.timings[entry["step"]] = Timing.model_validate(entry["timing"])
+    state.records[sealed.step] = sealed.record
+    state.failures.pop(sealed.step, None)
+    state.timings[sealed.step] = sealed.timing
     state.save()
     shutil.rmtree(staging)
 
@@ -118,31 +100,28 @@ def recover(state: RunState) -> None:
     for staging in sorted(parent.glob("*")):
         if not staging.is_dir():
             staging.unlink()
-        elif (staging / COMMIT).is_file() and _is_complete(state.root, staging):
-            commit(state, staging)
+        elif sealed := _sealed(state.root, staging):
+            commit(state, staging, sealed)
         else:
             shutil.rmtree(staging)
 
 
-def _is_complete(root: Path, staging: Path) -> bool:
-    """Whether the commit file, and what it names and is still here, is as it was sealed."""
+def _sealed(root: Path, staging: Path) -> Commit | None:
+    """What the commit file says, if it and what it names and is still here are as they were."""
+    from bampipe.results.run import Commit
+    from bampipe.schema import read
+
     try:
-        entry = read_json_table(staging / COMMIT)
+        sealed = read(Commit, read_json_table(staging / COMMIT), COMMIT)
     except InputError:
-        return False
-    step, remove = entry.get("step"), entry.get("remove")
-    made = record.sound_step(entry.get("record"))
-    if not isinstance(step, str) or folder_name(step) != staging.name:
-        return False
-    if made is None or not record.is_timing(entry.get("timing")):
-        return False
-    if not isinstance(remove, list) or not record.are_results(remove):
-        return False
-    names = (*made.outputs, *remove)
-    if not all(is_inside(root, name) and not (root / name).is_dir() for name in names):
-        return False
-    return all(
-        is_inside(staging, name) and digest_file(staging / name) == digest
-        for name, digest in made.outputs.items()
-        if (staging / name).is_file()
-    )
+        return None
+    outputs = sealed.record.outputs
+    if folder_name(sealed.step) != staging.name:
+        return None
+    for name in (*outputs, *sealed.remove):
+        if not is_inside(root, name) or (root / name).is_dir():
+            return None
+    for name, digest in outputs.items():
+        if (staging / name).is_file() and digest_file(staging / name) != digest:
+            return None
+    return sealed

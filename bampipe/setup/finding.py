@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bampipe.setup.corrections import Correction
+from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import Plausibility
 
 SUSPICIOUS_ERROR = 0.4
@@ -31,15 +32,18 @@ ALIKE = 1.5
 MOST_MISTAKES = 4
 
 
+Judge = Callable[[tuple[Correction, ...]], Plausibility | None]
+
+
 @dataclass(frozen=True)
 class Finding:
     """One mistake with the two set-ups it lies between.
 
     Attributes:
         correction: that sets it right; rivals: others that do so as well.
-        before, after: what the set-ups explain.
+        before, after: what the set-ups explain, with all other mistakes set right.
         gain: of the score.
-        drawn: whether both are with bodies as drawn, see `judge_drawn`.
+        drawn: whether both are with bodies as drawn.
     """
 
     correction: Correction
@@ -50,62 +54,71 @@ class Finding:
     drawn: bool = False
 
 
-@dataclass(frozen=True)
-class Tried:
-    """Corrections that were tried together, and what they explain."""
-
-    option: tuple[Correction, ...]
-    after: Plausibility
-
-    @property
-    def cost(self) -> float:
-        """How unlikely a person is to make these mistakes, in the unit of the score."""
-        return sum(one.cost for one in self.option)
-
-    @property
-    def score(self) -> float:
-        """The lower, the better."""
-        return self.after.score(RANKED_ERROR) + self.cost
-
-    @property
-    def signals(self) -> set[tuple[str, tuple[str, ...]]]:
-        """What is mistaken: the kinds, and the signals of each."""
-        return {(one.kind, one.signals) for one in self.option}
-
-
-def choose(
-    before: Plausibility,
-    tried: Sequence[Tried],
+def conclude(
+    judge: Judge,
+    chosen: tuple[Correction, ...],
+    others: Sequence[Correction],
     placeholders: Sequence[str] = (),
     drawn: bool = False,
-) -> list[Finding]:
-    """The mistakes that set most right, of those worth naming; none if none is.
+) -> tuple[Finding, ...]:
+    """The mistakes among corrections that were found together, the one that gains most first.
+
+    Those without which hardly more is left are no mistakes. None is one if some axis is not
+    explained in the end, or is worse than as stated.
 
     Args:
-        before: what is explained without; tried: what may be mistaken.
+        judge: what is explained with some corrections; chosen: what was found.
+        others: corrections that may do in the place of one that was.
         placeholders: signals whose scale stands at exactly 1.
         drawn: whether all that is with bodies as drawn.
     """
-    ranked = sorted(tried, key=lambda one: one.score)
-    for best in ranked:
-        gain = gain_of(before, best.after, best.cost)
-        hinted = all(
-            one.kind == "scale" and set(one.signals) <= set(placeholders) for one in best.option
-        )
-        least = LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN
-        if gain < least or spoils_sound_axes(before, best.after):
-            continue
+    found: list[Finding] = []
+    while chosen:
+        after = judge(chosen)
+        if after is None:
+            return ()
+        found = []
+        for one in chosen:
+            before = judge(without(chosen, one)) or after.with_nothing_explained()
+            found.append(Finding(one, (), before, after, gain_of(before, after, one.cost), drawn))
+        idle = min(found, key=lambda f: f.gain - least_gain(f.correction, placeholders))
+        if idle.gain >= least_gain(idle.correction, placeholders):
+            break
+        chosen = without(chosen, idle.correction)
+    stated = judge(())
+    spoilt = stated is not None and chosen and spoils_sound_axes(stated, found[0].after)
+    if spoilt or not 0 < len(chosen) <= MOST_MISTAKES:
+        return ()
+    most = score_of(judge, chosen) + ALIKE
+    for place, finding in enumerate(found):
+        rest = without(chosen, finding.correction)
+        known = {(one.kind, one.signals) for one in chosen}
         rivals = [
-            other.option[0]
-            for other in ranked
-            if len(best.option) == len(other.option) == 1
-            and other.signals != best.signals
-            and other.score < best.score + ALIKE
+            other
+            for other in others
+            if (other.kind, other.signals) not in known and score_of(judge, (*rest, other)) < most
         ]
-        return [
-            Finding(one, distinct(rivals), before, best.after, gain, drawn) for one in best.option
-        ]
-    return []
+        found[place] = replace(finding, rivals=distinct(rivals))
+    found.sort(key=lambda finding: -finding.gain)
+    return tuple(found) if all(is_explained(f, f.after) for f in found) else ()
+
+
+def without(corrections: tuple[Correction, ...], one: Correction) -> tuple[Correction, ...]:
+    """All corrections but ``one``."""
+    return tuple(other for other in corrections if other is not one)
+
+
+def score_of(judge: Judge, corrections: tuple[Correction, ...]) -> float:
+    """Of a set-up, the lower the better; infinite where it cannot be computed with."""
+    found = judge(corrections)
+    cost = sum(one.cost for one in corrections)
+    return math.inf if found is None else found.score(RANKED_ERROR) + cost
+
+
+def least_gain(correction: Correction, placeholders: Sequence[str] = ()) -> float:
+    """Score that a correction must gain."""
+    hinted = correction.kind == "scale" and set(correction.signals) <= set(placeholders)
+    return LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN
 
 
 def spoilt_axes(finding: Finding) -> list[int]:

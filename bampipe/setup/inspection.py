@@ -12,15 +12,15 @@ from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, SetupResult
-from bampipe.setup.drawing import drawn_robot
 from bampipe.setup.finding import Finding, spoilt_axes
 from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
+from bampipe.setup.robot_search import drawn_robot
 from bampipe.setup.search import CorrectionSearch, shorten
 from bampipe.setup.words import describe_correction, describe_evidence, describe_lack, describe_size
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
-from bampipe.trials.signals import Change, Signals
+from bampipe.trials.signals import Signals
 
 _FARTHEST = {"rotary": (62.8, "degrees"), "linear": (20.0, "millimetres")}
 """By kind: ten turns, rad, and a long hall, m, which an axis rarely moves through while it is
@@ -47,8 +47,8 @@ def inspect_setup(
     signals = Signals.of_session(system, session)
     placeholders = find_placeholders(system, session)
     search = CorrectionSearch(system, short, band, folds, signals)
-    held = search.judge(Change.none(len(signals.names)))
-    findings = search.find_mistakes(held, tuple(n for p in placeholders for n in p.signals))
+    held = search.judge(())
+    findings = search.find_mistakes(tuple(n for p in placeholders for n in p.signals))
     mistakes = tuple(_record(system, session, found, placeholders) for found in findings)
     axes = {
         axis: _axis(place, axis, held, mistakes) for place, axis in enumerate(system.coordinates)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
@@ -30,8 +31,6 @@ CERTAIN = 5.0
 of a model that lacks something are too small."""
 VAGUE = 100.0
 """Deviations of its prior within which a parameter is even where the trials say nothing of it."""
-_RIDGE = 1e-9
-"""What holds the sizes of shapes that look alike, as a share of what the trials say of each."""
 LEAST_MOVING = 0.05
 """Share of the samples in which an axis must move for its equation to be judged."""
 
@@ -47,15 +46,12 @@ class Plausibility:
         moving: share of the samples in which each axis moves, (n_q,).
         p: parameters, (n_p,).
         objections: half the squared distance of each from its prior, in its deviations, (n_p,).
-        usual: what they sum up to where all is well: each of many numbers that are known as data
-            are is off by its deviation.
     """
 
     error: Array
     moving: Array
     p: Array
     objections: Array
-    usual: float = 0.0
 
     @property
     def worst_error(self) -> float:
@@ -66,6 +62,11 @@ class Plausibility:
         """The lower, the better; errors below ``least`` are as good as each other."""
         errors = np.log(np.hypot(self.error, least))
         return float(WEIGHT * errors.sum() + self.objections.sum())
+
+    def with_nothing_explained(self) -> Plausibility:
+        """The same device with a set-up that it cannot be computed with."""
+        nothing, objections = np.full_like(self.error, 1e3), np.full_like(self.objections, 0.5)
+        return replace(self, error=nothing, moving=np.ones_like(nothing), objections=objections)
 
 
 def judge_setup(
@@ -88,86 +89,57 @@ def judge_setup(
             evidence = gather_evidence(
                 system, motions, band, system.prior, folds, most_iterations=steps
             )
-            found = _with_pose(evidence, posed)
-            moving = _moving(evidence.used)
-            size = applied_rms(system, motions, band, found.p, evidence.used)
+            error = _errors_with_pose(evidence, posed) if posed else evidence.rmse()
+            size = applied_rms(system, motions, band, evidence.p, evidence.used)
         except (InputError, ValueError, np.linalg.LinAlgError):
             return None
-        share = np.where(size > 0.0, found.error / size, 0.0)
+        moving = np.mean(np.concatenate(evidence.used), axis=0)
+        share = np.where(size > 0.0, error / size, 0.0)
         share = np.where(moving >= LEAST_MOVING, share, 1.0)
     if not np.isfinite(share).all():
         return None
-    return Plausibility(share, moving, found.p, *_object_to(system.parameters, found))
+    spread = CERTAIN * _standard_errors(evidence)
+    objections = [
+        _objection(item, value, margin)
+        for item, value, margin in zip(system.parameters, evidence.p, spread, strict=True)
+    ]
+    return Plausibility(share, moving, evidence.p, np.array(objections))
 
 
 def axes_without_pose(system: System, motions: Sequence[Motion]) -> list[int]:
     """Numbers of the axes at which no torque of the device follows their own position."""
     p = system.prior + np.array([item.sd for item in system.parameters])
-    return [i for i in range(len(system.coordinates)) if not _follows(system, motions, p, i)]
-
-
-def _follows(system: System, motions: Sequence[Motion], p: Array, axis: int) -> bool:
+    free = set(range(len(system.coordinates)))
     for motion in motions:
-        still = np.zeros_like(motion.q)
-        u = np.zeros((len(motion.q), len(system.inputs)))
+        still, u = np.zeros_like(motion.q), np.zeros((len(motion.q), len(system.inputs)))
         z = system.memory(motion.q, still, still, u, p, motion.t)
-        middle = motion.q.copy()
-        middle[:, axis] = motion.q[:, axis].mean()
-        held, moved = (system.residual(q, still, still, z, u, p) for q in (middle, motion.q))
-        if not np.allclose(held[:, axis], moved[:, axis], rtol=1e-9, atol=1e-12):
-            return True
-    return False
+        for axis in tuple(free):
+            middle = motion.q.copy()
+            middle[:, axis] = motion.q[:, axis].mean()
+            held, moved = (system.residual(q, still, still, z, u, p) for q in (middle, motion.q))
+            if not np.allclose(held[:, axis], moved[:, axis], rtol=1e-9, atol=1e-12):
+                free.remove(axis)
+    return sorted(free)
 
 
-@dataclass(frozen=True)
-class _Fitted:
-    """Error by axis, (n_q,), parameters, (n_p,), and their covariance, (n_p, n_p).
-
-    The covariance is as if samples were independent, and zero of what is held.
-    """
-
-    error: Array
-    p: Array
-    covariance: Array
-
-
-def _with_pose(evidence: Evidence, posed: Sequence[int]) -> _Fitted:
-    """The fit with a torque over the position of the axes ``posed`` beside the device."""
-    free, weight, sums = list(evidence.free), evidence.weight, evidence.sums
-    step, more = np.zeros(len(free)), np.zeros(0)
-    if posed:
-        columns = [_pose_columns(evidence, k, posed) for k in range(len(evidence.residual))]
-        nothing = [np.zeros_like(residual) for residual in evidence.residual]
-        sums = sums.bordered(evidence.jacobian, columns, nothing, evidence.residual)
-        # The device may have a constant of its own, and a short travel shows no more than a line.
-        more = _RIDGE * np.einsum("q,kqii->i", weight, sums.xx)[len(free) :]
-        part = sums.subset(evidence.folds.fitted_trials)
-        ridge, wide = np.append(step, more), np.full(more.size, np.inf)
-        step = replace(part, precision=part.precision + ridge).solve(
-            weight, np.append(evidence.lower, -wide), np.append(evidence.upper, wide)
-        )
-    p, covariance = evidence.p.copy(), np.zeros((len(evidence.p),) * 2)
-    p[free] += step[: len(free)]
-    prior_sd = np.array([evidence.system.parameters[i].sd for i in free])
-    size = np.append(
-        np.maximum(prior_sd, np.finfo(float).tiny), np.sqrt(_RIDGE / np.maximum(more, _RIDGE))
-    )
-    least = np.append(np.full(len(free), VAGUE**-2.0), np.full(more.size, _RIDGE))
-    normal = np.einsum("q,kqij->ij", weight, sums.xx)
-    inverse = _inverse(normal * np.outer(size, size), least) * np.outer(size, size)
-    covariance[np.ix_(free, free)] = inverse[: len(free), : len(free)]
-    return _Fitted(np.sqrt(sums.mean_square(step)), p, covariance)
-
-
-def _inverse(normal: Array, least: Array) -> Array:
-    """The inverse of ``normal``, (n, n), with ``least`` on its diagonal, (n,).
-
-    Of the bodies of a robot many combinations do not show, to which rounding may give less than
-    nothing.
-    """
-    values, directions = np.linalg.eigh(normal + np.diag(least))
-    inverse = directions / np.maximum(values, least.min()) @ directions.T
-    return np.asarray(inverse)
+def _errors_with_pose(evidence: Evidence, posed: Sequence[int]) -> Array:
+    """Errors (n_q,) of the fit with a torque over the position of the axes ``posed`` beside it."""
+    count = len(evidence.free)
+    wide = np.full(4 * len(posed), np.inf)
+    columns = [
+        np.concatenate([slopes, _pose_columns(evidence, k, posed)], axis=2)
+        for k, slopes in enumerate(evidence.jacobian)
+    ]
+    root = np.sqrt(evidence.weight)[:, None]
+    fitted = evidence.folds.fitted_trials
+    design = np.concatenate([(root * columns[k]).reshape(-1, count + wide.size) for k in fitted])
+    target = np.concatenate([(evidence.residual[k] * root[:, 0]).ravel() for k in fitted])
+    scale = np.maximum(np.linalg.norm(design, axis=0), np.finfo(float).tiny)
+    lower, upper = np.append(evidence.lower, -wide), np.append(evidence.upper, wide)
+    step = lsq_linear(design / scale, -target, (lower * scale - 1e-12, upper * scale + 1e-12)).x
+    left = [r + c @ (step / scale) for r, c in zip(evidence.residual, columns, strict=True)]
+    used = np.maximum(np.concatenate(evidence.used).sum(axis=0), 1.0)
+    return np.asarray(np.sqrt(np.sum(np.concatenate(left) ** 2, axis=0) / used))
 
 
 def _pose_columns(evidence: Evidence, trial: int, posed: Sequence[int]) -> Array:
@@ -175,23 +147,28 @@ def _pose_columns(evidence: Evidence, trial: int, posed: Sequence[int]) -> Array
 
     A constant and a line; with a wave a turn long where the axis turns, a cubic where it slides.
     """
-    motion, n_q = evidence.motions[trial], len(evidence.system.coordinates)
+    motion = evidence.motions[trial]
     found = np.zeros((*evidence.residual[trial].shape, 4 * len(posed)))
     for number, axis in enumerate(posed):
         q = motion.q[:, axis]
         turning = evidence.system.model.device.coordinates[axis].kind == "rotary"
         curves = (np.sin(q), np.cos(q)) if turning else (q**2, q**3)
-        shapes = (np.ones_like(q), q, *curves)
-        for place, shape in enumerate(shapes, start=4 * number):
-            column = np.zeros((len(q), n_q))
-            column[:, axis] = shape
-            found[..., place] = evidence.band.thin(column) * evidence.used[trial]
+        shapes = np.column_stack([np.ones_like(q), q, *curves])
+        thinned = evidence.band.thin(shapes, [axis] * 4) * evidence.used[trial][:, [axis]]
+        found[:, axis, 4 * number : 4 * number + 4] = thinned
     return found
 
 
-def _moving(used: Sequence[NDArray[np.bool_]]) -> Array:
-    total = sum(len(u) for u in used)
-    return np.asarray(sum(u.sum(axis=0) for u in used) / max(total, 1))
+def _standard_errors(evidence: Evidence) -> Array:
+    """Of the fit, (n_p,), as if samples were independent; zero of what is held."""
+    free, found = list(evidence.free), np.zeros(len(evidence.p))
+    prior_sd = np.array([evidence.system.parameters[i].sd for i in free])
+    size = np.maximum(prior_sd, np.finfo(float).tiny)
+    normal = np.einsum("q,kqij->ij", evidence.weight, evidence.sums.xx) * np.outer(size, size)
+    values, directions = np.linalg.eigh(normal + VAGUE**-2.0 * np.eye(len(free)))
+    # Rounding may give less than nothing to combinations that do not show.
+    found[free] = size * np.sqrt(directions**2 @ (1.0 / np.maximum(values, VAGUE**-2.0)))
+    return found
 
 
 def distance_from_prior(item: Parameter, value: float) -> float:
@@ -212,52 +189,6 @@ def distance_from_prior(item: Parameter, value: float) -> float:
     return (value - item.prior) / item.sd
 
 
-def _object_to(parameters: Sequence[Parameter], found: _Fitted) -> tuple[Array, float]:
-    """Half the squared distance of each parameter from its prior, (n_p,); what is usual of all.
-
-    Numbers that are known as data are, such as those of drawn bodies, are taken together.
-    """
-    spread = CERTAIN * np.sqrt(np.diag(found.covariance))
-    objections = np.array(
-        [
-            _objection(item, value, margin)
-            for item, value, margin in zip(parameters, found.p, spread, strict=True)
-        ]
-    )
-    usual = 0.0
-    known = [i for i, p in enumerate(parameters) if p.weighed and not p.fixed and p.sd > 0.0]
-    if known:
-        prior = np.array([parameters[i].prior for i in known])
-        sd = np.array([parameters[i].sd for i in known])
-        covariance = found.covariance[np.ix_(known, known)] / np.outer(sd, sd)
-        objections[known], usual = _joint_objections(found.p[known] / sd, prior / sd, covariance)
-    return objections, usual
-
-
 def _objection(item: Parameter, value: float, margin: float) -> float:
     nearest = min(max(item.prior, value - margin), value + margin)
     return 0.5 * min(distance_from_prior(item, nearest) ** 2, FARTHEST**2)
-
-
-def _joint_objections(found: Array, prior: Array, covariance: Array) -> tuple[Array, float]:
-    """Objections to parameters of which the trials only show combinations, (n,).
-
-    Each alone can be what it is expected to be, as the mass of one link can at the cost of the
-    next, and all together not: so the combinations are judged, in their deviations. These are
-    wider where no factor brings what is found and what is expected closer than they say (Birge
-    1932): the trials may lack something else than the right units.
-
-    Args:
-        found, prior: in deviations of the prior; covariance: of the fit, likewise.
-
-    Returns:
-        The objections, and what they sum up to on average where all is well.
-    """
-    variance, directions = np.linalg.eigh(covariance)
-    shown = 1.0 / (1.0 + CERTAIN**2 * np.maximum(variance, 0.0))
-    said, expected = directions.T @ found, directions.T @ prior
-    factor = (shown * said) @ expected / max((shown * expected) @ expected, np.finfo(float).tiny)
-    apart = float(shown @ (said - factor * expected) ** 2)
-    birge = min(1.0, float(shown.sum()) / apart) if apart > 0.0 else 1.0
-    each = 0.5 * np.minimum(birge * shown * (said - expected) ** 2, FARTHEST**2)
-    return directions**2 @ each, 0.5 * float(shown.sum())

@@ -13,9 +13,26 @@ from numpy.typing import NDArray
 from bampipe.estimate.heavier_body import HeavierBody
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
-from bampipe.setup.corrections import (
+from bampipe.setup.finding import (
+    ALIKE,
+    LEAST_GAIN,
+    LEAST_GAIN_PLACEHOLDER,
+    MOST_MISTAKES,
+    RANKED_ERROR,
+    SUSPICIOUS_ERROR,
+    Finding,
+    conclude,
+    gain_of,
+    least_gain,
+    score_of,
+    spoils_sound_axes,
+)
+from bampipe.setup.hypotheses import (
+    JOINT_SPANS,
+    MOST_TRAVEL,
     Correction,
     clock_corrections,
+    combine,
     exchange_corrections,
     groups_of_like,
     quarter_turns,
@@ -24,29 +41,16 @@ from bampipe.setup.corrections import (
     sign_corrections,
     unit_corrections,
 )
-from bampipe.setup.drawing import DrawnSearch, find_body_unlike_drawn, is_drawn
-from bampipe.setup.finding import (
-    ALIKE,
-    JUDGED_ERROR,
-    LEAST_GAIN,
-    LEAST_GAIN_PLACEHOLDER,
-    MOST_MISTAKES,
-    RANKED_ERROR,
-    SUSPICIOUS_ERROR,
-    Finding,
-    Tried,
-    choose,
-    is_explained,
-)
 from bampipe.setup.plausibility import Plausibility, axes_without_pose, judge_setup
+from bampipe.setup.robot_search import DrawnSearch, is_drawn
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
-from bampipe.trials.signals import Change, Signals
+from bampipe.trials.signals import Signals
 
 Array = NDArray[np.float64]
 
 SUSPICIOUS_PRIORS = 5.0
-"""Sum of objections, beyond the usual, from which other set-ups are tried: two parameters beyond
+"""Sum of objections from which other set-ups are tried: two parameters beyond
 two deviations."""
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
 """A factor, an angle (rad) and a share of an axis' travel below which what is off is no mistake of
@@ -63,7 +67,12 @@ _SHORTLIST = 6
 _DECADES = np.arange(-10, 11) / 2.0
 _STEPS = 16
 _MOST_TRIALS = 6
+_SAME_FACTOR = 0.05
+"""Logarithm within which the factor that explains most is a usual one."""
 _HALVINGS = 11
+
+
+Family = Callable[[float], Correction]
 
 
 @dataclass
@@ -87,6 +96,9 @@ class CorrectionSearch:
     tested: int = field(default=0, init=False)
     over_position: Plausibility | None = field(default=None, init=False)
     heavier: HeavierBody | None = field(default=None, init=False)
+    _judged: dict[tuple[int, ...], tuple[Plausibility | None, tuple[Correction, ...]]] = field(
+        default_factory=dict, init=False
+    )
 
     @property
     def has_few_axes(self) -> bool:
@@ -104,69 +116,107 @@ class CorrectionSearch:
         most = _SCREENED_SAMPLES if self.has_few_axes else _SCREENED_SAMPLES // 2
         return shorten([self.motions[k] for k in chosen], most), part
 
-    def judge(self, change: Change) -> Plausibility | None:
+    def judge(self, corrections: tuple[Correction, ...]) -> Plausibility | None:
         """What a set-up explains of the trials; None where it cannot be computed with."""
-        return self._judge(change, self.motions, self.folds, 12)
+        key = tuple(id(one) for one in corrections)
+        if key not in self._judged:
+            found = self._judge(corrections, self.motions, self.folds, 12)
+            self._judged[key] = found, corrections
+        return self._judged[key][0]
 
     def _judge(
-        self, change: Change, motions: Sequence[Motion], folds: Folds, steps: int
+        self,
+        corrections: tuple[Correction, ...],
+        motions: Sequence[Motion],
+        folds: Folds,
+        steps: int,
+        posed: Sequence[int] = (),
     ) -> Plausibility | None:
+        change = combine(self.signals, corrections)
         with np.errstate(all="ignore"):
             changed = [change.of_motion(motion, self.signals) for motion in motions]
-        return judge_setup(self.system, changed, change.of_band(self.band), folds, steps)
+        return judge_setup(self.system, changed, change.of_band(self.band), folds, steps, posed)
 
-    def screen(self, correction: Correction, change: Change) -> float:
-        """Score and cost of a correction on top of ``change``; infinite where it makes no sense."""
+    def screen(self, chosen: tuple[Correction, ...], correction: Correction) -> float:
+        """Score and cost of one correction more; infinite where it makes no sense."""
         if not _is_gross(correction, self.motions, self.signals):
             return math.inf
         self.tested += 1
-        found = self._judge(correction.change.after(change), *self.screened, _SCREENING_STEPS)
+        found = self._judge((*chosen, correction), *self.screened, _SCREENING_STEPS)
         return math.inf if found is None else found.score(RANKED_ERROR) + correction.cost
 
-    def find_mistakes(
-        self, stated: Plausibility | None, placeholders: Sequence[str]
-    ) -> tuple[Finding, ...]:
-        """The mistakes of the set-up, the one that spoils most first.
+    def find_mistakes(self, placeholders: Sequence[str]) -> tuple[Finding, ...]:
+        """The mistakes of the set-up, the one that gains most first.
 
         Args:
-            stated: what the set-up as it is stated explains of ``motions``.
             placeholders: signals whose scale stands at exactly 1.
         """
-        against = self._against_drawing()
-        if against or self.heavier is not None:
-            return against
-        change, now = Change.none(len(self.signals.names)), stated
-        found: list[Finding] = []
-        while len(found) < MOST_MISTAKES and self._is_suspicious(now, placeholders):
-            step = self._best(change, now, placeholders)
-            if (now is not None and not found and self._lacks_pose(now, step)) or step is None:
+        if is_drawn(self.system):
+            # Bodies that are free take on much of a mistake.
+            drawn = DrawnSearch(
+                self.system, shorten(self.motions, _DRAWN_SAMPLES), self.band, self.signals
+            )
+            mistakes = drawn.find_mistakes()
+            self.tested += drawn.tested
+            self.heavier = drawn.heavier
+            return mistakes
+        chosen: tuple[Correction, ...] = ()
+        tried: list[Correction] = []
+        while len(chosen) < MOST_MISTAKES and self._is_suspicious(self.judge(chosen), placeholders):
+            options = self._shortlist(chosen, self._discrete())
+            best = self._best(chosen, options, placeholders)
+            after = self.judge((*chosen, best) if best else chosen)
+            if self.has_few_axes and self._is_suspicious(after, ()):
+                options += self._shortlist(chosen, self._continuous(chosen))
+                best = self._best(chosen, options, placeholders)
+            if (not chosen and self._lacks_pose(best)) or best is None:
                 break
-            found.append(step)
-            change, now = step.correction.change.after(change), step.after
-        return tuple(f for f in found if now is None or is_explained(f, now))
+            tried += options
+            chosen = (*chosen, self._refined_factor(chosen, best))
+        return conclude(self.judge, chosen, tried, placeholders)
 
-    def _against_drawing(self) -> tuple[Finding, ...]:
-        """The mistakes that bodies as drawn show; those that are free take on much of them."""
-        if not is_drawn(self.system):
-            return ()
-        short = shorten(self.motions, _DRAWN_SAMPLES)
-        self.heavier = find_body_unlike_drawn(self.system, short, self.band)
-        search = DrawnSearch(self.system, short, self.band, self.signals, self.heavier)
-        against = search.find_mistakes(exchanged=self.has_few_axes)
-        self.tested += search.tested
-        return against
+    def _best(
+        self,
+        chosen: tuple[Correction, ...],
+        options: Sequence[Correction],
+        placeholders: Sequence[str],
+    ) -> Correction | None:
+        """The correction that sets most right, of those that gain enough and spoil no axis."""
+        before = self.judge(chosen)
+        for one in sorted(options, key=lambda one: score_of(self.judge, (*chosen, one))):
+            after = self.judge((*chosen, one))
+            if after is None:
+                continue
+            stated = before or after.with_nothing_explained()
+            gain = gain_of(stated, after, one.cost)
+            if gain >= least_gain(one, placeholders) and not spoils_sound_axes(stated, after):
+                return one
+        return None
 
-    def _lacks_pose(self, stated: Plausibility, step: Finding | None) -> bool:
-        """Whether a torque over position explains as much of the stated set-up as ``step`` does.
+    def _refined_factor(self, chosen: tuple[Correction, ...], best: Correction) -> Correction:
+        """``best`` with the factor that explains most, where that is none of a unit or a gain."""
+        if best.kind != "scale" or not self.has_few_axes:
+            return best
+        family = partial(_scaled_by_power, self.signals, best.signals)
+        start = math.log10(best.factor)
+        found = self._refine(chosen, family, start, math.inf, float(_DECADES[1] - _DECADES[0]))
+        far = abs(math.log(found.factor / best.factor)) > _SAME_FACTOR
+        gain = score_of(self.judge, (*chosen, best)) - score_of(self.judge, (*chosen, found))
+        return found if far and gain > ALIKE else best
+
+    def _lacks_pose(self, best: Correction | None) -> bool:
+        """Whether a torque over position explains as much of the stated set-up as ``best`` does.
 
         That of gravity on a link or of a spring, where the device has none: no column is mistaken.
         """
         axes = axes_without_pose(self.system, self.motions) if self.has_few_axes else []
-        if not axes:
+        stated = self.judge(())
+        found = self._judge((), self.motions, self.folds, 12, axes) if axes else None
+        if found is None or stated is None:
             return False
-        found = judge_setup(self.system, self.motions, self.band, self.folds, 12, axes)
-        least = LEAST_GAIN if step is None else step.gain - ALIKE
-        if found is None or stated.score(JUDGED_ERROR) - found.score(JUDGED_ERROR) < least:
+        after = self.judge((best,)) if best is not None else None
+        gain = gain_of(stated, after, best.cost) if best is not None and after is not None else 0.0
+        if gain_of(stated, found, 0.0) < (gain - ALIKE if gain else LEAST_GAIN):
             return False
         self.over_position = found
         return True
@@ -175,19 +225,7 @@ class CorrectionSearch:
         if now is None or now.error.max() > SUSPICIOUS_ERROR:
             return True
         most = LEAST_GAIN_PLACEHOLDER if placeholders else SUSPICIOUS_PRIORS
-        return bool(now.objections.sum() - now.usual > most)
-
-    def _best(
-        self, change: Change, now: Plausibility | None, placeholders: Sequence[str]
-    ) -> Finding | None:
-        """The mistake whose correction gains most beyond what is stated, None if none does."""
-        before = now or _nothing_explained(self.system)
-        tried = self._try_best(change, self._discrete())
-        best = choose(before, tried, placeholders)
-        if self.has_few_axes and self._is_suspicious(best[0].after if best else now, ()):
-            tried += self._try_best(change, self._continuous(change))
-            best = choose(before, tried, placeholders)
-        return next(iter(best), None)
+        return bool(now.objections.sum() > most)
 
     def _discrete(self) -> Iterator[Correction]:
         yield from sign_corrections(self.signals)
@@ -199,52 +237,58 @@ class CorrectionSearch:
             yield from exchange_corrections(self.signals)
             yield from quarter_turns(self.signals)
 
-    def _continuous(self, change: Change) -> list[Correction]:
+    def _continuous(self, chosen: tuple[Correction, ...]) -> list[Correction]:
         """Scales and zeros of any size: the best families on a grid, then refined."""
-        families: list[tuple[Callable[[float], Correction], Array]] = []
-        for names in groups_of_like(self.signals):
-            families.append((partial(_scaled_by_power, self.signals, names), _DECADES))
+        change = combine(self.signals, chosen)
+        families: list[tuple[Family, Array]] = [
+            (partial(_scaled_by_power, self.signals, names), _DECADES)
+            for names in groups_of_like(self.signals)
+        ]
+        changed = [change.of_motion(motion, self.signals) for motion in self.screened[0]]
         for place, axis in enumerate(self.signals.axes):
-            changed = [change.of_motion(motion, self.signals) for motion in self.screened[0]]
             q = np.concatenate([motion.q[:, place] for motion in changed])
+            if self.signals.units[place] == "rad" and np.ptp(q) > MOST_TRAVEL:
+                gear = partial(_scaled_by_power, self.signals, (axis,))
+                families.append((gear, np.log10(JOINT_SPANS / np.ptp(q))))
             reach = 2.0 * max(float(np.ptp(q)), float(np.abs(np.median(q))))
             size = math.pi if self.signals.units[place] == "rad" else reach
             grid = size * np.linspace(-1.0, 1.0, _STEPS)
             families.append((partial(_shifted_by, self.signals, axis), grid))
         coarse = []
         for family, grid in families:
-            scores = [self.screen(family(x), change) for x in grid]
-            coarse.append((min(scores), family, grid, float(grid[int(np.argmin(scores))])))
+            scores = [self.screen(chosen, family(x)) for x in grid]
+            best = int(np.argmin(scores))
+            coarse.append((scores[best], family, float(grid[best]), float(grid[1] - grid[0])))
         coarse.sort(key=lambda one: one[0])
-        return [self._refined(change, *one) for one in coarse[: _SHORTLIST // 2]]
+        return [
+            self._refine(chosen, family, best, least, step)
+            for least, family, best, step in coarse[: _SHORTLIST // 2]
+        ]
 
-    def _refined(
+    def _refine(
         self,
-        change: Change,
-        least: float,
-        family: Callable[[float], Correction],
-        grid: Array,
+        chosen: tuple[Correction, ...],
+        family: Family,
         best: float,
+        least: float,
+        step: float,
     ) -> Correction:
         """The best correction of a family near ``best``, where it scores ``least``."""
-        step = float(grid[1] - grid[0])
         for _ in range(_HALVINGS):
             step *= 0.5
             for x in (best - step, best + step):
-                score = self.screen(family(x), change)
+                score = self.screen(chosen, family(x))
                 if score < least:
                     best, least = x, score
         return family(best)
 
-    def _try_best(self, change: Change, corrections: Iterable[Correction]) -> list[Tried]:
-        """Screen all corrections; return the best with what they explain of all trials."""
-        screened = [(self.screen(correction, change), correction) for correction in corrections]
+    def _shortlist(
+        self, chosen: tuple[Correction, ...], corrections: Iterable[Correction]
+    ) -> list[Correction]:
+        """The corrections that do best on the small part of the trials."""
+        screened = [(self.screen(chosen, correction), correction) for correction in corrections]
         screened.sort(key=lambda one: one[0])
-        tried = []
-        for score, correction in screened[:_SHORTLIST]:
-            found = self.judge(correction.change.after(change)) if math.isfinite(score) else None
-            tried += [Tried((correction,), found)] if found is not None else []
-        return tried
+        return [one for score, one in screened[:_SHORTLIST] if math.isfinite(score)]
 
 
 def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:
@@ -269,12 +313,6 @@ def _scaled_by_power(signals: Signals, names: tuple[str, ...], power: float) -> 
 
 def _shifted_by(signals: Signals, axis: str, offset: float) -> Correction:
     return shifted(signals, axis, offset, 3.0)
-
-
-def _nothing_explained(system: System) -> Plausibility:
-    n = len(system.coordinates)
-    objections = np.full(len(system.parameters), 0.5)
-    return Plausibility(np.full(n, 1e3), np.ones(n), system.prior, objections)
 
 
 def _is_gross(correction: Correction, motions: Sequence[Motion], signals: Signals) -> bool:

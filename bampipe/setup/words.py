@@ -7,7 +7,7 @@ import math
 from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
-from bampipe.setup.corrections import FACTORS, Correction
+from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import Plausibility, distance_from_prior
 
 
@@ -49,7 +49,9 @@ def describe_evidence(
         if abs(distance_from_prior(item, old)) > abs(distance_from_prior(item, new)) + 1.0
     ]
     said = "; ".join(parts or back[:3])
-    return f"with bodies as drawn, {said}" if drawn else said
+    if not drawn:
+        return said
+    return f"with bodies as drawn, {said or 'all drives are off by one factor'}"
 
 
 def describe_lack(system: System, before: Plausibility, after: Plausibility) -> list[str]:
@@ -117,13 +119,7 @@ def _scale(correction: Correction, session: IngestResult) -> str:
     channels = [f"channels.{name}" for name in correction.signals if name in session.channels]
     if len(channels) == len(correction.signals) > 1:
         fixes = {f"multiply scale of {join_names(channels)} by {number(correction.factor)}": None}
-    unit = _si(correction, session)
-    like = ""
-    if correction.unit and unit:
-        meant, stated = correction.unit, unit
-        if not _is_stated_as_si(correction, unit):
-            meant, stated = stated, meant
-        like = f", as {meant} read as {stated}"
+    like = f", as {correction.meant} read as {correction.stated}" if correction.meant else ""
     return f"{describe_size(correction)}{like}: {'; '.join(fixes)}"
 
 
@@ -135,39 +131,15 @@ def _scale_fix(name: str, correction: Correction, session: IngestResult) -> str:
             stated = encoder.counts_per_unit
             right = number(stated / factor)
             return f"counts_per_unit of {name} should be about {right}, not {number(stated)}"
-        unit = _unit_meant(correction, encoder.raw_unit, encoder.unit)
-        return f'unit = "{unit}"' if unit else f"gear_ratio = {number(1.0 / factor)}"
+        if correction.meant and encoder.raw_unit == correction.stated:
+            return f'unit = "{correction.meant}"'
+        return f"gear_ratio = {number(1.0 / factor)}"
     if name in session.force.columns:
-        unit = _unit_meant(correction, session.force.raw_unit, session.force.unit)
-        if unit:
-            return f'unit = "{unit}" of [force]'
+        if correction.meant and session.force.raw_unit == correction.stated:
+            return f'unit = "{correction.meant}" of [force]'
         row = " of its row" if len(correction.signals) < len(session.force.columns) else ""
         return f"multiply {_force_entry(session)}{row} by {number(factor)}"
     return f"multiply scale of channels.{name} by {number(factor)}"
-
-
-def _unit_meant(correction: Correction, stated: str, si: str) -> str:
-    """The unit to write in place of ``stated``, "" where no unit explains the factor."""
-    if not correction.unit:
-        return ""
-    if stated == si and _is_stated_as_si(correction, si):
-        return correction.unit
-    return si if stated == correction.unit and not _is_stated_as_si(correction, si) else ""
-
-
-def _is_stated_as_si(correction: Correction, si: str) -> bool:
-    """Whether readings in ``correction.unit`` were taken for ``si``, not the other way round."""
-    return math.isclose(correction.factor, dict(FACTORS[si])[correction.unit])
-
-
-def _si(correction: Correction, session: IngestResult) -> str:
-    name = correction.signals[0]
-    if name in session.axes:
-        return session.axes[name].unit
-    if name in session.channels:
-        found = session.channels[name].unit
-        return found if found in FACTORS else ""
-    return session.force.unit if session.force.unit in FACTORS else ""
 
 
 def _force_entry(session: IngestResult) -> str:

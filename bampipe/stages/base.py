@@ -27,6 +27,7 @@ files into the run folder once ``execute`` has returned. No stage calls another.
 from __future__ import annotations
 
 import importlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -49,35 +50,46 @@ class Stage(Protocol):
         """Do the work; return a summary that JSON can hold."""
 
 
-STAGES: tuple[str, ...] = (
-    "ingest",
-    "filter",
-    "stiffness",
-    "identify",
-    "viscous",
-    "performance",
-    "validate",
-    "diagnose",
-    "draft",
-    "next",
-    "compare",
-    "report",
+@dataclass(frozen=True)
+class StageEntry:
+    """What is known of a stage before its module is imported.
+
+    Attributes:
+        name: of the module and of the command.
+        per_model: whether ``Config`` has a field ``model``: it runs once for each model.
+        reads_session: whether ``Config`` has a field ``session``.
+        prints: whether it calls the report, whose changes then rerun it.
+        after: the command that is suggested once it has run; "" where its own command says more.
+    """
+
+    name: str
+    per_model: bool = False
+    reads_session: bool = False
+    prints: bool = False
+    after: str = ""
+
+
+ENTRIES = (
+    StageEntry("ingest", reads_session=True, after="filter"),
+    StageEntry("filter", after="stiffness"),
+    StageEntry("stiffness", after="identify"),
+    StageEntry("identify", per_model=True, after="validate"),
+    StageEntry("viscous", per_model=True, after="report"),
+    StageEntry("performance", per_model=True, after="report"),
+    StageEntry("validate", per_model=True, after="diagnose"),
+    StageEntry("diagnose", per_model=True),
+    StageEntry("draft", per_model=True),
+    StageEntry("next", per_model=True, prints=True),
+    StageEntry("compare", after="report"),
+    StageEntry("report", prints=True),
 )
 """All stages, in the order in which they run."""
 
-READS_SESSION: tuple[str, ...] = ("ingest",)
-"""Stages whose ``Config`` has a field ``session``."""
-
-PER_MODEL: tuple[str, ...] = (
-    "identify",
-    "viscous",
-    "performance",
-    "validate",
-    "diagnose",
-    "draft",
-    "next",
-)
-"""Stages whose ``Config`` has a field ``model``: they run once for each model."""
+STAGES = tuple(entry.name for entry in ENTRIES)
+READS_SESSION = tuple(entry.name for entry in ENTRIES if entry.reads_session)
+PER_MODEL = tuple(entry.name for entry in ENTRIES if entry.per_model)
+PRINTING = tuple(entry.name for entry in ENTRIES if entry.prints)
+AFTER = {entry.name: entry.after for entry in ENTRIES}
 
 
 def check_stage_name(name: str) -> None:

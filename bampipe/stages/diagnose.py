@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
@@ -20,7 +19,6 @@ from bampipe.diagnosis.candidates import list_candidates
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.description import describe
 from bampipe.diagnosis.select import Selection, select_effects
-from bampipe.diagnosis.sentences import axis_sentences
 from bampipe.diagnosis.session import Session
 from bampipe.diagnosis.shape import residual_map, variables, worst_windows
 from bampipe.diagnosis.verdict import conclude
@@ -28,6 +26,7 @@ from bampipe.errors import InputError, NothingToDoError, did_you_mean
 from bampipe.estimate.simulation import Runaway
 from bampipe.identification.terms import effect_text
 from bampipe.next_trial.suggestion import suggest_trial
+from bampipe.phrases import diagnosis as phrases
 from bampipe.physics import compile_model, registry
 from bampipe.physics.effect import effect_from
 from bampipe.physics.recipe import Recipe
@@ -41,67 +40,36 @@ from bampipe.results.diagnose import (
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.setup import SetupResult
 from bampipe.results.terms import EffectText
-from bampipe.schema import STRICT, Count, Distinct, Positive
+from bampipe.schema import STRICT, Count, Distinct
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.measured import read_measured_trials, trial_of_block
 
 _DESCRIBED = 12
 """Effects of the ranking whose formulas are stored with it."""
-_DEFAULT = Criteria()
 
 SUMMARY = "Find which physical effect the model lacks"
 INPUTS = (*INGESTED, *FILTERED, "filter/setup.json?", *IDENTIFIED_MODEL)
 OUTPUTS = ("models/{model}/diagnose.json", "models/{model}/map_variables.parquet")
 
-Fraction = Annotated[float, Field(gt=0, lt=1)]
-
 
 @checked_dataclass(frozen=True, config=STRICT)
-class Config:
+class Config(Criteria):
     """Settings of the stage; what each number decides is in docs/method_selection.md.
 
     Attributes:
         model: which model version to diagnose.
-        probability: from which an effect is called missing.
-        size: least share of the applied force of an axis that an effect must add to matter.
-        significance: chance of a false alarm in a session where nothing is missing.
-        replicates: replays of the fitted model, as in a parametric bootstrap.
-        expected_effects: how many effects a model is expected to lack.
-        most_effects: beyond those of the model.
-        bias_error: relative error of the bias that filters leave where friction turns.
-        discrepancy: error of any model, as a share of the applied force.
-        tails: degrees of freedom of Student's t distribution, as which errors are distributed.
-        block_s: stretches of time that are independent, s: one alone must not decide.
-        beam: sets of effects that are pursued side by side.
-        doubt: scale of what is left on an axis from which on effects may be mere resemblances.
-        jobs: worker processes; 0 means one for each processor, eight at most.
-        seed: of the noise in the replays.
-        trust_setup: whether to diagnose in spite of a mistake that was named in the set-up.
-        without: effects that are not weighed, such as one that came to nothing when it was added.
+        jobs: number of worker processes; 0 means one for each processor, eight at most.
+        seed: seed of the noise in the replicates.
+        trust_setup: whether to diagnose in spite of a mistake that was found in the set-up.
+        without: effects that are not weighed, such as one that was added in vain.
     """
 
     model: str = "base"
-    probability: Annotated[float, Field(gt=0.5, lt=1)] = _DEFAULT.probability
-    size: Fraction = _DEFAULT.size
-    significance: Fraction = _DEFAULT.significance
-    replicates: Annotated[int, Field(ge=4)] = _DEFAULT.replicates
-    expected_effects: Positive = _DEFAULT.expected_effects
-    most_effects: Annotated[int, Field(ge=1)] = _DEFAULT.most_effects
-    bias_error: Positive = _DEFAULT.bias_error
-    discrepancy: Positive = _DEFAULT.discrepancy
-    tails: Positive = _DEFAULT.tails
-    block_s: Positive = _DEFAULT.block_s
-    beam: Annotated[int, Field(ge=1)] = _DEFAULT.beam
-    doubt: Positive = _DEFAULT.doubt
     jobs: Count = 0
     seed: Count = 0
     trust_setup: bool = False
     without: Distinct[str] = ()
-
-    def criteria(self) -> Criteria:
-        """The numbers that decide."""
-        return Criteria(**{f.name: getattr(self, f.name) for f in fields(Criteria)})
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -136,7 +104,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     _require_known(config.without, recipe)
     start = identified(run, config.model, system)
     jobs = config.jobs or min(8, os.cpu_count() or 1)
-    session = Session(trials, config.criteria(), jobs, config.seed)
+    session = Session(trials, config, jobs, config.seed)
     try:
         selection = select_effects(session, recipe, start, config.without, progress)
     except Runaway as error:
@@ -154,8 +122,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     result = result.model_copy(
         update={"suggested_trial": suggest_trial(session, selection.final, result)}
     )
-    headline = "; ".join(f"{axis}: {words}" for axis, words in result.verdicts_in_words.items())
-    return {"headline": headline, **_summary(result.write(out), result.limits)}
+    headline = "; ".join(f"{axis}: {phrases.verdict(result, axis)}" for axis in result.axes)
+    return {"headline": headline, **_summary(result.write(out), phrases.limits(result))}
 
 
 def _require_known(without: Sequence[str], recipe: Recipe) -> None:
@@ -236,7 +204,7 @@ def _result(
         for i, axis in enumerate(names)
         if result.axes[axis].remains
     }
-    said = axis_sentences(result, shapes)
+    said = phrases.describe_axes(result, shapes)
     axes = {
         axis: entry.model_copy(update={"sentence": said[axis]})
         for axis, entry in result.axes.items()

@@ -1,13 +1,11 @@
-"""Stage draft: a formula for what no effect explains, as an effect file, with its chance level."""
+"""Stage draft: a formula for what no effect explains, as an effect file, with its p-value."""
 
 from __future__ import annotations
 
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
 
-from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
@@ -51,21 +49,17 @@ _MORE_FORMULAS = (
 
 
 @checked_dataclass(frozen=True, config=STRICT)
-class Config:
-    """Settings of the stage.
+class Config(Criteria):
+    """Settings of the stage, those by which a diagnosis decides among them.
 
     Attributes:
         model: which model version to draft for.
-        replicates: replays of the model, which are recombined to the null distribution.
-        significance: chance of a formula where nothing is missing.
-        jobs: worker processes; 0 means one for each processor, eight at most.
-        seed: of the noise in the replays.
-        curve: whether to draft a curve through points, where prediction is all that is wanted.
+        jobs: number of worker processes; 0 means one for each processor, eight at most.
+        seed: seed of the noise in the replicates.
+        curve: whether to draft a curve through points instead, for prediction only.
     """
 
     model: str = "base"
-    replicates: Annotated[int, Field(ge=4)] = Criteria.replicates
-    significance: Annotated[float, Field(gt=0, lt=1)] = Criteria.significance
     jobs: Count = 0
     seed: Count = 0
     curve: bool = False
@@ -88,10 +82,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     system = compile_model(model)
     timing = run.read(IdentifyResult, config.model).input_timing
     trials = read_measured_trials(run, system, every_input=True, timing=timing)
-    criteria = Criteria(replicates=config.replicates, significance=config.significance)
     session = Session(
         replace(trials, motions=tuple(trials.motions)),
-        criteria,
+        config,
         config.jobs or min(8, os.cpu_count() or 1),
         config.seed,
     )

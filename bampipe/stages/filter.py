@@ -20,6 +20,7 @@ from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother
 from bampipe.estimate.differentiation import Array, Flags, UniformGrid, uniform_grid
 from bampipe.estimate.low_pass import Band
+from bampipe.phrases.results import describe_dead_stretch, list_setup_faults
 from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.filter import (
@@ -188,7 +189,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
                 lasting = sum(one.end_s - one.start_s for one in of_it)
                 where = f"{len(of_it)} stretches, {lasting:.1f} s in all,"
             notes.append(f"{name}: {where} left out: {reason}")
-    return result.write(out) | {"setup": list(setup.lines), "notes": notes}
+    return result.write(out) | {"setup": list_setup_faults(setup), "notes": notes}
 
 
 def _nothing_to_differentiate(
@@ -249,7 +250,7 @@ def _dead(session: IngestResult) -> dict[str, tuple[Disturbance, ...]]:
     """Where a sensor of a moving trial is dead, by trial."""
     return {
         name: tuple(
-            Disturbance(start_s=one.start_s, end_s=one.end_s, reason=one.sentence)
+            Disturbance(start_s=one.start_s, end_s=one.end_s, reason=describe_dead_stretch(one))
             for one in stretches
         )
         for name, stretches in session.dead.items()

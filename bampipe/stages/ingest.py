@@ -26,6 +26,7 @@ from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.declarations.session_device import placeholders, session_device
 from bampipe.errors import InputError
 from bampipe.files import digest_content, toml_text
+from bampipe.phrases import results as phrases
 from bampipe.physics.device import Device
 from bampipe.progress import Progress
 from bampipe.results.ingest import EncoderChannel, ForceChannels, IngestResult, RecordedChannel
@@ -82,7 +83,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     description.write(out)
     if session.device_file is not None:
         _write_device(session.device_file, device, out / "ingest")
-    notes = [*description.sensor_warnings, *(line.sentence for line in description.mains_hum)]
+    notes = [*description.sensor_warnings, *map(phrases.describe_hum, description.mains_hum)]
     if device.robot is not None:
         notes += [
             f"no body has what is drawn, and the nearest is taken: {line}"

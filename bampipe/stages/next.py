@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -33,16 +33,16 @@ from bampipe.next_trial.primitives import Envelope, imitate_trials
 from bampipe.next_trial.reasons import explain_proposal, find_shown
 from bampipe.next_trial.sensitivity import HOPELESS, Blindness, find_blindness
 from bampipe.next_trial.suggestion import find_ambiguity, make_contest
+from bampipe.phrases.forecast import find_open, read_forecasts
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
-from bampipe.results.forecast import find_open, read_forecasts
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.next import Detectable, NextResult, Plan, Purpose
 from bampipe.results.validate import JudgedError, ValidateResult
-from bampipe.schema import STRICT, Count, Positive
+from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials, trial_of_block
 from bampipe.trials.motion import Motion
 
@@ -62,8 +62,6 @@ OUTPUTS = (
 )
 
 Array = NDArray[np.float64]
-Share = Annotated[float, Field(gt=0, lt=1)]
-_DEFAULT = Criteria()
 
 _SHOWN = 3
 """Proposals in the summary."""
@@ -74,8 +72,8 @@ _LITTLE = 0.05
 
 
 @checked_dataclass(frozen=True, config=STRICT)
-class Config:
-    """Settings of the stage.
+class Config(Criteria):
+    """Settings of the stage, those by which a diagnosis decides among them.
 
     Attributes:
         model: which model version.
@@ -84,12 +82,10 @@ class Config:
             shown; the name of a parameter; or ``auto``: what the diagnosis asks for.
         seconds: length of the trial.
         plan: whether to make a set of trials, and its protocol sheet.
-        sd: what the plan is to bring every standard deviation below, as a share of the estimate.
-        confusion: what it is to bring every chance of confusing two effects below.
-        seed: of how people differ, and of sensor noise.
-        jobs: worker processes; 0 means one for each processor.
-        probability, size, replicates, expected_effects, bias_error, discrepancy, tails, block_s: by
-            which a diagnosis decides, as of `diagnose`.
+        sd: goal of the plan for every standard deviation, as a share of the estimate.
+        confusion: goal of the plan for every chance of confusing two effects.
+        seed: seed of the variation between people, and of sensor noise.
+        jobs: number of worker processes; 0 means one for each processor.
     """
 
     model: str = "base"
@@ -100,19 +96,6 @@ class Config:
     confusion: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     seed: Count = 0
     jobs: Count = 0
-    probability: Annotated[float, Field(gt=0.5, lt=1)] = _DEFAULT.probability
-    size: Share = _DEFAULT.size
-    replicates: Annotated[int, Field(ge=4)] = _DEFAULT.replicates
-    expected_effects: Positive = _DEFAULT.expected_effects
-    bias_error: Positive = _DEFAULT.bias_error
-    discrepancy: Positive = _DEFAULT.discrepancy
-    tails: Positive = _DEFAULT.tails
-    block_s: Positive = _DEFAULT.block_s
-
-    def criteria(self) -> Criteria:
-        """The numbers that decide; those that only a search over sets has stay as they are."""
-        own = {f.name: getattr(self, f.name) for f in fields(Criteria) if hasattr(self, f.name)}
-        return Criteria(**own)
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -141,7 +124,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = read_measured_trials(run, system, every_input=True, timing=found.input_timing)
     trials = replace(trials, motions=tuple(trials.motions))
     recipe = read_recipe(run, config.model, model)
-    session = Session(trials, config.criteria(), config.jobs or os.cpu_count() or 1, config.seed)
+    session = Session(trials, config, config.jobs or os.cpu_count() or 1, config.seed)
     fitted = [trials.motions[k] for k in trials.folds.fitted_trials]
     noise = sensor_noise(trials.sensors, system, fitted, p, FilterChoice())
     seen = Envelope.of_trials(trials.motions, system, p)

@@ -21,14 +21,14 @@ from bampipe.errors import InputError
 from bampipe.identification.drift import find_drift
 from bampipe.identification.free_run import free_runs
 from bampipe.identification.terms import describe_terms
+from bampipe.phrases.results import find_failed_checks
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
-from bampipe.results.checks import find_failed_checks
+from bampipe.results.floor import AT_FLOOR, compare_with_floor
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.rounding import significant
-from bampipe.results.standing import AT_FLOOR, standing
 from bampipe.results.validate import (
     AxisError,
     ForceError,
@@ -82,10 +82,9 @@ class Config:
 
     Attributes:
         model: which model version.
-        noise_floor: whether to compute what sensors and filters alone would leave.
-        repeats: replays for the noise floor; 0 takes as many as the length of the session asks
-            for, which is what `diagnose` does.
-        seed: of their sensor noise.
+        noise_floor: whether to compute the error that sensors and filters alone would leave.
+        repeats: replicates for the noise floor; 0 takes three to six, fewer for a long session.
+        seed: seed of their sensor noise.
         free_run: whether to run the model freely over every trial, and from many starts in it.
         hold_out_by: a channel that is constant in each trial, such as a gain or a supply voltage:
             trials at one value of it are held out together. Empty: one trial at a time.
@@ -243,7 +242,7 @@ def _judged(
         **vars(found),
         noise_floor=level,
         noise_floor_sd=scatter,
-        standing=standing(found.held_out_rmse, level, scatter),
+        standing=compare_with_floor(found.held_out_rmse, level, scatter),
         expected_ratio=expected_ratio,
         estimate="refused" if refused else "accepted",
     )

@@ -32,7 +32,7 @@ _BLOCK_S = 0.2
 """Length of the blocks of which the errors are compared, s."""
 _TIMES = 20.0
 """Error of the worst block of such a stretch over that of the rest. `benchmarks/disturbances.py` is
-the study behind it; docs/benchmarks_setup.md has what came of it."""
+the study behind it; benchmarks/notebook/setup.md has what came of it."""
 _ALONE = 25.0
 """The same, over the whole stretch, of a motion that does not come back: a stop that is reached
 once has 15."""

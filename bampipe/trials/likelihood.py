@@ -35,6 +35,8 @@ _LEAST = 1e-3
 _DETERMINED = 1e-9
 """Of the largest eigenvalue of the scaled normal equations, below which a direction of the model's
 own parameters is not determined by the trials, and stays."""
+_SLOW = 3.0
+"""Sign widths: slow motion, in which dry friction is as large as it gets."""
 _MOST_STOPPING = 1.5
 """Largest factor of the residual of a replay that truly stops."""
 _RIDGE = 1e-10
@@ -229,6 +231,24 @@ class Likelihood:
             root.append(self.root[axis] * np.sqrt((tails + 1.0) / (tails + square / mean)))
         return replace(self, root=tuple(root))
 
+    def count_independent(self, problem: Problem, lags: int) -> tuple[Samples, ...]:
+        """Count the samples of each axis that are independent in what a fit of the model leaves.
+
+        What a model lacks comes back with the motion, sample after sample; noise does not. There
+        are fewer independent samples by the sum of squared autocorrelations (Bartlett 1946, Journal
+        of the Royal Statistical Society, Supplement 8, 27), over that of replays.
+
+        Args:
+            problem: the fit, its solution at zero; lags: the most that are summed.
+        """
+        solved, counted = problem.solve(), []
+        for axis, here in enumerate(self.samples):
+            noise = (self.noise.residuals[axis] - self.noise.bias[axis]) * self.root[axis]
+            ours = _correlation(problem.y[axis] + problem.base[axis] @ solved.base, here, lags)
+            replays = float(np.median([_correlation(r, here, lags) for r in noise]))
+            counted.append(replace(here, independent=here.independent * min(replays / ours, 1.0)))
+        return tuple(counted)
+
     def pose(
         self,
         evidence: Evidence,
@@ -298,24 +318,54 @@ class Problem:
         return solve_bounded(self, *self.sums())
 
 
+def _correlation(values: Array, samples: Samples, lags: int) -> float:
+    """Sum of the squared autocorrelation of values (n,) up to a lag, both ways, within trials."""
+    total = np.zeros(lags + 1)
+    for trial in np.unique(samples.trial):
+        here = samples.trial == trial
+        rows = samples.rows[here]
+        series = np.zeros(int(np.ptp(rows)) + 1)
+        series[rows - rows[0]] = values[here]
+        size = 2 * len(series)
+        found = np.fft.irfft(np.abs(np.fft.rfft(series, size)) ** 2, size)[: len(series)][
+            : lags + 1
+        ]
+        total[: len(found)] += found
+    if not total[0] > 0.0:
+        return 1.0
+    return float(2.0 * np.sum((total / total[0]) ** 2) - 1.0)
+
+
 def _error_of_turning(evidence: Evidence) -> list[Array]:
     """What is not known of friction as a log does not say when between two samples a machine turns.
 
     By trial, each (T, n_q), N.m or N: the change of friction from sample to sample, times the
     standard deviation of a moment that lies evenly between two of them.
     """
-    dry, width = dry_friction(evidence)
+    width = sign_widths(evidence)
     jumps = [np.gradient(np.tanh(m.qd / width), axis=0) for m in evidence.motions]
-    return [dry * jump / np.sqrt(12.0) for jump in jumps]
+    return [d * j / np.sqrt(12.0) for d, j in zip(dry_friction(evidence), jumps, strict=True)]
 
 
-def dry_friction(evidence: Evidence) -> tuple[Array, Array]:
-    """Coulomb friction of each axis in a model and the width of its sign, both (n_q,)."""
-    coordinates = evidence.system.model.device.coordinates
-    values = zip(evidence.system.parameters, evidence.p.tolist(), strict=True)
-    known = {parameter.name: abs(value) for parameter, value in values}
-    dry = np.array([known.get(f"coulomb.{c.name}", 0.0) for c in coordinates])
-    return dry, np.array([c.sign_width for c in coordinates])
+def sign_widths(evidence: Evidence) -> Array:
+    """Width of the sign of each axis' velocity, (n_q,), rad/s or m/s."""
+    return np.array([c.sign_width for c in evidence.system.model.device.coordinates])
+
+
+def dry_friction(evidence: Evidence) -> list[Array]:
+    """What turns with the motion in a model, by trial, each (T, n_q), N.m or N.
+
+    Half the difference between moving slowly one way and the other, brakes included.
+    """
+    found, slow = [], _SLOW * sign_widths(evidence)
+    for at in evidence.fitted:
+        q, qd, qdd = at.mechanism.kinematics
+        back, on = (
+            at.system.residual(q, side * slow + np.zeros_like(qd), qdd, at.memory, at.inputs, at.p)
+            for side in (-1.0, 1.0)
+        )
+        found.append(0.5 * (back - on))
+    return found
 
 
 def _pose(

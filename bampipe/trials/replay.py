@@ -2,9 +2,10 @@
 
 Noise floors, chance levels and the bias of least squares come from here. The model is driven along
 nearly the measured motion by the measured force plus an arm. Where something stiff gives the
-motion it keeps that and takes the force it needs: on a test bench; of a robot whose position
-controllers are so fast that its drives jump where joints turn round; and of any robot that a spring
-which the model lacks would carry away. What it does is read by the same sensors and goes through
+motion it keeps that and takes the force it needs: on a test bench; of a machine whose friction
+would stop it within a small part of a sample; of a robot whose position controllers are so fast
+that its drives jump where joints turn round; and of any robot that a spring which the model lacks
+would carry away. What it does is read by the same sensors and goes through
 the same filters.
 """
 
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from bampipe.estimate.butterworth import zero_phase
-from bampipe.estimate.simulation import Runaway, simulate_tracking
+from bampipe.estimate.simulation import Runaway, count_steps, simulate_tracking
 from bampipe.files import temporary_space
 from bampipe.physics import System
 from bampipe.physics.device import derivative
@@ -60,6 +61,13 @@ _LATEST = 8
 """Samples by which a drive may act after its log says so, or be read after it acts: its jumps then
 stand in the log before or behind those of friction."""
 _FEW_REVERSALS = 5
+_PROBED = 300
+"""Samples of a trial at which the steps of integration are counted."""
+LONGEST_STEP_S = 2.5e-4
+_STIFFEST = 10.0
+"""Steps of integration over those of `LONGEST_STEP_S` from which on friction holds a machine so
+fast that its drive gives the motion: simulated and measured machines that move freely take 1 to
+1.5, a damper on a test bench 30 to 70."""
 FOLLOWED_HZ = 10.0
 """Highest frequency of the motion to follow where encoder and handle move apart."""
 
@@ -160,6 +168,22 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     return Course(seen, u[:, columns] + np.column_stack(logged))
 
 
+def steps_to_follow(
+    system: System, p: Array, motion: Motion, longest_step_s: float = LONGEST_STEP_S
+) -> float:
+    """Steps of integration that a model takes along a motion, from sample to sample on average."""
+    u = motion.inputs(system.inputs)
+    true = motion.of_mechanism(system, u, p)
+    memory = system.memory(*true.kinematics, u, p, true.t)
+    rows = slice(None, None, -(-len(u) // _PROBED))
+    return count_steps(
+        system.derivative, np.hstack([true.q, true.qd, memory])[rows], u[rows],
+        np.ascontiguousarray(p), float(motion.t[1] - motion.t[0]),
+        width=np.array([c.sign_width for c in system.model.device.coordinates]),
+        n_noise=len(system.noise), max_step=longest_step_s,
+    )  # fmt: skip
+
+
 def _lateness(fitted: ModelOnTrial, u: Array) -> Array:
     """Time by which each force acts after it was logged, (n_f,), s; negative if it acts before.
 
@@ -202,8 +226,18 @@ def keep_motion(fitted: Sequence[ModelOnTrial]) -> bool:
 
 
 def _is_motion_given(fitted: ModelOnTrial, u: Array) -> bool:
-    device = fitted.system.model.device
-    return device.prescribed or (_is_controlled(fitted.system) and _jumps(fitted, u))
+    system = fitted.system
+    if system.model.device.prescribed:
+        return True
+    if system.model.device.robot is not None:
+        return _is_controlled(system) and _jumps(fitted, u)
+    return is_stiff(system, fitted.p, fitted.motion)
+
+
+def is_stiff(system: System, p: Array, motion: Motion) -> bool:
+    """Whether friction would stop a machine within a small part of a sample, all along a motion."""
+    usual = max(float(motion.t[1] - motion.t[0]) / LONGEST_STEP_S, 1.0)
+    return steps_to_follow(system, p, motion) > _STIFFEST * usual
 
 
 def _is_controlled(system: System) -> bool:

@@ -1,4 +1,4 @@
-"""Simulators that share no code with bampipe: sessions of five machines with a known truth.
+"""Simulators that share no code with bampipe: sessions of six machines with a known truth.
 
 Equations of motion, integrators, friction, sensors and session files are written here from the
 physics, with numpy, numba and scipy alone, so that benchmarks and tests hold the product against
@@ -13,10 +13,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from independent import axis, bam, damper, joint, wrist
+from independent import axis, bam, damper, drive, joint, wrist
 from independent.sensors import Conditions
 
-MACHINES = {"bam": bam, "joint": joint, "axis": axis, "damper": damper, "wrist": wrist}
+MACHINES = {
+    "bam": bam, "joint": joint, "axis": axis, "damper": damper, "drive": drive, "wrist": wrist,
+}  # fmt: skip
 
 
 def record(

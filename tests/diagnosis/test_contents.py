@@ -12,7 +12,7 @@ from bampipe.diagnosis.session import candidates_of, system_of
 from bampipe.diagnosis.shape import worst_windows
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
-from bampipe.results.standing import standing
+from bampipe.results.floor import compare_with_floor
 from bampipe.trials.evidence import gather_evidence
 from bampipe.trials.measured import MeasuredTrials
 
@@ -59,7 +59,7 @@ def test_two_devices_of_one_name_have_their_own_candidates():
     ],
 )
 def test_one_judgement_of_at_the_floor(error, floor, sd, expected):
-    assert standing(error, floor, sd) == expected
+    assert compare_with_floor(error, floor, sd) == expected
 
 
 def test_every_axis_has_its_worst_window():

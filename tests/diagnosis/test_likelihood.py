@@ -156,3 +156,22 @@ def test_a_few_samples_that_no_replay_has_do_not_decide_under_heavy_tails(line):
     assert abs(problem.solve().base[0] - 2.0) < 0.5 * off
     calm = np.setdiff1d(np.arange(400), wild)
     assert like.root[0][wild].max() < 0.5 * like.root[0][calm].mean()
+
+
+def test_what_comes_back_with_the_motion_counts_as_few_independent_samples(fitted):
+    """White noise keeps its samples; a slow wave of the same size is a few of them."""
+    _, fit = fitted
+    like = fit.likelihood
+    rows = [s.rows for s in like.samples]
+
+    def counted(y):
+        problem = replace(fit.problem, y=tuple(y), base=tuple(0.0 * b for b in fit.problem.base))
+        return np.array([s.independent for s in like.count_independent(problem, 100)])
+
+    before = np.array([s.independent for s in like.samples])
+    replay = [
+        (r[0] - b) * root
+        for r, b, root in zip(like.noise.residuals, like.noise.bias, like.root, strict=True)
+    ]
+    assert np.all(counted(replay) > 0.8 * before)
+    assert np.all(counted([np.sin(0.02 * r) for r in rows]) < 0.1 * before)

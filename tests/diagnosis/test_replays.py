@@ -11,10 +11,8 @@ import pytest
 from independent_runs import record_trials
 
 from bampipe.diagnosis.session import system_of
-from bampipe.estimate.least_squares import fit
 from bampipe.physics import Model, compile_model
-from bampipe.trials import draw, replay
-from bampipe.trials.bias import remove_bias
+from bampipe.trials import replay
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.replay import StandIn, replay_motion
@@ -34,28 +32,6 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[MeasuredTrials, Ev
     )
     system = system_of(recipe)
     return trials, gather_evidence(system, trials.motions, trials.band, system.prior, trials.folds)
-
-
-def test_the_bias_of_a_long_session_comes_with_what_the_trials_left_out_may_change(
-    fitted, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trials, evidence = fitted
-    problem = problem_of(evidence.system, trials.motions, trials.band)
-    raw = fit(problem, np.append(evidence.p, 0.0))
-    found = []
-    monkeypatch.setattr(draw, "LEAST_DRAWN", 2)
-    for most in (10**6, 1400):
-        monkeypatch.setattr(draw, "ENOUGH_SAMPLES", most)
-        found.append(
-            remove_bias(
-                trials.sensors, trials.kinematics, evidence.system, trials.motions, problem, raw
-            )
-        )
-    everything, part = found
-    np.testing.assert_array_equal(everything.covariance, raw.covariance)
-    added = np.diag(part.covariance - raw.covariance)
-    assert np.all(added > 0.0)
-    assert np.all(np.abs(part.p - everything.p)[problem.free] < 4.0 * np.sqrt(added))
 
 
 def test_a_replay_for_one_model_has_the_same_inputs(fitted) -> None:

@@ -9,10 +9,9 @@ from collections.abc import Mapping
 import pytest
 from made_results import diagnosis, filled
 
-from bampipe.diagnosis.sentences import axis_sentences
-from bampipe.results import phrases
+from bampipe.phrases import diagnosis as phrases
 from bampipe.results.diagnose import DiagnoseResult
-from bampipe.results.standing import standing
+from bampipe.results.floor import compare_with_floor
 
 Sets = Mapping[tuple[str, ...], float]
 A, B, C = "a:joint", "b:joint", "c:joint"
@@ -23,7 +22,7 @@ def made(verdict: str, sets: Sets, before=1.0, after=0.104, floor=0.1, **more) -
     """A diagnosis of one axis called joint, in N.m; of another, elbow, with ``elbow`` set."""
     axis = {
         "verdict": verdict, "rmse_before": before, "rmse_after": after, "noise_floor": floor,
-        "rmse_beyond_bias": 0.0831, "standing": standing(after, floor), "unit": "N.m",
+        "rmse_beyond_bias": 0.0831, "standing": compare_with_floor(after, floor), "unit": "N.m",
         "explained": 0.98837, "unknown": 0.0312, "remains": verdict == "unknown_effect",
     }  # fmt: skip
     whole = {k: more.pop(k) for k in ("cut_short", "worst_windows") if k in more}
@@ -32,7 +31,7 @@ def made(verdict: str, sets: Sets, before=1.0, after=0.104, floor=0.1, **more) -
 
 
 def say(*args, shape: str = SHAPE, **more) -> str:
-    return axis_sentences(made(*args, **more), {"joint": shape})["joint"]
+    return phrases.describe_axes(made(*args, **more), {"joint": shape})["joint"]
 
 
 CASES = [
@@ -59,7 +58,7 @@ CASES = [
 def test_every_number_in_a_sentence_is_one_of_the_record(verdict, sets, before, after, floor):
     found = made(verdict, sets, before, after, floor)
     entry = found.axes["joint"]
-    said = axis_sentences(found)["joint"]
+    said = phrases.describe_axes(found)["joint"]
     known = [before, after, floor, after / floor, entry.rmse_beyond_bias, entry.unknown]
     known += [100 * entry.explained, 0.99, 0.01, *entry.probabilities.values(), *sets.values()]
     for text in re.findall(r"(?<![\w.])\d+(?:\.\d+)?", said):
@@ -134,7 +133,7 @@ def test_an_error_above_its_floor_with_nothing_missing_says_what_filters_leave()
     [
         (0.3, 1.0, "its held-out error of 0.300 N.m is far below its noise floor, which is"),
         (0.3, 0.0, "its held-out error of 0.300 N.m is without a noise floor to be held against."),
-        (20.0, 1.0, "replays of the model are not like the measurement"),
+        (20.0, 1.0, "replays of the model do not resemble the measurement"),
     ],
 )
 def test_no_verdict_says_why_and_what_to_do(after: float, floor: float, why: str) -> None:
@@ -159,8 +158,8 @@ def test_nothing_is_called_certain() -> None:
 
 def test_alternatives_that_trials_do_not_decide_are_doubted() -> None:
     found = made("undecided", {(A, B): 0.6, (A, C): 0.4})
-    assert found.doubted == {B, C} and found.lacking == ("joint",)
-    assert found.verdicts_in_words == {
-        "joint": "undecided: a:joint (> 0.99), and either b:joint (0.60) or c:joint (0.40)"
-    }
-    assert made("missing", {(A,): 0.97, (B,): 0.03}).doubted == frozenset()
+    assert phrases.find_open_effects(found) == {B, C} and found.lacking == ("joint",)
+    shown = "undecided: a:joint (> 0.99), and either b:joint (0.60) or c:joint (0.40)"
+    assert phrases.verdict(found, "joint") == shown
+    decided = made("missing", {(A,): 0.97, (B,): 0.03})
+    assert phrases.find_open_effects(decided) == frozenset()

@@ -21,7 +21,7 @@ from bampipe.errors import InputError
 from bampipe.files import is_inside, is_normal, read_json, read_toml
 from bampipe.lab.collect import collect
 from bampipe.results.ingest import IngestResult
-from bampipe.results.run import RunResult
+from bampipe.results.run import RunResult, is_result
 from bampipe.run import models, record
 from bampipe.run.events import unheard
 from bampipe.run.publish import publish
@@ -214,14 +214,14 @@ NOT_NORMAL = [
 def test_a_name_that_is_not_normal_is_no_name_of_a_result(tmp_path: Path, name: object) -> None:
     assert not is_normal(name)
     assert not is_inside(tmp_path, name)
-    assert not record.are_results([name])
+    assert not is_result(name)
 
 
 @pytest.mark.parametrize(
     "name", ["run.json", ".bampipe", ".bampipe/lock", ".bampipe/staging/x", ".BAMPIPE/lock"]
 )
 def test_files_of_the_runner_are_no_results(name: str) -> None:
-    assert is_normal(name) and not record.are_results([name])
+    assert is_normal(name) and not is_result(name)
 
 
 def test_inside_means_links_followed(tmp_path: Path) -> None:

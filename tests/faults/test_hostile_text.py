@@ -52,7 +52,7 @@ def test_plain_text_stays_as_it_is() -> None:
 def test_tables_and_lines_obey_no_control_character(
     control: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    show.table(["name", control], [[f"a{control}b", 1.0]])
+    show.print_table(["name", control], [[f"a{control}b", 1.0]])
     show.say(control)
     show.note(control)
     printed = capsys.readouterr()
@@ -151,7 +151,7 @@ def test_the_report_takes_names_for_text(text: str) -> None:
         Subheading(text),
         Bullets((text,)),
         Callout("good", text, text),
-        Table(text, (text,), ((text,),), "l"),
+        Table(text, text.replace(" | ", " "), ((text,),)),
     )
     document = Document(text, text, (Section(text, blocks),))
     body = page(document)

@@ -11,9 +11,9 @@ from made_results import diagnosis, write_result
 from bampipe.data import store
 from bampipe.files import write_json, write_text
 from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.floor import compare_with_floor
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.standing import standing
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import ValidateResult
 
@@ -112,7 +112,7 @@ class Made:
                 "rmse_without_friction": 2.0,
                 "held_out_rmse": 0.02 * ratio,
                 "noise_floor": 0.02,
-                "standing": standing(0.02 * ratio, 0.02),
+                "standing": compare_with_floor(0.02 * ratio, 0.02),
                 "fit_percent": 99.0,
                 "unit": "N.m",
             }

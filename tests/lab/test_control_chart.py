@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bampipe.lab.control_chart import FALSE_ALARM, FEWEST, MEDIAN_RANGE, chart, factor
+from bampipe.lab.control_chart import FALSE_ALARM, FEWEST, MEDIAN_RANGE, find_factor, make_chart
 
 
 @pytest.mark.parametrize("sessions", [6, 9, 14, 30])
@@ -13,13 +13,13 @@ def test_the_factors_are_the_quantiles_they_claim_to_be(sessions: int) -> None:
     x = np.random.default_rng(3).normal(size=(2_000_000 // sessions, sessions))
     sigma = np.median(np.abs(np.diff(x, axis=1)), axis=1) / MEDIAN_RANGE
     distance = np.abs(x - np.median(x, axis=1, keepdims=True)) / sigma[:, None]
-    share = float((distance > factor(sessions)).mean())
+    share = float((distance > find_factor(sessions)).mean())
     # 5400 alarms are expected, and those of one lab come together: 6 % is well over their scatter
     assert share == pytest.approx(FALSE_ALARM, rel=0.06)
 
 
 def test_the_factor_falls_to_three() -> None:
-    assert factor(10_000) == pytest.approx(3.0, abs=0.002)
+    assert find_factor(10_000) == pytest.approx(3.0, abs=0.002)
 
 
 @pytest.mark.parametrize("within", [0.0, 1.0, 3.0])
@@ -29,7 +29,9 @@ def test_false_alarms_with_scatter_between_and_within(within: float) -> None:
     alarms = 0
     for _ in range(500):
         sds = within * rng.uniform(0.5, 1.5, size=12)
-        alarms += chart(rng.normal(size=12) + sds * rng.normal(size=12), sds).outside_limits.sum()
+        alarms += make_chart(
+            rng.normal(size=12) + sds * rng.normal(size=12), sds
+        ).outside_limits.sum()
     assert alarms / (500 * 12) < 2.5 * FALSE_ALARM
 
 
@@ -37,22 +39,22 @@ def test_one_session_off_and_two_neighbours_off_are_seen() -> None:
     rng = np.random.default_rng(6)
     x = 4.0 + 0.02 * rng.normal(size=12)
     x[5] += 0.5
-    assert np.flatnonzero(chart(x, np.full(12, 0.002)).outside_limits).tolist() == [5]
+    assert np.flatnonzero(make_chart(x, np.full(12, 0.002)).outside_limits).tolist() == [5]
     x[6] += 0.5
-    assert np.flatnonzero(chart(x, np.full(12, 0.002)).outside_limits).tolist() == [5, 6]
+    assert np.flatnonzero(make_chart(x, np.full(12, 0.002)).outside_limits).tolist() == [5, 6]
 
 
 def test_an_uncertain_session_is_given_its_room() -> None:
     x = np.array([4.0, 4.02, 3.98, 4.01, 3.99, 4.6, 4.0, 4.01])
     sds = np.full(8, 0.005)
-    assert chart(x, sds).outside_limits[5]
+    assert make_chart(x, sds).outside_limits[5]
     sds[5] = 0.3
-    assert not chart(x, sds).outside_limits.any()
+    assert not make_chart(x, sds).outside_limits.any()
 
 
 def test_a_slow_drift_is_a_trend_and_does_not_hide_in_its_own_scatter() -> None:
     rng = np.random.default_rng(7)
-    found = chart(np.linspace(4.0, 4.6, 15) + 0.01 * rng.normal(size=15), np.full(15, 0.005))
+    found = make_chart(np.linspace(4.0, 4.6, 15) + 0.01 * rng.normal(size=15), np.full(15, 0.005))
     assert found.drifts
     assert found.slope == pytest.approx(0.6 / 14, rel=0.05)
     assert found.outside_limits[0] and found.outside_limits[-1]
@@ -60,16 +62,16 @@ def test_a_slow_drift_is_a_trend_and_does_not_hide_in_its_own_scatter() -> None:
 
 def test_a_step_is_a_run_on_one_side() -> None:
     x = np.where(np.arange(20) < 10, 0.99, 1.01) + 0.004 * np.sin(np.arange(20) * 2.1)
-    found = chart(x, np.full(20, 0.01))
+    found = make_chart(x, np.full(20, 0.01))
     assert not found.outside_limits.any()
     assert found.run == (0, 9)
 
 
 def test_no_limits_from_too_few_sessions() -> None:
-    found = chart([1.0] * (FEWEST - 2) + [9.0], [0.1] * (FEWEST - 1))
+    found = make_chart([1.0] * (FEWEST - 2) + [9.0], [0.1] * (FEWEST - 1))
     assert np.isnan(found.lower).all() and not found.outside_limits.any()
 
 
 def test_the_same_value_every_time_is_in_control() -> None:
-    found = chart([2.0] * 8, [0.0] * 8)
+    found = make_chart([2.0] * 8, [0.0] * 8)
     assert not found.outside_limits.any() and not found.drifts and found.run is None

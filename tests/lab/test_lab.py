@@ -20,6 +20,7 @@ from bampipe.errors import InputError
 from bampipe.files import digest_file
 from bampipe.lab.collect import collect
 from bampipe.lab.folders import is_current
+from bampipe.phrases import lab as phrases
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.run.accepted import accept
@@ -264,7 +265,7 @@ def test_nothing_is_in_control_before_there_are_limits(
     tmp_path: Path, sessions: int, said: str
 ) -> None:
     found = collect(make_lab(tmp_path, sessions=sessions), tmp_path / "lab", report=False).content
-    assert {found.verdict_in_words(one) for one in found.sessions} == {said}
+    assert {phrases.verdict(found, one) for one in found.sessions} == {said}
 
 
 def test_nothing_to_collect_is_one_line(tmp_path: Path) -> None:

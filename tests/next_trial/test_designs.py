@@ -34,8 +34,8 @@ from bampipe.next_trial.primitives import (
 )
 from bampipe.next_trial.reasons import explain_proposal, find_shown
 from bampipe.next_trial.words import describe
+from bampipe.phrases.forecast import compare_forecast, read_forecasts
 from bampipe.physics import Model, compile_model, registry
-from bampipe.results.forecast import compare_forecast, read_forecasts
 from bampipe.results.next import (
     Detectable,
     ExpectedConfusion,
@@ -650,7 +650,7 @@ def test_a_plan_says_whether_more_trials_would_help(is_enough, is_full, said):
 @pytest.mark.parametrize(
     ("came", "said"),
     [
-        (0.004, "within what was forecast."),
+        (0.004, "within the forecast range."),
         (0.001, "less than forecast."),
         (0.02, "more than forecast."),
     ],
@@ -670,7 +670,7 @@ def test_what_came_is_held_against_a_range(came, said):
 @pytest.mark.parametrize(
     ("weighed", "selected", "said"),
     [
-        (("t1",), ("drag:x",), "`bampipe diagnose RUN` says whether it is there."),
+        (("t1",), ("drag:x",), "`bampipe diagnose RUN` tells whether it is there."),
         (("t1", "t2", "t3"), ("drag:x",), "it is there."),
         (("t1", "t2", "t3"), (), "the diagnosis does not find it, so that it is hardly larger."),
     ],
@@ -693,8 +693,8 @@ def test_what_a_trial_was_to_show_is_held_against_the_diagnosis_that_knows_it(
     )
     diagnosed = SimpleNamespace(trials=weighed, selected=selected, axes={})
     first, second = compare_forecast(proposed, identified, diagnosed)
-    assert "was forecast with trials t2 and t3, ± 0.005 came" in first
-    assert second == f"it was to show drag:x from 0.9 N on; {said}"
+    assert "was forecast with trials t2 and t3, ± 0.005 resulted" in first
+    assert second == f"it was to reveal drag:x from 0.9 N on; {said}"
 
 
 def test_pairs_weigh_by_the_product_of_their_odds():
@@ -735,5 +735,7 @@ def test_sets_that_were_to_be_told_apart_are_held_against_the_diagnosis(selected
     axis = SimpleNamespace(verdict="undecided", probabilities=dict.fromkeys(undecided, 0.5))
     diagnosed = SimpleNamespace(trials=("t2",), selected=selected, axes={"x": axis})
     (line,) = compare_forecast(proposed, identified, diagnosed)
-    assert line.startswith("a:x or a:x + b:x: a chance of 2 % was forecast of confusing them; ")
+    assert line.startswith(
+        "a:x or a:x + b:x: a probability of 2 % was forecast of confusing them; "
+    )
     assert line.endswith(f"{said}.")

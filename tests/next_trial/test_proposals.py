@@ -14,7 +14,7 @@ from independent_runs import SHORT, diagnose, record_run
 
 import bampipe
 from bampipe.errors import InputError
-from bampipe.results.forecast import compare_forecast, compare_forecasts, read_forecasts
+from bampipe.phrases.forecast import compare_forecast, compare_forecasts, read_forecasts
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import NextResult
 
@@ -180,7 +180,7 @@ def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(tmp_path)
     (said,) = compare_forecast(easy, identified, None)
     came = identified.parameters["coulomb.joint"].sd
     assert said.startswith("`coulomb.joint`: ±")
-    assert f"± {came:.2g} came" in said
+    assert f"± {came:.2g} resulted" in said
     assert compare_forecast(easy, identified.model_copy(update={"trials": easy.trials}), None) == ()
     lines = compare_forecasts(read_forecasts(again.root, "base"), identified, None)
     assert [line.partition(",")[0] for line in lines] == ["viscous.joint", "coulomb.joint"]

@@ -12,15 +12,15 @@ import pandas as pd
 from made_results import diagnosis, filled, write_result
 
 from bampipe.data.store import write_parquet
-from bampipe.diagnosis.sentences import axis_sentences
 from bampipe.files import write_text
+from bampipe.phrases import diagnosis as phrases
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.filter import FilterResult
+from bampipe.results.floor import compare_with_floor
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.run import RunResult
-from bampipe.results.standing import standing
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.terms import TermsResult
 from bampipe.results.validate import ValidateResult
@@ -237,7 +237,7 @@ def write_validation(root: Path, model: str) -> None:
         axis: {
             "rmse": 0.98 * error, "rmse_without_friction": 3.1234, "held_out_rmse": error,
             "noise_floor": FLOOR[axis], "noise_floor_sd": 0.001, "fit_percent": 91.24,
-            "standing": standing(error, FLOOR[axis], 0.001), "unit": TORQUE_UNIT[axis],
+            "standing": compare_with_floor(error, FLOOR[axis], 0.001), "unit": TORQUE_UNIT[axis],
         }
         for axis, error in held_out(model).items()
     }  # fmt: skip
@@ -374,7 +374,7 @@ def write_diagnosis(root: Path, model: str) -> None:
             "next": "bampipe extend RUN stribeck:yaw --model base" if missing else "nothing to add",
         },
     )  # fmt: skip
-    said = axis_sentences(DiagnoseResult.model_validate(found))
+    said = phrases.describe_axes(DiagnoseResult.model_validate(found))
     for axis, sentence in said.items():
         found["axes"][axis]["sentence"] = sentence
     write_result(root, DiagnoseResult, **{**found, "sentence": " ".join(said.values())})

@@ -77,17 +77,18 @@ def test_the_section_says_what_to_do_and_what_went_unseen():
 
 
 def test_beside_nothing_missing_stands_what_the_trials_would_not_have_shown():
-    asked = diagnosis._unseen(results_with(NextResult.model_validate(FOUND)), "base")
-    assert asked == (
+    asked = diagnosis._tell_sensitivity(results_with(NextResult.model_validate(FOUND)), "base")
+    assert asked.text == (
         "These trials would not have shown stribeck:yaw below 2 N.m. The table under What to record"
-        " next has every effect."
+        " next lists every effect."
     )
-    assert "`bampipe next s01` says" in diagnosis._unseen(results_with(None), "base")
+    without = diagnosis._tell_sensitivity(results_with(None), "base")
+    assert "`bampipe next s01` computes" in without.text
 
 
 def test_where_one_number_cannot_be_trusted_a_range_is_shown():
     entry = FOUND["proposals"][0]["sd"]["coulomb.yaw"] | {"low": 0.002, "high": 0.009}
-    table = next_trial.sd_table("Expected", {"coulomb.yaw": ExpectedSd.model_validate(entry)})
+    table = next_trial.tabulate_sds("Expected", {"coulomb.yaw": ExpectedSd.model_validate(entry)})
     assert table.rows == (("`coulomb.yaw`", "0.010", "0.0020 to 0.0090", "N·m"),)
     assert "eight of ten" in table.note
 
@@ -117,7 +118,7 @@ def test_the_protocol_sheet_is_one_page(trials, parameters):
 
 
 def test_a_sheet_lists_the_parameters_that_stay_farthest_from_what_is_asked():
-    table = protocol._uncertainties(made_plan(parameters=20), "base", 3)
+    table = protocol._tabulate_uncertainties(made_plan(parameters=20), "base", 3)
     assert [row[0] for row in table.rows] == [f"`coulomb.joint_{k}`" for k in (17, 18, 19)]
     assert "Of 20 parameters" in table.note
 

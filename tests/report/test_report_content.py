@@ -35,7 +35,7 @@ def page_of(root: Path) -> str:
     """The page of a run's report without its figures; those and the print take nearly all time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typeset, "pdf", lambda *_: b"")
-        patch.setattr(style, "svg", lambda _: "<svg></svg>")
+        patch.setattr(style, "render_svg", lambda _: "<svg></svg>")
         return build(Results(root), quiet).html
 
 
@@ -414,7 +414,7 @@ def test_the_drift_of_a_model_is_a_table_and_its_absence_a_sentence(
     path.write_text(json.dumps(content))
     blocks = validation.section(Results(root)).blocks
     table = next(b for b in blocks if getattr(b, "caption", "").startswith("Drift"))
-    assert table.rows == (("yaw", "1.2", "3.4", "200", "mrad"),)
+    assert list(table.rows) == [("yaw", "1.2", "3.4", "200", "mrad")]
     assert any(f"yaw: {why[:1].lower()}{why[1:]}" in getattr(b, "items", ()) for b in blocks)
 
 
@@ -604,12 +604,12 @@ def test_a_model_that_is_not_there_changes_nothing_in_the_run(
 
 
 def test_long_names_break_behind_underscores_so_that_neighbours_do_not_touch():
-    assert style.heading("shoulder_pan_joint", 6) == "shoulder_\npan_joint"
-    assert style.heading("shoulder_pan_joint", 3) == "shoulder_pan_joint"
-    assert style.lines("two words, joint_1", 9) == "two\nwords,\njoint_1"
-    assert style.label("wrist_1_joint, torque", "N·m", 20) == "wrist_1_joint,\ntorque (N·m)"
+    assert style.break_heading("shoulder_pan_joint", 6) == "shoulder_\npan_joint"
+    assert style.break_heading("shoulder_pan_joint", 3) == "shoulder_pan_joint"
+    assert style.break_lines("two words, joint_1", 9) == "two\nwords,\njoint_1"
+    assert style.label_axis("wrist_1_joint, torque", "N·m", 20) == "wrist_1_joint,\ntorque (N·m)"
 
 
 def test_no_figure_is_taller_than_a_page_leaves_beside_its_caption():
-    figure, _ = style.panels(10, 2, 14.0)
+    figure, _ = style.make_panels(10, 2, 14.0)
     assert figure.get_figheight() == style.TALLEST

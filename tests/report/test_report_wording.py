@@ -16,7 +16,7 @@ from bampipe.report.document import spans
     [("N.m.s/rad", "N·m·s/rad"), ("m/s2", "m/s²"), ("kg.m2", "kg·m²"), ("", ""), ("1/s", "1/s")],
 )
 def test_unit(stored: str, shown: str) -> None:
-    assert wording.unit(stored) == shown
+    assert wording.format_unit(stored) == shown
 
 
 @pytest.mark.parametrize(
@@ -38,12 +38,12 @@ def test_unit(stored: str, shown: str) -> None:
     ],
 )
 def test_with_sd(value: float | None, sd: float | None, shown: str) -> None:
-    assert wording.with_sd(value, sd) == shown
+    assert wording.format_with_sd(value, sd) == shown
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e4))
 def test_rounding_stays_within_a_twentieth_of_the_uncertainty(value: float, sd: float) -> None:
-    both, _, raised = wording.with_sd(value, sd).replace("−", "-").partition(")·10")
+    both, _, raised = wording.format_with_sd(value, sd).replace("−", "-").partition(")·10")
     shown = [10.0 ** read_power(raised) * float(x) for x in both.strip("()").split(" ± ")]
     assert abs(shown[0] - value) <= 0.0505 * sd + 1e-9 * abs(value)
     assert abs(shown[1] - sd) <= 0.0505 * sd
@@ -55,7 +55,7 @@ def read_power(raised: str) -> int:
 
 @given(st.floats(1e-9, 1e9))
 def test_significant_keeps_three_digits(value: float) -> None:
-    text = wording.significant(value)
+    text = wording.format_digits(value)
     if "·10" in text:
         mantissa, raised = text.split("·10")
         shown = float(mantissa) * 10.0 ** read_power(raised)
@@ -78,20 +78,20 @@ def test_significant_keeps_three_digits(value: float) -> None:
     ],
 )
 def test_scale(values: list[float], base: str, shown: tuple[float, str]) -> None:
-    factor, unit = wording.scale(values, base)
+    factor, unit = wording.choose_scale(values, base)
     assert factor == pytest.approx(shown[0])
     assert unit == shown[1]
 
 
 def test_names_in_words() -> None:
-    assert wording.parameter("viscous.yaw") == "Viscous damping, yaw"
-    assert wording.parameter("gravity_compensator_lag.time") == "Gravity compensator lag, time"
+    assert wording.name_parameter("viscous.yaw") == "Viscous damping, yaw"
+    assert wording.name_parameter("gravity_compensator_lag.time") == "Gravity compensator lag, time"
     assert join_names(["a", "b", "c"]) == "a, b and c"
     assert join_names(["a"]) == "a"
-    assert wording.count(1, "trial") == "1 trial"
-    assert wording.count(2, "trial") == "2 trials"
-    assert wording.probability(0.0002) == "< 0.001"
-    assert wording.percent(0.812) == "81 %"
+    assert wording.count_noun(1, "trial") == "1 trial"
+    assert wording.count_noun(2, "trial") == "2 trials"
+    assert wording.format_p_value(0.0002) == "< 0.001"
+    assert wording.format_percent(0.812) == "81 %"
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_names_in_words() -> None:
     ],
 )
 def test_prose_has_printed_numbers_and_leaves_names_alone(stored: str, printed: str) -> None:
-    assert wording.prose(stored) == printed
+    assert wording.format_prose(stored) == printed
 
 
 def test_code_is_printed_as_it_is_to_be_typed() -> None:

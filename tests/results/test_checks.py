@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from made_results import filled
 
-from bampipe.results.checks import find_failed_checks
+from bampipe.phrases.results import find_failed_checks
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.validate import JudgedError

@@ -14,6 +14,7 @@ from independent.sensors import Conditions
 from mistakes import MISTAKES, Case, run_case, set_text
 
 import bampipe
+from bampipe.phrases.results import list_setup_faults
 from bampipe.results.setup import SetupResult
 
 NAMED = [
@@ -104,7 +105,7 @@ def test_a_scale_of_one_is_said_even_where_nothing_contradicts_it(tmp_path: Path
     )
     found = inspected(tmp_path, *amperes)
     assert found.mistakes == ()
-    (line,) = found.lines
+    (line,) = list_setup_faults(found)
     assert line.startswith("torque_per_ampere of the device file is 1 N.m/A, source 'data sheet'")
 
 
@@ -117,7 +118,10 @@ def test_an_axis_that_hardly_moves_is_said(tmp_path: Path) -> None:
 
     found = inspected(tmp_path, stop)
     assert found.axes["joint"].state == "hardly_moves"
-    assert any(line.startswith("joint hardly moves: it stands still in") for line in found.lines)
+    assert any(
+        line.startswith("joint hardly moves: it stands still in")
+        for line in list_setup_faults(found)
+    )
 
 
 def test_an_axis_that_moves_beyond_reason_is_said(tmp_path: Path) -> None:
@@ -132,7 +136,7 @@ def test_an_axis_that_moves_beyond_reason_is_said(tmp_path: Path) -> None:
     found = inspected(tmp_path, in_degrees)
     assert any(
         line.startswith("joint moves through") and line.endswith("is its position in degrees?")
-        for line in found.lines
+        for line in list_setup_faults(found)
     )
 
 
@@ -189,5 +193,12 @@ def test_gravity_that_the_device_lacks_is_no_exchanged_column(tmp_path: Path) ->
     no_moments = set_text(r"moment\w* = .*\n", "", "joint.toml")
     found = inspected(tmp_path, weightless, no_moments)
     assert found.mistakes == ()
-    (line,) = found.lines
+    (line,) = list_setup_faults(found)
     assert line.startswith("a torque that follows the position of joint, as of gravity or a spring")
+
+
+def test_a_gear_that_was_left_out_is_found_whatever_its_reduction(tmp_path: Path) -> None:
+    """The weight of the joint goes with the sine of its angle: 70 is none of a usual gain."""
+    (mistake,) = inspected(tmp_path, mistakes.scale_column("q", 70.0)).mistakes
+    assert (mistake.kind, mistake.signals) == ("scale", ("joint",))
+    assert mistake.factor == pytest.approx(1.0 / 70.0, rel=0.03)

@@ -12,13 +12,13 @@ from bampipe.data.device_file import complete_device
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
-from bampipe.setup.corrections import scaled
-from bampipe.setup.finding import Finding, Tried, choose
+from bampipe.setup.finding import Finding, conclude
+from bampipe.setup.hypotheses import scaled
 from bampipe.setup.plausibility import Plausibility
 from bampipe.setup.search import CorrectionSearch
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
-from bampipe.trials.signals import Change, Signals
+from bampipe.trials.signals import Signals
 
 RATE = 100.0
 JOINTS = ("one", "two", "three", "four")
@@ -88,8 +88,7 @@ def search_in(given: list[Motion]) -> CorrectionSearch:
 
 
 def find_mistakes(given: list[Motion]) -> tuple[Finding, ...]:
-    search = search_in(given)
-    return search.find_mistakes(search.judge(Change.none(8)), ())
+    return search_in(given).find_mistakes(())
 
 
 @pytest.mark.parametrize("viscous", [2.0, 9.0])
@@ -121,7 +120,7 @@ def test_what_spoils_a_joint_that_was_right_is_no_mistake(third: float, named: b
         for error, objection in (((0.10, 0.55, 0.08, 0.21), 1.0), ((0.12, 0.32, third, 0.21), 0.5))
     )
     twice = scaled(search.signals, FORCES, 2.0, 0.0)
-    assert bool(choose(before, [Tried((twice,), after)])) == named
+    assert bool(conclude(lambda chosen: after if chosen else before, (twice,), ())) == named
 
 
 def turned(factor: float, zero: float, joint: int, drive: float) -> list[Motion]:
@@ -191,9 +190,23 @@ REVERSED = np.array([1.0, -1.0, 1.0, 1.0])
 @pytest.mark.parametrize(("tool", "factor"), [(1.0, None), (5.0, 5.0 * OFF[3])])
 def test_a_heavy_tool_is_no_mistake_of_units(tool: float, factor: float | None) -> None:
     search = search_in(motions(1.0, 2.0, tool=tool))
-    assert search.find_mistakes(search.judge(Change.none(8)), ()) == ()
+    assert search.find_mistakes(()) == ()
     if factor is None:
         assert search.heavier is None
     else:
         assert search.heavier is not None and search.heavier.place == 3
         assert search.heavier.factor == pytest.approx(factor, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("joint", "position", "torque", "named"),
+    [(1, 1.0, 1.0 / 70.0, ("torque_two",)), (0, 70.0, 1.0, ("one",))],
+    ids=["torque of the motor", "position of the motor"],
+)
+def test_a_reduction_follows_from_the_drives_and_is_none_of_a_list(
+    joint: int, position: float, torque: float, named: tuple[str, ...]
+) -> None:
+    (found,) = find_mistakes(turned(position, 0.0, joint, torque))
+    assert (found.correction.kind, found.correction.signals) == ("scale", named)
+    expected = 70.0 if position == 1.0 else 1.0 / 70.0
+    assert found.correction.factor == pytest.approx(expected, rel=0.25 if position == 1.0 else 0.03)

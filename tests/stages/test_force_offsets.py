@@ -11,7 +11,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.files import read_json
 from bampipe.progress import silent
-from bampipe.proposal import propose, write_proposal
+from bampipe.setup.proposal import propose, write_proposal
 from bampipe.stages import filter as filter_stage
 from bampipe.stages import ingest
 

@@ -10,10 +10,10 @@ from independent import arm
 import bampipe
 from bampipe.errors import InputError
 from bampipe.files import read_json
-from bampipe.proposal import propose, write_proposal
 from bampipe.report.document import Table
 from bampipe.report.results import Results
 from bampipe.report.sections import stiffness
+from bampipe.setup.proposal import propose, write_proposal
 
 SECOND = """
 [channels.second_{axis}]

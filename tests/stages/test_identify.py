@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +16,9 @@ from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.files import digest_file, read_json, write_text
 from bampipe.identification.estimates import Estimate
+from bampipe.identification.filter_estimate import FilterTask
 from bampipe.identification.filter_run import MotionLost
-from bampipe.progress import silent
+from bampipe.progress import Progress, silent
 from bampipe.run.settings import configure
 from bampipe.stages import identify
 from bampipe.stages.base import paths_of
@@ -105,11 +106,10 @@ def test_what_a_trial_told_the_filter_is_taken_off_without_running_it_again(tmp_
     run = simulated_run(tmp_path / "all", trials=3, seconds=6.0)
     by_count: dict[int, Estimate] = {}
 
-    def noting(
-        run: object, system: object, narrowed: object, motions: Sequence[object], *rest: object
-    ) -> Estimate:
-        by_count[len(motions)] = original(run, system, narrowed, motions, *rest)
-        return by_count[len(motions)]
+    def noting(task: FilterTask, progress: Progress) -> Estimate:
+        count = len(task.squares.trials.motions)
+        by_count[count] = original(task, progress)
+        return by_count[count]
 
     original = identify.estimate_by_filter
     with pytest.MonkeyPatch.context() as patched:
@@ -122,18 +122,6 @@ def test_what_a_trial_told_the_filter_is_taken_off_without_running_it_again(tmp_
     without = by_count[3].held_out[2][again.free]
     assert np.max(np.abs(without - again.value) / again.sd) < 0.3
     assert np.max(np.abs(by_count[3].value - again.value) / again.sd) > 0.6
-
-
-def test_output_error(simulated: RunFolder) -> None:
-    content = identified(simulated, replace(FAST, method="output-error"))
-    assert_recovered(content, TRUTH)
-    z = [
-        (content["parameters"][name]["estimate"] - value) / content["parameters"][name]["sd"]
-        for name, value in TRUTH.items()
-    ]
-    assert np.sqrt(np.mean(np.square(z))) < 2.0
-    assert content["convergence"]["converged"]
-    assert all(0.0 < error < 1e-3 for error in content["position_error"].values())
 
 
 def test_velocity_may_be_measured_too(simulated: RunFolder) -> None:

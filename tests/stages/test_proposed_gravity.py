@@ -12,7 +12,7 @@ import pytest
 from bampipe.data import guesses
 from bampipe.physics import registry
 from bampipe.physics.units import check_device
-from bampipe.proposal import propose
+from bampipe.setup.proposal import propose
 
 Torque = Callable[[np.ndarray], np.ndarray]
 RATE = 200.0

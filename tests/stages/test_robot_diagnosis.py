@@ -10,7 +10,7 @@ from independent import arm
 import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.files import read_json
-from bampipe.proposal import propose, write_proposal
+from bampipe.setup.proposal import propose, write_proposal
 
 
 def run_arm(

@@ -16,9 +16,9 @@ from bampipe.data.session import read_session
 from bampipe.errors import InputError
 from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
-from bampipe.proposal import ProposedSession, propose, write_proposal
-from bampipe.proposal.drawing import Drive
-from bampipe.proposal.notes import COLUMNS
+from bampipe.setup.drawn_bodies import Drive
+from bampipe.setup.proposal import ProposedSession, propose, write_proposal
+from bampipe.setup.proposal.notes import COLUMNS
 
 URDF = """<?xml version="1.0"?><robot name="arm">
 <link name="base"/>

@@ -3,13 +3,14 @@
 Every reader returns the wanted columns as float64, with NaN where a cell is empty, and raises
 :class:`bampipe.errors.InputError` naming file, row and column where the file cannot be trusted.
 Rows of a text file are counted as an editor does (the first line is row 1); samples of the other
-files are counted from 1. Memory stays below three times what is returned; JSON and ROS bags apart,
-whose samples have to be held as objects. What a file would unpack to is found before the memory is
-taken (:mod:`.unpacking`).
+files are counted from 1. Memory stays below three times what is returned; JSON, MATLAB files and
+ROS bags apart, which have to be held as a whole. A small file can unpack to gigabytes, by damage or
+because somebody made it so: no reader gets more memory than its file can be worth.
 """
 
 from __future__ import annotations
 
+import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -46,6 +47,8 @@ EXTENSIONS = tuple(_READERS)
 """File extensions that can be read."""
 
 _HEAD = 1 << 10
+_MOST_UNPACKED, _LEAST_ROOM = 100, 2 << 30
+"""Of the size of a file, and bytes, which it may take in memory while it is read, if it is free."""
 _KINDS = (
     (b"PAR1", (".parquet",), "a Parquet file"),
     (b"TDSm", (".tdms",), "a TDMS file"),
@@ -86,7 +89,7 @@ def read_trial(
     path, name = Path(path), name or str(path)
     reader = _READERS[_checked_extension(path, name)]
     wanted = Wanted(tuple(columns), datetimes or {}, dialect or Dialect(), largest_bytes)
-    with _memory_named(name):
+    with _limited_memory(path, name):
         trial: RawTrial = reader.read(path, wanted, name)
     if columns and len(trial) == 0:
         raise InputError("a header but no samples", where=name)
@@ -104,7 +107,7 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
     """
     path, name = Path(path), name or str(path)
     reader = _READERS[_checked_extension(path, name)]
-    with _memory_named(name):
+    with _limited_memory(path, name):
         if reader is text and dialect is not None:
             return text.columns(path, name, dialect)
         columns: dict[str, str] = reader.columns(path, name)
@@ -112,12 +115,36 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
 
 
 @contextmanager
-def _memory_named(name: str) -> Iterator[None]:
-    """Turn a lack of memory into InputError."""
+def _limited_memory(path: Path, name: str) -> Iterator[None]:
+    """Let this process take as much memory as the file may; where Linux is not, it takes any.
+
+    Raises:
+        InputError: it does not suffice.
+    """
+    try:
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        meminfo = Path("/proc/meminfo").read_text()
+    except (ImportError, OSError):
+        resource = None  # type: ignore[assignment]
+    else:
+        free = int(re.findall(r"MemAvailable:\s*(\d+) kB", meminfo)[0]) << 10
+        room = min(free, max(_MOST_UNPACKED * path.stat().st_size, _LEAST_ROOM))
+        before = resource.getrlimit(resource.RLIMIT_AS)
+        limits = [pages * resource.getpagesize() + room, *(x for x in before if x >= 0)]
+        resource.setrlimit(resource.RLIMIT_AS, (min(limits), before[1]))
     try:
         yield
     except MemoryError as error:
-        raise InputError("does not fit into memory", where=name) from error
+        raise InputError(
+            "does not fit into memory",
+            where=name,
+            remedy="is it damaged? else split it, or export the columns that are wanted",
+        ) from error
+    finally:
+        if resource is not None:
+            resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def _checked_extension(path: Path, name: str) -> str:

@@ -29,14 +29,12 @@ from bampipe.data.readers import moments
 from bampipe.data.readers.extras import need
 from bampipe.data.readers.nested import MISSING, as_number, find, items, leaves, names_in, spread
 from bampipe.data.readers.trial import (
-    LARGEST_BYTES,
     RawTrial,
     Wanted,
     check_columns,
     check_size,
     interpolated,
 )
-from bampipe.data.readers.unpacking import check_mcap, check_ros1
 from bampipe.errors import InputError
 
 RECORDED = "@time"
@@ -170,7 +168,7 @@ def _read_streams(
     topics = tuple(dict.fromkeys(field.topic for field in fields.values()))
     streams: dict[tuple[Any, ...], _Stream] = {}
     samples, near = 0, ""
-    for topic, moment, message in _messages(path, topics, wanted.largest_bytes, name):
+    for topic, moment, message in _messages(path, topics, name):
         kind = _kind(message)
         stream = streams.get((topic, kind))
         if stream is None:
@@ -238,7 +236,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     seen: set[tuple[Any, ...]] = set()
-    for topic, _, message in _messages(path, (), LARGEST_BYTES, name):
+    for topic, _, message in _messages(path, (), name):
         key = (topic, _kind(message))
         if key in seen:
             continue
@@ -295,9 +293,7 @@ def _times(
     return np.array(known, dtype=np.int64)
 
 
-def _messages(
-    path: Path, topics: Sequence[str], largest_bytes: int, name: str
-) -> Iterator[tuple[str, int, Any]]:
+def _messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of recording (ns) and message, in the order of recording; all if no topics.
 
     Raises:
@@ -306,11 +302,7 @@ def _messages(
     need("rosbags.highlevel", "ros", name)
     ending = path.suffix.lower()
     try:
-        if ending == ".bag":
-            check_ros1(path, name)
-        elif ending == ".mcap":
-            check_mcap(path, largest_bytes, name)
-        else:
+        if ending == ".db3":
             _check_tables(path)
         source = _json_messages if ending == ".mcap" and _holds_json(path, name) else _ros_messages
         yield from source(path, topics, name)

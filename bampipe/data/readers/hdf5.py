@@ -7,8 +7,6 @@ or a column of a matrix (``log/pose[2]``). What lies outside the file is not fol
 from __future__ import annotations
 
 import math
-import re
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,6 @@ import numpy as np
 from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import labels, pick, recorded, split_index
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
-from bampipe.data.readers.unpacking import MARGIN, check_unpacked, inflated_size
 from bampipe.errors import InputError
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -29,14 +26,11 @@ FAULTS = (
     LookupError,
     ArithmeticError,
     RuntimeError,
-    zlib.error,
 )
 """What reading a damaged file raises: h5py has no one error type for it."""
 
 _MOST_DATASETS = 2000
-_MOST_FROM_ZLIB = 1032
-"""Bytes that zlib makes of one, at the most."""
-_BLOCK_BYTES = 1 << 24
+_BLOCK_ROWS = 1 << 14
 
 
 def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTrial:
@@ -54,7 +48,6 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
     import h5py  # heavy: only for these files
 
     matlab = what == "variable"
-    longest = _longest_text(path) if wanted.datetimes else 0
     try:
         with h5py.File(path, "r") as file:
             values: dict[str, np.ndarray] = {}
@@ -67,9 +60,8 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
                 _check(data, kind, moment, where)
                 count = math.prod(data.shape)
                 check_size(count, wanted, name)
-                _check_chunks(data, 8 * count * len(wanted.columns), where)
                 if moment:
-                    stamps = _stamps(data, field, index, wanted.datetimes[column], longest, where)
+                    stamps = _stamps(data, field, index, wanted.datetimes[column], where)
                     values[column] = moments.seconds(stamps)
                 else:
                     cells = data[()] if field is None else data[field]
@@ -181,64 +173,19 @@ def _check(data: Any, kind: Any, moment: bool, where: str) -> None:
         )
 
 
-def _check_chunks(data: Any, trial_bytes: int, where: str) -> None:
-    """Raise InputError where a chunk unpacks to far more than the trial takes.
-
-    What zlib unpacks counts, not what the file claims: HDF5 enlarges its buffer until all fits.
-    """
-    import h5py
-
-    if data.chunks is None:
-        return
-    claimed = math.prod(data.chunks) * data.dtype.itemsize
-    check_unpacked(claimed, trial_bytes, where, "a chunk")
-    limit = max(3 * trial_bytes, MARGIN)
-    plan = data.id.get_create_plist()
-    filters = [plan.get_filter(n)[0] for n in range(plan.get_nfilters())]
-    if h5py.h5z.FILTER_DEFLATE not in filters:
-        return
-    if filters.count(h5py.h5z.FILTER_DEFLATE) > 1:
-        raise InputError("compressed twice", where=where, remedy="compress it once")
-    chunks: list[Any] = []
-    data.id.chunk_iter(chunks.append)
-    for chunk in chunks:
-        if chunk.size * _MOST_FROM_ZLIB > limit:
-            packed = data.id.read_direct_chunk(chunk.chunk_offset)[1]
-            check_unpacked(inflated_size(packed, limit), trial_bytes, where, "a chunk")
-
-
-def _longest_text(path: Path) -> int:
-    """Bytes that a text of variable length in the file can have at the most.
-
-    They are in global heaps, which say how large they are.
-    """
-    longest, before = 4096, b""
-    with path.open("rb") as stream:
-        while block := stream.read(1 << 20):
-            joined = before + block
-            for match in re.finditer(rb"GCOL\x01...(.{8})", joined, re.DOTALL):
-                longest = max(longest, int.from_bytes(match[1], "little"))
-            before = joined[-15:]
-    return min(longest, path.stat().st_size)
-
-
-def _stamps(
-    data: Any, field: str | None, index: int | None, form: str, longest: int, where: str
-) -> np.ndarray:
+def _stamps(data: Any, field: str | None, index: int | None, form: str, where: str) -> np.ndarray:
     """Dates and times as ns, (T,) int64, read in blocks of bounded size."""
     kind = data.dtype if field is None else data.dtype[field]
-    width = longest if kind.kind == "O" else kind.itemsize
-    if kind.kind == "S" and width > moments.LONGEST:
-        raise InputError(f"a text of {width} bytes, expected a date and time", where=where)
+    if kind.kind == "S" and kind.itemsize > moments.LONGEST:
+        raise InputError(f"a text of {kind.itemsize} bytes, expected a date and time", where=where)
     stamps = np.empty(len(pick(np.empty(data.shape, dtype="V0"), index, where)), dtype=np.int64)
     axis = int(np.argmax(data.shape))
-    rows = max(_BLOCK_BYTES // (width * (math.prod(data.shape) // len(stamps))), 1)
-    for start in range(0, len(stamps), rows):
-        block = data[(slice(None),) * axis + (slice(start, start + rows),)]
+    for start in range(0, len(stamps), _BLOCK_ROWS):
+        block = data[(slice(None),) * axis + (slice(start, start + _BLOCK_ROWS),)]
         cells = np.moveaxis(block if field is None else block[field], axis, 0)
         cells = cells.reshape(len(cells), -1)[:, index or 0]
         text = [x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in cells]
-        stamps[start : start + rows] = moments.nanoseconds(text, form, where, start + 1)
+        stamps[start : start + len(text)] = moments.nanoseconds(text, form, where, start + 1)
     return stamps
 
 

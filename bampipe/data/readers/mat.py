@@ -1,18 +1,28 @@
-"""MATLAB files of version 5 to 7.2 (:mod:`.level5`) and 7.3 (:mod:`.hdf5`)."""
+"""MATLAB files of version 5 to 7.2, and of 7.3 (:mod:`.hdf5`)."""
 
 from __future__ import annotations
 
+import math
 import struct
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from bampipe.data.readers import hdf5, level5
+import numpy as np
+
+from bampipe.data.readers import hdf5
 from bampipe.data.readers.arrays import pick, recorded, split_index
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
 from bampipe.errors import InputError
 
-_FAULTS = (*hdf5.FAULTS, struct.error)
+_HEADER = 128
+_MATRIX, _COMPRESSED = 14, 15
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
+_NUMBERS |= {12: "i8", 13: "u8"}
+_STRUCT_CLASS, _NUMERIC_CLASSES, _OPAQUE_CLASS = 2, range(6, 16), 17
+_COMPLEX = 0x0800
+_DEEPEST = 8
+_MOST_FIELDS = 4096
 
 
 def is_hdf5(head: bytes) -> bool:
@@ -32,9 +42,30 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
             where=f"{name}, variable '{column}'",
             remedy="save seconds: t = seconds(stamp - stamp(1))",
         )
-    if _is_level_5(path, name):
-        return _read_level_5(path, wanted, name)
-    return hdf5.read(path, wanted, name, "variable")
+    if not _is_level_5(path, name):
+        return hdf5.read(path, wanted, name, "variable")
+    known = _arrays(path, name)
+    values = {}
+    for column in wanted.columns:
+        variable, index = split_index(column, known)
+        check_columns(list(known), [variable], name)
+        array, where = known[variable], f"{name}, variable '{column}'"
+        inside = [other for other in known if other.startswith((f"{variable}.", f"{variable}[0]."))]
+        if inside:
+            raise InputError(
+                "a struct, expected a vector of numbers",
+                where=where,
+                remedy=f"name what is in it: {', '.join(inside[:8])}",
+            )
+        if array is None:
+            raise InputError(
+                "not numbers, expected a vector of real numbers",
+                where=where,
+                remedy="save it as a numeric array: cells, tables and objects are not",
+            )
+        check_size(array.size, wanted, name)
+        values[column] = np.asarray(pick(array, index, where), dtype=np.float64)
+    return RawTrial(aligned(values, name, "variable"), first_row=1)
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
@@ -45,9 +76,8 @@ def columns(path: Path, name: str) -> dict[str, str]:
     """
     if not _is_level_5(path, name):
         return hdf5.columns(path, name)
-    with _faults_named(name):
-        found = level5.variables(path)
-    return dict.fromkeys(recorded({v.name: v.shape for v in found if v.real}), "")
+    shapes = {label: a.shape for label, a in _arrays(path, name).items() if a is not None}
+    return dict.fromkeys(recorded(shapes), "")
 
 
 def _is_level_5(path: Path, name: str) -> bool:
@@ -55,7 +85,7 @@ def _is_level_5(path: Path, name: str) -> bool:
         head = stream.read(1024)
     if is_hdf5(head):
         return False
-    if level5.is_level5(head):
+    if len(head) >= _HEADER and head[126:128] in (b"IM", b"MI"):
         return True
     raise InputError(
         "not a MATLAB file of version 5 or newer",
@@ -64,44 +94,81 @@ def _is_level_5(path: Path, name: str) -> bool:
     )
 
 
-def _read_level_5(path: Path, wanted: Wanted, name: str) -> RawTrial:
-    with _faults_named(name):
-        known = {variable.name: variable for variable in level5.variables(path)}
-        values = {}
-        for column in wanted.columns:
-            variable_name, index = split_index(column, known)
-            check_columns(list(known), [variable_name], name)
-            variable = known[variable_name]
-            where = f"{name}, variable '{column}'"
-            inside = [other for other in known if other.startswith(f"{variable_name}.")]
-            inside += [other for other in known if other.startswith(f"{variable_name}[0].")]
-            if inside:
-                raise InputError(
-                    "a struct, expected a vector of numbers",
-                    where=where,
-                    remedy=f"name what is in it: {', '.join(inside[:8])}",
-                )
-            if not variable.real:
-                raise InputError(
-                    "not numbers, expected a vector of real numbers",
-                    where=where,
-                    remedy="save it as a numeric array: cells, tables and objects are not",
-                )
-            check_size(variable.length, wanted, name)
-            flat = level5.values(path, variable)
-            shaped = flat.reshape(variable.shape, order="F")
-            values[column] = pick(shaped, index, where)
-    return RawTrial(aligned(values, name, "variable"), first_row=1)
+def _arrays(path: Path, name: str) -> dict[str, np.ndarray | None]:
+    """Arrays of a file, each struct followed by what is in it; None for what are no real numbers.
 
-
-@contextmanager
-def _faults_named(name: str) -> Iterator[None]:
-    """Turn what damage raises into InputError."""
+    scipy.io reads the same files, but past its buffers where a damaged one lies about a length,
+    which ends the process without a word. Source: MathWorks, MAT-File Format, level 5.
+    """
     try:
-        yield
-    except level5.TooLargeError as error:
-        raise InputError(str(error), where=name, remedy="save fewer variables") from error
-    except _FAULTS as error:
+        data = memoryview(path.read_bytes())
+        order = "<" if bytes(data[126:128]) == b"IM" else ">"
+        found: dict[str, np.ndarray | None] = {}
+        at = _HEADER
+        while at + 8 <= len(data):
+            kind, size = struct.unpack_from(order + "II", data, at)
+            body, at = data[at + 8 : at + 8 + size], at + 8 + size
+            if kind == _COMPRESSED:
+                kind, body = _Elements(memoryview(zlib.decompress(body)), order).take()
+            if kind != _MATRIX or at > len(data):
+                raise ValueError("an element is not what it says")
+            found |= {label: a for label, a in _Elements(body, order).arrays("", 0) if label}
+    except (ValueError, IndexError, struct.error, zlib.error) as error:
         raise InputError(
             "not a sound MATLAB file", where=name, remedy="save it again from MATLAB"
         ) from error
+    return found
+
+
+class _Elements:
+    """The elements of an array, one after the other, every length checked."""
+
+    def __init__(self, data: memoryview, order: str) -> None:
+        self._data, self._order, self._at = data, order, 0
+
+    def take(self) -> tuple[int, memoryview]:
+        """Type and data of the next element."""
+        word, size = struct.unpack_from(self._order + "II", self._data, self._at)
+        start = self._at + 8
+        self._at = start + size + -size % 8
+        if word >> 16:  # a small element has its data in the second half of its head
+            word, size, self._at, start = word & 0xFFFF, word >> 16, start, start - 4
+        if start + size > min(len(self._data), self._at):
+            raise ValueError("an element ends early")
+        return word, self._data[start : start + size]
+
+    def numbers(self) -> np.ndarray:
+        """The next element, of numbers."""
+        kind, data = self.take()
+        if kind not in _NUMBERS:
+            raise ValueError("an element holds no numbers")
+        return np.frombuffer(data, dtype=self._order + _NUMBERS[kind])
+
+    def text(self) -> str:
+        """The next element, of letters."""
+        return bytes(self.take()[1]).decode("utf-8", "replace")
+
+    def arrays(self, label: str, depth: int) -> Iterator[tuple[str, np.ndarray | None]]:
+        """This array, called ``label`` or as it says itself, and those in its fields."""
+        flags = int(self.numbers()[0])
+        kind = flags & 0xFF
+        extents = [] if kind == _OPAQUE_CLASS else self.numbers().tolist()
+        name = self.text()
+        label = label or name
+        if kind in _NUMERIC_CLASSES and not flags & _COMPLEX:
+            yield label, self.numbers().reshape(extents, order="F")
+            return
+        yield label, None
+        count = math.prod(extents)
+        if kind != _STRUCT_CLASS or depth >= _DEEPEST:
+            return
+        width, names = int(self.numbers()[0]), self.text()
+        fields = [names[k : k + width].partition("\0")[0] for k in range(0, len(names), width)]
+        if count * len(fields) > _MOST_FIELDS:
+            return
+        for number in range(count):
+            own = label if count == 1 else f"{label}[{number}]"
+            for field in fields:
+                body = self.take()[1]
+                if len(body):
+                    yield from _Elements(body, self._order).arrays(f"{own}.{field}", depth + 1)

@@ -8,6 +8,7 @@ as many names stands beside them, they have these.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -16,11 +17,8 @@ import numpy as np
 from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import pick, recorded, split_index
 from bampipe.data.readers.nested import MISSING, as_number, find, leaves
-from bampipe.data.readers.trial import LARGEST_BYTES, RawTrial, Wanted, aligned, check_columns
+from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns
 from bampipe.errors import InputError
-
-_COSTS = {b"{": 184, b"[": 96, b",": 40, b"\n": 16}
-"""Bytes of memory that each of these characters stands for once parsed (CPython 3.11)."""
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
@@ -31,7 +29,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     Raises:
         InputError: not JSON, no such list, a column missing or not of numbers.
     """
-    samples, constants, notes = _samples(path, wanted.largest_bytes, name)
+    samples, constants, notes = _samples(path, name)
     if isinstance(samples, dict):
         return _from_arrays(samples, constants, wanted, notes, name)
     first = _first(samples, name)
@@ -66,7 +64,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
     Raises:
         InputError: as :func:`read`.
     """
-    samples, constants, _ = _samples(path, LARGEST_BYTES, name)
+    samples, constants, _ = _samples(path, name)
     if isinstance(samples, dict):
         shapes = {column: values.shape for column, values in samples.items()}
         moment = {column for column, values in samples.items() if values.dtype == object}
@@ -79,6 +77,14 @@ def columns(path: Path, name: str) -> dict[str, str]:
         elif isinstance(cell, str) and moments.is_moment(cell):
             found[column] = "datetime"
     return found | {c: "" for c in constants if c not in found}
+
+
+def stated_units(path: Path, name: str) -> dict[str, str]:
+    """Units that stand beside the samples, as of ``"force units": "kip"``, by their quantity."""
+    content = _parsed(path.read_text(encoding="utf-8-sig"), name)
+    items = content.items() if isinstance(content, dict) else ()
+    parts = [(re.split(r"[ _]units?$", str(key), flags=re.I), value) for key, value in items]
+    return {key[0]: value for key, value in parts if len(key) > 1 and isinstance(value, str)}
 
 
 def _first(samples: list[object], name: str) -> dict[str, object]:
@@ -147,21 +153,10 @@ def _are_names(values: list[object]) -> bool:
 
 
 def _samples(
-    path: Path, largest_bytes: int, name: str
+    path: Path, name: str
 ) -> tuple[list[object] | dict[str, np.ndarray], Mapping[str, object], tuple[str, ...]]:
     """Samples of a file, or its arrays; the numbers beside them, and what was left out."""
-    size = 3 * path.stat().st_size
-    if size <= largest_bytes:
-        data = path.read_bytes()
-        size = (3 if data.isascii() else 10) * len(data)
-        size += sum(cost * data.count(character) for character, cost in _COSTS.items())
-    if size > largest_bytes:
-        raise InputError(
-            f"a JSON text that unpacks to {size >> 20} MB, where {largest_bytes >> 20} MB are"
-            " allowed",
-            where=name,
-            remedy="log to CSV or Parquet, or allow more (largest_trial_mb)",
-        )
+    data = path.read_bytes()
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

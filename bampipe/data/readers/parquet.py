@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -13,12 +11,10 @@ import pyarrow.parquet as pq
 
 from bampipe.data.readers import moments
 from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size
-from bampipe.data.readers.unpacking import check_unpacked
 from bampipe.errors import InputError
 
 BATCH_ROWS = 1 << 16
 _BUFFER = 1 << 20
-_LONGEST_HEADER = 1 << 24
 _NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_boolean)
 _MOMENTS = (pa.types.is_timestamp, pa.types.is_date, pa.types.is_string, pa.types.is_large_string)
 
@@ -40,19 +36,22 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
                 _check_kind(schema.field(column).type, column in wanted.datetimes, name, column)
             rows = file.metadata.num_rows
             check_size(rows, wanted, name)
-            _check_pages(path, file.metadata, wanted, name)
             values = {
                 column: np.empty(rows, np.int64 if column in wanted.datetimes else np.float64)
                 for column in wanted.columns
             }
             done = 0
-            for batch in file.iter_batches(BATCH_ROWS, columns=list(wanted.columns)):
+            for batch in file.iter_batches(
+                BATCH_ROWS, columns=list(wanted.columns), use_threads=False
+            ):
                 for column in wanted.columns:
                     cells = batch.column(column)
                     values[column][done : done + batch.num_rows] = _numbers(
                         cells, wanted.datetimes.get(column), f"{name}, column '{column}'", done + 1
                     )
                 done += batch.num_rows
+    except MemoryError:
+        raise
     except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(
             "not a sound Parquet file", where=name, remedy="copy it again from the logger"
@@ -82,81 +81,6 @@ def columns(path: Path, name: str) -> dict[str, str]:
         elif pa.types.is_timestamp(field.type):
             found[field.name] = "datetime"
     return found
-
-
-def _check_pages(path: Path, metadata: pq.FileMetaData, wanted: Wanted, name: str) -> None:
-    """Raise InputError where a page of a wanted column unpacks to far more than the trial takes.
-
-    Arrow allocates what the page's own header says; the footer may say less.
-    """
-    trial_bytes = 8 * metadata.num_rows * len(wanted.columns)
-    with path.open("rb") as stream:
-        for group in range(metadata.num_row_groups):
-            for number in range(metadata.num_columns):
-                chunk = metadata.row_group(group).column(number)
-                if chunk.path_in_schema not in wanted.columns:
-                    continue
-                offset = chunk.data_page_offset
-                if chunk.has_dictionary_page and chunk.dictionary_page_offset:
-                    offset = min(offset, chunk.dictionary_page_offset)
-                end = offset + chunk.total_compressed_size
-                where = f"{name}, column '{chunk.path_in_schema}'"
-                while offset < end:
-                    header, length = _page_header(stream, offset)
-                    if not length:  # damaged: Arrow ends here, too
-                        break
-                    check_unpacked(header.get(2, 0), trial_bytes, where, "a page")
-                    offset += length + max(header.get(3, 0), 0)
-
-
-def _page_header(stream: BinaryIO, offset: int) -> tuple[dict[int, int], int]:
-    """Whole numbers in a page's header by field, and its length; 0 where it is none."""
-    for length in (1 << 12, _LONGEST_HEADER):
-        stream.seek(offset)
-        with suppress(IndexError):
-            return _numbers_of_struct(stream.read(length), 0)
-    return {}, 0
-
-
-def _numbers_of_struct(data: bytes, at: int, depth: int = 0) -> tuple[dict[int, int], int]:
-    """Whole numbers in a struct of Thrift's compact protocol, by field, and where it ends.
-
-    Raises:
-        IndexError: it is not there as a whole.
-    """
-    found: dict[int, int] = {}
-    field = 0
-    while kind := data[at] & 0x0F:
-        step, at = data[at] >> 4, at + 1
-        if step:
-            field += step
-        else:
-            field, at = _zigzag(data, at)
-        if kind in (4, 5, 6):
-            found[field], at = _zigzag(data, at)
-        elif kind == 8:
-            length, at = _varint(data, at)
-            at += length
-        elif kind == 12 and depth < 4:
-            _, at = _numbers_of_struct(data, at, depth + 1)
-        elif kind in (3, 7):
-            at += 1 if kind == 3 else 8
-        elif kind > 2:  # a list, set or map: none is in a page's header
-            raise IndexError
-    return found, at + 1
-
-
-def _varint(data: bytes, at: int) -> tuple[int, int]:
-    value = shift = 0
-    while data[at] & 0x80:
-        value |= (data[at] & 0x7F) << shift
-        at, shift = at + 1, shift + 7
-    return value | data[at] << shift, at + 1
-
-
-def _zigzag(data: bytes, at: int) -> tuple[int, int]:
-    value, at = _varint(data, at)
-    return (value >> 1) ^ -(value & 1), at
 
 
 def _check_kind(kind: pa.DataType, moment: bool, name: str, column: str) -> None:

@@ -24,7 +24,7 @@ from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.session import Fit, Session, shared, system_of, workers
 from bampipe.physics.recipe import Recipe
 from bampipe.results.draft import ChanceOfDraft
-from bampipe.results.standing import standing
+from bampipe.results.floor import compare_with_floor
 from bampipe.trials.evidence import gather_evidence
 
 Array = NDArray[np.float64]
@@ -252,7 +252,7 @@ class _AxisSearch:
             search, before = self._open(stand[0]), stand[1]
             progress(0.15 + 0.4 * number, "searching replays for as good a formula")
             chances.append(weigh_chance(self.session, search))
-            if chances[-1].p_value > self.session.criteria.significance:
+            if chances[-1].p_value > self.session.criteria.largest_p_value:
                 break
             progress(0.3 + 0.4 * number, "fitting the best forms with the model")
             tried = self._fit_forms(search, before)
@@ -260,7 +260,7 @@ class _AxisSearch:
             stand = self._take(stand, tried)
             if stand[1] is before or not self._leaves_much(*stand):
                 break
-        wanted = not self.curves and chances[0].p_value <= self.session.criteria.significance
+        wanted = not self.curves and chances[0].p_value <= self.session.criteria.largest_p_value
         wanted = wanted and self._leaves_much(*stand)
         if wanted and symbolic.is_available():
             progress(0.85, "symbolic regression")
@@ -305,7 +305,7 @@ class _AxisSearch:
         return float(found.held_out_rmse[self.axis])
 
     def _leaves_much(self, fit: Fit, option: Option) -> bool:
-        return standing(option.held_out_rmse, self._floor(fit)) == "above_floor"
+        return compare_with_floor(option.held_out_rmse, self._floor(fit)) == "above_floor"
 
     def _fit_forms(self, search: FormSearch, current: Option) -> list[Option]:
         """The model with each of the best forms, all parameters fitted together."""
@@ -361,7 +361,7 @@ def weigh_chance(session: Session, search: FormSearch) -> ChanceOfDraft:
     blocks = 1 + max(int(s.block.max(initial=0)) for s in samples)
     random = np.random.default_rng((session.seed, _SEED, search.forms.axis))
     gains = []
-    for _ in range(int(np.ceil(1.0 / session.criteria.significance)) - 1):
+    for _ in range(int(np.ceil(1.0 / session.criteria.largest_p_value)) - 1):
         of = random.integers(replays, size=blocks)
         y = tuple(
             (noise.bias[axis] + around[axis][of[s.block], np.arange(len(s.rows))])

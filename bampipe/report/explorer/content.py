@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bampipe.report import verdicts, wording
 from bampipe.report.explorer.packing import Packer
-from bampipe.report.results import Results
+from bampipe.report.results import R, Results
+from bampipe.report.wording import format_unit, name_trial_state, split_name
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
@@ -35,32 +35,36 @@ class _Span:
     offset: float
 
 
-def content_of(results: Results, packer: Packer) -> Content:
+def gather_content(results: Results, packer: Packer) -> Content:
     """Return everything that the page shows; channels as blocks of ``packer``."""
-    spans = _spans(results)
+    spans = _place_trials(results)
     grids = _Grids(spans, packer)
     _add_residuals(results, grids)
     _add_map_variables(results, grids)
     _add_recorded(results, grids)
-    models = [_model(results, number, name) for number, name in enumerate(results.models)]
+    models = [_describe_model(results, number, name) for number, name in enumerate(results.models)]
+    axes = [
+        {"name": a, "noun": results.name_force(a), "unit": format_unit(results.force_unit(a))}
+        for a in results.axes
+    ]
     return {
         "models": models,
         "shown": results.models.index(results.model) if models else 0,
-        "axes": [_axis(results, axis) for axis in results.axes],
+        "axes": axes,
         "trials": [asdict(span) for span in spans],
         "grids": grids.described,
         "channels": grids.channels,
-        "maps": _maps(results),
-        "windows": _windows(results),
-        "ladder": _ladder(results),
-        "parameters": _parameters(results),
-        "correlations": _correlations(results),
-        "tables": [table for table in _tables(results) if table["rows"]],
+        "maps": _list_maps(results),
+        "windows": _list_windows(results),
+        "ladder": _list_errors(results),
+        "parameters": _list_parameters(results),
+        "correlations": _list_correlations(results),
+        "tables": [table for table in _make_tables(results) if table["rows"]],
     }
 
 
-def _spans(results: Results) -> list[_Span]:
-    """Return the trials that were read, one behind the other."""
+def _place_trials(results: Results) -> list[_Span]:
+    """Return the trials that were read, one after the other."""
     found, start = [], 0.0
     for row in results.trials.to_dict("records"):
         name = str(row["trial_id"])
@@ -123,7 +127,7 @@ def _add_residuals(results: Results, grids: _Grids) -> None:
         for axis in results.axes:
             if f"torque_measured_{axis}" not in rows:
                 continue
-            unit = wording.unit(results.force_unit(axis))
+            unit = format_unit(results.force_unit(axis))
             if first:
                 measured = rows[f"torque_measured_{axis}"]
                 grids.add("residuals", measured, role="measured", axis=axis, unit=unit)
@@ -155,200 +159,168 @@ def _add_map_variables(results: Results, grids: _Grids) -> None:
 
 def _add_recorded(results: Results, grids: _Grids) -> None:
     samples = results.table("ingest/samples.parquet")
+    session = results.session
     if samples is not None and len(samples):
         rows = grids.start("recorded", samples)
-        session = results.session
-        others = {**session.brakes, **session.channels}
-        for column in rows.columns:
-            name = str(column)
-            if name.startswith("q_") and name.removeprefix("q_") in session.axes:
-                axis = name.removeprefix("q_")
-                label, unit = f"position {axis}", results.unit(axis)
-            elif name in session.force.noise_sd or name in session.force.columns:
-                label, unit = wording.words(name), session.force.unit
-            elif name in others:
-                label, unit = wording.words(name), others[name].unit
-            else:
-                continue
-            grids.add("recorded", rows[column], role="recorded", label=label,
-                      unit=wording.unit(unit))  # fmt: skip
-    known = results.columns("filter/kinematics.parquet")
-    rates = [axis for axis in results.axes if f"qd_{axis}" in known]
-    if not rates:
-        return
-    columns = ["trial_id", "t", *(f"qd_{axis}" for axis in rates)]
-    motion = results.table("filter/kinematics.parquet", columns)
-    if motion is not None and len(motion):
+        units = {
+            name: session.force.unit for name in (*session.force.columns, *session.force.noise_sd)
+        }
+        units |= {name: one.unit for name, one in {**session.brakes, **session.channels}.items()}
+        labels = {name: split_name(name) for name in units}
+        units |= {f"q_{axis}": results.unit(axis) for axis in session.axes}
+        labels |= {f"q_{axis}": f"position {axis}" for axis in session.axes}
+        for name in (str(column) for column in rows.columns if str(column) in units):
+            about = {"label": labels[name], "unit": format_unit(units[name])}
+            grids.add("recorded", rows[name], role="recorded", **about)
+    path = "filter/kinematics.parquet"
+    rates = [axis for axis in results.axes if f"qd_{axis}" in results.columns(path)]
+    motion = results.table(path, ["trial_id", "t", *(f"qd_{axis}" for axis in rates)])
+    if rates and motion is not None and len(motion):
         rows = grids.start("motion", motion)
         for axis in rates:
-            unit = wording.unit(results.rate_unit(axis))
-            grids.add("motion", rows[f"qd_{axis}"], role="motion", label=f"velocity {axis}",
-                      unit=unit)  # fmt: skip
+            about = {"label": f"velocity {axis}", "unit": format_unit(results.rate_unit(axis))}
+            grids.add("motion", rows[f"qd_{axis}"], role="motion", **about)
 
 
-def _model(results: Results, number: int, name: str) -> Content:
-    compared = results.read(CompareResult)
-    rungs = {rung.model: rung for rung in compared.ladder} if compared else {}
-    added = rungs[name].added if name in rungs else None
-    validated = results.read(ValidateResult, name)
-    floors = (
-        {axis: entry.noise_floor for axis, entry in validated.axes.items()} if validated else {}
-    )
+def _label_model(number: int, name: str) -> str:
+    return name if number == 0 else f"version {number}"
+
+
+def _describe_model(results: Results, number: int, name: str) -> Content:
+    compared, validated = results.read(CompareResult), results.read(ValidateResult, name)
+    added = [rung.added for rung in (compared.ladder if compared else ()) if rung.model == name]
+    axes = validated.axes if validated else {}
     return {
         "name": name,
-        "label": name if number == 0 else f"version {number}",
-        "added": added or "",
+        "label": _label_model(number, name),
+        "added": (added and added[0]) or "",
         "effects": list(results.effects(name)),
-        "floors": floors,
+        "floors": {axis: entry.noise_floor for axis, entry in axes.items()},
     }
 
 
-def _axis(results: Results, axis: str) -> Content:
-    noun = "torque" if results.is_rotary(axis) else "force"
-    return {"name": axis, "noun": noun, "unit": wording.unit(results.force_unit(axis))}
+def _read_all(results: Results, kind: type[R]) -> list[tuple[int, R]]:
+    """Return a result of every model that has it, each with the number of the model."""
+    found = ((number, results.read(kind, name)) for number, name in enumerate(results.models))
+    return [(number, one) for number, one in found if one is not None]
 
 
-def _maps(results: Results) -> list[Content]:
+def _list_maps(results: Results) -> list[Content]:
     found = []
-    for number, model in enumerate(results.models):
-        diagnosis = results.read(DiagnoseResult, model)
-        for axis, maps in (diagnosis.maps if diagnosis else {}).items():
-            for variable, drawn in maps.items():
-                plain = drawn.model_dump(mode="json", include={"center", "mean", "low", "high"})
-                about = {"unit": wording.unit(drawn.unit), "share": drawn.variance_share}
-                found.append(
-                    {"model": number, "axis": axis, "variable": variable, **about, **plain}
-                )
+    for number, diagnosis in _read_all(results, DiagnoseResult):
+        for axis, maps in diagnosis.maps.items():
+            for variable, one in maps.items():
+                band = one.model_dump(mode="json", include={"center", "mean", "low", "high"})
+                about = {"model": number, "axis": axis, "variable": variable, **band}
+                unit = format_unit(one.unit)
+                found.append({**about, "unit": unit, "share": one.variance_share})
     return found
 
 
-def _windows(results: Results) -> list[Content]:
-    """Return the worst windows of the latest diagnosis first."""
-    found = []
-    for number, model in reversed(list(enumerate(results.models))):
-        diagnosis = results.read(DiagnoseResult, model)
-        for window in diagnosis.worst_windows if diagnosis else ():
-            unit = wording.unit(window.unit)
-            found.append({"model": number, **window.model_dump(), "unit": unit})
-    return found
+def _list_windows(results: Results) -> list[Content]:
+    """Return the worst windows, those of the latest diagnosis first."""
+    return [
+        {"model": number, **window.model_dump(), "unit": format_unit(window.unit)}
+        for number, diagnosis in reversed(_read_all(results, DiagnoseResult))
+        for window in diagnosis.worst_windows
+    ]
 
 
-def _ladder(results: Results) -> Content:
+def _list_errors(results: Results) -> Content:
     """Return, by axis, held-out error and noise floor of each version, in their order."""
-    validated = [results.read(ValidateResult, model) for model in results.models]
-    return {
-        axis: [
-            {"error": entry.axes[axis].held_out_rmse, "floor": entry.axes[axis].noise_floor}
-            if entry and axis in entry.axes
-            else {"error": None, "floor": None}
-            for entry in validated
-        ]
-        for axis in results.axes
-        if any(entry and axis in entry.axes for entry in validated)
-    }
+    validated = dict(_read_all(results, ValidateResult))
+    ladder: Content = {}
+    for axis in results.axes:
+        errors = {n: one.axes[axis] for n, one in validated.items() if axis in one.axes}
+        if errors:
+            ladder[axis] = [
+                {"error": errors[n].held_out_rmse, "floor": errors[n].noise_floor}
+                if n in errors
+                else {"error": None, "floor": None}
+                for n in range(len(results.models))
+            ]
+    return ladder
 
 
-def _parameters(results: Results) -> list[Content]:
+def _list_parameters(results: Results) -> list[Content]:
     identified = [results.read(IdentifyResult, model) for model in results.models]
-    names = {name: None for entry in identified if entry for name in entry.parameters}
+    names = {name: p.unit for one in identified if one for name, p in one.parameters.items()}
     found = []
-    for name in results.in_order(names):
-        values = [entry.parameters.get(name) if entry else None for entry in identified]
-        unit = next(value.unit for value in values if value)
-        found.append(
-            {
-                "name": name,
-                "unit": wording.unit(unit),
-                "values": [
-                    v.model_dump(include={"estimate", "sd", "at_bound"}) if v else None
-                    for v in values
-                ],
-            }
-        )
+    for name in results.order_parameters(names):
+        values = [one.parameters.get(name) if one else None for one in identified]
+        shown = [
+            v.model_dump(include={"estimate", "sd", "at_bound"}) if v else None for v in values
+        ]
+        found.append({"name": name, "unit": format_unit(names[name]), "values": shown})
     return found
 
 
-def _correlations(results: Results) -> list[Content]:
+def _list_correlations(results: Results) -> list[Content]:
     found = []
-    for number, model in enumerate(results.models):
-        identified = results.read(IdentifyResult, model)
-        if identified is None or not identified.covariance.names:
+    for number, identified in _read_all(results, IdentifyResult):
+        if not identified.covariance.names:
             continue
         covariance = np.array(identified.covariance.matrix)
         sd = np.sqrt(np.diag(covariance))
         with np.errstate(divide="ignore", invalid="ignore"):
             matrix = covariance / np.outer(sd, sd)
         rows = [[float(v) if np.isfinite(v) else None for v in row] for row in matrix]
-        found.append(
-            {
-                "model": number,
-                "names": list(identified.covariance.names),
-                "matrix": rows,
-                "blocks": identified.blocks,
-            }
-        )
+        names = list(identified.covariance.names)
+        blocks = identified.blocks
+        found.append({"model": number, "names": names, "matrix": rows, "blocks": blocks})
     return found
 
 
-def _tables(results: Results) -> Iterable[Content]:
-    yield _trial_errors(results)
-    for number, model in reversed(list(enumerate(results.models))):
-        diagnosis = results.read(DiagnoseResult, model)
-        if diagnosis is not None:
-            label = model if number == 0 else f"version {number}"
-            yield _candidates(diagnosis, label)
+def _make_tables(results: Results) -> Iterable[Content]:
+    yield _make_trials(results)
+    for number, diagnosis in reversed(_read_all(results, DiagnoseResult)):
+        yield _make_candidates(diagnosis, _label_model(number, diagnosis.model))
 
 
-def _trial_errors(results: Results) -> Content:
+def _make_trials(results: Results) -> Content:
     validated = results.read(ValidateResult)
     trials = validated.trials if validated else {}
-    axes = verdicts.ordered(results, validated.axes) if validated else ()
+    axes = results.order_axes(validated.axes) if validated else ()
     rows: list[list[Cell]] = []
     for row in results.trials.to_dict("records"):
         name, kind = str(row["trial_id"]), str(row["kind"])
-        state = wording.trial_state(str(row["status"]))
+        state = name_trial_state(str(row["status"]))
         seconds = float(row["duration_s"])
         # A trial that is alone is held out block by block.
-        blocks = [block for block in trials if block.startswith(f"{name}@")]
-        for part in [name, *blocks]:
-            judged = trials.get(part)
+        for part in [name, *(block for block in trials if block.startswith(f"{name}@"))]:
+            known = trials[part].axes if part in trials else {}
             errors = [
-                (judged.axes[axis].held_out_rmse or None)
-                if judged and axis in judged.axes
-                else None
-                for axis in axes
+                (known[axis].held_out_rmse or None) if axis in known else None for axis in axes
             ]
             whole = part == name and np.isfinite(seconds)
             rows.append([part, kind, state, seconds if whole else None, *errors])
-    heads = [f"RMSE {axis} ({wording.unit(results.force_unit(axis))})" for axis in axes]
-    return {
-        "title": "Trials",
-        "note": f"Held-out errors of model {results.model}." if axes else "",
-        "head": ["Trial", "Kind", "State", "Duration (s)", *heads],
-        "rows": rows,
-    }
+    heads = [f"RMSE {axis} ({format_unit(results.force_unit(axis))})" for axis in axes]
+    note = f"Held-out errors of model {results.model}." if axes else ""
+    head = ["Trial", "Kind", "State", "Duration (s)", *heads]
+    return {"title": "Trials", "note": note, "head": head, "rows": rows}
 
 
-def _candidates(diagnosis: DiagnoseResult, label: str) -> Content:
-    return {
-        "title": f"Candidate effects, {label}",
-        "note": "Held-out error without and with each effect; p: chance that replays give any "
-        "candidate as large a gain.",
-        "head": [
-            *("Effect", "Axis", "Without", "With", "Unit", "Probability", "p"),
-            "Indistinguishable from",
-        ],
-        "rows": [
-            [
-                entry.effect,
-                entry.axis,
-                entry.held_out_rmse_before,
-                entry.held_out_rmse_after,
-                wording.unit(entry.unit),
-                entry.probability,
-                entry.p_value,
-                ", ".join(entry.indistinguishable_from),
-            ]
-            for entry in diagnosis.ranking
-        ],
-    }
+def _make_candidates(diagnosis: DiagnoseResult, label: str) -> Content:
+    rows = [
+        [
+            *(entry.effect, entry.axis, entry.held_out_rmse_before, entry.held_out_rmse_after),
+            *(format_unit(entry.unit), entry.probability, entry.p_value),
+            ", ".join(entry.indistinguishable_from),
+        ]
+        for entry in diagnosis.ranking
+    ]
+    head = [
+        "Effect",
+        "Axis",
+        "Without",
+        "With",
+        "Unit",
+        "Probability",
+        "p",
+        "Indistinguishable from",
+    ]
+    note = (
+        "Held-out error without and with each effect; p: probability that replays give any "
+        "candidate as large a gain."
+    )
+    return {"title": f"Candidate effects, {label}", "note": note, "head": head, "rows": rows}

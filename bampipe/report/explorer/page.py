@@ -9,7 +9,7 @@ from string import Template
 
 from bampipe.report import verdicts
 from bampipe.report.document import plain_text
-from bampipe.report.explorer.content import content_of
+from bampipe.report.explorer.content import gather_content
 from bampipe.report.explorer.packing import Packer
 from bampipe.report.results import Results
 
@@ -26,8 +26,8 @@ def explorer_page(results: Results, subtitle: str) -> str:
         subtitle: device and date.
     """
     packer = Packer()
-    content = content_of(results, packer)
-    verdict = verdicts.overall(results)
+    content = gather_content(results, packer)
+    verdict = verdicts.judge_session(results)
     lines = [plain_text(line) for line in verdict.text.splitlines()]
     title = plain_text(verdict.title)
     content["verdict"] = {"tone": verdict.tone, "title": title, "lines": lines}

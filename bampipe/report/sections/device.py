@@ -4,76 +4,58 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from bampipe.report import wording
 from bampipe.report.document import Block, Section, Table
 from bampipe.report.results import Results
+from bampipe.report.wording import format_decimals, format_digits, format_stated, format_unit
 from bampipe.results.identify import Combined, DeviceNumber, IdentifyResult
 from bampipe.results.performance import DeviceConstant, PerformanceResult
+
+_LEAST_PERCENT = 0.005
 
 
 def section(results: Results) -> Section | None:
     """Return the section; None where no constants are stored."""
     performance, identified = results.read(PerformanceResult), results.read(IdentifyResult)
     known = identified.identifiability if identified else None
-    together = known.together if known else ()
     blocks: list[Block] = []
     if performance and performance.constants:
-        blocks.append(_constants(results, performance.constants, together))
+        together = known.together if known else ()
+        blocks.append(_tabulate_constants(results, performance.constants, together))
     if known and known.numbers:
-        blocks.append(_numbers(known.numbers))
+        blocks.append(_tabulate_numbers(known.numbers))
     return Section("Device", tuple(blocks)) if blocks else None
 
 
-def _constants(
+def _tabulate_constants(
     results: Results, constants: Mapping[str, DeviceConstant], together: Iterable[Combined]
 ) -> Table:
     grouped = {name for group in together for name in group.members}
+    order = sorted(constants, key=lambda name: (name in grouped, name.lower()))
     rows = []
-    for name in sorted(constants, key=lambda name: (name in grouped, name.lower())):
-        entry = constants[name]
-        rows.append(
-            (
-                f"`{name}`",
-                entry.description,
-                wording.as_written(entry.value),
-                wording.unit(entry.unit) or "1",
-                entry.source,
-            )
-        )
+    for name in order:
+        one = constants[name]
+        value, unit = format_stated(one.value), format_unit(one.unit) or "1"
+        rows.append((f"`{name}`", one.description, value, unit, one.source))
     return Table(
-        f"Numbers that the device file gives, none of them estimated{results.in_paper('Table II')}",
-        ("Name", "What", "Value", "Unit", "Source"),
-        tuple(rows),
-        "llrll",
-        (0.0, 1.6, 0.0, 0.0, 1.2),
-    ).without_empty_columns()
+        f"Numbers of the device file, none of them estimated{results.cite_paper('Table II')}",
+        "Name | What ~1.6 | >Value | Unit | Source ~1.2",
+        rows,
+    ).drop_empty_columns()
 
 
-def _numbers(numbers: Iterable[DeviceNumber]) -> Table:
-    """Return what the trials say of these numbers, and which estimates rest on them."""
+def _tabulate_numbers(numbers: Iterable[DeviceNumber]) -> Table:
+    """Tabulate what the trials say of these numbers, and which estimates depend on them."""
     rows = []
-    for entry in numbers:
-        moved = sorted(entry.moves_percent.items(), key=lambda item: -abs(item[1]))
-        most = [
-            f"`{parameter}` {wording.plain(size, 2)} %"
-            for parameter, size in moved[:2]
-            if abs(size) >= 0.005
-        ]
-        unit = wording.unit(entry.unit) or "1"
-        rows.append(
-            (
-                f"`{entry.name}`",
-                f"{wording.as_written(entry.value)} {unit}",
-                wording.significant(entry.bound_sd, 2),
-                ", ".join(most) or "none by 0.01 %",
-            )
-        )
+    for one in numbers:
+        moved = sorted(one.moves_percent.items(), key=lambda item: -abs(item[1]))[:2]
+        most = [f"`{n}` {format_decimals(x, 2)} %" for n, x in moved if abs(x) >= _LEAST_PERCENT]
+        value = f"{format_stated(one.value)} {format_unit(one.unit) or '1'}"
+        bound = format_digits(one.bound_sd, 2)
+        rows.append((f"`{one.name}`", value, bound, ", ".join(most) or "none by 0.01 %"))
     return Table(
-        "What the estimates rest on",
-        ("Number", "Value", "SD at best", "An error of 1 % would move"),
-        tuple(rows),
-        "lrrl",
-        (1.5, 1.0, 0.6, 2.0),
-        "SD at best: how well these trials could determine it, were it estimated with the "
-        "parameters (Cramér-Rao bound).",
+        "Numbers of the device file on which the estimates depend",
+        "Number ~1.5 | >Value ~1 | >Least SD ~0.6 | An error of 1 % would move ~2",
+        rows,
+        "Least SD: how well these trials could determine the number if it were estimated together "
+        "with the parameters (Cramér-Rao bound).",
     )

@@ -1,4 +1,4 @@
-"""Effects: what each one found is, the curve identified, before and after, what to do, rivals."""
+"""Effects: a description of each one found, its curve, errors before and after, alternatives."""
 
 from __future__ import annotations
 
@@ -10,28 +10,21 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from bampipe.lists import join_names
-from bampipe.report import style, wording
-from bampipe.report.document import (
-    Block,
-    Figure,
-    Formulas,
-    Paragraph,
-    Section,
-    Subheading,
-)
+from bampipe.phrases import diagnosis as phrases
+from bampipe.report import style
+from bampipe.report.document import Block, Figure, Formulas, Paragraph, Section, Subheading, Table
 from bampipe.report.results import Results
-from bampipe.report.sections.diagnosis import LONG, ranking_table
-from bampipe.results import phrases
+from bampipe.report.sections.diagnosis import tabulate_candidates
+from bampipe.report.wording import format_digits, format_unit, format_with_sd, split_name
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult, WorstWindow
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.terms import ModelTerm, TermCurve, TermsResult
 
 TITLE = "Effects"
-_COLUMNS = 3
 _WEIGHED = 8
-_RIVALS = 3
-_LEAST_FOLLOWED = 0.2
+_ALTERNATIVES = 3
+_LEAST_SHARE = 0.2
 """Share of a term's variance that its curve has to carry to be drawn."""
 
 
@@ -40,136 +33,119 @@ def section(results: Results) -> Section | None:
     terms = results.read(TermsResult)
     if terms is None:
         return None
-    friction = [term for term in terms.terms if term.name.startswith("friction:") and term.curves]
-    effects = [term for term in terms.terms if not term.name.startswith("friction:")]
+    friction = [term for term in terms.terms if term.name.startswith("friction:")]
+    effects = [term for term in terms.terms if term not in friction]
     blocks: list[Block] = []
     if not effects:
-        blocks.append(Paragraph(f"Model `{results.model}` is the device alone, without effects."))
-    if friction:
-        curves = [curve for term in friction for curve in term.curves[:1]]
+        blocks.append(Paragraph(f"Model `{results.model}` is the device without effects."))
+    if curves := [term.curves[0] for term in friction if term.curves]:
         caption = (
             "Friction as identified: the force that it takes, with its 95 % band, over the motion "
-            "that it was learned from."
+            "of the trials."
         )
-        blocks.append(_curves("friction", curves, caption))
+        blocks.append(_draw_curves("friction", curves, caption))
     shown: set[str] = set()
     for term in effects:
-        blocks += _effect(results, term, shown)
-    blocks += _weighed(results, {term.name for term in effects})
+        blocks += _show_effect(results, term, shown)
+    blocks += _tabulate_weighed(results, {term.name for term in effects})
     return Section(TITLE, tuple(blocks))
 
 
-def _effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
-    """Return what is said of an effect; ``shown``: versions whose worst window is drawn already."""
+def _show_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
+    """Return the blocks of one effect; ``shown``: versions whose worst window is drawn already."""
     text = term.text
-    name = term.name.replace(":", "-")
-    blocks: list[Block] = [
-        Subheading(f"`{term.name}`"),
-        Paragraph(f"{text.summary}. {_found(results, term)}".rstrip()),
-        Formulas(text.formulas),
-    ]
-    blocks += _pictures(results, term, name, shown)
-    words = []
+    words = [f"**Alternatives.** {_tell_alternatives(results, term.name)}"]
     if text.on_the_machine:
-        words.append(f"**On the machine.** {text.on_the_machine}.")
-    words.append(f"**Rivals.** {_rivals(results, term.name)}")
+        words.insert(0, f"**On the machine.** {text.on_the_machine}.")
     if text.source:
         words.append(f"**Source.** {text.source}.")
-    return [*blocks, *map(Paragraph, words)]
+    return [
+        Subheading(f"`{term.name}`"),
+        Paragraph(f"{text.summary}. {_list_estimates(results, term)}".rstrip()),
+        Formulas(text.formulas),
+        *_draw_effect(results, term, shown),
+        *map(Paragraph, words),
+    ]
 
 
-def _found(results: Results, term: ModelTerm) -> str:
-    """Return its estimates in a sentence."""
+def _list_estimates(results: Results, term: ModelTerm) -> str:
     identified = results.read(IdentifyResult)
     known = identified.parameters if identified else {}
     shown = []
     for name in term.parameters:
-        if name in known:
-            entry = known[name]
-            value = wording.with_sd(entry.estimate, entry.sd)
-            unit = wording.unit(entry.unit)
-            short = wording.words(name.rpartition(".")[2])
-            shown.append(f"{short} {value} {unit}".rstrip())
+        if one := known.get(name):
+            value = f"{format_with_sd(one.estimate, one.sd)} {format_unit(one.unit)}".rstrip()
+            shown.append(f"{split_name(name.rpartition('.')[2])} {value}")
     return f"Found: {'; '.join(shown)}." if shown else ""
 
 
-def _variables(curves: Sequence[TermCurve]) -> str:
-    return join_names(dict.fromkeys(curve.variable for curve in curves))
+def _draw_curves(name: str, curves: Sequence[TermCurve], caption: str) -> Figure:
+    figure, panels = style.make_grid(len(curves), 3, 1.85, extra=0.0, column_width=2.1)
+    for panel, curve in zip(panels, curves, strict=True):
+        _draw_curve(panel, curve)
+    return style.finish(figure, name, caption)
 
 
-def _curves(name: str, curves: Sequence[TermCurve], caption: str) -> Figure:
-    """Draw each curve with its band in a panel."""
-    columns = min(_COLUMNS, len(curves))
-    rows = -(-len(curves) // columns)
-    width = min(style.WIDTH, 0.4 + 2.1 * columns)
-    figure, panels = style.panels(rows, columns, 1.85 * rows, width=width)
-    for panel, curve in zip(panels.flat, curves, strict=False):
-        _curve(panel, curve)
-    for panel in panels.flat[len(curves) :]:
-        panel.set_axis_off()
-    return Figure(name, caption, style.svg(figure))
-
-
-def _curve(panel: Axes, curve: TermCurve) -> None:
-    x, unit = style.scaled(np.array(curve.center), curve.variable_unit)
+def _draw_curve(panel: Axes, curve: TermCurve) -> None:
+    x, unit = style.scale_values(np.array(curve.center), curve.variable_unit)
     panel.fill_between(x, curve.low, curve.high, color=style.BLUE, alpha=0.25, lw=0)
     panel.plot(x, curve.mean, color=style.BLUE, marker=".", ms=3.0)
     panel.axhline(0.0, color=style.INK, lw=0.5)
     panel.set_title(curve.axis)
-    panel.set_xlabel(style.label(wording.words(curve.variable), unit))
+    panel.set_xlabel(style.label_axis(split_name(curve.variable), unit))
     kind = "torque" if curve.unit.startswith("N.m") else "force"
-    panel.set_ylabel(style.label(f"{kind} it takes", wording.unit(curve.unit)))
+    panel.set_ylabel(style.label_axis(f"{kind} it takes", curve.unit))
 
 
-def _pictures(results: Results, term: ModelTerm, name: str, shown: set[str]) -> list[Block]:
+def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
     """Draw the curves of an effect and, once a version, its worst window without and with it."""
-    curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_FOLLOWED]
+    name = f"effect-{term.name.replace(':', '-')}"
+    curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_SHARE]
     blocks: list[Block] = []
     if term.curves and not curves:
-        blocks.append(
-            Paragraph("No single variable carries a fifth of its force: no curve is drawn.")
-        )
-    found = _window(results, term)
+        words = "No single variable carries a fifth of its force, so that no curve is drawn."
+        blocks.append(Paragraph(words))
+    found = _find_window(results, term)
     if found is None or found.added in shown:
-        if curves:
-            words = _contribution(term, curves)
-            blocks.append(_curves(f"effect-{name}", curves, f"What {words}"))
-        return blocks
+        return [*blocks, *_draw_contribution(name, term, curves)]
     shown.add(found.added)
     first = next((curve for curve in curves if curve.axis == found.window.axis), None)
     if first is None:
-        figure, panels = style.panels(2, 1, 2.7)
-        top, bottom = panels.flat
+        figure, panels = style.make_grid(2, 1, 1.35, extra=0.0)
+        top, bottom = panels
     else:
-        figure, (left, top, bottom) = style.beside(2, 2.7)
-        _curve(left, first)
-    unit = wording.unit(results.force_unit(found.window.axis))
+        figure, (left, top, bottom) = style.split_figure(2, 2.7)
+        _draw_curve(left, first)
+    unit = format_unit(results.force_unit(found.window.axis))
     errors = _draw_window(top, bottom, found, unit)
-    style.legend_below(figure, top)
-    size = [wording.significant(error, 2) for error in errors]
+    before, after = (format_digits(error, 2) for error in errors)
     change = (
-        f"the residual falls from {size[0]} to {size[1]} {unit} (RMSE)"
+        f"the residual falls from {before} to {after} {unit} (RMSE)"
         if errors[1] < errors[0]
-        else f"the residual does not fall ({size[0]} and {size[1]} {unit} RMSE)"
+        else f"the residual does not fall ({before} and {after} {unit} RMSE)"
     )
-    window = (
-        f"worst window of {found.window.axis} without {found.added} "
-        f"({found.window.doing}), where {change}."
+    caption = (
+        f"he worst window of {found.window.axis} without {found.added} ({found.window.doing}), "
+        f"where {change}."
     )
-    beside = f"Left: what {_contribution(term, [first])} Right: the {window}" if first else ""
-    blocks.append(Figure(f"effect-{name}", beside or f"The {window}", style.svg(figure)))
+    beside = f"Left: {_describe(term, [first])} Right: t{caption}" if first else f"T{caption}"
+    blocks.append(style.finish(figure, name, beside, [top]))
     others = [curve for curve in curves if curve is not first]
-    if others:
-        axes = join_names(curve.axis for curve in others)
-        more = f"What {_contribution(term, others).rstrip('.')}, on {axes}."
-        blocks.append(_curves(f"effect-{name}-more", others, more))
-    return blocks
+    return [*blocks, *_draw_contribution(f"{name}-more", term, others)]
 
 
-def _contribution(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
+def _draw_contribution(name: str, term: ModelTerm, curves: Sequence[TermCurve]) -> list[Block]:
+    if not curves:
+        return []
+    words = _describe(term, curves)
+    return [_draw_curves(name, curves, words[:1].upper() + words[1:])]
+
+
+def _describe(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
+    variables = join_names(dict.fromkeys(curve.variable for curve in curves))
     return (
-        f"`{term.name}` contributes: the force that it takes, with its 95 % band, against "
-        f"{_variables(curves)}, which it follows most, over the trials that it was learned from."
+        f"the force that `{term.name}` takes, with its 95 % band, against the variable that it "
+        f"follows most ({variables}), over the motion of the trials."
     )
 
 
@@ -183,57 +159,52 @@ class _Window:
     after: pd.DataFrame
 
 
-def _window(results: Results, term: ModelTerm) -> _Window | None:
+def _find_window(results: Results, term: ModelTerm) -> _Window | None:
     """Return the worst window of the version before the one that added the effect."""
     compared = results.read(CompareResult)
     rungs = compared.ladder if compared else ()
-    rung = next((one for one in rungs if _adds(one.added, term.name)), None)
+    rung = next((one for one in rungs if term.name in (one.added or "").split(", ")), None)
     diagnosis = results.read(DiagnoseResult, rung.parent) if rung and rung.parent else None
-    axes = [curve.axis for curve in term.curves]
     if rung is None or rung.parent is None or diagnosis is None:
         return None
+    axes = [curve.axis for curve in term.curves]
     windows = (w for axis in axes for w in diagnosis.worst_windows if w.axis == axis)
-    window = next(windows, None)
-    if window is None:
+    if (window := next(windows, None)) is None:
         return None
-    before, after = (_stretch(results, model, window) for model in (rung.parent, rung.model))
+    before, after = (_read_stretch(results, name, window) for name in (rung.parent, rung.model))
     if before is None or after is None:
         return None
-    added = join_names(f"`{name}`" for name in _names(rung.added))
+    added = join_names(f"`{name}`" for name in (rung.added or "").split(", "))
     return _Window(window, added, before, after)
 
 
 def _draw_window(top: Axes, bottom: Axes, found: _Window, unit: str) -> list[float]:
-    """Draw forces above residuals; return the errors in the window, without and with."""
+    """Draw forces above residuals; return the RMS residuals in the window, without and with."""
     window, axis = found.window, found.window.axis
     measured = found.before[f"torque_measured_{axis}"]
     top.plot(found.before["t"], measured, color=style.FAINT, lw=2.6, label="measured")
+    errors = []
     for frame, title, colour, look in (
         (found.before, "without", style.VERMILLION, (0, (4, 1.5))),
         (found.after, "with", style.BLUE, "-"),
     ):
         top.plot(frame["t"], frame[f"torque_predicted_{axis}"], color=colour, ls=look, label=title)
-        bottom.plot(frame["t"], frame[f"residual_{axis}"], color=colour, ls=look)
+        residual = frame[f"residual_{axis}"]
+        bottom.plot(frame["t"], residual, color=colour, ls=look)
+        inside = residual[frame["t"].between(window.t_start, window.t_end)]
+        errors.append(float(np.sqrt(np.mean(inside.to_numpy() ** 2))))
     bottom.axhline(0.0, color=style.INK, lw=0.5)
     for panel in (top, bottom):
         panel.axvspan(window.t_start, window.t_end, color=style.SKY, alpha=0.2, lw=0)
     top.tick_params(labelbottom=False)
-    top.set_ylabel(style.label(axis, unit))
-    bottom.set_ylabel(style.label("residual", unit))
+    top.set_ylabel(style.label_axis(axis, unit))
+    bottom.set_ylabel(style.label_axis("residual", unit))
     bottom.set_xlabel(f"time in {window.trial_id} (s)")
-    return [_rms(frame, axis, window) for frame in (found.before, found.after)]
+    return errors
 
 
-def _names(added: str | None) -> list[str]:
-    return (added or "").replace(",", " ").split()
-
-
-def _adds(added: str | None, effect: str) -> bool:
-    return effect in _names(added)
-
-
-def _stretch(results: Results, model: str, window: WorstWindow) -> pd.DataFrame | None:
-    """Return the residuals of ``model`` in the window, with as much again to either side."""
+def _read_stretch(results: Results, model: str, window: WorstWindow) -> pd.DataFrame | None:
+    """Return the residuals of ``model`` in the window, with 1.5 times its length on either side."""
     frame = results.table(results.model_file("residuals.parquet", model), trial=window.trial_id)
     if frame is None or frame.empty or f"residual_{window.axis}" not in frame:
         return None
@@ -242,46 +213,36 @@ def _stretch(results: Results, model: str, window: WorstWindow) -> pd.DataFrame 
     return part if len(part) > 3 else None
 
 
-def _rms(frame: pd.DataFrame, axis: str, window: WorstWindow) -> float:
-    inside = frame.loc[frame["t"].between(window.t_start, window.t_end), f"residual_{axis}"]
-    return float(np.sqrt(np.mean(inside.to_numpy() ** 2)))
-
-
-def _diagnoses(results: Results) -> Iterable[DiagnoseResult]:
+def _read_diagnoses(results: Results) -> Iterable[DiagnoseResult]:
     """Yield the diagnoses of all versions, the latest first."""
     for model in reversed(results.models):
-        found = results.read(DiagnoseResult, model)
-        if found is not None:
+        if found := results.read(DiagnoseResult, model):
             yield found
 
 
-def _rivals(results: Results, effect: str) -> str:
-    """Say how probable ``effect`` is, and what else could stand in its place."""
-    for diagnosis in _diagnoses(results):
+def _tell_alternatives(results: Results, effect: str) -> str:
+    """Say how probable ``effect`` is, and which effects could stand in its place."""
+    for diagnosis in _read_diagnoses(results):
         if effect not in diagnosis.selected:
             continue
-        chance = {n: p for e in diagnosis.axes.values() for n, p in e.probabilities.items()}
-        others = diagnosis.alternatives[effect][:_RIVALS]
-        named = (f"`{n}` ({phrases.probability(chance.get(n, 0.0))})" for n in others)
+        known = {n: p for one in diagnosis.axes.values() for n, p in one.probabilities.items()}
+        others = diagnosis.alternatives[effect][:_ALTERNATIVES]
+        named = (f"`{n}` ({phrases.probability(known.get(n, 0.0))})" for n in others)
         place = f"In its place: {join_names(named)}" if others else "Nothing else takes its place"
-        return f"Its probability is {phrases.probability(chance[effect])}. {place}."
-    return "It was not found by a diagnosis of this run: none has weighed it against others."
+        return f"Its probability is {phrases.probability(known[effect])}. {place}."
+    return "No diagnosis of this run has weighed it against others."
 
 
-def _weighed(results: Results, added: set[str]) -> list[Block]:
-    """Return what the latest diagnosis weighed and did not add: best first."""
-    diagnosis = next((found for found in _diagnoses(results) if found.descriptions), None)
+def _tabulate_weighed(results: Results, added: set[str]) -> list[Table]:
+    """Return the candidates that the latest diagnosis weighed and that were not added."""
+    diagnosis = next((found for found in _read_diagnoses(results) if found.descriptions), None)
     if diagnosis is None:
         return []
     texts = diagnosis.descriptions
-    shown = [
-        (entry, text)
-        for entry in diagnosis.ranking
-        if entry.effect not in added and (text := texts.get(entry.effect.partition(":")[0]))
-    ][:_WEIGHED]
     rows = [
-        (entry, [f"{text.summary}. " + "; ".join(f"`{line}`" for line in text.formulas[:2])])
-        for entry, text in shown
-    ]
+        (one, [f"{text.summary}. " + "; ".join(f"`{line}`" for line in text.formulas[:2])])
+        for one in diagnosis.ranking
+        if one.effect not in added and (text := texts.get(one.effect.partition(":")[0]))
+    ][:_WEIGHED]
     title = f"Weighed on model `{diagnosis.model}`, best first"
-    return [ranking_table(title, rows, (LONG,), "")] if rows else []
+    return [tabulate_candidates(title, rows, "Description and formula ~2.6")] if rows else []

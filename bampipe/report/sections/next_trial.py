@@ -1,14 +1,14 @@
-"""What to record next, what it is expected to give, and what the trials would not have shown."""
+"""The trial to record next, what it would give, and what the present trials cannot reveal."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from bampipe.report import wording
+from bampipe.phrases.forecast import compare_forecasts, read_forecasts
 from bampipe.report.document import Block, Bullets, Callout, Paragraph, Section, Table
 from bampipe.report.results import Results
+from bampipe.report.wording import format_digits, format_percent, format_unit
 from bampipe.results.diagnose import DiagnoseResult
-from bampipe.results.forecast import compare_forecasts, read_forecasts
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import (
     Detectable,
@@ -23,7 +23,7 @@ TITLE = "What to record next"
 
 
 def section(results: Results) -> Section | None:
-    """Return the section; None where nobody asked."""
+    """Return the section; None where no trial was proposed."""
     found = results.read(NextResult)
     if found is None:
         return None
@@ -31,99 +31,73 @@ def section(results: Results) -> Section | None:
         Callout("note", "The next trial", found.sentence),
         Paragraph(f"{found.why} {found.expected}"),
     ]
-    identified = results.read(IdentifyResult)
-    came: tuple[str, ...] = ()
-    if identified is not None:
+    if identified := results.read(IdentifyResult):
         forecasts = read_forecasts(results.root, results.model)
-        came = compare_forecasts(forecasts, identified, results.read(DiagnoseResult))
-    if came:
-        blocks.append(Bullets(tuple(line.replace("RUN", results.root.name) for line in came)))
+        lines = compare_forecasts(forecasts, identified, results.read(DiagnoseResult))
+        if lines:
+            blocks.append(Bullets(tuple(one.replace("RUN", results.root.name) for one in lines)))
     best = found.proposals[0]
     if best.confusion:
-        heads = ("Effects", "with the trials at hand", "with the next one")
-        blocks.append(
-            confusion_table("Chance of taking one effect for the other", heads, best.confusion)
-        )
+        title = "Probability of taking one effect for the other"
+        heads = ">with the present trials | >with the next one"
+        blocks.append(tabulate_confusion(title, heads, best.confusion))
     if best.sd:
-        blocks.append(
-            sd_table(
-                "Standard deviation of each parameter, now and once the trial has been recorded",
-                best.sd,
-            )
-        )
+        title = "Standard deviation of each parameter, now and once the trial has been recorded"
+        blocks.append(tabulate_sds(title, best.sd))
     if found.sensitivity:
-        blocks.append(_sensitivity(found.sensitivity))
+        blocks.append(_tabulate_sensitivity(found.sensitivity))
     return Section(TITLE, tuple(blocks))
 
 
-def confusion_table(
-    title: str, heads: tuple[str, ...], pairs: Sequence[ExpectedConfusion | PlannedConfusion]
+def tabulate_confusion(
+    title: str, heads: str, pairs: Sequence[ExpectedConfusion | PlannedConfusion]
 ) -> Table:
-    """Return the chance of taking one effect for another, without and with new trials."""
-    rows = tuple(
+    """Return the probability of taking one effect for another, without and with new trials."""
+    rows = [
         (
             " or ".join(f"`{name}`" for name in pair.between),
-            wording.percent(pair.before),
-            wording.percent(pair.after),
+            format_percent(pair.before),
+            format_percent(pair.after),
         )
         for pair in pairs
-    )
-    return Table(title, heads, rows, "lrr")
+    ]
+    return Table(title, f"Effects | {heads}", rows)
 
 
-def sd_table(title: str, entries: Mapping[str, ExpectedSd]) -> Table:
+def tabulate_sds(title: str, entries: Mapping[str, ExpectedSd]) -> Table:
     """Return the standard deviations of parameters, without and with new trials.
 
     Args:
-        title: of the table; entries: by parameter; of a plan, what is asked is shown, too.
+        title: of the table; entries: by parameter; of a plan, the limit that it is to reach, too.
     """
-    asked = [e.asked for e in entries.values() if isinstance(e, PlannedSd)]
-    rows = tuple(
-        (
-            f"`{name}`",
-            wording.significant(entry.before, 2),
-            _expected(entry),
-            *([wording.significant(asked[k], 2)] if asked else []),
-            wording.unit(entry.unit),
-        )
-        for k, (name, entry) in enumerate(entries.items())
-    )
-    heads = ("Parameter", "now", "expected", *(["asked"] if asked else []), "Unit")
-    note = "A range, where one number cannot be trusted: eight of ten lie in it."
-    wide = not all(entry.is_sharp for entry in entries.values())
-    return Table(title, heads, rows, "lrrrl" if asked else "lrrl", note=note if wide else "")
+    rows = []
+    for name, one in entries.items():
+        values = (one.after,) if one.is_sharp else (one.low, one.high)
+        expected = " to ".join(format_digits(value, 2) for value in values)
+        asked = format_digits(one.asked, 2) if isinstance(one, PlannedSd) else ""
+        before = format_digits(one.before, 2)
+        rows.append((f"`{name}`", before, expected, asked, format_unit(one.unit)))
+    note = "A range is given where one number cannot be trusted: eight of ten results lie in it."
+    wide = not all(one.is_sharp for one in entries.values())
+    columns = "Parameter | >now | >expected | >asked | Unit"
+    return Table(title, columns, rows, note if wide else "").drop_empty_columns()
 
 
-def _expected(entry: ExpectedSd) -> str:
-    """What is forecast: one number where it can be trusted, else a range."""
-    values = (entry.after,) if entry.is_sharp else (entry.low, entry.high)
-    return " to ".join(wording.significant(value, 2) for value in values)
+def _tabulate_sensitivity(table: Mapping[str, Detectable]) -> Table:
+    def factor(one: Detectable) -> float:
+        return float("inf") if one.smallest is None else one.smallest / one.typical
 
-
-def _sensitivity(table: Mapping[str, Detectable]) -> Table:
-    def factor(entry: Detectable) -> float:
-        return float("inf") if entry.smallest is None else entry.smallest / entry.typical
-
-    order = sorted(table.items(), key=lambda pair: -factor(pair[1]))
-    rows = tuple(
-        (
-            f"`{name}`",
-            entry.axis or "–",
-            f"`{entry.parameter.rpartition('.')[2]}`",
-            wording.significant(entry.smallest, 2),
-            wording.significant(entry.with_proposal, 2),
-            wording.significant(entry.typical, 2),
-            wording.unit(entry.unit) or "1",
-        )
-        for name, entry in order
-    )
+    rows = []
+    for name, one in sorted(table.items(), key=lambda pair: -factor(pair[1])):
+        strength = f"`{one.parameter.rpartition('.')[2]}`"
+        sizes = (format_digits(x, 2) for x in (one.smallest, one.with_proposal, one.typical))
+        rows.append((f"`{name}`", one.axis or "–", strength, *sizes, format_unit(one.unit) or "1"))
     return Table(
         "The smallest strength of each effect that these trials would have revealed",
-        ("Effect", "Axis", "Strength", "now", "with the next", "typical", "Unit"),
+        "Effect | Axis | Strength | >now | >with the next | >typical | Unit",
         rows,
-        "lllrrrl",
-        note="With 90 % probability, the shape of the effect being typical. A dash: trials like "
-        "these do not show it at any size, or the model's own parameters imitate it. Typical: "
-        "where it is clearly there. With the next, a number may grow: errors are means over all "
-        "trials, and the next shows some effects less than those at hand do.",
+        "With 90 % probability, for the typical shape of the effect. A dash: such trials do not "
+        "reveal it at any size, or the model's own parameters imitate it. Typical: the strength at "
+        "which it is clearly there. A number may grow with the next trial: errors are means over "
+        "all trials, and the next one may excite an effect less than the present ones do.",
     )

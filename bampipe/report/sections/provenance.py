@@ -1,7 +1,7 @@
 """Provenance: inputs by hash, versions, settings and keys, last of all.
 
 Nothing here depends on when or where the stages ran: equal results give equal reports. Times and
-the machine stand in ``run.json``, and ``bampipe status`` prints them.
+the machine are in ``run.json``, and ``bampipe status`` prints them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from bampipe.report.document import Block, Paragraph, Section, Subheading, Table
 from bampipe.report.results import Results
 from bampipe.results.run import RunResult, StepRecord
 
-TITLE = "Provenance"
 _DIGITS = 12
 
 
@@ -20,21 +19,22 @@ def section(results: Results) -> Section:
     """Return the section."""
     run = results.read(RunResult)
     if run is None:
-        text = "This run folder has no run.json: what was run on what is not recorded."
-        return Section(TITLE, (Paragraph(text),))
+        text = "This run folder has no run.json, so that its provenance is not known."
+        return Section("Provenance", (Paragraph(text),))
     stages = {name: made for name, made in run.stages.items() if name != "report"}
-    blocks: list[Block] = [Paragraph(_versions(stages))]
-    inputs = _inputs(stages)
-    if inputs is not None:
-        blocks.append(inputs)
-    blocks.append(_stages(stages))
-    settings = _settings(stages)
-    if settings is not None:
+    blocks: list[Block] = [Paragraph(_list_versions(stages))]
+    if "ingest" in stages:
+        read = stages["ingest"].inputs
+        rows = [(f"`{name}`", f"`{digest[:_DIGITS]}`") for name, digest in read.items()]
+        title = f"Files that were read (first {_DIGITS} digits of their hash)"
+        blocks.append(Table(title, "File | Hash", rows))
+    blocks.append(_tabulate_stages(stages))
+    if settings := _tabulate_settings(stages):
         blocks += [Subheading("Settings"), settings]
-    return Section(TITLE, tuple(blocks))
+    return Section("Provenance", tuple(blocks))
 
 
-def _versions(stages: Mapping[str, StepRecord]) -> str:
+def _list_versions(stages: Mapping[str, StepRecord]) -> str:
     found: dict[str, set[str]] = {}
     for made in stages.values():
         for name, version in made.versions.items():
@@ -44,36 +44,22 @@ def _versions(stages: Mapping[str, StepRecord]) -> str:
     return f"{text}Full hashes are in `run.json`; equal inputs and versions give equal results."
 
 
-def _inputs(stages: Mapping[str, StepRecord]) -> Table | None:
-    if "ingest" not in stages:
-        return None
-    read = stages["ingest"].inputs
-    rows = tuple((f"`{name}`", f"`{digest[:_DIGITS]}`") for name, digest in read.items())
-    return Table(
-        f"Files that were read (first {_DIGITS} digits of their hash)",
-        ("File", "Hash"),
-        rows,
-        "ll",
-    )
-
-
-def _stages(stages: Mapping[str, StepRecord]) -> Table:
-    rows = tuple(
+def _tabulate_stages(stages: Mapping[str, StepRecord]) -> Table:
+    rows = [
         (f"`{name}`", str(len(made.outputs)), f"`{made.key[:_DIGITS]}`")
-        for name, made in _in_order(stages)
-    )
+        for name, made in _order_stages(stages)
+    ]
     return Table(
         "Stages",
-        ("Stage", "Files", "Key"),
+        "Stage | >Files | Key",
         rows,
-        "lrl",
-        note="Key: hash of everything the stage depends on (inputs, settings, code, versions). "
-        "When each ran, and for how long, `bampipe status` says.",
+        "Key: hash of everything on which the stage depends (inputs, settings, code, versions). "
+        "`bampipe status` says when each ran, and for how long.",
     )
 
 
-def _in_order(stages: Mapping[str, StepRecord]) -> list[tuple[str, StepRecord]]:
-    """Return the steps, a stage before those that read what it wrote."""
+def _order_stages(stages: Mapping[str, StepRecord]) -> list[tuple[str, StepRecord]]:
+    """Return the steps, a stage before those that read its outputs."""
     made_by = {name: step for step, made in stages.items() for name in made.outputs}
     ranks: dict[str, int] = {}
 
@@ -87,35 +73,30 @@ def _in_order(stages: Mapping[str, StepRecord]) -> list[tuple[str, StepRecord]]:
     return sorted(stages.items(), key=lambda item: (rank(item[0]), item[0]))
 
 
-def _settings(stages: Mapping[str, StepRecord]) -> Table | None:
+def _tabulate_settings(stages: Mapping[str, StepRecord]) -> Table | None:
     models: dict[tuple[str, str], list[str]] = {}
-    for name, made in _in_order(stages):
+    for name, made in _order_stages(stages):
         stage, _, model = name.partition(":")
         config = {key: value for key, value in made.config.items() if key != "model"}
-        shown = ", ".join(f"{key} = {_value(value)}" for key, value in config.items())
+        shown = ", ".join(f"{key} = {_format_value(value)}" for key, value in config.items())
         if shown:
             models.setdefault((stage, shown), []).append(model)
     if not models:
         return None
     alike = {stage: sum(stage == other for other, _ in models) == 1 for stage, _ in models}
-    rows = tuple(
+    rows = [
         (f"`{stage}`" if alike[stage] else ", ".join(f"`{stage}:{name}`" for name in names), shown)
         for (stage, shown), names in models.items()
-    )
-    return Table(
-        "Settings of each stage, for all models where none is named",
-        ("Stage", "Settings"),
-        rows,
-        "ll",
-        (0.0, 1.0),
-    )
+    ]
+    title = "Settings of each stage, for all models where none is named"
+    return Table(title, "Stage | Settings ~1", rows)
 
 
-def _value(value: object) -> str:
+def _format_value(value: object) -> str:
     if isinstance(value, str):
         return f'"{value}"'
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(_value(item) for item in value) + "]"
+        return "[" + ", ".join(_format_value(item) for item in value) + "]"
     return str(value)

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from bampipe.report import wording
 from bampipe.report.document import Block, Bullets, Callout, Section, Subheading, Table
 from bampipe.report.results import Results
+from bampipe.report.wording import NONE, format_digits, format_unit, format_with_sd
 
-_SIMULATED = (
-    Callout(
-        "note",
-        "This session is simulated",
-        "Agreement with the paper shows that the pipeline finds what the simulator was given. It "
-        "replicates nothing that was measured.",
-    ),
+_SIMULATED = Callout(
+    "note",
+    "This session is simulated",
+    "Agreement with the paper shows that the pipeline recovers the numbers of the simulator. It "
+    "replicates nothing that was measured.",
 )
 
 
@@ -24,81 +22,64 @@ def section(results: Results) -> Section | None:
     paper = results.paper
     if paper is None:
         return None
-    rows = tuple(_row(results, row) for row in paper["rows"])
-    blocks: list[Block] = [
-        *(_SIMULATED if results.session.simulated else ()),
+    rows = [_compare(results, row) for row in paper["rows"]]
+    blocks: list[Block] = [_SIMULATED] if results.session.simulated else []
+    blocks.append(
         Table(
             f"{paper['title']}: published values and those of this session",
-            ("Quantity", "Place", "Paper", "This session", "Unit"),
+            "Quantity | Place | >Paper | >This session | Unit",
             rows,
-            "llrrl",
-            note="Paper: digits as printed there." + _lacking(rows),
-        ),
-    ]
+            f"Paper: digits as printed there.{_explain_dash(rows)}",
+        )
+    )
     if "comparison" in paper:
-        blocks.append(_comparison(results, paper["comparison"]))
-    notes = tuple(paper.get("notes", {}).get("text", ()))
-    if notes:
+        blocks.append(_tabulate_devices(results, paper["comparison"]))
+    if notes := tuple(paper.get("notes", {}).get("text", ())):
         blocks += [Subheading("Where this differs from the paper, and why"), Bullets(notes)]
     return Section("Paper and this session", tuple(blocks))
 
 
-def _row(results: Results, row: dict[str, Any]) -> tuple[str, ...]:
-    value = _stored(results, row, "value")
-    sd = _stored(results, row, "sd")
-    if value is None:
-        shown = "–"
-    elif sd is None:
-        shown = wording.significant(value)
-    else:
-        shown = wording.with_sd(value, sd)
-    return (
-        row["quantity"],
-        row["place"],
-        row["published"],
-        shown,
-        wording.unit(row["unit"]),
-    )
+def _compare(results: Results, row: dict[str, Any]) -> tuple[str, ...]:
+    value, sd = _read_number(results, row, "value"), _read_number(results, row, "sd")
+    shown = format_digits(value) if sd is None else format_with_sd(value, sd)
+    return (row["quantity"], row["place"], row["published"], shown, format_unit(row["unit"]))
 
 
-def _comparison(results: Results, comparison: dict[str, Any]) -> Table:
+def _tabulate_devices(results: Results, comparison: dict[str, Any]) -> Table:
     """Return the device of this session beside others, as published."""
     rows = []
     for row in comparison["rows"]:
-        parts = [_range(results, place) for place in row["session"]]
-        own = "; ".join(part for part in parts if part) or "–"
+        parts = [_format_range(results, place) for place in row["session"]]
+        own = "; ".join(part for part in parts if part) or NONE
         rows.append((row["quantity"], own, *row["published"]))
+    widths = (1.2, 0.95, 0.95, 0.9)
+    heads = (f"{name} ~{w}" for name, w in zip(comparison["devices"], widths, strict=True))
     return Table(
         f"The device of this session beside others, as published ({comparison['place']})",
-        ("", "This session", *comparison["devices"]),
-        tuple(rows),
-        "llllll",
-        (0.9, 1.2, 1.2, 0.95, 0.95, 0.9),
-        comparison["note"] + _lacking(rows),
+        " | ".join((" ~0.9", "This session ~1.2", *heads)),
+        rows,
+        comparison["note"] + _explain_dash(rows),
     )
 
 
-def _lacking(rows: Iterable[tuple[str, ...]]) -> str:
-    return (
-        " –: no such result in this session: no trials for it, or a method that does not give it."
-        if any("–" in row for row in rows)
-        else ""
-    )
-
-
-def _range(results: Results, place: dict[str, Any]) -> str:
-    """Return a stored number or range with its unit; "" where it is not stored."""
-    unit, digits = wording.unit(place["unit"]), int(place.get("digits", 3))
-    if "value" in place:
-        value = _stored(results, place, "value")
-        return "" if value is None else f"{wording.significant(value, digits)} {unit}"
-    low, high = _stored(results, place, "lower"), _stored(results, place, "upper")
-    if low is None or high is None:
+def _explain_dash(rows: Iterable[tuple[str, ...]]) -> str:
+    if not any(NONE in row for row in rows):
         return ""
-    return f"{wording.significant(low, digits)} to {wording.significant(high, digits)} {unit}"
+    return " –: this session has no trials for it, or a method that does not give it."
 
 
-def _stored(results: Results, place: dict[str, Any], key: str) -> float | None:
+def _format_range(results: Results, place: dict[str, Any]) -> str:
+    """Return a stored number or range with its unit; "" where it is not stored."""
+    names = ("value",) if "value" in place else ("lower", "upper")
+    values = [_read_number(results, place, name) for name in names]
+    if None in values:
+        return ""
+    digits = int(place.get("digits", 3))
+    shown = " to ".join(format_digits(value, digits) for value in values)
+    return f"{shown} {format_unit(place['unit'])}"
+
+
+def _read_number(results: Results, place: dict[str, Any], key: str) -> float | None:
     """Return the number that ``place`` names under ``key``, times its factor."""
     if key not in place:
         return None

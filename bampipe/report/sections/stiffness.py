@@ -8,9 +8,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bampipe.report import style, verdicts, wording
+from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
+from bampipe.report.wording import (
+    choose_scale,
+    format_digits,
+    format_percent,
+    format_scaled,
+    format_with_sd,
+    split_name,
+)
 from bampipe.results.stiffness import AxisStiffness, GearStiffness, StiffnessResult
 
 TITLE = "Stiffness"
@@ -22,133 +30,112 @@ def section(results: Results) -> Section | None:
     if found is None:
         if not (results.trials["kind"] == "locked").any():
             return None
-        return results.not_done(TITLE, "The locked trials have not been used", "stiffness")
+        return results.make_section(TITLE, "The locked trials have not been used", "stiffness")
     axes, notes = found.axes, found.notes
     if not axes and not found.gears:
         return Section(TITLE, (Paragraph(" ".join(notes) or "There are no locked trials."),))
-    blocks: list[Block] = [_table(results, axes)] if axes else []
-    blocks += [_gears(results, found.gears)] if found.gears else []
+    blocks: list[Block] = [_tabulate_axes(results, axes)] if axes else []
+    blocks += [_tabulate_gears(results, found.gears)] if found.gears else []
     loops = results.table("stiffness/loops.parquet")
     if loops is not None and len(loops):
-        blocks.append(_loops(results, axes, loops))
+        blocks.append(_draw_loops(results, axes, loops))
     if notes:
         blocks.append(Bullets(notes))
     return Section(TITLE, tuple(blocks))
 
 
-def _table(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:
+def _tabulate_axes(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:
     rows = []
     poses: dict[str, str] = {}
-    for axis in verdicts.ordered(results, axes):
-        entry = axes[axis]
+    for axis in results.order_axes(axes):
+        one = axes[axis]
         rows.append(
             (
                 axis,
-                wording.scaled(entry.stiffness, entry.unit, sd=entry.sd),
-                str(entry.n_cycles),
-                wording.scaled(entry.loop_width, entry.loop_width_unit, 3),
-                wording.scaled(entry.energy_per_cycle, entry.energy_unit, 3),
-                wording.significant(entry.bandwidth_rad_s),
-                wording.significant(entry.bandwidth_hz),
+                format_scaled(one.stiffness, one.unit, sd=one.sd),
+                str(one.n_cycles),
+                format_scaled(one.loop_width, one.loop_width_unit, 3),
+                format_scaled(one.energy_per_cycle, one.energy_unit, 3),
+                format_digits(one.bandwidth_rad_s),
+                format_digits(one.bandwidth_hz),
             )
         )
-        pose = _pose(results, entry)
-        if pose:
+        if pose := _describe_pose(results, one):
             poses.setdefault(pose, axis)
     note = (
-        "± standard uncertainty: scatter of the cycles, and what is left of the turn of the loop."
-        " Loop width at constant deflection."
+        "± standard uncertainty: the scatter of the cycles, and the remaining curvature of the loop"
+        " after a reversal. Loop width at constant deflection."
     )
     if poses:
         note += f" Bandwidth √(K/M) at {'; '.join(poses)}."
     return Table(
-        f"Stiffness of the locked axes{results.in_paper('Table I')}",
-        (
-            "Axis",
-            "Stiffness",
-            "Cycles",
-            "Loop width",
-            "Loss per cycle",
-            "Bandwidth (rad/s)",
-            "(Hz)",
-        ),
-        tuple(rows),
-        "lrrrrrr",
-        (0.0, 1.3, 0.0, 1.0, 1.0, 1.0, 0.5),
+        f"Stiffness of the locked axes{results.cite_paper('Table I')}",
+        "Axis | >Stiffness ~1.3 | >Cycles | >Loop width ~1 | >Loss per cycle ~1"
+        " | >Bandwidth (rad/s) ~1 | >(Hz) ~0.5",
+        rows,
         note,
     )
 
 
-def _gears(results: Results, gears: Mapping[str, GearStiffness]) -> Table:
+def _tabulate_gears(results: Results, gears: Mapping[str, GearStiffness]) -> Table:
     rows = []
-    for axis in verdicts.ordered(results, gears):
+    for axis in results.order_axes(gears):
         gear = gears[axis]
         stiffness, play = "not seen", "not crossed"
         if gear.stiffness is not None and gear.sd is not None:
-            stiffness = wording.scaled(gear.stiffness, gear.unit, sd=gear.sd)
+            stiffness = format_scaled(gear.stiffness, gear.unit, sd=gear.sd)
         if gear.play is not None and gear.play_sd is not None:
-            play = wording.scaled(gear.play, gear.play_unit, sd=gear.play_sd)
-        late = wording.with_sd(1e3 * gear.late_s, 1e3 * gear.late_sd)
-        explained = f"{100.0 * gear.explained:.0f} %"
-        rows.append((axis, stiffness, play, explained, f"{late} ms", gear.side))
+            play = format_scaled(gear.play, gear.play_unit, sd=gear.play_sd)
+        late = f"{format_with_sd(1e3 * gear.late_s, 1e3 * gear.late_sd)} ms"
+        rows.append((axis, stiffness, play, format_percent(gear.explained), late, gear.side))
     return Table(
         "Gears with an encoder on either side",
-        ("Axis", "Stiffness", "Play", "Explained", "Read late by", "Second encoder"),
-        tuple(rows),
-        "lrrrrl",
-        (0.0, 1.3, 1.3, 0.8, 1.0, 1.0),
-        "By how far the encoders move apart with the load of the drive, its own friction and"
-        " inertia taken off. Explained: share of what these and timing leave of the difference's"
-        " variance.",
+        "Axis | >Stiffness ~1.3 | >Play ~1.3 | >Explained ~0.8 | >Read late by ~1"
+        " | Second encoder ~1",
+        rows,
+        "From the difference of the encoders against the load of the drive, less the drive's own"
+        " friction and inertia. Explained: share of the variance of the difference that stiffness"
+        " and play explain, after timing and the losses of the drive.",
     )
 
 
-def _pose(results: Results, entry: AxisStiffness) -> str:
+def _describe_pose(results: Results, entry: AxisStiffness) -> str:
     name = entry.bandwidth_pose
     pose = entry.poses.get(name, {})
-    parts = [
-        f"{axis} {pose[axis]:.3g} {results.unit(axis)}" for axis in verdicts.ordered(results, pose)
-    ]
-    return f"{wording.words(name)} ({', '.join(parts)})" if parts else wording.words(name)
+    parts = [f"{axis} {pose[axis]:.3g} {results.unit(axis)}" for axis in results.order_axes(pose)]
+    return f"{split_name(name)} ({', '.join(parts)})" if parts else split_name(name)
 
 
-def _loops(results: Results, axes: Mapping[str, AxisStiffness], loops: pd.DataFrame) -> Figure:
-    names = [axis for axis in verdicts.ordered(results, axes) if (loops["axis"] == axis).any()]
-    figure, panels = style.panels(
-        1, len(names), 2.35, width=min(style.WIDTH, 1.6 + 1.9 * len(names))
-    )
-    for panel, axis in zip(panels[0], names, strict=True):
-        _loop(results, panel, axis, axes[axis], loops[loops["axis"] == axis])
-    style.legend_below(figure, panels[0][0])
+def _draw_loops(results: Results, axes: Mapping[str, AxisStiffness], loops: pd.DataFrame) -> Figure:
+    names = [axis for axis in results.order_axes(axes) if (loops["axis"] == axis).any()]
+    figure, panels = style.make_grid(len(names), len(names), 2.35, extra=0.0, column_width=2.0)
+    for panel, axis in zip(panels, names, strict=True):
+        _draw_loop(results, panel, axis, axes[axis].stiffness, loops[loops["axis"] == axis])
     caption = (
-        f"Hysteresis loops of the locked axes{results.in_paper('Fig. 3')}: generalised force of "
+        f"Hysteresis loops of the locked axes{results.cite_paper('Fig. 3')}: generalised force of "
         "the hand against deflection. The slope of the parts away from reversals (blue) is the "
         "stiffness (dashed)."
     )
-    return Figure("stiffness-loops", caption, style.svg(figure))
+    return style.finish(figure, "stiffness-loops", caption, panels[:1])
 
 
-def _loop(
-    results: Results, panel: Any, axis: str, entry: AxisStiffness, rows: pd.DataFrame
+def _draw_loop(
+    results: Results, panel: Any, axis: str, stiffness: float, rows: pd.DataFrame
 ) -> None:
-    rows = rows.iloc[style.pick(len(rows), 6000)]
-    deflection = rows["deflection"].to_numpy()
-    torque = rows["torque"].to_numpy()
-    centre = 0.5 * (deflection.min() + deflection.max())
-    level = 0.5 * (torque.min() + torque.max())
-    shown, unit = style.scaled(deflection - centre, results.unit(axis))
-    factor = wording.scale([float(np.max(np.abs(deflection - centre)))], results.unit(axis))[0]
-    panel.plot(shown, torque, color=style.FAINT, lw=0.6, label="around a reversal")
+    rows = rows.iloc[style.thin(len(rows), 6000)]
+    deflection, torque = rows["deflection"].to_numpy(), rows["torque"].to_numpy()
+    deflection = deflection - 0.5 * (deflection.min() + deflection.max())
+    factor, unit = choose_scale([float(np.max(np.abs(deflection)))], results.unit(axis))
+    panel.plot(factor * deflection, torque, color=style.FAINT, lw=0.6, label="around a reversal")
     if "post_yield" in rows:
         away = np.where(rows["post_yield"].to_numpy(dtype=bool), torque, np.nan)
-        panel.plot(shown, away, color=style.BLUE, lw=0.8, label="away from reversals")
-    reach = 0.5 * (torque.max() - torque.min())
+        panel.plot(factor * deflection, away, color=style.BLUE, lw=0.8, label="away from reversals")
+    middle, reach = 0.5 * (torque.max() + torque.min()), 0.5 * (torque.max() - torque.min())
     line = np.array([-reach, reach])
     panel.plot(
-        factor * line / entry.stiffness, level + line,
+        factor * line / stiffness, middle + line,
         color=style.VERMILLION, ls=(0, (4, 2)), lw=1.2, label="stiffness",
     )  # fmt: skip
     panel.set_title(axis)
-    panel.set_xlabel(style.label("deflection", unit))
-    force = wording.unit(results.force_unit(axis))
-    panel.set_ylabel(style.label("torque" if results.is_rotary(axis) else "force", force))
+    panel.set_xlabel(style.label_axis("deflection", unit))
+    panel.set_ylabel(style.label_axis(results.name_force(axis), results.force_unit(axis)))

@@ -1,4 +1,4 @@
-"""Summary: what was done, the verdict, the key numbers."""
+"""Summary: the verdict, the trials and the model, the key numbers."""
 
 from __future__ import annotations
 
@@ -6,18 +6,30 @@ from collections.abc import Mapping
 from typing import Any
 
 from bampipe.lists import join_names
-from bampipe.report import verdicts, wording
+from bampipe.phrases.results import METHODS
+from bampipe.report import verdicts
 from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.results import Results
+from bampipe.report.wording import (
+    NONE,
+    count_noun,
+    format_decimals,
+    format_digits,
+    format_scaled,
+    format_unit,
+    format_with_sd,
+    name_parameter,
+)
 from bampipe.results.compare import CompareResult
-from bampipe.results.identify import METHODS_IN_WORDS, IdentifyResult, ParameterEstimate
+from bampipe.results.identify import IdentifyResult, ParameterEstimate
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.setup import SetupResult
-from bampipe.results.stiffness import AxisStiffness, StiffnessResult
-from bampipe.results.validate import AxisError, ValidateResult
+from bampipe.results.stiffness import StiffnessResult
+from bampipe.results.validate import JudgedError, ValidateResult
 
 _MOST_OTHERS = 12
 """Parameters of no axis that a note can name."""
+_FRICTION = ("viscous.", "coulomb.")
 _TERMS = (
     "RMSE: root mean square of measured minus predicted force. Noise floor: the error that sensor "
     "noise, quantisation and filtering alone would leave. Fit: share of the measured force that is "
@@ -28,50 +40,42 @@ _TERMS = (
 def section(results: Results) -> Section:
     """Return the section."""
     setup = results.read(SetupResult)
-    blocks: list[Block] = [Paragraph(_done(results))]
+    blocks: list[Block] = [Paragraph(_describe_session(results))]
     if setup is None or not setup.mistakes:  # else no verdict on the model counts
-        blocks.insert(0, verdicts.overall(results))
-    ladder = _ladder(results)
-    if ladder:
+        blocks.insert(0, verdicts.judge_session(results))
+    if ladder := _describe_ladder(results):
         blocks.append(Paragraph(ladder))
-    numbers = _numbers(results)
-    if numbers is not None:
+    if numbers := _tabulate_numbers(results):
         blocks.append(numbers)
     return Section("Summary", tuple(blocks))
 
 
-def _done(results: Results) -> str:
+def _describe_session(results: Results) -> str:
     trials = results.trials
     used = trials[trials["status"] != "set_aside"]
     kinds = [
-        wording.count(int((used["kind"] == kind).sum()), f"{kind} trial")
+        count_noun(number, f"{kind} trial")
         for kind in ("free", "viscous", "locked")
-        if (used["kind"] == kind).any()
+        if (number := int((used["kind"] == kind).sum()))
     ]
-    seconds = float(used["duration_s"].sum())
-    parts = [f"{join_names(kinds) or 'No trial'} ({wording.plain(seconds, 0)} s) could be used"]
+    seconds = format_decimals(float(used["duration_s"].sum()), 0)
     aside = len(trials) - len(used)
-    parts[0] += f"; {wording.count(aside, 'trial')} set aside." if aside else "."
-    identified = results.read(IdentifyResult)
-    if identified is not None:
-        names = len(identified.parameters)
-        effects = results.effects(results.model)
-        added = f", with {join_names(f'`{name}`' for name in effects)}," if effects else ""
+    rest = f"; {count_noun(aside, 'trial')} set aside." if aside else "."
+    parts = [f"{join_names(kinds) or 'No trial'} ({seconds} s) could be used{rest}"]
+    if identified := results.read(IdentifyResult):
+        count = count_noun(len(identified.parameters), "parameter")
+        effects = f",{results.list_effects()}," if results.list_effects() else ""
         parts.append(
-            f"{wording.count(names, 'parameter')} of model `{results.model}`{added} were identified"
-            f" by {METHODS_IN_WORDS[identified.method]}."
+            f"{count} of model `{results.model}`{effects} were identified by "
+            f"{METHODS[identified.method]}."
         )
-    validated = results.read(ValidateResult)
-    if validated is not None:
+    if validated := results.read(ValidateResult):
         where = "held-out" if any(t.held_out for t in validated.trials.values()) else "the same"
-        parts.append(
-            f"The force that the model predicts was compared with the measured one on {where} "
-            "trials."
-        )
+        parts.append(f"The predicted force was compared with the measured one on {where} trials.")
     return " ".join(parts)
 
 
-def _ladder(results: Results) -> str:
+def _describe_ladder(results: Results) -> str:
     compared = results.read(CompareResult)
     if compared is None or len(compared.ladder) < 2:
         return ""
@@ -79,24 +83,23 @@ def _ladder(results: Results) -> str:
     number = [rung.model for rung in compared.ladder].index(results.model)
     last = compared.ladder[number]
     if last is first:
-        return _unconfirmed(results, compared)
+        return _explain_rejection(results, compared)
     changes = []
-    for axis in verdicts.ordered(results, first.held_out_rmse):
+    for axis in results.order_axes(first.held_out_rmse):
         before, after = first.held_out_rmse[axis], last.held_out_rmse.get(axis)
         floor = last.noise_floor.get(axis)
-        if after is None:
-            continue
-        unit = wording.unit(results.force_unit(axis))
-        text = f"{axis} {wording.significant(before)} to {wording.significant(after)} {unit}"
-        changes.append(text + (f" (floor {wording.significant(floor)})" if floor else ""))
+        if after is not None:
+            unit = format_unit(results.force_unit(axis))
+            text = f"{axis} {format_digits(before)} to {format_digits(after)} {unit}"
+            changes.append(text + (f" (floor {format_digits(floor)})" if floor else ""))
     return (
         f"From model `{first.model}` to version {number} (`{last.model}`), the best confirmed one, "
-        f"the error on held-out trials went: {'; '.join(changes)}."
+        f"the error on held-out trials changed: {'; '.join(changes)}."
     )
 
 
-def _unconfirmed(results: Results, compared: CompareResult) -> str:
-    """Say why no later version counts, which may have a lower error all the same."""
+def _explain_rejection(results: Results, compared: CompareResult) -> str:
+    """Say why no later version counts, although one may have a lower error."""
     first = compared.ladder[0]
     better = [rung for rung in compared.ladder if rung.has_lower_error_than(first)]
     if not better:
@@ -112,101 +115,71 @@ def _unconfirmed(results: Results, compared: CompareResult) -> str:
     )
 
 
-def _numbers(results: Results) -> Table | None:
+def _tabulate_numbers(results: Results) -> Table | None:
     identify, validate = results.read(IdentifyResult), results.read(ValidateResult)
     stiffness = results.read(StiffnessResult)
     identified = identify.parameters if identify else {}
     validated = validate.axes if validate else {}
     stiff = stiffness.axes if stiffness else {}
-    axes = results.axes
-    rows = [
-        _row(
-            f"{title}",
-            axes,
-            lambda axis, key=key: _estimate(identified.get(f"{key}.{axis}")),
-        )
-        for title, key in (
-            ("Viscous damping", "viscous"),
-            ("Coulomb friction", "coulomb"),
-        )
-    ]
-    rows += [
-        _row(
-            title,
-            axes,
-            lambda axis, key=key: _error(validated.get(axis), key),
-        )
-        for title, key in (
-            ("Error on held-out trials (RMSE)", "held_out_rmse"),
-            ("Noise floor", "noise_floor"),
-            ("Error without friction terms", "rmse_without_friction"),
-        )
-    ]
-    rows.append(_row("Fit", axes, lambda axis: _percent(validated.get(axis))))
-    rows.append(_row("Stiffness, brake locked", axes, lambda axis: _stiffness(stiff.get(axis))))
-    rows = [row for row in rows if any(cell != "–" for cell in row[1:])]
+    columns = []
+    for axis in results.axes:
+        error, locked = validated.get(axis), stiff.get(axis)
+        fit = error.fit_percent if error else None
+        cells = {
+            "Viscous damping": _format_estimate(identified.get(f"viscous.{axis}")),
+            "Coulomb friction": _format_estimate(identified.get(f"coulomb.{axis}")),
+            "Error on held-out trials (RMSE)": _format_error(error, "held_out_rmse"),
+            "Noise floor": _format_error(error, "noise_floor"),
+            "Error without friction terms": _format_error(error, "rmse_without_friction"),
+            "Fit": NONE if fit is None else f"{format_decimals(fit, 1)} %",
+            "Stiffness, brake locked": format_scaled(locked.stiffness, locked.unit, sd=locked.sd)
+            if locked
+            else NONE,
+        }
+        columns.append(cells)
+    rows = [(title, *(cells[title] for cells in columns)) for title in columns[0]]
+    rows = [row for row in rows if any(cell != NONE for cell in row[1:])]
     if not rows:
         return None
+    held_out = f"Held-out: {verdicts.describe_held_out(validate)}. {_TERMS}" if validate else ""
+    notes = (_name_zeros(results, identified), _list_others(results, identified), held_out)
     return Table(
         "Key numbers (± one standard deviation)",
-        ("", *axes),
-        tuple(rows),
-        "l" + "r" * len(axes),
-        (0.0, *(1.0 for _ in axes)),
-        " ".join(
-            part
-            for part in (
-                _near_zero(results, identified),
-                _others(results, identified),
-                f"Held-out: {verdicts.held_out_in_words(validate)}. {_TERMS}" if validate else "",
-            )
-            if part
-        ),
+        " | ".join(("", *(f">{axis} ~1" for axis in results.axes))),
+        rows,
+        " ".join(filter(None, notes)),
     )
 
 
-def _row(title: str, axes: tuple[str, ...], cell: Any) -> tuple[str, ...]:
-    return (title, *(cell(axis) for axis in axes))
-
-
-def _estimate(entry: ParameterEstimate | None) -> str:
+def _format_estimate(entry: ParameterEstimate | None) -> str:
     if entry is None:
-        return "–"
-    return f"{wording.with_sd(entry.estimate, entry.sd)} {wording.unit(entry.unit)}".rstrip()
+        return NONE
+    return f"{format_with_sd(entry.estimate, entry.sd)} {format_unit(entry.unit)}".rstrip()
 
 
-def _error(entry: AxisError | None, key: str) -> str:
-    value = None if entry is None else getattr(entry, key)
+def _format_error(entry: JudgedError | None, key: str) -> str:
+    value: Any = getattr(entry, key, None)
     if entry is None or value is None:
-        return "–"
-    return f"{wording.significant(value)} {wording.unit(entry.unit)}"
+        return NONE
+    return f"{format_digits(value)} {format_unit(entry.unit)}"
 
 
-def _percent(entry: AxisError | None) -> str:
-    value = None if entry is None else entry.fit_percent
-    return "–" if value is None else f"{wording.plain(value, 1)} %"
-
-
-def _stiffness(entry: AxisStiffness | None) -> str:
-    return "–" if entry is None else wording.scaled(entry.stiffness, entry.unit, sd=entry.sd)
-
-
-def _near_zero(results: Results, parameters: Mapping[str, ParameterEstimate]) -> str:
-    """Name the strengths that these trials do not show to differ from zero."""
+def _name_zeros(results: Results, parameters: Mapping[str, ParameterEstimate]) -> str:
+    """Name the friction parameters that do not differ from zero by more than chance."""
     names = [
         f"`{name}`"
-        for name in results.in_order(parameters)
-        if name.startswith(("viscous.", "coulomb."))
+        for name in results.order_parameters(parameters)
+        if name.startswith(_FRICTION)
         and abs(parameters[name].estimate) < NORMAL_95 * parameters[name].sd
     ]
-    verb = "is" if len(names) == 1 else "are"
-    return f"{join_names(names)} {verb} not shown to differ from zero." if names else ""
+    verb = "does" if len(names) == 1 else "do"
+    return f"{join_names(names)} {verb} not differ from zero by more than chance." if names else ""
 
 
-def _others(results: Results, parameters: Mapping[str, ParameterEstimate]) -> str:
-    named = results.in_order(parameters)
-    others = [name for name in named if not name.startswith(("viscous.", "coulomb."))]
+def _list_others(results: Results, parameters: Mapping[str, ParameterEstimate]) -> str:
+    named = results.order_parameters(parameters)
+    others = [name for name in named if not name.startswith(_FRICTION)]
     if len(others) > _MOST_OTHERS:  # a robot's bodies
-        return f"{wording.count(len(others), 'other parameter')} under Identification."
-    shown = [f"{wording.parameter(name)}: {_estimate(parameters[name])}" for name in others]
+        return f"{count_noun(len(others), 'other parameter')} under Identification."
+    shown = [f"{name_parameter(name)}: {_format_estimate(parameters[name])}" for name in others]
     return "; ".join(shown) + "." if shown else ""

@@ -1,20 +1,15 @@
-"""What the estimates are worth: weak directions, information by trial, tests of the innovations."""
+"""How far the estimates can be trusted: weak directions, trials, tests of the innovations."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bampipe.report import verdicts, wording
 from bampipe.report.document import Block, Bullets, Paragraph, Section, Table
 from bampipe.report.results import Results
-from bampipe.results.identify import (
-    IdentifiabilityReport,
-    IdentifyResult,
-    InnovationTests,
-    TrialGrowth,
-)
+from bampipe.report.wording import format_decimals, format_digits, format_percent, format_unit
+from bampipe.results.identify import IdentifiabilityReport, IdentifyResult, InnovationTests
 
-TITLE = "What the estimates are worth"
+TITLE = "Trust in the estimates"
 
 
 def section(results: Results) -> Section | None:
@@ -25,114 +20,100 @@ def section(results: Results) -> Section | None:
     known = identified.identifiability
     blocks: list[Block] = []
     if known:
-        blocks.append(Paragraph(_words(identified, known)))
+        blocks.append(Paragraph(_summarise(identified, known)))
         if known.sentences:
             blocks.append(Bullets(known.sentences))
-        blocks.append(_parameters(results, identified, known))
+        blocks.append(_tabulate_bounds(results, identified, known))
         if len(known.trials) > 1:
-            blocks.append(_trials(known.trials))
+            rows = [
+                (name, format_percent(one.growth), f"`{one.parameter}`")
+                for name, one in known.trials.items()
+            ]
+            caption = "Growth of a bound without each trial, for the parameter that needs it most"
+            blocks.append(Table(caption, "Trial | >Growth | Parameter", rows))
     if identified.innovations:
-        blocks.append(_innovations(results, identified.innovations, identified.method == "ukf"))
+        is_published = identified.method == "ukf"
+        blocks.append(_tabulate_innovations(results, identified.innovations, is_published))
     return Section(TITLE, tuple(blocks)) if blocks else None
 
 
-def _words(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
+def _summarise(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
     if known.weak_directions:
-        words = "Not everything below is known as well as its interval alone suggests."
+        words = "Some parameters are known less well than their intervals suggest."
     elif identified.base_parameters:
-        words = "Of a robot's bodies motion shows combinations only (under Identification)."
+        words = (
+            "The motion of a robot determines only combinations of its inertial numbers (under "
+            "Identification)."
+        )
     else:
         words = (
-            "No two parameters hide each other in these trials. What remains beyond reach follows "
-            "from the equations and from the numbers of the device file."
+            "These trials tell every parameter from the others. The remaining limits follow from "
+            "the equations and from the numbers of the device file."
         )
     if identified.inertial:
         words += (
-            " A single inertial number leans on the drawing, however small its standard deviation: "
-            f"those are left out below, and stand in `models/{identified.model}/identify.json`."
+            " A single inertial number depends on the drawing, however small its standard "
+            "deviation: the table below leaves them out, and "
+            f"`models/{identified.model}/identify.json` lists them."
         )
     return words
 
 
-def _parameters(
+def _tabulate_bounds(
     results: Results, identified: IdentifyResult, known: IdentifiabilityReport
 ) -> Table:
     rows = []
-    for name in results.in_order(known.parameters.keys() - identified.inertial):
-        entry, found = known.parameters[name], identified.parameters[name]
-        partner = (
-            "–"
-            if entry.correlation is None
-            else f"`{entry.partner}` {wording.plain(entry.correlation, 2)}"
-        )
-        rows.append(
-            (
-                f"`{name}`",
-                wording.significant(found.sd, 2),
-                wording.significant(entry.bound_sd, 2),
-                wording.significant(entry.alone_sd, 2),
-                partner,
-                wording.significant(found.least_squares_bias, 2),
-                wording.unit(found.unit) or "1",
-            )
-        )
+    for name in results.order_parameters(known.parameters.keys() - identified.inertial):
+        bound, found = known.parameters[name], identified.parameters[name]
+        partner = "–"
+        if bound.correlation is not None:
+            partner = f"`{bound.partner}` {format_decimals(bound.correlation, 2)}"
+        sds = (format_digits(x, 2) for x in (found.sd, bound.bound_sd, bound.alone_sd))
+        bias = format_digits(found.least_squares_bias, 2)
+        rows.append((f"`{name}`", *sds, partner, bias, format_unit(found.unit) or "1"))
     return Table(
         "Standard deviation of each estimate beside the least possible",
-        ("Parameter", "SD", "Bound", "Alone", "Goes with", "Bias of filtering", "Unit"),
-        tuple(rows),
-        "lrrrlrl",
-        note="Bound: Cramér-Rao, the least that sensor noise allows on these trials; alone, were "
-        "all others known. Goes with: the parameter whose error is most correlated with its own. "
-        "Bias of filtering: what filtered velocities add to plain least squares, found by "
-        "replaying the fit, and taken off; the unscented filter sees positions alone.",
-    )
-
-
-def _trials(trials: Mapping[str, TrialGrowth]) -> Table:
-    rows = tuple(
-        (name, wording.percent(entry.growth), f"`{entry.parameter}`")
-        for name, entry in trials.items()
-    )
-    return Table(
-        "What each trial adds: growth of the bound of the parameter that needs it most, without it",
-        ("Trial", "Growth", "Parameter"),
+        "Parameter | >SD | >Bound | >Alone | Correlated with | >Bias of filtering | Unit",
         rows,
-        "lrl",
+        "Bound: Cramér-Rao, the least that sensor noise allows on these trials. Alone: the same if "
+        "all others were known. Correlated with: the parameter whose error is most correlated with "
+        "this one. Bias of filtering: the bias that filtered velocities give plain least squares, "
+        "found by replaying the fit, and subtracted; the unscented filter uses positions alone.",
     )
 
 
-def _innovations(results: Results, tests: Mapping[str, InnovationTests], published: bool) -> Table:
+def _tabulate_innovations(
+    results: Results, tests: Mapping[str, InnovationTests], is_published: bool
+) -> Table:
     """Tabulate the tests, in words only where the filter's parameters are those published."""
     rows = []
-    for axis in verdicts.ordered(results, tests):
+    for axis in results.order_axes(tests):
         own, driven = tests[axis].whiteness, tests[axis].inputs
         rows.append(
             (
                 axis,
-                _outcome(own.white if own else None),
-                wording.percent(own.share if own else None),
-                _outcome(driven.independent if driven else None),
-                wording.percent(driven.share if driven else None),
-                tests[axis].sentence if published else "",
+                _tell_outcome(own.white if own else None),
+                format_percent(own.share if own else None),
+                _tell_outcome(driven.independent if driven else None),
+                format_percent(driven.share if driven else None),
+                tests[axis].sentence if is_published else "",
             )
         )
     note = (
         "White: Ljung-Box over one second. Inputs: regression on the inputs up to half a second "
         "back. Share: of the variance that is predictable beyond chance."
     )
-    if not published:
+    if not is_published:
         note += (
-            " The filter's parameters are not those published: a failure may speak of them alone."
+            " The parameters of the filter are not those published: a failure may be due to them."
         )
     return Table(
         "Innovations of the filter",
-        ("Axis", "White", "Share", "Inputs", "Share", "In words"),
-        tuple(rows),
-        "llrlrl",
-        (0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+        "Axis | White | >Share | Inputs | >Share | In words ~1",
+        rows,
         note,
-    ).without_empty_columns()
+    ).drop_empty_columns()
 
 
-def _outcome(passed: bool | None) -> str:
+def _tell_outcome(passed: bool | None) -> str:
     return "–" if passed is None else ("passes" if passed else "**fails**")

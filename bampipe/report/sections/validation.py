@@ -9,9 +9,17 @@ import numpy as np
 import pandas as pd
 
 from bampipe.lists import join_names
-from bampipe.report import style, verdicts, wording
+from bampipe.report import style, verdicts
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
+from bampipe.report.wording import (
+    NONE,
+    choose_scale,
+    format_decimals,
+    format_digits,
+    format_unit,
+    split_name,
+)
 from bampipe.results.validate import AxisDrift, ValidateResult
 
 TITLE = "Validation"
@@ -23,179 +31,131 @@ def section(results: Results) -> Section:
     """Return the section."""
     validated = results.read(ValidateResult)
     if validated is None:
-        said = "Predicted and measured force have not been compared"
-        return results.not_done(TITLE, said, "validate")
-    blocks: list[Block] = [_by_axis(results, validated)]
+        said = "The predicted force has not been compared with the measured one"
+        return results.make_section(TITLE, said, "validate")
+    blocks: list[Block] = [_tabulate_axes(results, validated)]
     if validated.trials:
-        blocks.append(_by_trial(results, validated))
+        blocks.append(_tabulate_trials(results, validated))
     if validated.forces:
-        blocks.append(Paragraph(_at_the_handle(validated, results.pusher)))
+        blocks.append(Paragraph(_list_force_errors(validated, results.pusher)))
     if validated.free_run is not None and validated.free_run.drift:
-        blocks += _drift(results, validated, validated.free_run.drift)
+        blocks += _tabulate_drift(results, validated, validated.free_run.drift)
     if validated.notes:
         blocks.append(Bullets(validated.notes))
-    residuals = _shown_trial(results)
+    residuals = _read_trial(results)
     if residuals is not None:
-        blocks.append(_forces(results, residuals))
-        velocity = _velocity(results, residuals)
+        blocks.append(_draw_forces(results, residuals))
+        velocity = _read_velocity(results, residuals)
         if velocity:
-            blocks.append(_friction(results, residuals, velocity))
+            blocks.append(_draw_friction(results, residuals, velocity))
     return Section(TITLE, tuple(blocks))
 
 
-def _by_axis(results: Results, validated: ValidateResult) -> Table:
+def _tabulate_axes(results: Results, validated: ValidateResult) -> Table:
     rows = []
-    for axis in verdicts.ordered(results, validated.axes):
-        entry = validated.axes[axis]
-        fit = entry.fit_percent
-        rows.append(
-            (
-                axis,
-                wording.significant(entry.held_out_rmse),
-                wording.significant(entry.noise_floor),
-                wording.significant(entry.rmse),
-                wording.significant(entry.rmse_without_friction),
-                "–" if fit is None else wording.plain(fit, 1),
-                wording.unit(entry.unit),
-            )
-        )
-    bands = {
-        axis: f"at {wording.significant(hz, 2)} Hz" for axis, hz in validated.cutoff_hz.items()
-    }
+    for axis in results.order_axes(validated.axes):
+        one = validated.axes[axis]
+        fit = NONE if one.fit_percent is None else format_decimals(one.fit_percent, 1)
+        errors = (one.held_out_rmse, one.noise_floor, one.rmse, one.rmse_without_friction)
+        rows.append((axis, *map(format_digits, errors), fit, format_unit(one.unit)))
+    bands = {axis: f"at {format_digits(hz, 2)} Hz" for axis, hz in validated.cutoff_hz.items()}
     each = join_names(f"{axis} {band}" for axis, band in bands.items())
     if len(set(bands.values())) == 1:
         each = next(iter(bands.values()))
     return Table(
         f"Error of the predicted force, model `{validated.model}`",
-        (
-            "Axis",
-            "Held-out RMSE",
-            "Noise floor",
-            "RMSE, all trials",
-            "RMSE without friction",
-            "Fit (%)",
-            "Unit",
-        ),
-        tuple(rows),
-        "lrrrrrl",
-        (0.0, 1.0, 1.0, 1.0, 1.2, 0.6, 0.0),
-        f"Held out: {verdicts.held_out_in_words(validated)}. Noise floor: what sensor noise, "
-        "quantisation and filtering alone would leave. Fit: share of the measured "
-        "force that is explained, as 100 (1 − held-out RMSE / standard deviation)."
-        f" Measured and predicted force are low-passed {each}.",
+        "Axis | >Held-out RMSE ~1 | >Noise floor ~1 | >RMSE, all trials ~1"
+        " | >RMSE without friction ~1.2 | >Fit (%) ~0.6 | Unit",
+        rows,
+        f"Held out: {verdicts.describe_held_out(validated)}. Noise floor: the error that sensor "
+        "noise, quantisation and filtering alone would leave. Fit: share of the measured force "
+        "that is explained, as 100 (1 − held-out RMSE / standard deviation). Both forces are "
+        f"low-passed {each}.",
     )
 
 
-def _by_trial(results: Results, validated: ValidateResult) -> Table:
+def _tabulate_trials(results: Results, validated: ValidateResult) -> Table:
     rows = []
     for name, trial in validated.trials.items():
         key = "held_out_rmse" if trial.held_out else "rmse"
         # Zero: the axis rested, no sample counts.
-        cells = (
-            wording.significant(getattr(trial.axes.get(axis), key, None) or None)
-            for axis in results.axes
-        )
-        rows.append((name, "yes" if trial.held_out else "no", *cells))
-    units = (f"{axis} ({wording.unit(results.force_unit(axis))})" for axis in results.axes)
-    return Table(
-        "RMSE by trial",
-        ("Trial", "Held out", *units),
-        tuple(rows),
-        "ll" + "r" * len(results.axes),
-        note="–: the axis rested." if any("–" in row for row in rows) else "",
-    )
+        errors = (getattr(trial.axes.get(axis), key, None) or None for axis in results.axes)
+        rows.append((name, "yes" if trial.held_out else "no", *map(format_digits, errors)))
+    heads = (f">{axis} ({format_unit(results.force_unit(axis))})" for axis in results.axes)
+    note = "–: the axis rested." if any(NONE in row for row in rows) else ""
+    return Table("RMSE by trial", " | ".join(("Trial | Held out", *heads)), rows, note)
 
 
-def _at_the_handle(validated: ValidateResult, pusher: str) -> str:
-    """Return the error of the measured force in words."""
+def _list_force_errors(validated: ValidateResult, pusher: str) -> str:
     shown = (
-        f"{wording.words(name)} {wording.significant(entry.rmse)} {wording.unit(entry.unit)}"
-        for name, entry in validated.forces.items()
+        f"{split_name(name)} {format_digits(one.rmse)} {format_unit(one.unit)}"
+        for name, one in validated.forces.items()
     )
     place = " at the handle" if pusher == "hand" else ""
     return f"Error of the predicted force{place} (RMSE): {join_names(shown)}."
 
 
-def _drift(
+def _tabulate_drift(
     results: Results, validated: ValidateResult, drift: Mapping[str, AxisDrift]
 ) -> list[Block]:
-    """Return how far the model drifts in short free runs, and where it is not said why."""
-    axes = verdicts.ordered(results, drift)
+    """Return how far the model drifts in short free runs, and the reasons where it is unknown."""
+    axes = results.order_axes(drift)
     horizons = sorted({h.horizon_s for axis in axes for h in drift[axis].horizons})
-    reasons = tuple(
-        f"{axis}: {reason[:1].lower()}{reason[1:]}"
-        for axis in axes
-        if (reason := drift[axis].reason)
-    )
-    everywhere = {drift[axis].reason for axis in axes}
-    if not horizons and len(everywhere) == 1 and reasons:
-        return [Paragraph(f"No short free runs of this model. {everywhere.pop()}")]
+    reasons = {axis: drift[axis].reason for axis in axes if drift[axis].reason}
+    if not horizons and len(reasons) == len(axes) and len(set(reasons.values())) == 1:
+        return [Paragraph(f"No short free runs of this model. {next(iter(reasons.values()))}")]
     blocks: list[Block] = []
-    rows = []
-    for axis in axes:
-        found = {h.horizon_s: h for h in drift[axis].horizons}
-        largest = [h.quantile_90 for h in found.values()]
-        factor, unit = wording.scale(largest, results.unit(axis))
-        cells = []
-        for horizon in horizons:
-            h = found.get(horizon)
-            shown = (h.median, h.quantile_90, h.displacement) if h else ()
-            cells += [wording.significant(factor * value, 2) for value in shown] or ["–"] * 3
-        rows.append((axis, *cells, unit))
     if horizons:
-        head = ((f"in {h:g} s", "90 %", "moved") for h in horizons)
-        blocks.append(
-            Table(
-                "Drift of the model left to itself",
-                ("Axis", *(name for names in head for name in names), "Unit"),
-                tuple(rows),
-                "l" + "rrr" * len(horizons) + "l",
-                (),
-                f"From many moments of {_where_it_ran(validated)} the model runs freely under the "
-                "recorded inputs: distance from the measured position, median and 90 % quantile, "
-                "beside how far the axis itself has moved by then.",
-            )
+        rows = []
+        for axis in axes:
+            found = {h.horizon_s: h for h in drift[axis].horizons}
+            factor, unit = choose_scale((h.quantile_90 for h in found.values()), results.unit(axis))
+            cells: list[str] = []
+            for horizon in horizons:
+                h = found.get(horizon)
+                shown = (h.median, h.quantile_90, h.displacement) if h else ()
+                cells += [format_digits(factor * x, 2) for x in shown] or [NONE] * 3
+            rows.append((axis, *cells, unit))
+        heads = (f">in {h:g} s | >90 % | >moved" for h in horizons)
+        note = (
+            f"The model runs freely under the recorded inputs from many moments of "
+            f"{_describe_trials(validated)} Distance from the measured position, median and 90 % "
+            "quantile, and the distance that the axis itself has moved by then."
         )
+        columns = " | ".join(("Axis", *heads, "Unit"))
+        blocks.append(Table("Drift of the model left to itself", columns, rows, note))
     if reasons:
-        blocks.append(Bullets(reasons))
+        lines = (f"{axis}: {why[:1].lower()}{why[1:]}" for axis, why in reasons.items())
+        blocks.append(Bullets(tuple(lines)))
     return blocks
 
 
-def _where_it_ran(validated: ValidateResult) -> str:
-    """Return the trials of the free runs, and with what parameters."""
+def _describe_trials(validated: ValidateResult) -> str:
+    """Name the trials of the free runs, and their parameters, at the end of a sentence."""
     held_out = sum(trial.held_out for trial in validated.trials.values())
     if not held_out or len(validated.trials) == 1:
-        return "each trial"
-    which = "each trial," if held_out == len(validated.trials) else "each held-out trial,"
-    return f"{which} with parameters that never saw it,"
+        return "each trial."
+    which = "each trial" if held_out == len(validated.trials) else "each held-out trial"
+    return f"{which}, with parameters fitted to other trials."
 
 
-def _shown_trial(results: Results) -> pd.DataFrame | None:
+def _read_trial(results: Results) -> pd.DataFrame | None:
     """Return the residuals of the first held-out trial, else of the first."""
     path = results.model_file("residuals.parquet")
-    columns = results.columns(path)
-    if not columns:
-        return None
-    names = ["trial_id", "held_out"] if "held_out" in columns else ["trial_id"]
-    ids = results.table(path, names)
+    ids = results.table(path, [n for n in ("trial_id", "held_out") if n in results.columns(path)])
     if ids is None or ids.empty:
         return None
     held = ids[ids["held_out"].astype(bool)] if "held_out" in ids else ids
-    trial = str((held if len(held) else ids)["trial_id"].iloc[0])
-    return results.table(path, trial=trial)
+    return results.table(path, trial=str((held if len(held) else ids)["trial_id"].iloc[0]))
 
 
-def _forces(results: Results, frame: pd.DataFrame) -> Figure:
-    """Fig. 9: forces at the handle where they are stored with and without friction, else joints."""
-    components = [
-        name.removeprefix("force_predicted_without_friction_")
-        for name in frame.columns
-        if str(name).startswith("force_predicted_without_friction_")
-    ]
-    at_handle = bool(components)
+def _draw_forces(results: Results, frame: pd.DataFrame) -> Figure:
+    """Fig. 9: forces at the handle if they are stored with and without friction, else at joints."""
+    start = "force_predicted_without_friction_"
+    components = [str(n).removeprefix(start) for n in frame.columns if str(n).startswith(start)]
     names = components or [a for a in results.axes if f"torque_measured_{a}" in frame]
-    kind = "force" if at_handle else "torque"
-    figure, panels = style.panels(len(names), 1, 0.45 + 1.2 * len(names), sharex=True)
+    kind = "force" if components else "torque"
+    figure, panels = style.make_panels(len(names), 1, 0.45 + 1.2 * len(names), sharex=True)
     t = frame["t"].to_numpy()
     window = (t >= t[0] + _SETTLE_S) & (t <= t[0] + _SETTLE_S + _WINDOW_S)
     part = frame[window] if window.sum() > 10 else frame
@@ -208,48 +168,38 @@ def _forces(results: Results, frame: pd.DataFrame) -> Figure:
             (f"{kind}_predicted_{name}", "predicted", style.BLUE, {"lw": 0.9}),
         ):  # fmt: skip
             if column in part:
-                style.series(panel, t, part[column].to_numpy(), colour, title, **look)
-        unit = "N" if at_handle else wording.unit(results.force_unit(name))
-        what = f"force {name}" if at_handle else f"{name}, {_noun(results, name)}"
-        panel.set_ylabel(style.label(what, unit, 20))
+                style.draw_series(panel, t, part[column].to_numpy(), colour, title, **look)
+        quantity = f"force {name}" if components else f"{name}, {results.name_force(name)}"
+        unit = "N" if components else results.force_unit(name)
+        panel.set_ylabel(style.label_axis(quantity, unit, 20))
     panels[-1, 0].set_xlabel("time (s)")
-    style.legend_below(figure, panels[0, 0])
-    trial = str(frame["trial_id"].iloc[0])
-    whose = f"the {results.pusher}'s"
-    where = f"{whose} force" if at_handle else f"{whose} generalised force at each joint"
+    place = "force" if components else "generalised force at each joint"
     caption = (
-        f"Trial {trial}{results.in_paper('Fig. 9')}: {where}, measured and predicted by the "
-        "inverse dynamics, with and without its friction terms."
+        f"Trial {frame['trial_id'].iloc[0]}{results.cite_paper('Fig. 9')}: the {results.pusher}'s "
+        f"{place}, measured and predicted by the inverse dynamics, with and without its friction "
+        "terms."
     )
-    return Figure("force-prediction", caption, style.svg(figure))
+    return style.finish(figure, "force-prediction", caption, [panels[0, 0]])
 
 
-def _noun(results: Results, axis: str) -> str:
-    return "torque" if results.is_rotary(axis) else "force"
-
-
-def _velocity(results: Results, residuals: pd.DataFrame) -> dict[str, np.ndarray]:
+def _read_velocity(results: Results, residuals: pd.DataFrame) -> dict[str, np.ndarray]:
     """Return the velocity of each axis at the times of the residuals, where it is stored."""
+    path = "filter/kinematics.parquet"
+    stored = results.columns(path)
     axes = [
         axis
         for axis in results.axes
-        if f"torque_predicted_without_friction_{axis}" in residuals
-        and f"qd_{axis}" in results.columns("filter/kinematics.parquet")
+        if f"torque_predicted_without_friction_{axis}" in residuals and f"qd_{axis}" in stored
     ]
     trial = str(residuals["trial_id"].iloc[0])
-    frame = results.table(
-        "filter/kinematics.parquet",
-        ["t", *(f"qd_{axis}" for axis in axes)],
-        trial=trial,
-    )
+    frame = results.table(path, ["t", *(f"qd_{axis}" for axis in axes)], trial=trial)
     if not axes or frame is None or frame.empty:
         return {}
-    t = residuals["t"].to_numpy()
-    known = frame["t"].to_numpy()
+    t, known = residuals["t"].to_numpy(), frame["t"].to_numpy()
     return {axis: np.interp(t, known, frame[f"qd_{axis}"].to_numpy()) for axis in axes}
 
 
-def _one_movement(speed: np.ndarray) -> slice:
+def _find_movement(speed: np.ndarray) -> slice:
     """Return the stretch around the fastest moment, from rest to rest."""
     peak = int(np.argmax(np.abs(speed)))
     sign = np.sign(speed[peak])
@@ -261,52 +211,57 @@ def _one_movement(speed: np.ndarray) -> slice:
     return slice(max(0, start - margin), min(len(speed), stop + margin))
 
 
-def _friction(results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndarray]) -> Figure:
+def _draw_friction(
+    results: Results, frame: pd.DataFrame, velocity: dict[str, np.ndarray]
+) -> Figure:
     axes = list(velocity)
     alone = len(axes) == 1
-    figure, panels = style.panels(1, 2, 2.2) if alone else style.panels(2, len(axes), 3.9)
     if alone:
+        figure, panels = style.make_panels(1, 2, 2.2)
         panels = panels.T
-    t = frame["t"].to_numpy()
+    else:
+        figure, panels = style.make_panels(2, len(axes), 3.9)
     for column, axis in enumerate(axes):
-        measured = frame[f"torque_measured_{axis}"].to_numpy()
-        without = frame[f"torque_predicted_without_friction_{axis}"].to_numpy()
-        error = measured - without
-        one = _one_movement(velocity[axis])
-        keep = style.pick(len(error), 2500)
-        speed, unit = velocity[axis], wording.unit(results.rate_unit(axis))
         top, bottom = panels[0, column], panels[1, column]
-        top.plot(speed[keep], error[keep], ".", ms=2.2, mew=0, color=style.BLUE, alpha=0.5)
-        top.plot(speed[one], error[one], color=style.VERMILLION, lw=1.2, label="one movement")
-        _arrow(top, speed[one], error[one])
-        force = wording.unit(results.force_unit(axis))
-        top.set_title(style.heading(axis, len(axes)))
-        top.set_xlabel(style.label("velocity", unit))
-        quantity = style.label(f"{_noun(results, axis)} error", force)
-        new = column == 0 or quantity != panels[0, 0].get_ylabel()
-        top.set_ylabel(quantity if new else "")
-        style.limits(top, [np.quantile(error, [0.001, 0.999]), error[one]])
-        shown = t[one] - t[one][0]
-        bottom.plot(shown, measured[one], color=style.INK, lw=1.4, label="measured")
-        bottom.plot(shown, without[one], color=style.ORANGE, ls=(0, (4, 1.5)), lw=1.1,
-                    label="predicted without friction")  # fmt: skip
-        bottom.axhline(0.0, color=style.INK, lw=0.5)
+        kind, unit = results.name_force(axis), results.force_unit(axis)
+        _draw_movement(top, bottom, frame, axis, velocity[axis])
+        top.set_title(style.break_heading(axis, len(axes)))
+        top.set_xlabel(style.label_axis("velocity", results.rate_unit(axis)))
         bottom.set_xlabel("time (s)")
-        bottom.set_ylabel(style.label(_noun(results, axis), force) if new else "")
+        quantity = style.label_axis(f"{kind} error", unit)
+        if column == 0 or quantity != panels[0, 0].get_ylabel():
+            top.set_ylabel(quantity)
+            bottom.set_ylabel(style.label_axis(kind, unit))
     panels[0, 0].plot([], [], "o", ms=3.5, color=style.BLUE, label="whole trial")
-    top_handles, top_names = panels[0, 0].get_legend_handles_labels()
-    more_handles, more_names = panels[1, 0].get_legend_handles_labels()
-    style.legend_of(figure, top_handles + more_handles, top_names + more_names)
     places = ("Left", "Right") if alone else ("Top", "Bottom")
     caption = (
-        f"The friction that a model without it leaves{results.in_paper('Fig. 4')}. {places[0]}: "
-        "measured minus predicted generalised force against velocity; the arrow shows the start "
+        f"The friction that a model without it leaves{results.cite_paper('Fig. 4')}. {places[0]}: "
+        "measured minus predicted generalised force against velocity; the arrow marks the start "
         f"of one movement. {places[1]}: that movement."
     )
-    return Figure("error-without-friction", caption, style.svg(figure))
+    return style.finish(figure, "error-without-friction", caption, [panels[0, 0], panels[1, 0]])
 
 
-def _arrow(panel: Any, x: np.ndarray, y: np.ndarray) -> None:
+def _draw_movement(
+    top: Any, bottom: Any, frame: pd.DataFrame, axis: str, speed: np.ndarray
+) -> None:
+    """Draw the error of a model without friction over speed, and below one movement over time."""
+    t, measured = frame["t"].to_numpy(), frame[f"torque_measured_{axis}"].to_numpy()
+    without = frame[f"torque_predicted_without_friction_{axis}"].to_numpy()
+    error = measured - without
+    one, keep = _find_movement(speed), style.thin(len(error), 2500)
+    top.plot(speed[keep], error[keep], ".", ms=2.2, mew=0, color=style.BLUE, alpha=0.5)
+    top.plot(speed[one], error[one], color=style.VERMILLION, lw=1.2, label="one movement")
+    _draw_arrow(top, speed[one], error[one])
+    style.set_limits(top, [np.quantile(error, [0.001, 0.999]), error[one]])
+    shown = t[one] - t[one][0]
+    bottom.plot(shown, measured[one], color=style.INK, lw=1.4, label="measured")
+    bottom.plot(shown, without[one], color=style.ORANGE, ls=(0, (4, 1.5)), lw=1.1,
+                label="predicted without friction")  # fmt: skip
+    bottom.axhline(0.0, color=style.INK, lw=0.5)
+
+
+def _draw_arrow(panel: Any, x: np.ndarray, y: np.ndarray) -> None:
     if len(x) < 12:
         return
     start = len(x) // 5

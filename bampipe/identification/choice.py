@@ -1,0 +1,129 @@
+"""Which estimate ``--method auto`` publishes: one rule.
+
+Least squares under the likelihood are always computed. They hold whatever the model lacks, for
+that stays in their residual. The unscented filter is the more precise where the model is right and
+the machine answers the measured forces. It is published where all of this is so:
+
+1. no test bench, and no controller of a robot, gives the motion, and the model is linear in its
+   parameters;
+2. to follow it takes at most `MOST_EVALUATIONS` evaluations of the model;
+3. it follows the motion, and its innovations have the size that it expects;
+4. no parameter differs from that of least squares by more than chance (Hausman 1978,
+   Econometrica 46, 1251: least squares are consistent either way, the filter is efficient);
+5. its standard deviations are the smaller ones, by their geometric mean.
+
+Else least squares are. `benchmarks/recovery.py` holds both against the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from bampipe.identification.estimates import Estimate
+from bampipe.identification.least_squares_estimate import SquaresFit
+from bampipe.lists import join_names
+from bampipe.phrases.results import METHODS
+from bampipe.physics import System
+from bampipe.results.identify import Method, MethodTried, MethodValue
+from bampipe.results.rounding import round_with_sd, significant
+from bampipe.trials.motion import Motion, trial_sizes
+from bampipe.trials.replay import steps_to_follow
+
+Array = NDArray[np.float64]
+
+MOST_EVALUATIONS = 2e7
+"""Of the model by all sigma points along all trials: some five seconds for each pass."""
+_CHANCE = 0.01
+"""Probability that the largest of the differences is by chance, below which two disagree."""
+_SHOWN = 4
+
+
+def why_not_filtered(system: System, squares: SquaresFit, longest_step_s: float) -> str | None:
+    """Why the filter is not run: "" where there is nothing to say of it; None where it is run."""
+    device = system.model.device
+    if device.prescribed or device.robot is not None or not squares.problem.linear:
+        return ""
+    motions: Sequence[Motion] = squares.trials.motions
+    each = steps_to_follow(system, squares.p[:-1], motions[0], longest_step_s)
+    steps = each * sum(trial_sizes(motions))
+    points = 2 * (len(system.states) + squares.free.size + len(system.noise)) + 1
+    if steps * points <= MOST_EVALUATIONS:
+        return None
+    return f"to follow the motion it would take {steps:.1g} steps of {points} points each"
+
+
+def find_objections(system: System, by_filter: Estimate, by_squares: Estimate) -> tuple[str, ...]:
+    """What speaks against publishing the filter's estimate, a clause each."""
+    apart = np.abs(by_filter.value - by_squares.value)
+    chance = stats.norm.isf(0.5 * _CHANCE / max(len(apart), 1))
+    far = apart > chance * np.hypot(by_filter.sd, by_squares.sd)
+    found = [*by_filter.doubts]
+    if far.any():
+        shown = [
+            f"`{system.parameters[place].name}` at {round_with_sd(value, sd)}"
+            for place, value, sd, is_far in zip(
+                by_filter.free, by_filter.value, by_filter.sd, far, strict=True
+            )
+            if is_far
+        ]
+        found.append(f"the latter puts {join_names(shown, _SHOWN)}, farther away than by chance")
+    least = np.finfo(float).tiny
+    ratio = np.maximum(by_filter.sd, least) / np.maximum(by_squares.sd, least)
+    if (looser := float(np.exp(np.mean(np.log(ratio))))) > 1.0:
+        found.append(
+            f"the latter's standard deviations are {significant(looser)} times the former's"
+        )
+    return tuple(found)
+
+
+def tabulate_methods(
+    system: System, squares: SquaresFit, published: Estimate, others: Sequence[Estimate], lost: str
+) -> dict[Method, MethodTried]:
+    """Return what identify.json says of each method, the published one first.
+
+    Args:
+        lost: why there is no estimate of the filter, "" where there is one or none was sought.
+    """
+    found: dict[Method, MethodTried] = {}
+    for each in (published, *others):
+        names = [system.parameters[place].name for place in each.free]
+        joint = 2.0 * np.hypot(each.sd, published.sd)
+        apart = np.abs(each.value - published.value) > joint
+        error = held_out_error(squares, each)
+        found[each.method] = MethodTried(
+            held_out_rmse=dict(zip(system.coordinates, error, strict=True)),
+            parameters={
+                name: MethodValue(estimate=value, sd=sd)
+                for name, value, sd in zip(names, each.value, each.sd, strict=True)
+            },
+            disagrees=tuple(name for name, far in zip(names, apart, strict=True) if far),
+            doubts=each.doubts,
+        )
+    if lost:
+        found["ukf"] = MethodTried(doubts=(lost,))
+    return found
+
+
+def held_out_error(squares: SquaresFit, estimate: Estimate) -> Array:
+    """Error (n_q,) of predictions of each trial by parameters that have not seen it, N.m or N."""
+    problem, evidence = squares.problem, squares.fit.evidence
+    total, count = 0.0, 0.0
+    for trial, (p, used) in enumerate(zip(estimate.held_out, evidence.used, strict=True)):
+        left = problem.band.thin(problem.residual(trial, p)) * used
+        total, count = total + np.sum(left**2, axis=0), count + used.sum(axis=0)
+    return np.asarray(np.sqrt(total / np.maximum(count, 1)))
+
+
+def describe_methods(methods: Mapping[Method, MethodTried]) -> list[str]:
+    """Say what a method that is not published has against it, and what the published one has."""
+    published, *others = methods
+    words = METHODS[published]
+    return [f"Published by {words}, although {doubt}." for doubt in methods[published].doubts] + [
+        f"Published by {words}, not by {METHODS[other]}: {'; '.join(doubts)}."
+        for other in others
+        if (doubts := methods[other].doubts)
+    ]

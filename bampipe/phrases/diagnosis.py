@@ -1,0 +1,228 @@
+"""Phrases and sentences on a diagnosis, made from its record alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+
+from bampipe.lists import join_names
+from bampipe.phrases.results import STANDINGS
+from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, NullDistribution
+from bampipe.results.floor import FLOOR_WRONG
+from bampipe.results.rounding import significant
+
+_MOST_ALTERNATIVES = 3
+"""Sets of effects that a phrase names."""
+_NO_SHAPES: Mapping[str, str] = MappingProxyType({})
+_PROBABILITY = "probability "
+
+
+def probability(value: float) -> str:
+    """Return a probability with two decimals; none is called certain."""
+    shown = f"{value:.2f}"
+    return {"1.00": "> 0.99", "0.00": "< 0.01"}.get(shown, shown)
+
+
+def percent_of_force(share: float) -> str:
+    """Return a share of the force in per cent, with enough decimals to tell it from all of it."""
+    left = 100.0 * abs(1.0 - share)
+    decimals = 1 if left == 0.0 else max(1, math.ceil(-math.log10(left)))
+    return f"{100.0 * share:.{min(decimals, 6)}f} %"
+
+
+def share_of_force(entry: AxisVerdict) -> str:
+    """Return the share of the force of an axis that the final model explains."""
+    return f"{percent_of_force(entry.explained)} of the mean square of the applied force"
+
+
+def times_floor(error: float, floor: float) -> str:
+    """Return an error as a multiple of its noise floor."""
+    return f"{error / floor:.3g} times the noise floor" if floor > 0.0 else "without a noise floor"
+
+
+def list_effects(entry: AxisVerdict, effects: Iterable[str], mark: str = "") -> str:
+    """Return ``a:yaw (0.98) and b:yaw (0.95)``: effects of an axis with their probabilities.
+
+    Args:
+        entry: the axis; effects: some of its probable ones; mark: put on either side of a name.
+    """
+    known = entry.probabilities
+    return join_names(f"{mark}{name}{mark} ({probability(known[name])})" for name in effects)
+
+
+def split_sets(
+    found: DiagnoseResult, axis: str
+) -> tuple[list[str], list[tuple[tuple[str, ...], float]]]:
+    """Return the effects common to all probable sets of an axis, and the sets to be named."""
+    sets = found.sets_on(axis)[:_MOST_ALTERNATIVES]
+    sets = [one for one in sets if probability(one[1]) != "< 0.01"] or sets[:1]
+    if len(sets) < 2:
+        return [], sets
+    return [name for name in sets[0][0] if all(name in names for names, _ in sets[1:])], sets
+
+
+def find_open_effects(found: DiagnoseResult) -> frozenset[str]:
+    """Return the effects that these trials leave open: not all probable sets hold them."""
+    axes = [axis for axis, entry in found.axes.items() if entry.verdict == "undecided"]
+    known = {name for axis in axes for name in split_sets(found, axis)[0]}
+    return frozenset(name for axis in axes for name in found.axes[axis].probabilities) - known
+
+
+def split_alternatives(
+    found: DiagnoseResult, axis: str, mark: str = "", first: str = ""
+) -> tuple[str, list[str]]:
+    """Return the effects common to all probable sets of an axis, and their differences.
+
+    Args:
+        found: the diagnosis; axis: of it; mark: put on either side of a name.
+        first: a word before the first probability of each part.
+
+    Returns:
+        ``a:yaw (0.99)``, or "" where there is none; ``b:yaw (0.60)``, ``nothing more (0.40)``.
+    """
+    common, sets = split_sets(found, axis)
+    parts: list[str] = []
+    for names, chance in sets:
+        rest = [f"{mark}{name}{mark}" for name in names if name not in common]
+        shown = " with ".join(rest) or ("nothing more" if common else "nothing")
+        parts.append(f"{shown} ({'' if parts else first}{probability(chance)})")
+    known = list_effects(found.axes[axis], common, mark).replace(" (", f" ({first}", 1)
+    return known, parts
+
+
+def open_question(parts: Sequence[str]) -> str:
+    """Return that trials do not decide between parts of `split_alternatives`."""
+    return f"these trials do not decide {'between' if parts[1:] else 'on'} {join_names(parts)}"
+
+
+def missing_effects(found: DiagnoseResult, axis: str, mark: str = "") -> str:
+    """Return the effects that an axis lacks, or the alternatives among them."""
+    if found.axes[axis].verdict == "undecided":
+        known, parts = split_alternatives(found, axis, mark)
+        either = f"either {' or '.join(parts)}" if parts[1:] else f"perhaps {join_names(parts)}"
+        return ", and ".join(filter(None, (known, either)))
+    return list_effects(found.axes[axis], found.axes[axis].effects, mark)
+
+
+def verdict(found: DiagnoseResult, axis: str) -> str:
+    """Return the verdict on an axis in a few words, with the effects that may be missing."""
+    kind = found.axes[axis].verdict
+    if kind in ("missing", "undecided"):
+        return f"{kind}{':' * (kind == 'undecided')} {missing_effects(found, axis)}"
+    return kind.replace("_", " ")
+
+
+def limits(found: DiagnoseResult) -> str:
+    """Return the effects that the search left out, in a sentence, or ""."""
+    names = ", ".join(found.not_weighed)
+    return f"Not weighed (setting `without`): {names}." if names else ""
+
+
+def null_distribution(null: NullDistribution | None) -> str:
+    """Return the gains of candidates on replays that lack nothing, in a sentence."""
+    if null is None:
+        return (
+            "Replays of the model do not resemble the measurement, so that the gain of a candidate"
+            " by chance is not known."
+        )
+    return (
+        f"On {null.replicates} replays of the final model, which lack nothing, the largest gain of"
+        f" any candidate is {min(null.largest):.3g} to {max(null.largest):.3g} nats; on"
+        f" the measured trials it is {null.measured:.3g} nats, of {null.effect}"
+        f" (p = {null.p_value:.2g})."
+    )
+
+
+def describe_axes(result: DiagnoseResult, shapes: Mapping[str, str] = _NO_SHAPES) -> dict[str, str]:
+    """Return one or more sentences for each axis.
+
+    Args:
+        result: the diagnosis.
+        shapes: by axis, the shape of the residual of the final model, in words.
+    """
+    said = {}
+    for axis, entry in result.axes.items():
+        name = axis.capitalize() if axis.isalpha() else axis  # joint_1 is a name, not a word
+        if entry.verdict == "no_verdict":
+            said[axis] = f"{name}: no verdict, for {_explain_refusal(axis, entry, result)}"
+            continue
+        parts = [f"{name}: {_describe_verdict(axis, entry, result)}."]
+        if entry.remains and entry.verdict in ("missing", "undecided"):
+            rest = _describe_unknown(entry, result)
+            parts.append(f"Beside that, something is missing that {rest}.")
+        if entry.remains and shapes.get(axis):
+            parts.append(f"Its shape: {shapes[axis]}.")
+        if not entry.remains and entry.standing == "above_floor":
+            parts.append(
+                "Without the bias that filters leave where friction turns, the error is"
+                f" {significant(entry.rmse_beyond_bias)} {entry.unit}."
+            )
+        said[axis] = " ".join(parts)
+    return said
+
+
+def _describe_verdict(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> str:
+    """Return the missing effects, the error with them, and the explained share of the force."""
+    before, error = significant(entry.rmse_before), significant(entry.rmse_after)
+    after = f"{error} {entry.unit}, {times_floor(entry.rmse_after, entry.noise_floor)}"
+    share = f"explains {share_of_force(entry)}"
+    errors = f"the held-out error is {after}, and the model {share}"
+    if result.selected and (entry.effects or before != error):
+        adding = f"{_describe_addition(entry, result)} takes the held-out error from {before}"
+        errors = f"{adding} to {after}; the model then {share}"
+    if entry.verdict == "nothing_missing":
+        return f"nothing of a size that matters is missing, as far as these trials show; {errors}"
+    if entry.verdict == "unknown_effect":
+        return f"something is missing that {_describe_unknown(entry, result)}; {errors}"
+    if entry.verdict == "missing":
+        verb = "is" if len(entry.effects) == 1 else "are"
+        values = join_names(probability(entry.probabilities[name]) for name in entry.effects)
+        return f"{join_names(entry.effects)} {verb} missing ({_PROBABILITY}{values}); {errors}"
+    known, parts = split_alternatives(result, axis, first=_PROBABILITY)
+    sure = f"{known} {'are' if ' and ' in known else 'is'} missing, and " if known else ""
+    return f"{sure}{open_question(parts)}; {errors}"
+
+
+def _describe_addition(entry: AxisVerdict, result: DiagnoseResult) -> str:
+    """Return which effects give the errors of an axis: its own, or those of several axes."""
+    if set(entry.effects) != set(result.selected):
+        return f"adding all that is selected ({join_names(result.selected)})"
+    if entry.verdict == "missing":
+        return "adding it" if len(entry.effects) == 1 else "adding them"
+    return f"adding {join_names(entry.effects)}"
+
+
+def _describe_unknown(entry: AxisVerdict, result: DiagnoseResult) -> str:
+    """Return that no effect explains the rest, with the probability that something is left."""
+    none = (
+        "no set of as many effects as may be added explains"
+        if result.cut_short
+        else "no effect of the library explains"
+    )
+    return f"{none} ({_PROBABILITY}{probability(entry.unknown)})"
+
+
+def _explain_refusal(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> str:
+    """Return why an axis has no verdict, which effects fit nevertheless, and the remedy."""
+    error, floor = (f"{significant(x)} {entry.unit}" for x in (entry.rmse_after, entry.noise_floor))
+    do = "Compare the noise and resolution in session.toml with what `bampipe ingest` measured."
+    if entry.standing in FLOOR_WRONG:
+        of = f" ({floor})" if entry.standing == "floor_implausible" else ""
+        why = f"its held-out error of {error} is {STANDINGS[entry.standing]}{of}."
+    else:
+        why = (
+            "replays of the model do not resemble the measurement, so that the gain of a candidate"
+            f" by chance is not known; the held-out error is {error}, that of replays {floor}, and"
+            f" the model explains {share_of_force(entry)}."
+        )
+        windows = [one for one in result.worst_windows if one.axis == axis]
+        if windows:
+            worst = max(windows, key=lambda one: one.rmse)
+            do += (
+                f" The error is largest, {significant(worst.rmse)} {worst.unit}, from"
+                f" {worst.t_start:.1f} to {worst.t_end:.1f} s of trial {worst.trial_id}"
+                f" ({worst.doing}): look there first."
+            )
+    fit = f"By their fit alone: {list_effects(entry, entry.likely)}." if entry.likely else ""
+    return " ".join(filter(None, (why, fit, do)))

@@ -1,0 +1,333 @@
+"""Drives of a robot held against its bodies as they are drawn: the measure of every hypothesis.
+
+Bodies that are free take on much of a mistake: with a reversed drive they come out turned over,
+within what is not known of them, and little is left. Drawn bodies cannot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.physics.robot import Robot
+from bampipe.setup.mounting import Mounting
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Bounds = tuple[float, float]
+
+WIDE: Bounds = (-np.inf, np.inf)
+"""What a drive may be of what is required, where neither its sign nor its unit is stated."""
+_SURE = 5.0
+"""Standard errors from which on the sign of a drive is known."""
+_LEAST_LEFT = 3e-3
+"""Part of a drive's variance below which no drawing is believed to be better than another."""
+_CONTRADICTED = 2.0 * np.log(2.0)
+"""What a drive counts for against a mounting with which its friction would drive the joint."""
+_MOST_LEFT = 0.05
+"""Of the drives' variance: what a drawing with the right reductions leaves at most."""
+_TURNING = 0.02
+"""Of the largest velocity: width of its sign."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How the drive of a joint goes with what its motion requires by the drawing.
+
+    Attributes:
+        share: of the drive, for one of what is required; 1 where both are of the joint.
+        error: its standard error by the scatter alone; the drawing has another.
+        left: part of the drive's variance that drawing, drive's inertia and friction leave, with a
+            share within the bounds that were given.
+        losses: mean power that friction takes from the drive, in its standard errors: negative
+            where the drive, or the joint, is logged with the other sign.
+    """
+
+    share: float
+    error: float
+    left: float
+    losses: float
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether weight tells a sign with which friction would drive the joint."""
+        against = self.is_dissipative if self.share < 0.0 else self.losses < -_SURE
+        return abs(self.share) > _SURE * self.error and against
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether weight and inertia tell the sign: friction gives no power, whatever they say."""
+        return abs(self.share) > _SURE * self.error and not self.is_contradicted
+
+    @property
+    def is_dissipative(self) -> bool:
+        """Whether friction surely takes power from the drive."""
+        return self.losses > _SURE
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether it is surely logged with the other sign, by weight and inertia or by friction."""
+        return self.share < 0.0 if self.is_sure else self.losses < -_SURE
+
+
+@dataclass(frozen=True)
+class JointMotion:
+    """Positions, velocities and accelerations of a robot's joints, each (T, n)."""
+
+    position: Array
+    rate: Array
+    change: Array
+
+    def reread(self, gain: Array, time: float = 1.0) -> JointMotion:
+        """The same of joints that are ``gain``, (n, n), times these, by a clock ``time`` slower."""
+        return JointMotion(
+            self.position @ gain.T, self.rate @ gain.T / time, self.change @ gain.T / time**2
+        )
+
+    def scaled(self, factor: Array) -> JointMotion:
+        """The same of joints that move ``factor``, (n,), times as far."""
+        return self.reread(np.diag(factor))
+
+
+def _keep(values: Array, axes: Sequence[int]) -> Array:
+    return values
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Drives beside what the drawn bodies require along the motion of some trials.
+
+    Attributes:
+        robot: whose bodies are drawn; turning: whether each of its joints turns.
+        motions: of the joints as their readings have it, one a trial.
+        drives: (K, n), N.m, N or A.
+        ratio: turns of each drive for one of its joint, (n,).
+        thin: makes of columns (T, m) those that are compared, given the joint of each.
+        used: which samples of each joint are compared, (K, n); None for all.
+        shared: turns by joint, (n,), of motors that turn several: their friction acts on all.
+        has_offset: whether a drive may read something at rest. It takes on weight of the wrong
+            sign, so where signs are stated it must not.
+    """
+
+    robot: Robot
+    turning: tuple[bool, ...]
+    motions: Sequence[JointMotion]
+    drives: Array
+    ratio: Array
+    thin: Callable[[Array, Sequence[int]], Array] = _keep
+    used: Flags | None = None
+    shared: Sequence[Array] = ()
+    has_offset: bool = True
+    _required: dict[bytes, Array] = field(default_factory=dict, repr=False)
+    _sums: dict[bytes, list[tuple[Array, ...]]] = field(default_factory=dict, init=False)
+
+    @property
+    def drawn(self) -> Mounting:
+        """All as it is drawn."""
+        return Mounting.as_drawn(len(self.ratio), self.robot.gravity)
+
+    def reread(self, gain: Array, time: float = 1.0) -> Comparison:
+        """With other readings of the joints, see `JointMotion.reread`."""
+        motions = [m.reread(gain, time) for m in self.motions]
+        return replace(self, motions=motions, _required={})
+
+    def driven(self, gain: Array) -> Comparison:
+        """With drives that are ``gain``, (n, n), times these."""
+        return replace(self, drives=self.drives @ gain.T)
+
+    def _rows(self, values: Array, k: int) -> Array:
+        """Of ``values``, (K, ...), the samples of joint ``k``."""
+        return values if self.used is None else values[self.used[:, k]]
+
+    def _thinned(self, columns: Sequence[Array], k: int) -> Array:
+        """Columns (K, m) of joint ``k`` of all trials, each given as (T, m)."""
+        parts = [self.thin(one, [k] * one.shape[1]) for one in columns]
+        return self._rows(np.concatenate(parts), k)
+
+    def _require(self, mounting: Mounting) -> Array:
+        """Drives (4, K, n) required without gravity, and by 1 m/s2 of it along each axis."""
+        n, found = len(self.ratio), []
+        for motion in self.motions:
+            moved = motion.scaled(mounting.direction)
+            still = np.zeros((3 * len(moved.rate), n))
+            q = np.tile(moved.position + mounting.zero, (4, 1))
+            qd, qdd = (np.concatenate([part, still]) for part in (moved.rate, moved.change))
+            gravity = np.repeat(np.eye(4)[1:], len(moved.rate), axis=1)
+            parts = self.robot.drawn_forces(q, qd, qdd, gravity) / self.ratio
+            beside = np.hstack(list(parts.reshape(4, -1, n)))
+            found.append(self.thin(beside, list(range(n)) * 4))
+        return np.concatenate(found).reshape(-1, 4, n).transpose(1, 0, 2)
+
+    def by_body(self, mounting: Mounting) -> list[Array]:
+        """By joint, what losses leave of the drive that each drawn body asks for, (K, bodies)."""
+        n, bodies = len(self.ratio), range(len(self.robot.joints))
+        found: list[list[Array]] = []
+        for motion in self.motions:
+            moved = motion.scaled(mounting.direction)
+            at = moved.position + mounting.zero, moved.rate, moved.change
+            found.append(
+                [
+                    self.robot.drawn_forces(*at, mounting.gravity, only=b) / self.ratio
+                    for b in bodies
+                ]
+            )
+        return [
+            loss.without(
+                self._thinned([np.column_stack([f[:, k] for f in trial]) for trial in found], k).T
+            ).T
+            for k, loss in zip(range(n), self.losses, strict=True)
+        ]
+
+    def by_number(self, mounting: Mounting, place: int) -> list[Array]:
+        """By joint, what losses leave of one of each inertial number of a body, (K, 10)."""
+        under = self.robot.model_copy(update={"gravity": tuple(mounting.gravity)})
+        found: list[list[Array]] = [[] for _ in self.ratio]
+        for motion in self.motions:
+            moved = motion.scaled(mounting.direction)
+            columns = under.columns(moved.position + mounting.zero, moved.rate, moved.change)
+            for parts, row, ratio in zip(found, columns, self.ratio, strict=True):
+                numbers = [np.broadcast_to(c, len(moved.rate)) for c in row[place]]
+                parts.append(np.column_stack(numbers) / ratio)
+        return [
+            loss.without(self._thinned(parts, k).T).T
+            for k, (parts, loss) in enumerate(zip(found, self.losses, strict=True))
+        ]
+
+    @cached_property
+    def losses(self) -> list[Losses]:
+        """Of each drive, which a motor that turns the other way counts so."""
+        found = []
+        for k, way in enumerate(np.sign(self.ratio)):
+            turns = [way * np.eye(len(self.ratio))[k], *(t for t in self.shared if t[k])]
+            columns, powers = [], np.zeros(3 * len(turns))
+            widest = [
+                _TURNING * max(np.abs(motion.rate @ by).max() for motion in self.motions)
+                for by in turns
+            ]
+            for motion in self.motions:
+                rates = [motion.rate @ by for by in turns]
+                signs = [np.tanh(r / max(w, 1e-9)) for r, w in zip(rates, widest, strict=True)]
+                columns.append(
+                    np.column_stack([*(motion.change @ by for by in turns), *rates, *signs])
+                )
+            thinned, m = self._thinned(columns, k), len(turns)
+            rate, sign = thinned[:, m : 2 * m], thinned[:, 2 * m :]
+            powers[m : 2 * m] = np.mean(rate**2, axis=0) if len(rate) else 0.0
+            powers[2 * m :] = np.mean(sign * rate, axis=0) if len(rate) else 0.0
+            found.append(
+                Losses.of(thinned, powers, self._rows(self.drives[:, k], k), self.has_offset)
+            )
+        return found
+
+    def hold(self, mounting: Mounting, bounds: Bounds = WIDE) -> list[Drive]:
+        """How each drive goes with the drawing, the joints counted and the base mounted so."""
+        key = mounting.direction.tobytes() + mounting.zero.tobytes()
+        if key not in self._sums:
+            if key not in self._required:
+                self._required[key] = self._require(mounting)
+            parts = self._required[key]
+            self._sums[key] = [
+                loss.sums(np.array([self._rows(part[:, k], k) for part in parts]))
+                for k, loss in enumerate(self.losses)
+            ]
+        by_part = np.array([1.0, *mounting.gravity])
+        return [
+            loss.beside(sums, by_part, mounting.direction[k], bounds)
+            for k, (loss, sums) in enumerate(zip(self.losses, self._sums[key], strict=True))
+        ]
+
+    def misfit(self, mounting: Mounting) -> float:
+        """What `find_mounting` makes small: more where friction contradicts weight."""
+        drives = self.hold(mounting)
+        left = np.log([drive.left + _LEAST_LEFT for drive in drives])
+        return float(left.sum() + _CONTRADICTED * sum(drive.is_contradicted for drive in drives))
+
+
+@dataclass(frozen=True)
+class Losses:
+    """What its own inertia, friction and an offset take of a drive (K,), and what they leave.
+
+    Attributes:
+        basis: of their columns, (K, m) and orthonormal.
+        power: the mean power of friction is its product with what is not required, (K,).
+        drive: what they leave of the drive, (K,); size: mean square of the drive without an offset.
+        taken: mean power of friction where nothing is required.
+        known: whether they can be told from each other.
+    """
+
+    basis: Array
+    power: Array
+    drive: Array
+    size: float
+    taken: float
+    known: bool
+
+    @classmethod
+    def of(cls, columns: Array, powers: Array, drive: Array, has_offset: bool) -> Losses:
+        """With columns (K, m), the mean power of one of each, (m,), and the drive (K,)."""
+        if has_offset:
+            columns, powers = np.column_stack([columns, np.ones(len(drive))]), np.append(powers, 0)
+        size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        left, values, right = np.linalg.svd(columns / size, full_matrices=False)
+        held = values > 1e-9 * values.max(initial=1e-300)
+        power = left[:, held] @ (right[held] @ (powers / size) / values[held])
+        rest = drive - left[:, held] @ (left[:, held].T @ drive)
+        spread = np.var(drive) if has_offset else np.mean(drive**2)
+        return cls(
+            left[:, held],
+            power,
+            rest,
+            max(float(np.nan_to_num(spread)), 1e-300),
+            float(power @ drive),
+            bool(len(held)) and bool(held.all()),
+        )
+
+    def sums(self, parts: Array) -> tuple[Array, ...]:
+        """Products of what is required, in ``parts`` (m, K), by which `beside` needs no samples."""
+        own = self.without(parts)
+        return own @ own.T, parts @ parts.T, own @ self.drive, parts @ self.power
+
+    def without(self, columns: Array) -> Array:
+        """What the losses leave of columns, (m, K)."""
+        return np.asarray(columns - (columns @ self.basis) @ self.basis.T)
+
+    def beside(
+        self, sums: tuple[Array, ...], by_part: Array, direction: float, bounds: Bounds
+    ) -> Drive:
+        """A regression of the drive on what is required too, the sum of ``by_part`` (m,) parts.
+
+        Of a joint that counts in ``direction``; ``sums``: of the parts; ``bounds``: of the share.
+        """
+        square, whole = (float(by_part @ of @ by_part) for of in sums[:2])
+        along, power = (float(of @ by_part) for of in sums[2:])
+        left, count = float(self.drive @ self.drive), max(len(self.drive), 1)
+        if not self.known or square <= 1e-18 * max(whole, 1e-300):
+            return Drive(0.0, np.inf, left / count / self.size, 0.0)
+        share = along / square
+        mean_square = max(left - share * along, 0.0) / count
+        # Neighbouring samples err alike: about one in ten counts.
+        variance = 10.0 * mean_square
+        power_sd = np.sqrt(variance * (float(self.power @ self.power) + power**2 / square))
+        taken = direction * (self.taken - share * power)
+        held = min(max(share, bounds[0]), bounds[1])
+        held_left = mean_square + (held - share) ** 2 * square / count
+        return Drive(
+            share,
+            float(np.sqrt(variance / square)),
+            held_left / self.size,
+            float(taken / max(power_sd, 1e-300)),
+        )
+
+
+def fits(drives: Sequence[Drive]) -> bool:
+    """Whether drawing and log are of the same joints."""
+    return mean_left(drives) < _MOST_LEFT
+
+
+def mean_left(drives: Sequence[Drive]) -> float:
+    """Part of the drives' variance that is left, on average."""
+    return float(np.mean([drive.left for drive in drives]))

@@ -1,0 +1,230 @@
+"""A session file proposed for a folder of logs: what can be seen is guessed, the rest left open.
+
+Every guess is marked in the text. What no look at the data can tell, such as how many counts make
+a radian, is left at a value that the session reader refuses with a line saying what to fill in.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bampipe.data.survey import survey
+from bampipe.errors import InputError
+from bampipe.files import write_text
+from bampipe.lists import join_names
+from bampipe.setup.mounting import Mounting
+from bampipe.setup.proposal.clock import clock_of
+from bampipe.setup.proposal.device import (
+    DEVICE,
+    ChosenDevice,
+    find_device,
+    new_device,
+    with_gravity,
+    with_motors,
+)
+from bampipe.setup.proposal.encoders import encoders_table
+from bampipe.setup.proposal.inputs import input_tables
+from bampipe.setup.proposal.matching import Matcher
+from bampipe.setup.proposal.notes import Notes, quoted
+from bampipe.setup.proposal.readings import fresh_readings, signed_readings
+from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
+from bampipe.setup.proposal.trials import trials_tables
+
+SESSION = "session.toml"
+
+
+@dataclass(frozen=True)
+class ProposedSession:
+    """What to write, and what a person has to look at.
+
+    Attributes:
+        session: text of ``session.toml``.
+        device: text of a device file to write beside it, "" where there is one already.
+        fill_in: what only a person can know, a sentence each; the session is refused without.
+        check: guesses, a sentence each.
+        passed: files left out, with the reason.
+    """
+
+    session: str
+    device: str
+    fill_in: list[str]
+    check: list[str]
+    passed: list[str]
+
+
+def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> ProposedSession:
+    """Propose a session file for the logs in ``folder``; writes nothing.
+
+    Args:
+        folder: with logs, in it or in folders below.
+        device: a built-in device or a device file in the folder; guessed where empty.
+        names: of the columns, where the logs are texts without a header.
+
+    Raises:
+        InputError: no logs, a session file is there already, or no such device.
+    """
+    if (folder / SESSION).exists():
+        raise InputError(
+            f"there is a {SESSION} already",
+            where=str(folder),
+            remedy=f"it is left alone; to run it: bampipe run {folder}",
+        )
+    found = survey(folder, names)
+    notes = Notes(check=list(found.remarks))
+    found, registers = signed_readings(fresh_readings(found, notes))
+    chosen = find_device(folder, found, device)
+    clock = clock_of(found, notes)
+    match = Matcher(found, clock.t, set(clock.columns), registers)
+    if chosen is None:
+        chosen = new_device(folder, match, notes)
+        positions = len([c for c in found.of("position") if not c.is_constant])
+        if positions > 1:
+            notes.check.append(
+                f"{positions} columns are positions: of a robot? put its URDF beside the logs"
+            )
+    elif chosen.device.robot is not None:
+        several = len(chosen.device.robot.joints) > 1
+        columns = find_robot_columns(
+            folder, chosen.device, chosen.device.robot, found, clock.t, notes
+        )
+        chosen = _with_guessed_motors(folder, chosen, columns)
+        match.joints, match.of_robot = columns.columns, several
+        match.turned, match.gears = columns.turned, columns.gears
+        if columns.mounting is not None:
+            chosen = _hung(folder, chosen, columns.mounting, notes)
+            joints = [c.name for c in chosen.device.coordinates]
+            match.counting = dict(zip(joints, columns.mounting.by_joint, strict=True))
+        _check_robot(chosen, columns, notes)
+    encoders, axes = encoders_table(chosen.device, match, notes)
+    inputs = input_tables(chosen, axes, match, notes)
+    lines = [
+        *_head(folder, chosen.name, clock.rate),
+        *_names(names),
+        *clock.lines,
+        *encoders,
+        *inputs,
+        *_not_used(match),
+        *trials_tables(chosen.device, axes, match, notes),
+    ]
+    return ProposedSession(
+        session="\n".join(lines) + "\n",
+        device=chosen.text,
+        fill_in=notes.questions,
+        check=notes.check,
+        passed=[
+            f"{name}: {reason.removeprefix(name).lstrip(':, ')}" for name, reason in found.passed
+        ],
+    )
+
+
+def _head(folder: Path, device: str, rate: str) -> list[str]:
+    sanitised = re.sub(r"[^A-Za-z0-9._-]", "_", folder.resolve().name).lstrip("._-")
+    return [
+        "# Proposed by `bampipe init`. Look at every line marked `guess` or `fill in`.",
+        'schema = "bampipe.session/1"',
+        f'session_id = "{sanitised or "session"}"',
+        f"device = {quoted(device)}",
+        rate,
+        "",
+    ]
+
+
+def _names(names: Sequence[str]) -> list[str]:
+    listed = ", ".join(quoted(name) for name in names)
+    return ["[csv]", f"names = [{listed}]", ""] if names else []
+
+
+def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColumns) -> ChosenDevice:
+    """A new device file with the torque constants or reductions that the drawing suggests."""
+    sizes = [abs(drive.share) for drive in columns.drives.values()]
+    if not chosen.text or not all(drive.is_sure for drive in columns.drives.values()) or not sizes:
+        return chosen
+    joints = [c.name for c in chosen.device.coordinates]
+    turns = [columns.gears.get(joint, 1.0) for joint in joints]
+    of_motor = [size * ratio for size, ratio in zip(sizes, turns, strict=True)]
+    if chosen.device.force_unit == "A":
+        found = zip(joints, turns, of_motor, strict=True)
+        guessed = {j: (n, 1.0 / size) for j, n, size in found}
+        # Where most is carried, errors of single bodies count least.
+        size = {
+            joint: float(np.nanstd(columns.columns[name].values) / abs(drive.share))
+            for joint, (name, drive) in zip(joints, columns.drives.items(), strict=True)
+        }
+        return with_motors(folder, chosen, guessed, max(size, key=lambda joint: size[joint]))
+    if columns.gears and all(LEAST_AT_JOINT < size < 1.0 / LEAST_AT_JOINT for size in of_motor):
+        return with_motors(folder, chosen, {j: (columns.gears.get(j, 1.0), None) for j in joints})
+    if not columns.gears and all(size < LEAST_AT_JOINT for size in sizes):
+        gears = {j: (1.0 / size, None) for j, size in zip(joints, sizes, strict=True)}
+        return with_motors(folder, chosen, gears)
+    return chosen
+
+
+def _hung(folder: Path, chosen: ChosenDevice, mounting: Mounting, notes: Notes) -> ChosenDevice:
+    """The robot under the gravity that the drawn bodies ask for, where that is not as stated."""
+    if not mounting.hangs:
+        return chosen
+    gravity = ", ".join(
+        f"{v:.4g}" for v in np.where(np.abs(mounting.gravity) < 1e-9, 0.0, mounting.gravity)
+    )
+    said = f"gravity = [{gravity}]"
+    notes.check.append(
+        f"{said} in the frame of the base, by weight and inertia as drawn: is the robot mounted so?"
+        + ("" if chosen.text else f" put that into [robot] of {chosen.name}")
+    )
+    return with_gravity(folder, chosen, said) if chosen.text else chosen
+
+
+def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> None:
+    """What a look at the columns does not show of a robot."""
+    robot = chosen.device.robot
+    assert robot is not None
+    if "tip =" in chosen.text:
+        notes.check.append(f"{chosen.name}: the robot ends at {robot.tip}; is that its last link?")
+    if not columns.drives:
+        joints = ", ".join(j.name for j in robot.joints)
+        notes.check.append(
+            f"positions and torques are those of the joints, {joints}: if they are of motors, give"
+            " [robot.motors] and the reductions"
+        )
+        if chosen.device.force_unit == "A" and chosen.text:
+            notes.check.append(
+                f"{chosen.name}: torque_constant 1.0 is not yours yet: all forces and inertias"
+                " scale with it"
+            )
+    notes.check += [
+        f"no body has this, and the nearest that one can have is taken: {line}"
+        for line in robot.impossible
+    ]
+    if robot.undrawn:
+        notes.check.append(
+            f"no mass is drawn on {join_names(robot.undrawn)}: put it in where there is a body"
+        )
+
+
+def _not_used(match: Matcher) -> list[str]:
+    left = [column.name for column in match.found.columns if column.name not in match.used]
+    return [f"# not used: {', '.join(left)}", ""] if left else []
+
+
+def write_proposal(folder: Path, proposal: ProposedSession) -> list[Path]:
+    """Write what was proposed; returns the files written.
+
+    Raises:
+        InputError: one of them is there already, or the folder cannot be written.
+    """
+    texts = {folder / SESSION: proposal.session}
+    if proposal.device:
+        texts[folder / DEVICE] = proposal.device
+    for path in texts:
+        if path.exists():
+            raise InputError(
+                "is there already and is left alone", where=str(path), remedy="move it away"
+            )
+    for path, text in texts.items():
+        write_text(path, text)
+    return list(texts)

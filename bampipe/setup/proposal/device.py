@@ -1,0 +1,335 @@
+"""The device of a session: one named or in the folder, a built-in one that fits, or a new one."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from bampipe.data import guesses
+from bampipe.data.chain import Branches
+from bampipe.data.device_file import complete_device, read_device_file
+from bampipe.data.robot_xml import read_xml
+from bampipe.data.survey import Survey, SurveyedColumn, words
+from bampipe.data.urdf import unexpanded
+from bampipe.errors import InputError
+from bampipe.estimate.white_noise import counting_step, white_noise_sd
+from bampipe.files import read_toml
+from bampipe.physics import registry
+from bampipe.physics.device import KINDS, Device
+from bampipe.setup.hypotheses import MOST_TRAVEL
+from bampipe.setup.proposal.encoders import measured_position
+from bampipe.setup.proposal.gravity import weight_of
+from bampipe.setup.proposal.joints import chain_logged
+from bampipe.setup.proposal.matching import Matcher
+from bampipe.setup.proposal.notes import Notes
+from bampipe.setup.proposal.positions import SLIDING, in_counts, position_in_si, scale_to, slides
+from bampipe.setup.proposal.starter import Drive, starter_device
+
+DEVICE = "device.toml"
+_SCHEMA = "bampipe.device/1"
+_MAY_SLIDE = " (no unit says that it slides: if it does, bampipe init FOLDER --device slider)"
+_MAY_TURN = " (by a force in N alone: if it turns, call its column {0}_rad or {0}_deg)"
+_HEAD_BYTES = 4096
+"""Of a file that cannot be read whole, in which its first element is looked for."""
+_SAME_DRIVE = 0.8
+"""Correlation beyond which a current and a force are of one drive: that of a coil has its own."""
+
+
+@dataclass(frozen=True)
+class ChosenDevice:
+    """The device, and how the session file calls it.
+
+    Attributes:
+        name: of a built-in device, or the path of a device file relative to the folder of logs.
+        device: the device.
+        text: of a new device file, "" where there is one already.
+        columns: what the inputs of a new device were made from, by the name of the input.
+    """
+
+    name: str
+    device: Device
+    text: str = ""
+    columns: Mapping[str, SurveyedColumn] = field(default_factory=dict)
+
+
+def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None:
+    """The device ``wanted``; where that is empty, the one in the folder or that the logs are of.
+
+    Raises:
+        InputError: no such device, a device file outside the folder, or one that is wrong.
+    """
+    if wanted.endswith(".toml"):
+        return _device_file(folder, wanted)
+    if wanted:
+        return ChosenDevice(wanted, registry.device(wanted))
+    for path in sorted(folder.glob("*.toml")):
+        content = read_toml(path)
+        # That of a robot may be three lines without a schema.
+        schema = content.get("schema", _SCHEMA if "robot" in content else "")
+        if schema == _SCHEMA:
+            device = registry.device_from(read_device_file(path), str(path))
+            return ChosenDevice(path.name, device)
+    return _robot(folder, found) or _built_in(found)
+
+
+def _is_mjcf(path: Path) -> bool:
+    """Whether an XML file is one of MuJoCo.
+
+    Raises:
+        InputError: it names itself one, and cannot be read.
+    """
+    try:
+        return read_xml(path).tag == "mujoco"
+    except InputError as error:
+        if not _starts_as_mjcf(path):
+            return False
+        raise InputError(
+            error.what, where=error.where, remedy="mend it, or take it out of the folder"
+        ) from error
+
+
+def _starts_as_mjcf(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return b"<mujoco" in file.read(_HEAD_BYTES)
+    except OSError:
+        return False
+
+
+def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
+    """The robot of the URDF or MJCF in the folder, its drives logged as torque or as current.
+
+    Where joints branch, as fingers do, it ends with the last one that has a column, else before
+    them.
+
+    Raises:
+        InputError: the file cannot be used, is a xacro file, or there are several.
+    """
+    urdfs = sorted(folder.glob("*.urdf")) or [
+        path for path in sorted(folder.glob("*.xml")) if _is_mjcf(path)
+    ]
+    if not urdfs:
+        macros = next(iter(sorted(folder.glob("*.xacro"))), None)
+        if macros is not None:
+            raise unexpanded(macros)
+        return None
+    if len(urdfs) > 1:
+        raise InputError(
+            f"{len(urdfs)} files of robots: {', '.join(path.name for path in urdfs)}",
+            where=str(folder),
+            remedy="leave the one of the logs",
+        )
+    text = f'schema = "{_SCHEMA}"\nname = "{urdfs[0].stem}"\n\n[robot]\nurdf = "{urdfs[0].name}"\n'
+    try:
+        device = _complete(folder, text)
+    except Branches as error:
+        logged = chain_logged(error.chains, found)
+        if not (logged or error.stem):
+            raise InputError(
+                error.what,
+                where=error.where,
+                remedy=f'write {DEVICE} beside the logs: name = "robot", and in [robot] urdf ='
+                f' "{urdfs[0].name}" and tip = "...", the last link of the logged joints',
+            ) from error
+        why = "the last joint with a column" if logged else "the joints branch behind it"
+        text += f'tip = "{logged or error.stem}"  # guess: {why}\n'
+        device = _complete(folder, text)
+    chosen = ChosenDevice(DEVICE, device, text)
+    by_torque = any(not c.is_constant for c in found.of("force"))
+    if by_torque or not found.of("current"):
+        return chosen
+    return with_motors(folder, chosen, {c.name: (1.0, 1.0) for c in chosen.device.coordinates})
+
+
+def with_motors(
+    folder: Path,
+    chosen: ChosenDevice,
+    motors: Mapping[str, tuple[float, float | None]],
+    reference: str = "",
+) -> ChosenDevice:
+    """A new device file of a robot with a table for each motor.
+
+    Args:
+        folder: of the logs; chosen: the robot.
+        motors: by joint, turns for one of the joint and, where currents are logged, N.m/A.
+        reference: of constants that the drawing suggests, the joint whose constant the others are
+            estimated by.
+    """
+    robot = chosen.device.robot
+    uncertainty = robot.uncertainty if robot is not None else 0.0
+    text = chosen.text.partition("\n[robot.motors")[0]
+    for joint, (turns, constant) in motors.items():
+        text += f"\n[robot.motors.{joint}]\nturns = {{ {joint} = {turns:.4g} }}"
+        text += "" if turns == 1.0 else "  # guess: by the drawn bodies; put in that of the gear"
+        if constant is not None:
+            gears = ", gears included" if turns == 1.0 else ""
+            text += f"\ntorque_constant = {constant:.3g}  # guess: N.m/A{gears}"
+            if reference and joint != reference:
+                text += f"\ntorque_constant_sd = {uncertainty * constant:.2g}"
+                text += "  # estimated; leave out with that of the data sheet"
+        text += "\n"
+    return replace(chosen, text=text, device=_complete(folder, text))
+
+
+def with_gravity(folder: Path, chosen: ChosenDevice, said: str) -> ChosenDevice:
+    """A new device file of a robot with a line on gravity."""
+    head, motors, rest = chosen.text.partition("\n[robot.motors")
+    text = f"{head}{said}  # guess: by the drawn bodies\n{motors}{rest}"
+    return replace(chosen, text=text, device=_complete(folder, text))
+
+
+def _complete(folder: Path, text: str) -> Device:
+    return registry.device_from(complete_device(tomllib.loads(text), folder, DEVICE), DEVICE)
+
+
+def _device_file(folder: Path, wanted: str) -> ChosenDevice:
+    path = next((path for path in (folder / wanted, Path(wanted)) if path.is_file()), None)
+    if path is None:
+        raise InputError("no such file", where=wanted)
+    full, root = path.resolve(), folder.resolve()
+    if not full.is_relative_to(root):
+        raise InputError(
+            "the device file is not in the folder of the logs",
+            where=wanted,
+            remedy=f"copy it to {folder}",
+        )
+    device = registry.device_from(read_device_file(path), str(path))
+    return ChosenDevice(full.relative_to(root).as_posix(), device)
+
+
+def _built_in(found: Survey) -> ChosenDevice | None:
+    """The first built-in device of which the columns have all names."""
+    positions = {word for column in found.of("position") for word in words(column.name)}
+    columns = [set(words(column.name)) for column in found.columns]
+    for name in registry.device_names():
+        device = registry.device(name)
+        inputs = [
+            set(words(name.removeprefix("force_"))) for name in (*device.forces, *device.channels)
+        ]
+        named = all(any(said <= column for column in columns) for said in inputs)
+        if named and {c.name for c in device.coordinates} <= positions:
+            return ChosenDevice(name, device)
+    return None
+
+
+def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
+    """Propose a device file for one axis, with priors by a rough fit to the first log.
+
+    Raises:
+        InputError: no column looks like a position.
+    """
+    found = match.found
+    position = measured_position("", 1, match, notes)
+    if position is None:
+        raise InputError(
+            "no column looks like a position",
+            where=f"{folder}: {found.files[0]}",
+            remedy="name the device: bampipe init FOLDER --device NAME; columns are "
+            + ", ".join(c.name for c in found.columns[:12]),
+        )
+    linear = slides(position, found)
+    driver, role = match.driver(position)
+    supply = match.supply(driver) if role == "duty" else None
+    coil = role == "force" and _has_coil(driver, match, notes)
+    position = position if linear else _at_joint(position, driver, match)
+    fit = _rough_fit(position, driver, role, linear, match.t)
+    drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
+    width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
+    weight, on_gravity = weight_of(position, fit, linear, found)
+    starter = starter_device(position.name, linear, drive, fit, weight, width)
+    kind = "linear" if linear else "rotary"
+    doubt = "" if position.conversion is not None else _MAY_SLIDE
+    if doubt and linear:
+        doubt = "" if set(words(position.name)) & SLIDING else _MAY_TURN.format(position.name)
+    what = "torque" if role == "force" and not linear else role
+    notes.check.append(
+        f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {what}{doubt}; put in what you"
+        " know of it"
+    )
+    for constant in starter.placeholders:
+        notes.check.append(
+            f"{DEVICE}: {constant} is not yours yet: all forces and inertias scale with it"
+        )
+    if on_gravity:
+        notes.check.append(f"{DEVICE}: on '{starter.axis}', {on_gravity}")
+    columns = {"supply": supply, starter.input: driver}
+    return ChosenDevice(
+        DEVICE,
+        registry.device_from(tomllib.loads(starter.text), DEVICE),
+        starter.text,
+        {name: column for name, column in columns.items() if column is not None},
+    )
+
+
+def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bool:
+    """Whether a current beside a force is that of a coil or a brake, rather than of the drive."""
+    currents = [c for c in match.found.of("current") if not c.is_constant]
+    alike = [c for c in currents if driver is not None and _go_together(c.values, driver.values)]
+    for current in alike:
+        assert driver is not None
+        match.used.add(current.name)
+        notes.check.append(
+            f"{current.name} goes with {driver.name}: both are of the drive, and {driver.name} is"
+            " taken; either would do"
+        )
+    return len(alike) < len(currents)
+
+
+def _go_together(one: np.ndarray, other: np.ndarray) -> bool:
+    known = np.isfinite(one) & np.isfinite(other)
+    return abs(float(np.corrcoef(one[known], other[known])[0, 1])) > _SAME_DRIVE
+
+
+def _at_joint(
+    position: SurveyedColumn, driver: SurveyedColumn | None, match: Matcher
+) -> SurveyedColumn:
+    """The angle of the joint, where counts or a motor's angle are read and the weight shows it."""
+    known, counted = position.conversion, in_counts(position)
+    turns = known is not None and known.si == "rad"
+    scale = known.scale if known is not None else 1.0
+    if driver is None or not counted:
+        far = turns and float(np.ptp(position.values)) * scale > MOST_TRAVEL
+        if driver is None or not far:
+            return position
+    values = np.nan_to_num(driver.values)
+    worth = guesses.find_turning(match.t, np.nan_to_num(position.values), values)
+    if worth is None:
+        return position
+    match.turning = {position.name: worth}
+    angle = (position.values - worth.zero) / worth.size
+    return replace(position, values=angle, stated="rad", unit="rad")
+
+
+def _sign_width(position: SurveyedColumn, t: np.ndarray, linear: bool) -> float:
+    """Width for the sign of the velocity, rad/s or m/s, where less than the usual; else 0.
+
+    Friction that truly stops an axis is a sign over no width. Replays that creep over the usual one
+    leave less at reversals than such a machine, which then seems to lack a Stribeck friction or a
+    compliance; filtered velocities know the sign down to a fortieth of a step a sample.
+    """
+    kind = "linear" if linear else "rotary"
+    unit, _, usual = KINDS[kind]
+    q = position_in_si(position, t, unit)
+    step = counting_step(q)
+    step = max(step, float(np.sqrt(12.0)) * float(np.nan_to_num(white_noise_sd(q, t, step))))
+    width = max(step / float(np.median(np.diff(t))) / 40.0, usual / 20.0)
+    return float(f"{width:.0e}") if width < usual / 2.0 else 0.0
+
+
+def _rough_fit(
+    position: SurveyedColumn, driver: SurveyedColumn | None, role: str, linear: bool, t: np.ndarray
+) -> guesses.Driven:
+    """How the driver goes with the motion, both in SI; nothing found where nothing drives."""
+    if driver is None:
+        return guesses.Driven(0.0)
+    si = {"current": "A", "voltage": "V", "duty": ""}.get(role, "N" if linear else "N.m")
+    drive = np.nan_to_num(driver.values * scale_to(si, driver))
+    q = position_in_si(position, t, "m" if linear else "rad")
+    counted = in_counts(position)
+    found = guesses.driven(t, q, drive, angle=not linear and not counted)
+    # Sizes per count would pass for sizes per radian or metre.
+    return replace(found, inertia=0.0, viscous=0.0) if counted else found

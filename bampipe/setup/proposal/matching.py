@@ -1,0 +1,185 @@
+"""Which column of a log is which: by name and unit first, then by what the data show."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bampipe.data import guesses
+from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
+from bampipe.setup.proposal.positions import travelled
+
+_DRIVEN = 0.5
+"""Share of a column that the motion must explain for it to pass as what drives it."""
+
+_NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
+_INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
+Match = tuple[SurveyedColumn | None, str]
+
+
+@dataclass
+class Matcher:
+    """The columns of a survey, and which of them are taken.
+
+    Attributes:
+        found: the columns.
+        t: (T,) time stamps of the first log, s.
+        used: names of the columns that have a meaning already; grows as tables are proposed.
+        registers: columns that hold signed numbers in a register, and how.
+        joints: columns of a robot's joints and drives, by name of joint or input; of what stands
+            there no other column is thought.
+        turned: inputs that are logged with the other sign.
+        of_robot: whether the device is a robot of several joints.
+        gears: joints whose position is that of a motor, which turns so often for one of theirs.
+        turning: what the readings of a position are worth, by the weight on it, by name of column.
+        counting: of a robot's joints, direction and zero against the drawing, see `RobotColumns`.
+    """
+
+    found: Survey
+    t: np.ndarray
+    used: set[str]
+    registers: Mapping[str, guesses.Register]
+    joints: Mapping[str, SurveyedColumn] = field(default_factory=dict)
+    turned: frozenset[str] = frozenset()
+    gears: Mapping[str, float] = field(default_factory=dict)
+    turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
+    counting: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    of_robot: bool = False
+
+    def named(self, name: str, *roles: str) -> SurveyedColumn | None:
+        """The column that has the words of ``name``, of one of the roles."""
+        if name in self.joints:
+            return self.joints[name]
+        wanted, numbers = set(words(name)), set(_numbers(name))
+        for column in self.found.of(*roles):
+            counted = set(_numbers(column.name))
+            alike = wanted <= set(words(column.name)) and (numbers <= counted or not counted)
+            if column.name == name or alike:
+                return column
+        return None
+
+    def position(self, axis: str, axes: int) -> tuple[SurveyedColumn | None, list[str]]:
+        """The measured position of an axis; and all that it was chosen from, if several.
+
+        Args:
+            axis: name of the axis, "" for any.
+            axes: how many axes there are: of several, only the name tells which is which.
+        """
+        named = self.named(axis, "position") if axis else None
+        if named is not None or axes > 1:
+            return named, []
+        moving = [c for c in self.found.columns if not c.is_constant]
+        found = [c for c in moving if c.role == "position"]
+        found = found or [c for c in moving if not c.role and re.match(r"q\w?\Z", c.name.lower())]
+        # A test stand may log the velocity only, which is integrated then.
+        found = found or [c for c in moving if c.role == "velocity"]
+        found = found or [c for c in moving if c.name in ("v", "V")]
+        if len(found) < 2:
+            return (found[0] if found else None), []
+        best = found[0]
+        for other in found[1:]:
+            alike = abs(float(np.corrcoef(best.values, other.values)[0, 1])) > 0.9
+            best = other if alike and guesses.follows(best.values, other.values) else best
+        return best, [c.name for c in found]
+
+    def inputs(
+        self, wanted: Mapping[str, str], axes: tuple[SurveyedColumn, ...]
+    ) -> dict[str, Match]:
+        """The column of every input, and why it is thought so where that is not by its name.
+
+        Args:
+            wanted: inputs with their SI units.
+            axes: columns of the positions.
+        """
+        given: dict[str, Match] = {}
+        # Those with a unit first: what has none could be anything.
+        for name, si in sorted(wanted.items(), key=lambda item: not item[1]):
+            given[name] = self._input(name, si, axes)
+            column = given[name][0]
+            self.used |= {column.name} if column is not None else set()
+        return given
+
+    def _input(self, name: str, si: str, axes: tuple[SurveyedColumn, ...]) -> Match:
+        role = _INPUT_ROLE.get(si, "")
+        if name in self.joints:
+            return self.joints[name], ""
+        free = [c for c in self.found.columns if c.name not in self.used]
+        exact = next((c for c in free if c.name == name), None)
+        named = exact or self.named(name, role) or self.named(name.removeprefix("force_"), role)
+        if named is not None and named in free:
+            return named, ""
+        if self.of_robot:  # a column left over is another joint's as well as this one's
+            return None, ""
+        fitting = [c for c in free if c.role == role and not c.is_constant and (si or not c.unit)]
+        if len(fitting) == 1 and _compatible(fitting[0], si):
+            return fitting[0], ""
+        for position in axes:
+            best = self.driving(position)
+            if best is not None and best.role in ("", role) and _compatible(best, si):
+                return best, ", since the motion follows it"
+        return None, ""
+
+    def driver(self, position: SurveyedColumn) -> tuple[SurveyedColumn | None, str]:
+        """What drives an axis: by its motion, else by name; and what kind of input that is.
+
+        The kind is that of the column, ``duty`` for a voltage given as a share of the supply.
+        """
+        named = [c for role in DRIVERS for c in self.found.of(role) if not c.is_constant]
+        best = self.driving(position) or next(iter(named), None)
+        if best is not None and not best.unit and best.name in self.registers:
+            # What a servo calls its load is the share of the supply that its bridge is on: no force
+            # comes as a register, and a current is called one.
+            load = best.role != "current" or self.supply(best) is not None
+            return best, "duty" if load else "current"
+        if best is None or best.role not in DRIVERS:
+            return best, "force"
+        duty = best.role == "voltage" and {"pwm", "duty"} & set(words(best.name))
+        return best, "duty" if duty else best.role
+
+    def supply(self, driver: SurveyedColumn | None) -> SurveyedColumn | None:
+        """The supply voltage beside a duty cycle: in volts or of no unit, and never negative."""
+        for column in self.found.of("voltage"):
+            known = column.conversion
+            volts = known is None or known.si == "V"
+            if column is not driver and volts and np.nanmin(column.values) > 0.0:
+                return column
+        return None
+
+    def driving(self, position: SurveyedColumn) -> SurveyedColumn | None:
+        """The column that acceleration, velocity and friction of the motion explain best."""
+        share = {}
+        for column in self.found.columns:
+            free = column.name not in self.used and column.role not in _NEVER_DRIVES
+            if not free or column.is_constant or column is position:
+                continue
+            values = np.nan_to_num(column.values)
+            known = column.conversion
+            if known is not None and known.si in ("rad", "m"):  # of another axis
+                continue
+            if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
+                continue
+            share[column.name] = guesses.driven(self.t, travelled(position, self.t), values).share
+        roles = {column.name: column.role for column in self.found.columns}
+        fitting = [name for name in share if share[name] >= _DRIVEN]
+        # A velocity of an unknown name fits itself. Of several joints without a drawing, a drive
+        # has the number of its position.
+        fitting = [name for name in fitting if roles[name] in DRIVERS] or fitting
+        number = _numbers(position.name)
+        fitting = [name for name in fitting if number and _numbers(name) == number] or fitting
+        if not fitting:
+            return None
+        best = max(fitting, key=lambda name: share[name])
+        return next(c for c in self.found.columns if c.name == best)
+
+
+def _numbers(name: str) -> list[str]:
+    return [str(int(digits)) for digits in re.findall(r"\d+", name)]
+
+
+def _compatible(column: SurveyedColumn, si: str) -> bool:
+    """Whether nothing that the column says of its unit contradicts ``si``."""
+    known = column.conversion
+    return known is None or known.si == si

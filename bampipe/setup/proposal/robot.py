@@ -1,0 +1,316 @@
+"""The columns of a robot's log held against its drawing: order, units, signs and sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.chain import frame_of_tip
+from bampipe.data.robot_file import read_tree
+from bampipe.data.survey import Survey, SurveyedColumn
+from bampipe.physics.device import Device
+from bampipe.physics.robot import Robot
+from bampipe.setup.drawn_bodies import Drive, fits, mean_left
+from bampipe.setup.heavier import describe_heavy, find_heavy
+from bampipe.setup.mounting import Mounting
+from bampipe.setup.proposal.gears import BEYOND, DOUBTED, MOST_ROWS, Gears, Logged
+from bampipe.setup.proposal.joints import Group, pair_joints
+from bampipe.setup.proposal.notes import Notes
+from bampipe.setup.proposal.positions import scale_to
+
+Array = NDArray[np.float64]
+
+LEAST_AT_JOINT = 1.0 / 3.0
+"""Share of what the drawing requires below which a torque is that of a motor."""
+_BETTER = 0.5
+"""Of what one order of the joints leaves unexplained: another one must leave less."""
+PUT_IN = (
+    "put those of the gears into [robot.motors] of the device file, take session.toml away, and run"
+    " `bampipe init` again, which takes them from there"
+)
+_OTHER_UNITS = {"rad": ("deg", np.pi / 180.0), "m": ("mm", 1e-3)}
+
+
+@dataclass(frozen=True)
+class RobotColumns:
+    """What a robot's log was found to hold.
+
+    Attributes:
+        columns: by name of joint or input.
+        drives: by name of input, where drawing and log can be compared.
+        gears: by joint whose position is that of a motor, its turns for one of the joint.
+        mounting: of the joints and the base against the drawing; None where nothing tells.
+    """
+
+    columns: Mapping[str, SurveyedColumn]
+    drives: Mapping[str, Drive]
+    gears: Mapping[str, float] = field(default_factory=dict)
+    mounting: Mounting | None = None
+
+    @property
+    def turned(self) -> frozenset[str]:
+        """Inputs that are surely logged with the other sign."""
+        return frozenset(name for name, drive in self.drives.items() if drive.is_turned)
+
+
+def find_robot_columns(
+    folder: Path, device: Device, robot: Robot, found: Survey, t: Array, notes: Notes
+) -> RobotColumns:
+    """Pair columns with joints and drives, and hold them against the drawing.
+
+    Args:
+        folder: of the robot's file; device, robot: the robot.
+        found: the log; t: (T,) time, s.
+        notes: what is guessed is noted, and how sure it is.
+    """
+    pairing = pair_joints(device, found)
+    positions = next(iter(pairing.positions), None)
+    drives = next(iter(pairing.drives), None)
+    for what, chosen, others in (
+        ("positions", positions, pairing.positions[1:]),
+        ("drives", drives, pairing.drives[1:]),
+    ):
+        if chosen is not None and others:
+            listed = "; ".join(str(other) for other in others)
+            notes.check.append(f"of several {what}, {chosen} are taken, not {listed}")
+    turns, logged = _turns(device, robot), Logged(device, robot, t)
+    columns: dict[str, SurveyedColumn] = {}
+    if positions is not None:
+        columns |= dict(zip(_joints(device), positions.columns, strict=True))
+    if drives is None:
+        return RobotColumns({**columns, **pairing.some_drives}, {})
+    columns |= dict(zip(device.forces, drives.columns, strict=True))
+    if positions is None:
+        return RobotColumns(columns, {})
+
+    def explain(positions: Group, drives: Group) -> Gears | None:
+        """How the drawing explains the drives; None where they cannot be compared."""
+        if turns is None:
+            return None
+        return logged.explain(logged.positions(positions), drives, turns)
+
+    stated = positions
+    best = explain(positions, drives)
+    other_unit = _in_unit_of_range(logged, positions)
+    other = explain(other_unit, drives) if other_unit is not None else None
+    if other_unit is not None and other is not None and mean_left(other.drives) < _BETTER:
+        positions, best = other_unit, other
+        columns |= dict(zip(_joints(device), positions.columns, strict=True))
+    left = mean_left(best.drives) if best is not None else np.inf
+    sound = best is not None and fits(best.drives)
+    beyond = _beyond_range(logged, positions, of_joint=sound)
+    guessed = positions is not stated and DOUBTED < left < np.inf
+    known = turns is not None and (turns != 1.0).any()
+    geared: list[tuple[Group, Gears]] = []
+    # Hundreds without a unit are degrees, or radians of a motor.
+    for group in (positions, _in_si(device, stated)):
+        gears = None
+        if turns is not None and known and (beyond or not sound):
+            gears = logged.explain_geared(logged.positions(group), drives, turns)
+        elif best is not None and not robot.motors and (guessed or not sound):
+            gears = logged.find_gears(logged.positions(group), drives)
+        geared += [(group, gears)] if gears is not None else []
+    if geared:
+        group, gears = min(geared, key=lambda item: mean_left(item[1].drives))
+        better = mean_left(gears.drives) < left * (1.0 if known else _BETTER)
+        if better or (bool(beyond) if known else not sound):
+            return _geared(device, columns, group, gears, notes, given=known)
+    notes.check += beyond
+    if best is None or (beyond and not sound):
+        return RobotColumns(columns, {})
+    if not (positions.named or drives.named or sound):
+        ordered = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
+        other = explain(*ordered)
+        if other is not None and mean_left(other.drives) < _BETTER * left:
+            notes.check.append(
+                "columns stand in the alphabetical order of the joints' names, since weight and"
+                f" inertia as drawn explain {1.0 - mean_left(other.drives):.1%} of the drives that"
+                f" way, {max(1.0 - left, 0.0):.1%} in the order of the chain"
+            )
+            best, (positions, drives) = other, ordered
+            columns |= dict(zip(_joints(device), positions.columns, strict=True))
+            columns |= dict(zip(device.forces, drives.columns, strict=True))
+    compared = logged.compare(logged.positions(positions), drives, best.ratio, MOST_ROWS)
+    heavy = None
+    if compared is not None and device.force_unit != "A":
+        heavy = find_heavy(compared, best.mounting)
+    if compared is not None and heavy is not None:
+        in_tip = _placed_in_tip(folder, robot)
+        notes.check.append(describe_heavy(compared, best.mounting, heavy, in_tip))
+    by_input = dict(zip(device.forces, best.drives, strict=True))
+    notes.check += _sentences(device, columns, by_input)
+    return RobotColumns(columns, by_input, mounting=best.mounting)
+
+
+def _placed_in_tip(folder: Path, robot: Robot) -> Callable[[Array], Array]:
+    """What makes of a place in the frame of the last joint one in that of the tip, (3,)."""
+    if robot.urdf is None:
+        return lambda center: center
+    turn, offset = frame_of_tip(read_tree(folder / robot.urdf), robot.base, robot.tip)
+    return lambda center: np.asarray(turn.T @ (center - offset))
+
+
+def _geared(
+    device: Device,
+    columns: Mapping[str, SurveyedColumn],
+    positions: Group,
+    found: Gears,
+    notes: Notes,
+    given: bool = False,
+) -> RobotColumns:
+    """The columns of a log on the side of the motors, whose turns may be ``given``."""
+    joints = _joints(device)
+    paired = {**columns, **dict(zip(joints, positions.columns, strict=True))}
+    ratio = [float(r) if given else float(f"{r:.4g}") for r in found.ratio]
+    gears = {joint: r for joint, r in zip(joints, ratio, strict=True) if r != 1.0}
+    listed = ", ".join(f"{joint} {turns:g}" for joint, turns in gears.items())
+    notes.check.append(
+        "positions are those of motors, which turn for one of the joint as the device file says:"
+        f" {listed}"
+        if given
+        else "positions are those of motors, by weight and inertia as drawn with these turns for"
+        f" one of the joint: {listed}; {PUT_IN}"
+    )
+    explained = max(0.0, 1.0 - mean_left(found.drives))
+    notes.check.append(
+        f"drawing, drives' inertia and friction explain {explained:.1%} of the drives"
+    )
+    drives = dict(zip(device.forces, found.drives, strict=True))
+    return RobotColumns(paired, drives, gears, found.mounting)
+
+
+def _in_si(device: Device, group: Group) -> Group:
+    """The positions in rad or m where they state no unit."""
+    pairs = zip(device.coordinates, group.columns, strict=True)
+    return replace(group, columns=tuple(replace(p, unit=p.unit or c.unit) for c, p in pairs))
+
+
+def _joints(device: Device) -> list[str]:
+    return [c.name for c in device.coordinates]
+
+
+def _in_alphabetical_order(device: Device, group: Group) -> Group:
+    """Columns as ROS publishes joints: the first column is the first name of the alphabet."""
+    names = _joints(device)
+    order = [sorted(names).index(name) for name in names]
+    return replace(group, columns=tuple(group.columns[k] for k in order))
+
+
+def _in_unit_of_range(logged: Logged, group: Group) -> Group | None:
+    """The positions in degrees or millimetres where they state no unit and only these fit."""
+    device, found = logged.device, []
+    for c, column, width in zip(device.coordinates, group.columns, logged.ranges, strict=True):
+        name, scale = _OTHER_UNITS[c.unit]
+        most = BEYOND * width
+        span = float(np.ptp(np.nan_to_num(column.values)))
+        if column.unit or span <= most or span * scale > most:
+            found.append(column)
+        else:
+            found.append(replace(column, unit=name))
+    # One controller gives all angles alike: what is so for one is so for all.
+    angles = {c.unit for c in device.coordinates}
+    for si in angles:
+        name, _ = _OTHER_UNITS[si]
+        own = [k for k, c in enumerate(device.coordinates) if c.unit == si]
+        if any(found[k].unit == name and not group.columns[k].unit for k in own):
+            for k in own:
+                found[k] = replace(found[k], unit=found[k].unit or name)
+    changed = any(new is not old for new, old in zip(found, group.columns, strict=True))
+    return replace(group, columns=tuple(found)) if changed else None
+
+
+def _beyond_range(logged: Logged, positions: Group, of_joint: bool) -> list[str]:
+    found = []
+    joints = zip(logged.device.coordinates, positions.columns, logged.ranges, strict=True)
+    for c, column, width in joints:
+        span = float(np.ptp(np.nan_to_num(column.values))) * scale_to(c.unit, column)
+        if span > BEYOND * width:
+            why = "weight and inertia as drawn agree with that: is the range of the drawing right?"
+            if not of_joint:
+                why = (
+                    f"a position of the motor, which turns {span / width:.3g} times for one of the"
+                    f" joint or more? {PUT_IN}"
+                )
+            found.append(
+                f"{column.name} travels {span:.3g} {c.unit}, and the range of {c.name} is"
+                f" {width:.3g}: {why}"
+            )
+    return found
+
+
+def _turns(device: Device, robot: Robot) -> Array | None:
+    """Turns of each joint's motor for one of the joint (n,); None where motors turn several."""
+    turned = [list(motor.turns) for motor in robot.motors.values()]
+    names = _joints(device)
+    if not turned:
+        return np.ones(len(names))
+    if turned != [[name] for name in names]:
+        return None
+    return np.array([m.turns[n] for m, n in zip(robot.motors.values(), names, strict=True)])
+
+
+def _sentences(
+    device: Device, columns: Mapping[str, SurveyedColumn], drives: Mapping[str, Drive]
+) -> list[str]:
+    """What weight and inertia of the drawn bodies say of the drives, a sentence each."""
+    lines, agreed = [], []
+    together = len(drives) > 1 and all(drive.is_turned for drive in drives.values())
+    if together:
+        lines.append(
+            "all drives have the other sign, as torques on a drive rather than by it have: weight"
+            " and inertia as drawn, and friction, say so of each; `scale = -1.0` of each"
+            " channel sets that right"
+        )
+    for c, (name, drive) in zip(device.coordinates, drives.items(), strict=True):
+        column = columns[name].name
+        if not drive.is_sure:
+            if not together:
+                lines.append(
+                    f"{column}: too little weight and inertia act on {c.name} to tell its sign"
+                    + _by_friction(drive, c.name)
+                )
+            continue
+        size, share = abs(drive.share), -drive.share if together else drive.share
+        said = []
+        if share < 0.0:
+            said.append(f"its sign is turned; or that of {c.name} is the wrong one")
+        if device.force_unit == "A":
+            agreed.append(f"{c.name} {1.0 / size:.3g} N.m/A")
+        elif size >= 1.0 / LEAST_AT_JOINT:
+            said.append("another unit, or bodies that are not drawn")
+        elif size <= LEAST_AT_JOINT:
+            said.append(
+                f"another unit, or the torque of a motor with a reduction of about {1.0 / size:.3g}"
+            )
+        elif not said:
+            agreed.append(f"{c.name} {size:.2f}")
+        if said:
+            lines.append(
+                f"{column} is {share:.2g} ± {drive.error:.1g} times what the drawing"
+                f" requires: {'; and '.join(said)}"
+            )
+    if agreed and device.force_unit == "A":
+        lines.append(
+            f"torque constants by weight and inertia as drawn, and no better than these:"
+            f" {', '.join(agreed)}; put in those of the data sheet, gears included, or have them"
+            " estimated by that of one"
+        )
+    elif agreed:
+        lines.append(
+            f"signs and sizes of the drives agree with weight and inertia as drawn (1 is perfect):"
+            f" {', '.join(agreed)}"
+        )
+    explained = max(0.0, 1.0 - mean_left(list(drives.values())))
+    lines.append(f"drawing, drives' inertia and friction explain {explained:.1%} of the drives")
+    return lines
+
+
+def _by_friction(drive: Drive, joint: str) -> str:
+    """What friction says of a drive's sign, as the end of a sentence."""
+    if drive.is_turned:
+        return f"; by its friction it is turned, or that of {joint} is the wrong one"
+    return "; by its friction it is right" if drive.is_dissipative else ""

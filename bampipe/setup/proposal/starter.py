@@ -1,0 +1,219 @@
+"""A device file to start from: one axis with friction, driven by what was recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from bampipe.data.guesses import Driven
+from bampipe.data.survey import REFERENCE_WORDS, words
+from bampipe.physics.device import KINDS
+from bampipe.setup.proposal.gravity import Weight
+
+_NAMELESS = (
+    "enc encoder pos position angle counts ticks displacement disp stroke present actual act"
+    " measured meas current state value deg degree degrees rad radian radians vel velocity speed"
+    " header feedback column ang motion dist percent rec log data mot motor"
+)
+"""Words in the name of a position that name no axis."""
+_FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "eff", "torque", "tau"}
+_DRIVE = "drive = true                        # from a motor; false: from a force sensor\n"
+_PRESCRIBED = "prescribed = true                   # guess: a test bench gives the stroke\n"
+_FASTEST_S = 2e-4
+"""Time in which viscous friction stops the least mass that a simulation is asked to follow, s."""
+_YIELDS = 2e-3
+_SOURCES = {
+    "torque_constant": (1.0, "N.m/A", "at the joint"),
+    "resistance": (1.0, "Ohm", "data sheet"),
+    "supply": (12.0, "V", "measured"),
+    "force_at_full": (1.0, "N", "measured"),
+}
+"""Constants that only their user knows: value to start from, unit, and where to look them up."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What drives an axis, as far as a log shows it.
+
+    Attributes:
+        role: ``force``, ``current``, ``voltage`` or ``duty`` (cycle of a voltage).
+        column: that was recorded of it, "" where none was.
+        supply: whether the supply voltage that a duty cycle is a share of is recorded too.
+        coil: whether, beside a force, the current of a coil that changes the friction is.
+    """
+
+    role: str
+    column: str
+    supply: bool = False
+    coil: bool = False
+
+
+@dataclass(frozen=True)
+class Starter:
+    """A device file to start from.
+
+    Attributes:
+        text: of the file.
+        axis: name of its axis.
+        input: name of the input that drives the axis.
+        placeholders: names of the constants that only its user knows.
+    """
+
+    text: str
+    axis: str
+    input: str
+    placeholders: tuple[str, ...]
+
+
+def starter_device(
+    position: str,
+    linear: bool,
+    drive: Drive,
+    found: Driven,
+    weight: Weight | None = None,
+    sign_width: float = 0.0,
+) -> Starter:
+    """Write a device file of one axis.
+
+    Args:
+        position: column of the position; its name may name the axis.
+        linear: whether the axis slides rather than turns.
+        drive: what drives it.
+        found: sizes by a rough fit, SI, from which the priors are taken.
+        weight: gravity on the axis, None where it carries none.
+        sign_width: of the sign of the velocity, rad/s or m/s; 0 for the usual one.
+    """
+    taken = _NAMELESS.split()
+    names = [word for word in words(position) if word not in taken and len(word) > 2]
+    axis = names[0] if names else ("carriage" if linear else "joint")
+    kind, qd = ("linear" if linear else "rotary"), f"qd_{axis}"
+    torque, mass = KINDS[kind][1], "kg" if linear else "kg.m2"
+    rate = "N.s/m" if linear else "N.m.s/rad"
+    source, unit, applied, constants = _input_of(axis, linear, torque, drive)
+    channels = 'channels = { supply = "V" }\n' if drive.supply and not linear else ""
+    rubbed = ""
+    if drive.coil:
+        channels = 'channels = { coil_current = "A" }\n'
+        rubbed = f" - abs(coil_current)*(friction_per_ampere*sgn({qd}) + viscous_per_ampere*{qd})"
+    width = f"sign_width = {sign_width:g}  # guess: the encoder tells speeds as low\n"
+    if drive.coil:
+        width = f"sign_width = {_YIELDS:g}                  # a fluid yields over some mm/s\n"
+    motor = drive.role != "force" or not _FROM_A_MOTOR.isdisjoint(words(drive.column))
+    text = f'''# Proposed by `bampipe init`: one axis with inertia and friction
+schema = "bampipe.device/1"
+name = "{axis}"
+summary = "One {kind} axis driven by a {drive.role}"
+source = "fill in"
+
+[coordinates.{axis}]
+kind = "{kind}"
+symbol = "{axis[0]}"
+{width if drive.coil or sign_width else ""}
+{_constants_table(constants)}[energy]
+kinetic = "inertia*ddt({axis})**2/2"
+potential = {_potential(axis, linear, weight)}
+
+[torque]                            # what is left at standstill
+{axis} = "-offset{rubbed}"
+
+[inputs]
+force = ["{source}"]{f"             # {drive.column}" if drive.column else ""}
+force_unit = "{unit}"
+{_DRIVE if motor else _PRESCRIBED if drive.coil else ""}{channels}
+[applied]
+{axis} = "{applied}"
+
+'''
+    if constants:
+        listed = " and ".join(constants)
+        text += f"# Guessed with {listed} as above: scale what follows with what you put in.\n"
+    viscous, coulomb = (", ".join(_prior(size)) for size in (found.viscous, found.coulomb))
+    text += f'''[friction.{axis}]
+viscous = {{ unit = "{rate}", {viscous}, lower = 0.0 }}  # guess
+coulomb = {{ unit = "{torque}", {coulomb}, lower = 0.0 }}  # guess
+'''
+    inertia = (*_prior(found.inertia), f"lower = {_least_inertia(linear, drive.coil, found):g}")
+    offset = ("prior = 0.0", f"sd = {_rounded(3.0 * abs(found.coulomb) or 20.0):g}")
+    text += _parameter("inertia", mass, inertia, "all that moves, reduced to this axis")
+    text += _parameter("offset", torque, offset, "needed to hold the axis where nothing else acts")
+    if weight is not None:
+        meaning = "mass times gravity times distance of the centre of gravity"
+        for name, size in zip(("moment", "moment_across"), weight.moments, strict=True):
+            guessed = (f"prior = {_rounded(size):g}", f"sd = {_rounded(weight.sd):g}")
+            text += _parameter(name, "N.m", guessed, meaning)
+    if drive.coil:
+        for name, si, size in (
+            ("friction_per_ampere", torque, found.coulomb),
+            ("viscous_per_ampere", rate, found.viscous),
+        ):
+            meaning = "what the coil adds, in proportion to its current"
+            text += _parameter(name, f"{si}/A", _prior(size), meaning, "lower = 0.0\n")
+    return Starter(text, axis, source, tuple(constants))
+
+
+def _input_of(
+    axis: str, linear: bool, torque: str, drive: Drive
+) -> tuple[str, str, str, dict[str, tuple[float, str, str]]]:
+    """Name and unit of the input, what it does to the axis, and the constants in that."""
+    if drive.role in ("current", "voltage"):
+        si, per = ("A", "ampere") if drive.role == "current" else ("V", "volt")
+        gain = f"{'force' if linear else 'torque'}_per_{per}"
+        known = {gain: (1.0, f"{torque}/{si}", "data sheet, at the axis, gears included")}
+        return f"motor_{drive.role}", si, f"{gain}*motor_{drive.role}", known
+    if drive.role == "duty":
+        names = ["force_at_full"] if linear else ["torque_constant", "resistance"]
+        names += [] if linear or drive.supply else ["supply"]
+        applied = f"torque_constant/resistance*(duty*supply - torque_constant*qd_{axis})"
+        applied = "force_at_full*duty" if linear else applied
+        return "duty", "", applied, {name: _SOURCES[name] for name in names}
+    return "force_drive", torque, "force_drive", {}
+
+
+def _constants_table(constants: dict[str, tuple[float, str, str]]) -> str:
+    if not constants:
+        return ""
+    sets = "they set" if len(constants) > 1 else "sets"
+    lines = [
+        f'{name} = {{ value = {value}, unit = "{unit}", source = "fill in: {where}" }}  # guess'
+        for name, (value, unit, where) in constants.items()
+    ]
+    head = f"[constants]                         # {sets} the scale of all that is estimated"
+    return "\n".join([head, *lines, "", ""])
+
+
+def _potential(axis: str, linear: bool, weight: Weight | None) -> str:
+    if weight is None:
+        hint = f'gravity of a link: "-moment*cos({axis})", moment in N.m'
+        if linear:
+            hint = f'gravity where the axis rises: "9.81*inertia*{axis}"'
+        return f'"0"                     # {hint}'
+    doubt = weight.doubt or "the motion shows it"
+    without = 'of an upright axis "0", and without both tables [parameters.moment...]'
+    potential = f'"-moment*cos({axis}) + moment_across*sin({axis})"'
+    return f"{potential}  # guess: gravity; {doubt}; {without}"
+
+
+def _least_inertia(linear: bool, coil: bool, found: Driven) -> float:
+    # A mass near zero under friction is a motion that no simulation can follow. Where force is
+    # nearly all friction the guess of the mass is not worth much: friction has the last word.
+    least = 0.02 * found.inertia if found.inertia > 0.0 else 0.1 if linear else 1e-5
+    least = min(least, _FASTEST_S * found.viscous) if found.viscous > 0.0 else least
+    return _rounded(max(least, 0.3) if coil and linear else least)
+
+
+def _parameter(
+    name: str, unit: str, guessed: tuple[str, ...], meaning: str, known: str = ""
+) -> str:
+    """A table of a parameter: lines that are ``guessed``, and what is ``known`` of its meaning."""
+    marked = "".join(f"{line}  # guess\n" for line in guessed)
+    return f'\n[parameters.{name}]\nunit = "{unit}"\n{marked}description = "{meaning}"\n{known}'
+
+
+def _prior(size: float) -> tuple[str, str]:
+    """A prior of the size found and its spread, five times that; wide where nothing was found."""
+    if size <= 0.0:
+        return "prior = 1.0", "sd = 100.0"
+    return f"prior = {_rounded(size):g}", f"sd = {_rounded(5.0 * size):g}"
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.2g}")

@@ -1,0 +1,319 @@
+"""The mistakes that a robot's bodies as drawn show: `init`'s search, from what a session states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from bampipe.estimate.heavier_body import HeavierBody
+from bampipe.estimate.low_pass import Band
+from bampipe.estimate.standstill import find_moving_samples
+from bampipe.physics import System
+from bampipe.physics.robot import Robot
+from bampipe.setup.drawn_bodies import Bounds, Comparison, Drive, JointMotion
+from bampipe.setup.finding import ALIKE, LEAST_GAIN, Finding, conclude, score_of
+from bampipe.setup.heavier import find_heavy, with_heavier_body
+from bampipe.setup.hypotheses import (
+    JOINT_SPANS,
+    MOST_TRAVEL,
+    Correction,
+    clock_corrections,
+    combine,
+    exchange_corrections,
+    quarter_turns,
+    resized,
+    scaled,
+    shifted,
+    sign_corrections,
+    turned,
+    under_gravity,
+    unit_corrections,
+)
+from bampipe.setup.mounting import Mounting, find_mounting
+from bampipe.setup.plausibility import FARTHEST, WEIGHT, Plausibility
+from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import standstill_of
+from bampipe.trials.signals import Change, Signals
+
+Array = NDArray[np.float64]
+
+_STATED: Bounds = (1.0 / 3.0, 3.0)
+"""How many times lighter or heavier than drawn what hangs on a joint may be."""
+_SUSPICIOUS = 0.15
+"""Error with bodies as drawn from which other set-ups are tried: two joints exchanged leave 0.26 at
+least."""
+_ALIKE_SHARES, _FAR_SHARE = np.log(1.5), np.log(1.5)
+"""Within what logarithm drives are off alike, as of one unit, and from what on that is too much."""
+_NEXT = 0.3
+"""Logarithm within which the turns of a motor are sought from those on the grid."""
+_UNSURE = 0.3
+"""Relative uncertainty of what a drawing asks of a drive, at least."""
+
+
+def is_drawn(system: System) -> bool:
+    """Whether a device is a robot whose bodies are known from a drawing."""
+    robot = system.model.device.robot
+    return robot is not None and any(
+        p.weighed and not p.fixed and p.sd > 0.0 for p in system.parameters
+    )
+
+
+def drawn_robot(system: System) -> Robot:
+    """The robot of a device that is one."""
+    robot = system.model.device.robot
+    assert robot is not None
+    return robot
+
+
+@dataclass
+class DrawnSearch:
+    """Tries set-ups with bodies as drawn.
+
+    Each drive has besides an inertia and friction of its own, and one factor for its bodies.
+
+    Attributes:
+        system: the bare device; motions: the trials as they are stated, short enough.
+        band: of the residual; signals: of the session.
+        tested: number of set-ups tried.
+    """
+
+    system: System
+    motions: Sequence[Motion]
+    band: Band
+    signals: Signals
+    tested: int = field(default=0, init=False)
+    _reread: dict[bytes, Comparison] = field(default_factory=dict, init=False)
+
+    @cached_property
+    def stated(self) -> Comparison:
+        """The drives beside what the drawn bodies require, all as stated but for a heavy body."""
+        return (
+            replace(self._as_drawn, robot=with_heavier_body(self._as_drawn.robot, self.heavier))
+            if self.heavier is not None
+            else self._as_drawn
+        )
+
+    @cached_property
+    def heavier(self) -> HeavierBody | None:
+        """The body that alone is far heavier than drawn."""
+        if self.system.model.device.force_unit == "A":
+            return None
+        return find_heavy(self._as_drawn, self._as_drawn.drawn)
+
+    @cached_property
+    def _as_drawn(self) -> Comparison:
+        robot, n = drawn_robot(self.system), len(self.system.coordinates)
+        p = self.system.prior
+        for i, item in enumerate(self.system.parameters):
+            if not (item.weighed or item.fixed):
+                p[i] = 0.0
+        drives, used = [], []
+        with np.errstate(all="ignore"):
+            for motion in self.motions:
+                at, u = motion.kinematics, motion.inputs(self.system.inputs)
+                z = self.system.memory(*at, u, p, motion.t)
+                # What acts beside the bodies, such as a spring, is as stated whatever else is not.
+                beside = self.system.required(*at, z, u, p)
+                beside = beside - robot.drawn_forces(*at, np.array(robot.gravity))
+                drives.append(self.band.thin(self.system.applied(*at, z, u, p) - beside))
+                still = standstill_of(motion, self.system, self.band.rate_hz)
+                used.append(find_moving_samples(still, self.band))
+        shared = [
+            np.array([motor.turns.get(axis, 0.0) for axis in self.system.coordinates])
+            for motor in robot.motors.values()
+            if len(motor.turns) > 1
+        ]
+        return Comparison(
+            robot,
+            tuple(c.unit == "rad" for c in self.system.model.device.coordinates),
+            [JointMotion(*motion.kinematics) for motion in self.motions],
+            np.concatenate(drives),
+            np.ones(n),
+            self.band.thin,
+            np.concatenate(used),
+            shared,
+            has_offset=False,
+        )
+
+    @cached_property
+    def _by_force(self) -> Array:
+        """Joint forces by one of each force of the device, (n, forces)."""
+        n, inputs = len(self.system.coordinates), len(self.system.inputs)
+        at, p = (np.zeros((inputs + 1, n)),) * 3, self.system.prior
+        u = np.vstack([np.zeros(inputs), np.eye(inputs)])
+        z = self.system.memory(*at, u, p, np.arange(inputs + 1.0))
+        found = self.system.applied(*at, z, u, p)
+        places = [self.system.inputs.index(name) for name in self.signals.forces]
+        return np.asarray((found[1:] - found[0])[places].T)
+
+    def find_mistakes(self) -> tuple[Finding, ...]:
+        """The mistakes of the set-up, the one that gains most first; none if one is left over."""
+        held = self.judge(())
+        if held is None or not _is_suspicious(held):
+            return ()
+        readings = [(one,) for one in self._readings()]
+        weighed = [(self._misfit(option), option) for option in ((), *readings)]
+        best = self._geared(min(weighed, key=lambda one: one[0])[1])
+        options = [self._departures(start) for start in ([(), best] if best else [()])]
+        chosen = min(options, key=lambda option: score_of(self.judge, option))
+        others = (
+            *sign_corrections(self.signals),
+            *quarter_turns(self.signals),
+            under_gravity(self.signals, [-g for g in self.stated.robot.gravity], 1.0),
+        )
+        return conclude(self.judge, chosen, others if len(chosen) == 1 else (), drawn=True)
+
+    def _readings(self) -> Iterator[Correction]:
+        """Hypotheses about what a column is, rather than how a joint is counted."""
+        axes = set(self.signals.axes)
+        for correction in (
+            *exchange_corrections(self.signals),
+            *unit_corrections(self.signals),
+            *clock_corrections(self.signals),
+            *self._gears(),
+        ):
+            # Of a drive in another unit, the share tells.
+            if correction.kind != "scale" or axes.issuperset(correction.signals):
+                yield correction
+
+    def _gears(self) -> Iterator[Correction]:
+        """Positions of motors: what they turn for one of the joint, on a grid."""
+        ends = [(m.position.min(axis=0), m.position.max(axis=0)) for m in self.stated.motions]
+        travel = np.max([high for _, high in ends], axis=0) - np.min(
+            [low for low, _ in ends], axis=0
+        )
+        for axis, turns, far in zip(self.signals.axes, self.stated.turning, travel, strict=True):
+            for span in JOINT_SPANS if turns and far > MOST_TRAVEL else ():
+                yield scaled(self.signals, [axis], float(span / far), 3.0)
+
+    def _geared(self, best: tuple[Correction, ...]) -> tuple[Correction, ...]:
+        """``best`` with the turns that explain most, where it is a position of a motor."""
+        if not best or best[0].kind != "scale":
+            return best
+
+        def tried(x: float) -> tuple[Correction, ...]:
+            return (scaled(self.signals, best[0].signals, best[0].factor * float(np.exp(x)), 3.0),)
+
+        found = minimize_scalar(
+            lambda x: self._misfit(tried(x)), bounds=(-_NEXT, _NEXT), method="bounded"
+        )
+        gain = self._misfit(best) - self._misfit(tried(found.x))
+        return tried(found.x) if gain > 2.0 * ALIKE / WEIGHT else best
+
+    def _departures(self, start: tuple[Correction, ...]) -> tuple[Correction, ...]:
+        """What ``start``, the best mounting under it and the drives' shares say is mistaken."""
+        found = list(start)
+        compared = self._compare(combine(self.signals, start))
+        if compared is None:
+            return start
+        mounting = compared.drawn
+        if max(drive.left for drive in compared.hold(mounting)) > _SUSPICIOUS**2:
+            mounting = find_mounting(compared.turning, compared.drawn, compared.misfit)
+        for k, (axis, (direction, zero)) in enumerate(
+            zip(self.signals.axes, mounting.by_joint, strict=True)
+        ):
+            found += [turned(self.signals, [axis])] if direction < 0.0 else []
+            if zero:
+                off = float(np.remainder(zero + np.pi, 2.0 * np.pi) - np.pi) or np.pi
+                found.append(shifted(self.signals, axis, off if compared.turning[k] else zero, 1.0))
+        if mounting.hangs:
+            found.append(under_gravity(self.signals, mounting.gravity, 1.0))
+        drives = compared.hold(mounting)
+        return (*found, *self._by_share(drives))
+
+    def _by_share(self, drives: Sequence[Drive]) -> Iterator[Correction]:
+        """Drives whose sign or size is not that of the bodies, each by itself or all alike."""
+        single = {
+            f: k
+            for k, row in enumerate(self._by_force)
+            for f in np.flatnonzero(row)
+            if np.count_nonzero(row) == np.count_nonzero(self._by_force[:, f]) == 1
+        }
+        names = {f: self.signals.forces[f] for f in single}
+        signs = [names[f] for f, k in single.items() if drives[k].is_turned]
+        if len(signs) == len(names) > 1:
+            yield turned(self.signals, signs, 1.0)
+        else:
+            yield from (turned(self.signals, [name]) for name in signs)
+        sizes = {
+            names[f]: float(np.log(abs(drives[k].share)))
+            for f, k in single.items()
+            if drives[k].is_sure
+        }
+        logs = np.array(list(sizes.values()))
+        middle = float(np.median(logs)) if len(logs) else 0.0
+        alike = len(logs) > 2 and np.abs(logs - middle).max() < _ALIKE_SHARES
+        if alike and abs(middle) > _FAR_SHARE:
+            yield resized(self.signals, self.signals.forces, np.exp(-middle))
+            return
+        for name, size in sizes.items():
+            if abs(size) > np.log(_STATED[1]):
+                yield resized(self.signals, [name], np.exp(-size))
+
+    def _compare(self, change: Change) -> Comparison | None:
+        """The comparison with what ``change`` makes of readings and drives, zeros apart.
+
+        None where a force is to stand for a position.
+        """
+        n, forces = len(self.signals.axes), len(self.signals.forces)
+        readings, drives = change.gain[:n, :n], change.gain[n : n + forces, n : n + forces]
+        beside = change.gain[:n, n:].any() or change.gain[n:, :n].any()
+        if beside:
+            return None
+        key = readings.tobytes() + np.float64(change.time).tobytes()
+        if key not in self._reread:
+            self._reread[key] = self.stated.reread(readings, change.time)
+        found = self._reread[key]
+        if np.array_equal(drives, np.eye(forces)):
+            return found
+        # Drives at the joints are linear in the forces: what these become is found by those.
+        into = self._by_force @ drives @ np.linalg.pinv(self._by_force)
+        return found.driven(into)
+
+    def _hold(
+        self, corrections: Sequence[Correction], bounds: Bounds
+    ) -> tuple[Comparison, Mounting, list[Drive]] | None:
+        self.tested += 1
+        change = combine(self.signals, corrections)
+        compared = self._compare(change)
+        if compared is None:
+            return None
+        n = len(self.signals.axes)
+        gravity = np.array(change.gravity or compared.robot.gravity)
+        mounting = Mounting(np.ones(n), change.offset[:n], gravity, change.gravity is not None)
+        with np.errstate(all="ignore"):
+            drives = compared.hold(mounting, bounds)
+        if not np.isfinite([drive.left for drive in drives]).all():
+            return None
+        return compared, mounting, drives
+
+    def _misfit(self, corrections: Sequence[Correction]) -> float:
+        """How little is explained where signs and sizes of drives are free, as `init` counts it."""
+        held = self._hold(corrections, _STATED)
+        if held is None:
+            return np.inf
+        compared, mounting, _ = held
+        return compared.misfit(mounting) + 2.0 * sum(one.cost for one in corrections) / WEIGHT
+
+    def judge(self, corrections: tuple[Correction, ...]) -> Plausibility | None:
+        """What a set-up explains, all else as stated."""
+        held = self._hold(corrections, _STATED)
+        if held is None:
+            return None
+        compared, _, drives = held
+        assert compared.used is not None
+        unsure = max(compared.robot.uncertainty, _UNSURE)
+        shares = np.array([drive.share if drive.is_sure else 1.0 for drive in drives])
+        off = np.log(np.maximum(np.abs(shares), 1e-300)) / unsure
+        error = np.sqrt([drive.left for drive in drives])
+        objections = 0.5 * np.minimum(off**2, FARTHEST**2)
+        return Plausibility(error, compared.used.mean(axis=0), self.system.prior, objections)
+
+
+def _is_suspicious(held: Plausibility) -> bool:
+    return held.worst_error > _SUSPICIOUS or float(held.objections.sum()) > LEAST_GAIN

@@ -1,0 +1,102 @@
+"""The tables of docs/validation.md, made from the results that benchmarks have stored.
+
+    python benchmarks/validation.py            # write them into the page
+    python benchmarks/validation.py --check    # fail where the page has other ones
+
+`benchmarks/results/` has one file a benchmark, a line of JSON a session, and in `measured.json` the
+commit and the command of each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import mistakes
+import recovery
+from pydantic import TypeAdapter
+from scores import read_scores, write_tables
+
+from bampipe.diagnosis.criteria import Criteria
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+PAGE = ROOT / "docs" / "validation.md"
+BLOCK = re.compile(r"(<!-- results of (\w+) -->\n)(.*?)(<!-- end -->)", re.S)
+
+
+def write_calibration(path: Path) -> str:
+    """Stated probabilities against the share that is there."""
+    scores, criteria = list(read_scores(path)), Criteria()
+    stated = [
+        effect in one.effects
+        for one in scores
+        for effect, p in one.probabilities(criteria).items()
+        if p >= criteria.probability
+    ]
+    met = "met" if sum(stated) >= criteria.probability * len(stated) else "not met"
+    head = (
+        f"Of the {len(stated)} effects stated with a probability of {criteria.probability:g} or"
+        f" more, {sum(stated)} exist: the first target is {met}."
+    )
+    return f"{head}\n\n{write_tables(scores, criteria)}"
+
+
+def write_intervals(path: Path) -> str:
+    """How often stated intervals hold the truth."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    outcomes = [TypeAdapter(recovery.Outcome).validate_json(line) for line in lines]
+    return "\n".join(recovery.write_coverage(outcomes)).strip()
+
+
+def write_mistakes(path: Path) -> str:
+    """How many mistakes of a set-up are named."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return mistakes.write_table(
+        [TypeAdapter(mistakes.Outcome).validate_json(line) for line in lines]
+    )
+
+
+TABLES: dict[str, Callable[[Path], str]] = {
+    "calibration": write_calibration,
+    "intervals": write_intervals,
+    "mistakes": write_mistakes,
+}
+
+
+def read_measured() -> dict[str, dict[str, str]]:
+    """Command and commit of each stored result."""
+    return dict(json.loads((RESULTS / "measured.json").read_text(encoding="utf-8")))
+
+
+def fill(page: str) -> str:
+    """The page with the tables of the stored results in it."""
+    measured = read_measured()
+
+    def filled(match: re.Match[str]) -> str:
+        head, name, _, end = match.groups()
+        about = f"`{measured[name]['command']}`, commit {measured[name]['commit']}."
+        return f"{head}\n{about}\n\n{TABLES[name](RESULTS / f'{name}.jsonl')}\n\n{end}"
+
+    return BLOCK.sub(filled, page)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Write the tables, or compare them."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    given = parser.parse_args(arguments)
+    page = PAGE.read_text(encoding="utf-8")
+    made = fill(page)
+    if given.check and made != page:
+        raise SystemExit(f"{PAGE} is not what the results give: python benchmarks/validation.py")
+    if not given.check:
+        PAGE.write_text(made, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
