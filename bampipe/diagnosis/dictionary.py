@@ -191,21 +191,13 @@ class Dictionary:
             through.append(e.band.thin(system.applied(*motion.kinematics, z, u, p)))
             plain.append(e.band.thin(fitted.applied))
         found = np.zeros(len(self.samples))
+        half = _SEGMENT // 2
         for axis in range(len(found)):
-            auto: Array | float = 0.0
-            cross: Array | float = 0.0
-            for x, y in zip(plain, through, strict=True):
-                n = min(_SEGMENT, len(x))
-                half = _SEGMENT // 2
-                auto = (
-                    auto + welch(x[:, axis], nperseg=n, nfft=_SEGMENT, detrend="linear")[1][:half]
-                )
-                cross = (
-                    cross
-                    + csd(x[:, axis], y[:, axis], nperseg=n, nfft=_SEGMENT, detrend="linear")[1][
-                        :half
-                    ]
-                )
+            auto, cross = np.zeros(half), np.zeros(half, dtype=complex)
+            for a, b in ((x[:, axis], y[:, axis]) for x, y in zip(plain, through, strict=True)):
+                n = min(_SEGMENT, len(a))
+                auto += welch(a, nperseg=n, nfft=_SEGMENT, detrend="linear")[1][:half]
+                cross += csd(a, b, nperseg=n, nfft=_SEGMENT, detrend="linear")[1][:half]
             gain = np.abs(cross) / np.maximum(auto, 1e-300)
             found[axis] = min(float(np.mean(np.log(np.clip(gain[1:], 1e-2, 1e2)))), 0.0)
         return found

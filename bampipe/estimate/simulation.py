@@ -285,9 +285,9 @@ def simulate(
         Runaway: the motion grows without bounds.
     """
     nobody = np.zeros((0, 0))
-    return _integrate(
-        derivative, x0, u, p, dt, nobody, nobody, width, n_noise, max_step, hold=hold,
-        smooth=smooth,
+    return simulate_tracking(
+        derivative, x0, u, p, dt, nobody, nobody, width=width, n_noise=n_noise, force=(), hold=hold,
+        smooth=smooth, max_step=max_step,
     )[0]  # fmt: skip
 
 
@@ -312,6 +312,7 @@ def simulate_tracking(
     smooth: Sequence[int] = (),
     max_step: float = 2.5e-4,
     moved_first: NDArray[np.int64] | None = None,
+    hold: bool = False,
 ) -> tuple[Array, Array]:
     """Integrate the model under given inputs plus an arm that holds it near a given motion.
 
@@ -320,11 +321,11 @@ def simulate_tracking(
     the returned inputs, so these with the returned motion are one consistent recording.
 
     Args:
-        derivative, x0, p, dt, width, n_noise, smooth, max_step: as in `simulate`.
+        derivative, x0, p, dt, width, n_noise, smooth, max_step, hold: as in `simulate`.
         u: (T, nu) inputs without the arm's share; copied.
         q_ref, qd_ref: (T, n_q) motion that the arm wants.
         force: columns of ``u`` with the handle force, N. They may be fewer than coordinates; the
-            arm's force is then the least-squares one.
+            arm's force is then the least-squares one. Without any there is no arm.
         rate, curvature: columns with its first and second derivative, where the model has them;
             they receive those of the arm's force. In the order of ``force``, -1 for one
             that the model does not use.
@@ -341,38 +342,6 @@ def simulate_tracking(
     Raises:
         Runaway: the motion grows without bounds.
     """
-    return _integrate(
-        derivative, x0, u, p, dt, q_ref, qd_ref, width, n_noise, max_step,
-        force=force, rate=rate, curvature=curvature, arm=impedance or Impedance(),
-        brake=brake if brake_gain is not None else (), brake_gain=brake_gain,
-        brake_time=brake_time, smooth=smooth, moved_first=moved_first,
-    )  # fmt: skip
-
-
-def _integrate(
-    derivative: Any,
-    x0: Array,
-    u: Array,
-    p: Array,
-    dt: float,
-    q_ref: Array,
-    qd_ref: Array,
-    width: Array,
-    n_noise: int,
-    max_step: float,
-    *,
-    hold: bool = False,
-    force: Sequence[int] = (),
-    rate: Sequence[int] = (),
-    curvature: Sequence[int] = (),
-    arm: Impedance = Impedance(),
-    brake: Sequence[int] = (),
-    brake_gain: Array | None = None,
-    brake_time: float = 0.01,
-    smooth: Sequence[int] = (),
-    moved_first: NDArray[np.int64] | None = None,
-) -> tuple[Array, Array]:
-    """Give `_run` its arrays and its memory; return states (T, nx) and inputs (T, nu)."""
     finer = int(np.ceil(dt / _WIDEST_GRID_S - 1e-6)) if len(smooth) else 1
     if finer > 1:
         dt /= finer
@@ -384,7 +353,7 @@ def _integrate(
     x[0] = x0
     total = np.array(u, dtype=np.float64, order="C")
     gain = np.zeros((0, 0)) if brake_gain is None else np.ascontiguousarray(brake_gain)
-    n, nf = len(width), len(force)
+    n, nf, arm = len(width), len(force), impedance or Impedance()
     if moved_first is None:
         moved_first = np.arange(2 * n).reshape(2, n).T
     _run(
@@ -395,7 +364,7 @@ def _integrate(
             np.array(curvature, dtype=np.int64),
             arm.natural_frequency, arm.damping_ratio, arm.bandwidth,
         ),
-        _Brakes(np.array(brake, dtype=np.int64), gain, brake_time),
+        _Brakes(np.array(brake[: gain.shape[1]], dtype=np.int64), gain, brake_time),
         np.array(q_ref, dtype=np.float64, order="C"),  # a copy: columns of a table are read-only
         np.array(qd_ref, dtype=np.float64, order="C"), dt, hold,
         _Workspace(
