@@ -8,6 +8,7 @@ from motions import of_mechanism
 from scipy.optimize import least_squares
 from small_arm import ARM
 
+from bampipe.estimate.simulation import simulate_tracking
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.effect import unit_of
 from bampipe.physics.system import STABLE, STIFF_STEPS
@@ -344,6 +345,29 @@ def test_what_is_loose_flies_free_for_as_long_as_it_crosses_half_the_gap(effect)
     np.testing.assert_allclose(carried[flies], 0.0, atol=1e-9)
     assert carried[np.flatnonzero(~flies)[1]] > 0.0
     np.testing.assert_allclose(carried[-1], PUSH, rtol=1e-6)
+
+
+def test_an_arm_leads_the_motor_that_moves_the_axis_through_play():
+    device = registry.device("slider")
+    assert compile_model(Model(device, ["loose_load:carriage"])).moved_first.tolist() == [[0, 1]]
+    system = compile_model(Model(device, ["loose_drive:carriage"]))
+    own = ["loose_drive.carriage.place", "loose_drive.carriage.rate"]
+    assert [system.states[i] for i in system.moved_first[0]] == own
+    p, t = typical(system), np.arange(0.0, 3.0, 2e-3)
+    wanted, rate = 0.05 * (1.0 - np.cos(2.0 * t)), 0.1 * np.sin(2.0 * t)
+    u = np.zeros((t.size, len(system.inputs)))
+    start = np.concatenate([[0.0, 0.0], system.initial_memory(np.zeros(1), u[0], p)])
+    x, _ = simulate_tracking(
+        system.derivative, start, u, p, 2e-3, wanted[:, None], rate[:, None],
+        width=np.array([c.sign_width for c in device.coordinates]), n_noise=len(system.noise),
+        force=[system.inputs.index("force_motor")], moved_first=system.moved_first,
+    )  # fmt: skip
+    gap = p[system.index("loose_drive.carriage.gap")]
+    behind = x[:, 2] - x[:, 0]
+    # The motor drags the carriage along from the ends of the gap, pressed as far as friction takes.
+    assert np.abs(behind).max() < 0.5 * gap + 1e-3
+    assert np.ptp(behind) > 0.9 * gap
+    assert np.abs(x[:, 2] - wanted).max() < 0.02
 
 
 def delivered(current: np.ndarray, lag: float) -> np.ndarray:
