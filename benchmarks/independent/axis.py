@@ -43,8 +43,8 @@ OUTSIDE = ("detent", "rough_patch", "winding_cable")
 EFFECTS = (
     *(f"{name}:carriage" for name in LAWS if name not in OUTSIDE),
     "actuator_delay", "actuator_lag:motor", "flexible_load:carriage",
-    "loose_load:carriage", "loose_drive:carriage",
 )  # fmt: skip
+BY_NAME = ("loose_load:carriage", "loose_drive:carriage")
 UNKNOWN = tuple(f"{name}:carriage" for name in OUTSIDE)
 
 

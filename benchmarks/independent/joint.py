@@ -52,9 +52,9 @@ OUTSIDE = (
 )  # fmt: skip
 EFFECTS = (
     *(f"{name}:joint" for name in LAWS if name not in OUTSIDE),
-    "actuator_delay", "actuator_lag:current", "drive_sag:joint", "loose_load:joint",
-    "loose_drive:joint",
+    "actuator_delay", "actuator_lag:current", "drive_sag:joint",
 )  # fmt: skip
+BY_NAME = ("loose_load:joint", "loose_drive:joint")
 UNKNOWN = tuple(f"{name}:joint" for name in OUTSIDE)
 DEVICE = f"""schema = "bampipe.device/1"
 name = "joint"
