@@ -66,7 +66,7 @@ def stiffness(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None
 def identify(
     run: RunArgument = None,
     model: ModelOption = "",
-    method: Annotated[str, typer.Option(help="auto, ukf, least-squares or output-error.")] = "",
+    method: Annotated[str, typer.Option(help="auto, ukf or least-squares.")] = "",
     engine: Annotated[
         str,
         typer.Option(help="compiled; or filterpy: slow, to compare with."),
