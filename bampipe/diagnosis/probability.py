@@ -140,11 +140,13 @@ def _share_explained(search: Search, effect: str, far: NDArray[np.bool_]) -> flo
     """Of the mean square without an effect, what it takes on axes that are ``far``; the largest.
 
     What is missing there may resemble an effect that takes less than that leaves. 1 of an effect
-    that the other axes show.
+    that the other axes show, or show more than these.
     """
     now, without = _squares(search, ()), _squares(search, ((f"-{effect}", ()),))
     gain = 0.5 * search.p.independent * np.log(without / now)
-    return 1.0 if gain[~far].sum() > _NEAR else float(np.max(1.0 - now[far] / without[far]))
+    if gain[~far].sum() >= min(gain[far].sum(), _NEAR):
+        return 1.0
+    return float(np.max(1.0 - now[far] / without[far]))
 
 
 @dataclass(frozen=True)

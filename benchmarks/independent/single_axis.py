@@ -29,6 +29,8 @@ MACHINE = np.dtype(
     ]
 )  # fmt: skip
 
+GENTLE = 0.2
+"""Gains of a controller that sees the load through play, over those of one that sees the motor."""
 MOTOR = {
     "actuator_delay": ("delay", "delay"),
     "actuator_lag": ("lag", "time_constant"),
@@ -167,6 +169,9 @@ class Specimen:
                 m["load_frequency"] = np.sqrt(stiffness / m["load_inertia"])
                 m["load_damping"] = rng.uniform(0.1, 0.3)
                 m["driven"] = float(name == "loose_drive")
+                if m["driven"]:  # with gains for a stiff drive, the loop would hammer in the gap
+                    for gain in ("velocity_gain", "position_gain"):
+                        m[gain] *= GENTLE
                 names = {"gap": "gap", "load_inertia": "inertia"}
                 names |= {"load_frequency": "frequency", "load_damping": "damping"}
                 found = {f"{full.replace(':', '.')}.{n}": float(m[k]) for k, n in names.items()}
