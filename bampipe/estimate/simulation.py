@@ -123,7 +123,7 @@ _ARM = record_type(_Arm, _I, _I, _I, _I, _I, float64, float64, float64)
 _WORKSPACE = record_type(_Workspace, _M, _M, _M, _M, _V, _V, _V, _V)
 
 
-@njit(int64(DERIVATIVE, _V, _V, PLANT, float64, _M), cache=True, no_cpython_wrapper=True)
+@njit(int64(DERIVATIVE, _V, _V, PLANT, float64, _M), cache=True)
 def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-def]
     """Number of Runge-Kutta steps that ``dt`` needs from state ``x`` on.
 
