@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from independent import MACHINES, record
+from independent import record
 from independent.sensors import Conditions
 from recovery import DAYS, PIPELINE, draw_effects
 from scores import Scores, read_scores, write_tables
@@ -56,7 +56,7 @@ def diagnose(name: str, run: bampipe.Run | Path, truth: Mapping[str, Any]) -> Sc
         found = bampipe.diagnose(run, "base", jobs=1, trust_setup=True)
     except bampipe.InputError as problem:
         return Scores(name, **known, failure=str(problem))
-    limit, axes = Criteria().probability, found["axes"]
+    axes = found["axes"]
     return Scores(
         name, **known,
         effects_found={
@@ -75,7 +75,6 @@ def diagnose(name: str, run: bampipe.Run | Path, truth: Mapping[str, Any]) -> Sc
             axis: round(e["rmse_after"] / e["noise_floor"], 3)
             for axis, e in axes.items() if e["noise_floor"]
         },
-        exceeds=[a for a, e in axes.items() if e["remains"] and e["unknown"] < limit],
         no_verdict=[a for a, e in axes.items() if e["verdict"] == "no_verdict"],
         seconds=round(time.perf_counter() - begun, 1),
     )  # fmt: skip
@@ -84,7 +83,7 @@ def diagnose(name: str, run: bampipe.Run | Path, truth: Mapping[str, Any]) -> Sc
 def draw_session(seed: int, clean: bool) -> tuple[str, str, dict[str, float]]:
     """Machine, day and hidden effects with their strengths, 0.1 to 1, each as likely by ratio."""
     rng = np.random.default_rng([seed, clean])
-    machine = list(MACHINES)[seed % len(MACHINES)]
+    machine = list(USUAL)[seed % len(USUAL)]
     day = "good" if rng.uniform() < 0.5 else str(rng.choice([d for d in DAYS if d != "good"]))
     count = 0 if clean else int(rng.integers(1, MOST[machine] + 1))
     outside = int(count > 1 and rng.uniform() < 0.2)

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.data.chain import frame_of_tip
-from bampipe.data.robot_file import read_tree
+from bampipe.data.chain import frame_of_tip, read_tree
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
