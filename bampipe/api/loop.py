@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
-from bampipe.files import is_normal
+from bampipe.files import is_normal, write_text
 from bampipe.lists import join_names
 from bampipe.run import models, record
 from bampipe.run.events import Listener
@@ -142,7 +142,7 @@ def adopt_effect(file: Path, runs: Path) -> Path:
             f"there is a built-in effect {effect.name!r}", where=str(file), remedy="rename yours"
         )
     target = runs / models.ADOPTED / f"{effect.name}.toml"
-    record.replace_text(target, file.read_text(encoding="utf-8"))
+    write_text(target, file.read_text(encoding="utf-8"))
     return target
 
 
@@ -218,7 +218,7 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
             effect_files[f"{effect.partition(':')[0]}.toml"] = file
     for name, source in sorted(effect_files.items()):
         text = source.read_text(encoding="utf-8")
-        record.replace_text(root / "models" / child / "effects" / name, text)
+        write_text(root / "models" / child / "effects" / name, text)
     effects = (*before.effects, *named)
     model = ModelFile(name=child, parent=parent, device=before.device, effects=effects)
     models.write(root, model)

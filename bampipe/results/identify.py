@@ -10,16 +10,14 @@ from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
 Method = Literal["ukf", "least-squares", "output-error"]
-"""How parameters are estimated."""
+"""How parameters are estimated; by output error in runs of earlier versions only."""
 
 
 class ParameterEstimate(Record):
     """One parameter."""
 
     estimate: float
-    sd: Size = Field(
-        description="Standard deviation: block-wise sandwich, and spread between the methods"
-    )
+    sd: Size = Field(description="Standard deviation: block-wise sandwich, and the parts below")
     unit: str
     at_bound: bool = Field(description="Within one sd of its physical bound")
     filter_sd: Size | None = Field(
@@ -28,7 +26,7 @@ class ParameterEstimate(Record):
     )
     systematic_sd: Size | None = Field(
         default=None,
-        description="Part of sd by which methods that predict alike disagree beyond noise",
+        description="Part of sd by which methods disagree, in runs of earlier versions",
     )
     smoothing_sd: Size | None = Field(
         default=None,
@@ -45,7 +43,7 @@ class ParameterEstimate(Record):
     )
     least_squares_bias: float | None = Field(
         default=None,
-        description="Bias that filtering gives least squares, found by replaying the fit",
+        description="What filters and friction that stops would add to least squares",
     )
     bound_sd: Size | None = Field(
         description="Cramer-Rao bound: least sd that the sensors allow; null where there is none"
@@ -310,7 +308,7 @@ class IdentifyResult(Result):
     noise: NoiseLevels | None = None
     position_error: dict[str, Size] | None = Field(
         default=None,
-        description="Output error: position error that is left, by axis, rad or m",
+        description="Of output error, by earlier versions: position error by axis, rad or m",
     )
     residual_sd: dict[str, Size] | None = Field(
         default=None, description="Least squares: low-passed residual by axis, N.m or N"
