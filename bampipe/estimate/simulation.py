@@ -117,7 +117,7 @@ _ARM = record_type(_Arm, _I, _I, _I, float64, float64, float64)
 _WORKSPACE = record_type(_Workspace, _M, _M, _M, _M, _V, _V, _V, _V)
 
 
-@njit(int64(DERIVATIVE, _V, _V, PLANT, float64, _M), cache=True, no_cpython_wrapper=True)
+@njit(int64(DERIVATIVE, _V, _V, PLANT, float64, _M), cache=True)
 def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-def]
     """Number of Runge-Kutta steps that ``dt`` needs from state ``x`` on.
 
@@ -157,9 +157,7 @@ def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-
     return min(int(np.ceil(dt * fastest)), _MOST_STEPS)
 
 
-@njit(
-    void(DERIVATIVE, _V, _V, PLANT, _ARM, _V, _V, _WORKSPACE), cache=True, no_cpython_wrapper=True
-)
+@njit(void(DERIVATIVE, _V, _V, PLANT, _ARM, _V, _V, _WORKSPACE), cache=True)
 def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, work):  # type: ignore[no-untyped-def]
     """Handle force that alone would give the acceleration which the arm demands: ``work.goal``."""
     p, w, force, out = plant.p, plant.w, arm.force, work.goal

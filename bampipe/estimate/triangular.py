@@ -26,7 +26,6 @@ def padded(n: int) -> int:
 @njit(
     boolean(float64[:, ::1], float64[:, ::1]),
     cache=True,
-    no_cpython_wrapper=True,
     fastmath=_REASSOCIATE,
 )
 def cholesky(covariance, factor):  # type: ignore[no-untyped-def]
@@ -159,7 +158,7 @@ def condition(upper, noise, cross, gain, cosine, sine):  # type: ignore[no-untyp
                 noise[k, i] = s * old + c * noise[k, i]
 
 
-@njit(void(float64[:, ::1], int64, float64[::1]), cache=True, no_cpython_wrapper=True)
+@njit(void(float64[:, ::1], int64, float64[::1]), cache=True)
 def forward_substitute(factor, n, vector):  # type: ignore[no-untyped-def]
     """Replace ``vector`` (>= n,) by L^-1 vector, L the leading (n, n) block of ``factor``."""
     for i in range(n):
@@ -204,7 +203,7 @@ def rank_one_update(upper, n, sign, vector):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(void(float64[:, ::1], float64[:, ::1]), cache=True, no_cpython_wrapper=True)
+@njit(void(float64[:, ::1], float64[:, ::1]), cache=True)
 def transpose(upper, factor):  # type: ignore[no-untyped-def]
     """Write the transpose of the upper triangular R (n, >= n) into ``factor`` (n, n)."""
     n = upper.shape[0]
