@@ -23,11 +23,7 @@ def padded(n: int) -> int:
     return (n + _LANES - 1) // _LANES * _LANES
 
 
-@njit(
-    boolean(float64[:, ::1], float64[:, ::1]),
-    cache=True,
-    fastmath=_REASSOCIATE,
-)
+@njit(boolean(float64[:, ::1], float64[:, ::1]), cache=True, fastmath=_REASSOCIATE)
 def cholesky(covariance, factor):  # type: ignore[no-untyped-def]
     """Write the lower Cholesky factor of ``covariance`` (n, n) into ``factor`` (n, n).
 
