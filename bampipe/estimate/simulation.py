@@ -163,9 +163,7 @@ def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-
     return min(int(np.ceil(dt * fastest)), _MOST_STEPS)
 
 
-@njit(
-    void(DERIVATIVE, _V, _V, PLANT, _ARM, _V, _V, _WORKSPACE), cache=True, no_cpython_wrapper=True
-)
+@njit(void(DERIVATIVE, _V, _V, PLANT, _ARM, _V, _V, _WORKSPACE), cache=True)
 def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, work):  # type: ignore[no-untyped-def]
     """Handle force that alone would give the acceleration which the arm demands: ``work.goal``."""
     p, w, force, out = plant.p, plant.w, arm.force, work.goal
