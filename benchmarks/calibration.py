@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from independent import MACHINES, record
+from independent import record
 from independent.sensors import Conditions
 from recovery import DAYS, PIPELINE, draw_effects
 from scores import Scores, read_scores, write_tables
@@ -84,7 +84,7 @@ def diagnose(name: str, run: bampipe.Run | Path, truth: Mapping[str, Any]) -> Sc
 def draw_session(seed: int, clean: bool) -> tuple[str, str, dict[str, float]]:
     """Machine, day and hidden effects with their strengths, 0.1 to 1, each as likely by ratio."""
     rng = np.random.default_rng([seed, clean])
-    machine = list(MACHINES)[seed % len(MACHINES)]
+    machine = list(USUAL)[seed % len(USUAL)]
     day = "good" if rng.uniform() < 0.5 else str(rng.choice([d for d in DAYS if d != "good"]))
     count = 0 if clean else int(rng.integers(1, MOST[machine] + 1))
     outside = int(count > 1 and rng.uniform() < 0.2)

@@ -22,7 +22,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from independent import MACHINES, arm, record
 from independent.sensors import Conditions
@@ -404,7 +403,7 @@ def write_table(outcomes: Sequence[Outcome]) -> str:
         beside = sum(o.beside > 0 for o in spoilt)
         lines.append(
             f"\n{right} of {len(spoilt)} named ({right / len(spoilt):.1%}), in {beside} something"
-            f" else as well; {np.median([o.seconds for o in spoilt]):.1f} s a session."
+            " else as well."
         )
     sound = [o for o in outcomes if not o.case.mistake]
     if sound:

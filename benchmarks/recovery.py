@@ -382,14 +382,14 @@ def write_table(outcomes: Sequence[Outcome]) -> str:
             + f" | {np.median(worst):.2f}, at most {max(worst):.2f} | "
             f"{np.median([o.seconds for o in some]):.0f} |"
         )
-    lines += write_coverage(done)
+    lines += _coverage(done)
     failed = len(outcomes) - len(done)
     if failed:
         lines.append(f"\n{failed} sessions were refused.")
     return "\n".join(lines)
 
 
-def write_coverage(outcomes: Sequence[Outcome]) -> list[str]:
+def _coverage(outcomes: Sequence[Outcome]) -> list[str]:
     """How often intervals of right models hold the truth, and how near strengths and shapes are."""
     found = [(o.case, p) for o in outcomes for p in o.parameters]
     if not found:

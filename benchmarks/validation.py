@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mistakes
-import recovery
 from pydantic import TypeAdapter
 from scores import read_scores, write_tables
 
@@ -46,13 +45,6 @@ def write_calibration(path: Path) -> str:
     return f"{head}\n\n{write_tables(scores, criteria)}"
 
 
-def write_intervals(path: Path) -> str:
-    """How often stated intervals hold the truth."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    outcomes = [TypeAdapter(recovery.Outcome).validate_json(line) for line in lines]
-    return "\n".join(recovery.write_coverage(outcomes)).strip()
-
-
 def write_mistakes(path: Path) -> str:
     """How many mistakes of a set-up are named."""
     lines = path.read_text(encoding="utf-8").splitlines()
@@ -63,7 +55,6 @@ def write_mistakes(path: Path) -> str:
 
 TABLES: dict[str, Callable[[Path], str]] = {
     "calibration": write_calibration,
-    "intervals": write_intervals,
     "mistakes": write_mistakes,
 }
 

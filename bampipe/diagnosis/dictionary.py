@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import csd, welch
+from scipy.signal import csd
 
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_columns
@@ -179,32 +180,36 @@ class Dictionary:
 
     def _log_gain(self, item: Candidate, p: Array) -> Array:
         """Kolmogorov: what a filter takes off the innovations of all that goes through it."""
-        e, system = self.evidence, item.system
-        plain, through = [], []
-        for motion, fitted in zip(e.motions, e.fitted, strict=True):
+        e, system, through = self.evidence, item.system, []
+        for motion in e.motions:
             u = motion.inputs(system.inputs)
             z = system.memory(*motion.kinematics, u, p, motion.t)
             through.append(e.band.thin(system.applied(*motion.kinematics, z, u, p)))
-            plain.append(e.band.thin(fitted.applied))
         found = np.zeros(len(self.samples))
-        for axis in range(len(found)):
-            auto: Array | float = 0.0
-            cross: Array | float = 0.0
-            for x, y in zip(plain, through, strict=True):
-                n = min(_SEGMENT, len(x))
-                half = _SEGMENT // 2
-                auto = (
-                    auto + welch(x[:, axis], nperseg=n, nfft=_SEGMENT, detrend="linear")[1][:half]
-                )
-                cross = (
-                    cross
-                    + csd(x[:, axis], y[:, axis], nperseg=n, nfft=_SEGMENT, detrend="linear")[1][
-                        :half
-                    ]
-                )
-            gain = np.abs(cross) / np.maximum(auto, 1e-300)
-            found[axis] = min(float(np.mean(np.log(np.clip(gain[1:], 1e-2, 1e2)))), 0.0)
+        for axis, auto in enumerate(self._power):
+            pairs = [(x[:, axis], y[:, axis]) for x, y in zip(self._plain, through, strict=True)]
+            if any(not np.array_equal(x, y) for x, y in pairs):
+                gain = np.abs(sum(_spectrum(x, y) for x, y in pairs)) / np.maximum(auto, 1e-300)
+                found[axis] = min(float(np.mean(np.log(np.clip(gain[1:], 1e-2, 1e2)))), 0.0)
         return found
+
+    @cached_property
+    def _plain(self) -> list[Array]:
+        """The applied force by the model, low-passed, by trial, each (K, n_q)."""
+        return [self.evidence.band.thin(fitted.applied) for fitted in self.evidence.fitted]
+
+    @cached_property
+    def _power(self) -> list[Array]:
+        """Its power spectrum, by axis."""
+        columns = ([x[:, a] for x in self._plain] for a in range(len(self.samples)))
+        return [np.abs(sum(_spectrum(x, x) for x in each)) for each in columns]
+
+
+def _spectrum(x: Array, y: Array) -> NDArray[np.complex128]:
+    """Cross spectral density of two series, (_SEGMENT // 2,)."""
+    n = min(_SEGMENT, len(x))
+    found = csd(x, y, nperseg=n, nfft=_SEGMENT, detrend="linear")[1]
+    return np.asarray(found[: _SEGMENT // 2])
 
 
 _MULTIPLE = (0.5, 2.0)

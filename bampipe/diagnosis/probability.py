@@ -59,7 +59,7 @@ class Weighed:
         effects: probability of each effect of any of them.
         unknown: probability that an axis lacks something unknown, (n_q,).
         functions: what that would be, by axis; None where an axis does not move.
-        drops: log evidence lost without each effect, by the best sets with it and without it, nats.
+        drops: log evidence lost without each effect, where nothing takes its place, nats.
     """
 
     sets: tuple[WeighedSet, ...]
@@ -154,12 +154,18 @@ def _share(
 
 
 def _losses(sets: Sequence[WeighedSet]) -> dict[str, float]:
-    """For each effect, by how much the best set that holds it is ahead of the best without it."""
+    """For each effect, what the best set with it loses if nothing takes its place, nats."""
     found = {}
-    for effect in {e for one in sets for e in one.effects}:
-        held = [one.log_evidence for one in sets if effect in one.effects]
-        others = [one.log_evidence for one in sets if effect not in one.effects]
-        found[effect] = max(held) - max(others, default=max(held) - _NEAR)
+    for effect in dict.fromkeys(e for one in sets for e in one.effects):
+        held = [one for one in sets if effect in one.effects]
+        best = max(held, key=lambda one: one.log_evidence)
+        rest = {*best.effects} - {effect}
+        less = [
+            one.log_evidence
+            for one in sets
+            if one.unknown == best.unknown and {*one.effects} <= rest
+        ]
+        found[effect] = best.log_evidence - max(less, default=best.log_evidence - _NEAR)
     return found
 
 

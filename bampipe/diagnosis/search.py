@@ -90,7 +90,7 @@ class Search:
         self.least_size = criteria.size
         self._squares: dict[Key, dict[int, Array]] = {}
         self.applied = [max(float(f @ f), 1e-300) for f in p.likelihood.applied]
-        self._weight = self._bare_weight = p.independent / np.maximum(self.yy, 1e-300)
+        self._weight = p.independent / np.maximum(self.yy, 1e-300)
         grid = [key for name in dictionary.candidates for key in dictionary.grid(name)]
         self.ensure(grid)
         places = {key: atom for key in grid if (atom := self.atoms[key]) is not None}
@@ -152,7 +152,7 @@ class Search:
         other = copy(self)
         other.p = replace(self.p, likelihood=replace(self.p.likelihood, samples=samples))
         other._solved, other._own_penalties = {}, {}
-        other._weight = other._bare_weight = other.p.independent / np.maximum(self.yy, 1e-300)
+        other._weight = other.p.independent / np.maximum(self.yy, 1e-300)
         return other
 
     def largest_gain(self) -> tuple[float, str]:
@@ -330,13 +330,16 @@ class Search:
     def _penalty_of_own(self, name: str) -> float:
         """What the priors of the parameters of one of the model's effects cost."""
         if name not in self._own_penalties:
-            p, places = self.p, list(self.p.absence[name])
-            to = p.to_parameters[places]
-            normal = np.tensordot(self._bare_weight, self.bb, 1) + p.precision
-            spread = to @ solve_scaled(normal, to.T)
-            strengths = np.array(list(p.absence[name].values()))
+            # Of a candidate, too, the information on its strengths is that at its shape.
+            p, shapes = self.p, self.p.shapes[name]
+            away = {k: change for k, change in p.absence[name].items() if k not in shapes}
+            free = hold_parameters(p.to_parameters, dict.fromkeys(shapes, 0.0), self.bb.shape[1])[1]
+            to = p.to_parameters[list(away)] @ free
+            normal = np.tensordot(self.solve(()).weight, self.bb, 1) + p.precision
+            spread = to @ solve_scaled(free.T @ normal @ free, to.T)
+            strengths = np.array(list(away.values()))
             known: Array = np.asarray(np.linalg.pinv(spread, hermitian=True), dtype=float)
-            own = penalise(known, p.spread[name], strengths, p.shapes[name])
+            own = penalise(known, p.spread[name], strengths, len(shapes))
             self._own_penalties[name] = float(own)
         return self._own_penalties[name]
 
@@ -362,8 +365,7 @@ class Search:
     def gains(self, keys: Sequence[Key]) -> Array:
         """What each place of the grid would take off the cost beside a set, at its weights."""
         known, p, nb = self.solve(keys), self.p, self.bb.shape[1]
-        pinned = [k for name, _ in keys if name[0] == "-" for k in p.absence[name[1:]]]
-        keys = added(tuple(sorted(keys)))
+        all_keys, keys = keys, added(tuple(sorted(keys)))
         weight = known.weight
         xx, _, places = self._sums(keys)
         n = xx.shape[1]
@@ -380,7 +382,7 @@ class Search:
         # As the set has been solved within bounds, from there.
         b = np.concatenate([known.base, *known.strengths])
         moment = moment - cross.T @ b
-        free = hold_parameters(p.to_parameters, dict.fromkeys(pinned, 0.0), n)[1]
+        free = self._free_of(all_keys, n)
         taken = free @ solve_scaled(free.T @ normal @ free, free.T @ cross)
         widest = self.own.shape[2]
         place = self.first[:, None] + np.minimum(np.arange(widest), self.widths[:, None] - 1)
@@ -486,7 +488,7 @@ class Search:
             return None
         count = sum(len(shape) for _, shape in keys)
         more = {a: c * self.p.likelihood.root[a][:, None] for a, c in slopes.items()}
-        solved = self._solve_with_shapes(keys, more, found, self.residual_rows(all_keys))
+        solved = self._solve_with_shapes(all_keys, more, found)
         moved, place = [], 0
         for name, shape in keys:
             step = np.clip(solved[place : place + len(shape)], -_FARTHEST, _FARTHEST)
@@ -504,17 +506,17 @@ class Search:
 
     def _solve_with_shapes(
         self,
-        keys: tuple[Key, ...],
+        all_keys: tuple[Key, ...],
         more: Mapping[int, Array],
         known: Solution,
-        left: Sequence[Array],
     ) -> Array:
         """Steps of the shapes, (d,), strengths and the model's own parameters moving along.
 
         Args:
-            keys: the set; known: its solution; left: weighted rows that it leaves, by axis.
+            all_keys: the set; known: its solution.
             more: weighted slopes by the shapes, by axis, each (n, d).
         """
+        keys, left = added(all_keys), self.residual_rows(all_keys)
         p, nb, weight = self.p, self.bb.shape[1], known.weight
         xx, xy, places = self._sums(keys)
         m, extra = xx.shape[1], next(iter(more.values())).shape[1]
@@ -534,7 +536,14 @@ class Search:
             normal[m:, m:] += w * (slopes.T @ slopes)
             right[m:] -= w * (slopes.T @ left[axis])
         normal[m:, :m] = normal[:m, m:].T
-        return solve_scaled(normal, right)[m:]
+        free = self._free_of(all_keys, m + extra)
+        step = free @ solve_scaled(free.T @ normal @ free, free.T @ right)
+        return np.asarray(step[m:])
+
+    def _free_of(self, keys: Sequence[Key], n: int) -> Array:
+        """Directions in which n unknowns may move while effects that a set takes away stay away."""
+        away = [place for name in gone(keys) for place in self.p.absence[name]]
+        return hold_parameters(self.p.to_parameters, dict.fromkeys(away, 0.0), n)[1]
 
     def shape_slopes(
         self, keys: Sequence[Key], strengths: Sequence[Array]

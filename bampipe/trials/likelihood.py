@@ -254,18 +254,25 @@ class Likelihood:
     def count_independent(self, problem: Problem, lags: int) -> tuple[Samples, ...]:
         """Count the samples of each axis that are independent in what a fit of the model leaves.
 
-        What a model lacks comes back with the motion, sample after sample; noise does not. There
-        are fewer independent samples by the sum of squared autocorrelations (Bartlett 1946, Journal
-        of the Royal Statistical Society, Supplement 8, 27), over that of replays.
+        What a model lacks comes back with the motion, sample after sample; noise does not, coloured
+        or white. For what goes with the motion, as the applied force does, there are fewer samples
+        by the sum of the products of both autocorrelations (Bartlett 1935, Journal of the Royal
+        Statistical Society 98, 536), over the largest that a replay has.
 
         Args:
             problem: the fit, its solution at zero; lags: the most that are summed.
         """
         solved, counted = problem.solve(), []
         for axis, here in enumerate(self.samples):
-            noise = (self.noise.residuals[axis] - self.noise.bias[axis]) * self.root[axis]
-            ours = _correlation(problem.y[axis] + problem.base[axis] @ solved.base, here, lags)
-            replays = float(np.median([_correlation(r, here, lags) for r in noise]))
+            root = self.root[axis]
+            force = _correlate(self.applied[axis] * root, here, lags)
+
+            def inflation(values: Array, at: Samples = here, force: Array = force) -> float:
+                return max(2.0 * float(_correlate(values, at, lags) @ force) - 1.0, 1e-3)
+
+            ours = inflation(problem.y[axis] + problem.base[axis] @ solved.base)
+            noise = (self.noise.residuals[axis] - self.noise.bias[axis]) * root
+            replays = max((inflation(values) for values in noise), default=1.0)
             counted.append(replace(here, independent=here.independent * min(replays / ours, 1.0)))
         return tuple(counted)
 
@@ -297,10 +304,10 @@ class Problem:
         precision, moment: of what is known of these beforehand, (P, P) and (P,).
         to_parameters: (n_all, P) from these to the free parameters, nuisance parameters last.
         lower, upper: bounds of the change of those, (n_all,).
-        absence: of each effect of the model, by the place of each of its strengths among the free
-            parameters, the change that takes it away.
-        spread: of each, the standard deviations of these strengths before any data; shapes: how
-            many parameters it has beside them.
+        absence: of each effect of the model, by the place of each of its parameters among the free
+            ones, the change that takes it away.
+        spread: of each, the standard deviations of these strengths before any data; shapes: the
+            places of the parameters that it has beside them.
         prior_cost: negative log density of what is known beforehand, where nothing changes.
     """
 
@@ -314,7 +321,7 @@ class Problem:
     upper: Array
     absence: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     spread: Mapping[str, Array] = field(default_factory=dict)
-    shapes: Mapping[str, int] = field(default_factory=dict)
+    shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     prior_cost: float = 0.0
 
     @property
@@ -340,8 +347,8 @@ class Problem:
         return solve_bounded(self, *self.sums())
 
 
-def _correlation(values: Array, samples: Samples, lags: int) -> float:
-    """Sum of the squared autocorrelation of values (n,) up to a lag, both ways, within trials."""
+def _correlate(values: Array, samples: Samples, lags: int) -> Array:
+    """Autocorrelation of values (n,) within trials, (lags + 1,); one and zeros of nothing."""
     total = np.zeros(lags + 1)
     for trial in np.unique(samples.trial):
         here = samples.trial == trial
@@ -349,13 +356,10 @@ def _correlation(values: Array, samples: Samples, lags: int) -> float:
         series = np.zeros(int(np.ptp(rows)) + 1)
         series[rows - rows[0]] = values[here]
         size = 2 * len(series)
-        found = np.fft.irfft(np.abs(np.fft.rfft(series, size)) ** 2, size)[: len(series)][
-            : lags + 1
-        ]
+        found = np.fft.irfft(np.abs(np.fft.rfft(series, size)) ** 2, size)
+        found = found[: min(len(series), lags + 1)]
         total[: len(found)] += found
-    if not total[0] > 0.0:
-        return 1.0
-    return float(2.0 * np.sum((total / total[0]) ** 2) - 1.0)
+    return np.asarray(total / total[0]) if total[0] > 0.0 else np.eye(1, lags + 1)[0]
 
 
 def _error_of_turning(evidence: Evidence) -> list[Array]:
@@ -431,7 +435,7 @@ def _pose(
         to.T @ (precision[:, None] * to), to.T @ (precision * known), to, lower, upper,
         {item.name: _absence(evidence, item) for item in effects},
         {item.name: _spread(item) for item in effects},
-        {i.name: sum(q.shape for q in i.parameters) for i in effects},
+        {item.name: _shapes(evidence, item) for item in effects},
         0.5 * float(precision @ known**2),
     )  # fmt: skip
 
@@ -440,13 +444,21 @@ def _spread(item: BoundEffect) -> Array:
     return np.array([q.sd for q in item.parameters if q.strength and not q.fixed])
 
 
+def _shapes(evidence: Evidence, item: BoundEffect) -> tuple[int, ...]:
+    names = {q.name for q in item.parameters if q.shape}
+    parameters = evidence.system.parameters
+    return tuple(k for k, number in enumerate(evidence.free) if parameters[number].name in names)
+
+
 def _absence(evidence: Evidence, item: BoundEffect) -> dict[int, float]:
     strengths = {q.name for q in item.parameters if q.strength}
-    return {
+    away = {
         place: -float(evidence.p[number])
         for place, number in enumerate(evidence.free)
         if evidence.system.parameters[number].name in strengths
     }
+    # Without its strength a shape says nothing: it does not move to where it was expected.
+    return away | dict.fromkeys(_shapes(evidence, item), 0.0)
 
 
 @dataclass(frozen=True)

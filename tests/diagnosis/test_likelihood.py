@@ -159,10 +159,10 @@ def test_a_few_samples_that_no_replay_has_do_not_decide_under_heavy_tails(line):
 
 
 def test_what_comes_back_with_the_motion_counts_as_few_independent_samples(fitted):
-    """White noise keeps its samples; a slow wave of the same size is a few of them."""
+    """Noise keeps its samples, white or a hum; what goes as the applied force is a few of them."""
     _, fit = fitted
     like = fit.likelihood
-    rows = [s.rows for s in like.samples]
+    forces = [f * root for f, root in zip(like.applied, like.root, strict=True)]
 
     def counted(y):
         problem = replace(fit.problem, y=tuple(y), base=tuple(0.0 * b for b in fit.problem.base))
@@ -174,4 +174,5 @@ def test_what_comes_back_with_the_motion_counts_as_few_independent_samples(fitte
         for r, b, root in zip(like.noise.residuals, like.noise.bias, like.root, strict=True)
     ]
     assert np.all(counted(replay) > 0.8 * before)
-    assert np.all(counted([np.sin(0.02 * r) for r in rows]) < 0.1 * before)
+    assert np.all(counted([np.cos(2.5 * s.rows) for s in like.samples]) > 0.8 * before)
+    assert np.all(counted(forces) < 0.3 * before)

@@ -107,10 +107,6 @@ def test_inputs_that_are_read_half_a_sample_late_give_no_delay(record):
 TWIN = "other_thinning"
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="an effect of the fitted model is taken away for less than its twin has to pay",
-)
 def test_twins_are_undecided_and_their_probabilities_sum_to_one(record):
     """An effect, and a file of a user's that says the same under another name."""
     trials, recipe = record("joint", 41, "shear_thinning:joint")
