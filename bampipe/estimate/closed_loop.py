@@ -43,7 +43,7 @@ class _Controller(NamedTuple):
 _CONTROLLER = record_type(_Controller, int64[::1], int64, _V, _M, _V, _V, _V, _V)
 
 
-@njit(void(COMMAND, _CONTROLLER, _V, _V, float64), cache=True)
+@njit(void(COMMAND, _CONTROLLER, _V, _V, float64), cache=True, no_cpython_wrapper=True)
 def _act(command, controller, y, r, dt):  # type: ignore[no-untyped-def]
     """Command from readings and references, and advance the states of the controller by ``dt``."""
     states, limits, out = controller.states, controller.limits, controller.out

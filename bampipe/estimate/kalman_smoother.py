@@ -64,7 +64,7 @@ def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
     return float((2.0 * np.pi * bandwidth_hz / rate_hz) ** (2 * order))
 
 
-@njit(void(_V, _M, _M, _M, _M), cache=True)
+@njit(void(_V, _M, _M, _M, _M), cache=True, no_cpython_wrapper=True)
 def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None:
     """Advance state ``x`` (n,) and covariance ``p`` (n, n) by one sample, in place."""
     n = x.shape[0]
@@ -88,7 +88,11 @@ def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None
             p[j, i] = total
 
 
-@njit("UniTuple(float64, 2)(float64[::1], float64[:, ::1], float64, float64[::1])", cache=True)
+@njit(
+    "UniTuple(float64, 2)(float64[::1], float64[:, ::1], float64, float64[::1])",
+    cache=True,
+    no_cpython_wrapper=True,
+)
 def _update(x: Array, p: Array, y: float, gain: Array) -> tuple[float, float]:
     """Take in one sample ``y`` of noise 1, in place; return innovation and its variance."""
     n = x.shape[0]

@@ -71,6 +71,7 @@ def allocate_points(nx: int, nu: int, p: Array, nw: int) -> Array:
 @njit(
     void(_V, int64, float64, float64, _V, int64, int64, int64, int64, int64),
     cache=True,
+    no_cpython_wrapper=True,
     fastmath={"contract"},
 )
 def _spread(out, offset, centre, reach, root, n, pairs, first, count, padded):  # type: ignore[no-untyped-def]
@@ -86,6 +87,7 @@ def _spread(out, offset, centre, reach, root, n, pairs, first, count, padded):  
 @njit(
     void(ESTIMATED, _V, _M, float64, int64, int64, int64, int64, _V),
     cache=True,
+    no_cpython_wrapper=True,
     fastmath={"contract"},
 )
 def _spread_parameters(estimated, mean, factor, reach, pairs, first, count, padded, p):  # type: ignore[no-untyped-def]
@@ -110,6 +112,7 @@ def _spread_parameters(estimated, mean, factor, reach, pairs, first, count, padd
 @njit(
     void(DERIVATIVE_ROWS, int64, int64, int64, float64, int64, _M),
     cache=True,
+    no_cpython_wrapper=True,
     fastmath={"contract"},
 )
 def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, points):  # type: ignore[no-untyped-def]
@@ -155,6 +158,7 @@ def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, points):  # type:
 @njit(
     void(DERIVATIVE_ROWS, ESTIMATED, _V, _M, float64, _V, _V, _V, _V, _V, float64, int64, _M, _M),
     cache=True,
+    no_cpython_wrapper=True,
 )
 def propagate_points(  # type: ignore[no-untyped-def]
     derivative,
@@ -224,7 +228,9 @@ def propagate_points(  # type: ignore[no-untyped-def]
                 images[i, first + r] = x[i * ROWS + r]
 
 
-@njit(void(MEASURE_ROWS, ESTIMATED, _V, _M, float64, _V, _M, _M), cache=True)
+@njit(
+    void(MEASURE_ROWS, ESTIMATED, _V, _M, float64, _V, _M, _M), cache=True, no_cpython_wrapper=True
+)
 def measure_points(measure, estimated, mean, factor, reach, u, images, points):  # type: ignore[no-untyped-def]
     """Draw sigma points of (state, parameters) afresh and take the measurement of each.
 

@@ -23,7 +23,12 @@ def padded(n: int) -> int:
     return (n + _LANES - 1) // _LANES * _LANES
 
 
-@njit(boolean(float64[:, ::1], float64[:, ::1]), cache=True, fastmath=_REASSOCIATE)
+@njit(
+    boolean(float64[:, ::1], float64[:, ::1]),
+    cache=True,
+    no_cpython_wrapper=True,
+    fastmath=_REASSOCIATE,
+)
 def cholesky(covariance, factor):  # type: ignore[no-untyped-def]
     """Write the lower Cholesky factor of ``covariance`` (n, n) into ``factor`` (n, n).
 
@@ -154,7 +159,7 @@ def condition(upper, noise, cross, gain, cosine, sine):  # type: ignore[no-untyp
                 noise[k, i] = s * old + c * noise[k, i]
 
 
-@njit(void(float64[:, ::1], int64, float64[::1]), cache=True)
+@njit(void(float64[:, ::1], int64, float64[::1]), cache=True, no_cpython_wrapper=True)
 def forward_substitute(factor, n, vector):  # type: ignore[no-untyped-def]
     """Replace ``vector`` (>= n,) by L^-1 vector, L the leading (n, n) block of ``factor``."""
     for i in range(n):
@@ -199,7 +204,7 @@ def rank_one_update(upper, n, sign, vector):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(void(float64[:, ::1], float64[:, ::1]), cache=True)
+@njit(void(float64[:, ::1], float64[:, ::1]), cache=True, no_cpython_wrapper=True)
 def transpose(upper, factor):  # type: ignore[no-untyped-def]
     """Write the transpose of the upper triangular R (n, >= n) into ``factor`` (n, n)."""
     n = upper.shape[0]

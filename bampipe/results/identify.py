@@ -22,7 +22,7 @@ class ParameterEstimate(Record):
     at_bound: bool = Field(description="Within one sd of its physical bound")
     filter_sd: Size | None = Field(
         default=None,
-        description="What the filter alone believes, which holds for white noise only",
+        description="Of the filter alone, valid for white noise only",
     )
     systematic_sd: Size | None = Field(
         default=None,
@@ -76,7 +76,7 @@ class MethodTried(Record):
         description="Parameters that lie farther from the published ones than twice the "
         "uncertainty of both",
     )
-    doubts: Names = Field(default=(), description="Why it may not be believed")
+    doubts: Names = Field(default=(), description="Reasons to distrust it")
 
 
 class WorstSecond(Record):
@@ -88,9 +88,7 @@ class WorstSecond(Record):
     move: float = Field(
         description="Change of it without that second, in standard deviations that the rest leaves"
     )
-    sentence: str = Field(
-        default="", description="In words, where it stands out as a transient or an outlier does"
-    )
+    sentence: str = Field(default="", description="In words, if it is a transient or an outlier")
 
 
 class Influence(Record):
@@ -188,7 +186,7 @@ class NoiseLevels(Record):
 
 
 class Convergence(Record):
-    """Whether the search, or the filter along the data, came to rest."""
+    """Whether the search, or the filter along the data, converged."""
 
     converged: bool
     iterations: Count | None = Field(default=None, description="Of least squares")
@@ -201,7 +199,7 @@ class Convergence(Record):
 
 
 class ParameterBound(Record):
-    """bound_sd; alone_sd, were all others known; partner whose error goes with it."""
+    """bound_sd; alone_sd if all others were known; partner with the most correlated error."""
 
     bound_sd: Size | None
     alone_sd: Size | None
@@ -218,7 +216,7 @@ class WeakDirection(Record):
 
 
 class DeviceNumber(Record):
-    """A constant of the device file, or a sum of them, were it estimated too."""
+    """A constant of the device file, or a sum of them, as if it were estimated too."""
 
     name: str
     value: float
@@ -247,7 +245,7 @@ class TrialGrowth(Record):
 
 
 class IdentifiabilityReport(Record):
-    """What these trials could say of each number, at best."""
+    """The least uncertainty of each number that these trials allow."""
 
     parameters: dict[str, ParameterBound]
     weak_directions: tuple[WeakDirection, ...]
@@ -258,7 +256,7 @@ class IdentifiabilityReport(Record):
 
 
 class BaseEstimate(Record):
-    """A combination of a robot's inertial numbers that motion shows, and no part of it alone."""
+    """A combination of a robot's inertial numbers that motion determines, but no part of it."""
 
     combination: str = Field(description="Of the names of parameters, with factors")
     members: Names
@@ -267,7 +265,7 @@ class BaseEstimate(Record):
     drawn: float = Field(description="By the numbers of the drawing")
     drawn_sd: Size
     unit: str
-    shown: bool = Field(description="Whether the trials say more of it than the drawing")
+    shown: bool = Field(description="Whether the trials determine it better than the drawing")
 
 
 class IdentifyResult(Result):
@@ -279,9 +277,7 @@ class IdentifyResult(Result):
     model: str
     headline: str
     method: Method = Field(description="That of the published parameters")
-    methods: dict[Method, MethodTried] = Field(
-        description="Every method tried, the published one first"
-    )
+    methods: dict[Method, MethodTried] = Field(description="Every method tried, published first")
     engine: Literal["compiled", "filterpy"]
     trials: Names = Field(description="Free trials used")
     parameters: dict[str, ParameterEstimate] = Field(
@@ -306,7 +302,7 @@ class IdentifyResult(Result):
         description="Width of the smoothed sign of the velocities over the device's `sign_width`: "
         "less where the trials of a test bench are likelier so. What is made of the model has it",
     )
-    notes: Names = Field(default=(), description="What to know before believing a number")
+    notes: Names = Field(default=(), description="Limits of the estimates")
     nis: Consistency | None = None
     innovations: dict[str, InnovationTests] | None = Field(default=None, description="By axis")
     noise: NoiseLevels | None = None
@@ -320,13 +316,11 @@ class IdentifyResult(Result):
     blocks: Annotated[int, Field(ge=1)] | None = Field(
         default=None, description="Independent blocks of time"
     )
-    restarts: Count | None = Field(
-        default=None, description="Searches before the filter held on to the motion"
-    )
+    restarts: Count | None = Field(default=None, description="Searches until the filter followed")
 
     @property
     def inertial(self) -> frozenset[str]:
-        """Inertial numbers of a robot's bodies, of which motion shows combinations only."""
+        """Inertial numbers of a robot's bodies, of which motion determines only combinations."""
         return frozenset(name for base in self.base_parameters or () for name in base.members)
 
     repeats: Count | None = Field(

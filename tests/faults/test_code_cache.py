@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import os
 import subprocess
@@ -17,6 +18,7 @@ import numpy as np
 import pytest
 from numba.core import caching
 
+import bampipe
 from bampipe import compiled, generated_code
 from bampipe.errors import InputError
 from bampipe.physics import registry
@@ -161,6 +163,7 @@ def test_without_a_folder_every_process_compiles_for_itself(
 COMPILE = """
 import sys, time
 sys.path.insert(0, {folder!r})
+import bampipe
 from bampipe import compiled, generated_code
 save = compiled._Cache.save_overload
 def slow_save(self, *given):
@@ -321,3 +324,36 @@ def test_a_read_only_home_needs_one_line(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1 and "BAMPIPE_CACHE_DIR" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_no_kernel_without_an_entry_from_python_is_called_from_python():
+    """Such a call would end the process: numba leaves a null pointer in that place."""
+    trees = {
+        path: ast.parse(path.read_text(encoding="utf-8"))
+        for path in Path(bampipe.__file__).parent.rglob("*.py")
+    }
+    functions = [
+        (path, node, " ".join(map(ast.unparse, node.decorator_list)))
+        for path, tree in trees.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+    ]
+    without = {
+        (p.stem, node.name) for p, node, how in functions if "no_cpython_wrapper=True" in how
+    }
+    assert len(without) > 5
+    for path, node, how in functions:
+        known = {name for home, name in without if home == path.stem} | {
+            alias.name
+            for one in ast.walk(trees[path])
+            if isinstance(one, ast.ImportFrom)
+            for alias in one.names
+            if ((one.module or "").rpartition(".")[2], alias.name) in without
+        }
+        if "njit" not in how:
+            called = {
+                call.func.id
+                for call in ast.walk(node)
+                if isinstance(call, ast.Call) and isinstance(call.func, ast.Name)
+            }
+            assert not called & known, f"{path.name}: {node.name}"
