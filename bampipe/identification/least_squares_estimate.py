@@ -39,6 +39,9 @@ from bampipe.trials.residuals import problem_of
 Array = NDArray[np.float64]
 
 _REPLICATES = 6
+_LACKING = 3.0
+"""What is left over what sensors, filters and the discrepancy explain, from which on weights by
+these say nothing: a verdict has it that something unknown remains there."""
 _PASSES = 3
 """Most fits of a model that is nonlinear in its parameters, each with replicates of the last."""
 _SETTLED = 0.3
@@ -47,6 +50,9 @@ _FARTHEST = 3.0
 """Standard deviations that a nonlinear fit moves at most where a trial is left out."""
 _PERIODS = 10
 """Periods of the band in the shortest block that is taken as independent of the next."""
+_TAILED = 0.75
+"""Slope of the score of a sample under Student's t distribution over its weight, on average over
+normal errors, four degrees of freedom: as weights follow the errors, they overstate information."""
 _STRETCH_S = 1.0
 _STATES = 500_000
 """Samples, spread over all, that the typical uncertainty of a state is taken from."""
@@ -145,9 +151,10 @@ class SquaresFit:
         inverse = invert_scaled(self.normal)
         fitted = float(np.trace(inverse @ (self.normal - pose.precision)))
         samples = lay_out_samples(self.fit.evidence, self._block_length(fitted))
-        found = covariance_by_blocks(
-            self.rows, pose.precision, [s.block for s in samples], [s.independent for s in samples]
-        )
+        tailed = [_TAILED if np.ptp(root) > 0.0 else 1.0 for root in self.fit.likelihood.root]
+        rows = [(x, left / by) for (x, left), by in zip(self.rows, tailed, strict=True)]
+        independent = [s.independent * by**2 for s, by in zip(samples, tailed, strict=True)]
+        found = covariance_by_blocks(rows, pose.precision, [s.block for s in samples], independent)
         to = pose.to_parameters[: self.free.size]
         return np.asarray(to @ found @ to.T)
 
@@ -234,13 +241,14 @@ def fit_squares(
     system: System,
     start: Array,
     block_s: float,
+    remove_bias: bool = True,
 ) -> SquaresFit:
     """Fit a model under the likelihood.
 
     Args:
         trials: to be fitted, whose `timing` says how late inputs may be.
         recipe, system: the model; start: (n_p,) parameters to start from.
-        block_s: as of `SquaresFit`.
+        block_s: as of `SquaresFit`; remove_bias: whether replicates give weights and bias.
 
     Raises:
         ValueError: fewer samples are clear of standstill than there are parameters.
@@ -252,8 +260,10 @@ def fit_squares(
     problem = problem_of(system, trials.motions, trials.band, timing=trials.timed)
     at, found = plain.p, None
     with suppress(Runaway):
-        for _ in range(1 if problem.linear else _PASSES):
-            again = _with_values(session.fit(recipe, at), trials, problem, block_s)
+        for _ in range(0 if not remove_bias else 1 if problem.linear else _PASSES):
+            again = _with_values(
+                session.fit(recipe, at, lacking=_LACKING), trials, problem, block_s
+            )
             settled = found is not None and _is_settled(found, again)
             found, at = again, again.fit.evidence.p
             if settled:
@@ -323,7 +333,8 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
 
 def require_enough(squares: SquaresFit, where: str) -> None:
     """Raise :class:`InputError` where fewer than two independent samples a number would count."""
-    moving = int(sum(here.independent for here in squares.fit.likelihood.samples))
+    samples = lay_out_samples(squares.fit.evidence, squares.block_s)
+    moving = int(sum(here.independent for here in samples))
     if moving < 2 * squares.free.size:
         raise InputError(
             f"of the free trials, {moving} independent samples are clear of standstill, fewer than"

@@ -61,8 +61,8 @@ _LATEST = 8
 """Samples by which a drive may act after its log says so, or be read after it acts: its jumps then
 stand in the log before or behind those of friction."""
 _FEW_REVERSALS = 5
-_PROBED = 300
-"""Samples of a trial at which the steps of integration are counted."""
+_PROBED, _FEW = 300, 50
+"""Samples of a trial at which the steps of integration are counted; to tell ten from one, a few."""
 LONGEST_STEP_S = 2.5e-4
 _STIFFEST = 10.0
 """Steps of integration over those of `LONGEST_STEP_S` from which on friction holds a machine so
@@ -154,7 +154,7 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
             force=columns,
             rate=[at.get(derivative(f, 1), -1) for f in forces],
             curvature=[at.get(derivative(f, 2), -1) for f in forces],
-            smooth=system.forced,
+            smooth=system.forced, moved_first=system.moved_first,
         )  # fmt: skip
     except Runaway:
         if not _is_controlled(system):
@@ -169,13 +169,17 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
 
 
 def steps_to_follow(
-    system: System, p: Array, motion: Motion, longest_step_s: float = LONGEST_STEP_S
+    system: System,
+    p: Array,
+    motion: Motion,
+    longest_step_s: float = LONGEST_STEP_S,
+    probed: int = _PROBED,
 ) -> float:
     """Steps of integration that a model takes along a motion, from sample to sample on average."""
     u = motion.inputs(system.inputs)
     true = motion.of_mechanism(system, u, p)
     memory = system.memory(*true.kinematics, u, p, true.t)
-    rows = slice(None, None, -(-len(u) // _PROBED))
+    rows = slice(None, None, -(-len(u) // probed))
     return count_steps(
         system.derivative, np.hstack([true.q, true.qd, memory])[rows], u[rows],
         np.ascontiguousarray(p), float(motion.t[1] - motion.t[0]),
@@ -237,7 +241,7 @@ def _is_motion_given(fitted: ModelOnTrial, u: Array) -> bool:
 def is_stiff(system: System, p: Array, motion: Motion) -> bool:
     """Whether friction would stop a machine within a small part of a sample, all along a motion."""
     usual = max(float(motion.t[1] - motion.t[0]) / LONGEST_STEP_S, 1.0)
-    return steps_to_follow(system, p, motion) > _STIFFEST * usual
+    return steps_to_follow(system, p, motion, probed=_FEW) > _STIFFEST * usual
 
 
 def _is_controlled(system: System) -> bool:
@@ -447,9 +451,11 @@ def _reference(
     Where play or wind-up lies between encoder and handle, the handle's motion is the encoder's
     plus what the model puts between them. That jumps where a gap is crossed, a little before or
     after the logged jump; a handle with inertia does not follow the difference of the two.
+    Where the force moves a part first that an internal state follows, it is that state.
     """
     if not system.moves_sensors:
-        return motion.q, motion.qd
+        x = np.hstack([motion.q, motion.qd, system.memory(*motion.kinematics, u, p, motion.t)])
+        return x[:, system.moved_first[:, 0]], x[:, system.moved_first[:, 1]]
     q = motion.q + system.offset(motion.q, u, p)
     smooth = [zero_phase(column, rate_hz, min(FOLLOWED_HZ, 0.2 * rate_hz)) for column in q.T]
     return np.column_stack([c[0] for c in smooth]), np.column_stack([c[1] for c in smooth])
