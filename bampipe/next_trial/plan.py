@@ -10,7 +10,7 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.next_trial.choice import Tried
+from bampipe.next_trial.choice import RankedDesign
 from bampipe.next_trial.discrimination import Sums
 from bampipe.next_trial.forecast import Forecast, describe_moves
 from bampipe.next_trial.precision import Expected
@@ -35,7 +35,7 @@ class Goal:
 
     Attributes:
         sd: most standard deviation of each parameter, (n,); infinite where nothing is asked.
-        confusion: most chance of confusing two rivals.
+        confusion: most chance of confusing two alternatives.
     """
 
     sd: Array
@@ -67,7 +67,7 @@ class TrialPlan:
     Attributes:
         designs: what to do.
         sd: standard deviations expected in the end.
-        confusion: chance of confusing each pair of rivals in the end.
+        confusion: chance of confusing each pair of alternatives in the end.
         is_enough: whether the goal is reached.
         is_full: whether more trials would bring it nearer, and there are only too many already.
     """
@@ -79,13 +79,13 @@ class TrialPlan:
     is_full: bool
 
 
-def plan_trials(forecast: Forecast, tried: Sequence[Tried], goal: Goal) -> TrialPlan:
+def plan_trials(forecast: Forecast, ranked: Sequence[RankedDesign], goal: Goal) -> TrialPlan:
     """Choose trials greedily until the goal is reached, then leave out and shorten what can be.
 
     Args:
-        forecast: of what trials give; tried: the designs to choose from; goal: what is asked.
+        forecast: of what trials give; ranked: the designs to choose from; goal: what is asked.
     """
-    options = [_option(forecast, one) for one in tried]
+    options = [_option(forecast, one) for one in ranked]
     chosen: list[_Option] = []
     outcome, is_full = _at_hand(forecast), False
     is_enough = _distance(outcome, goal) <= 0.0
@@ -131,17 +131,19 @@ def _shortest(design: Primitive) -> float:
     return design.parts * max(_SHORTEST_S, FEWEST_STROKES * stroke_s)
 
 
-def _option(forecast: Forecast, tried: Tried) -> _Option:
+def _option(forecast: Forecast, ranked: RankedDesign) -> _Option:
     """A design by the version whose information is the median one."""
-    added = forecast.added_by(tried)
+    added = forecast.added_by(ranked)
     order = np.argsort([forecast.precision.gain(one) for one in added])
     middle = int(order[(len(order) - 1) // 2])
-    sums = forecast.contest.sums([tried.usual[middle]]) if forecast.contest else None
-    return _Option(tried.design, added[middle], sums)
+    sums = (
+        forecast.comparison.sums([ranked.expected_motions[middle]]) if forecast.comparison else None
+    )
+    return _Option(ranked.design, added[middle], sums)
 
 
 _Outcome = tuple[Expected, dict[tuple[int, int], float]]
-"""Standard deviations, and the chance of confusing each pair of rivals."""
+"""Standard deviations, and the chance of confusing each pair of alternatives."""
 
 
 def _at_hand(forecast: Forecast) -> _Outcome:
@@ -160,11 +162,11 @@ def _outcome(forecast: Forecast, chosen: Sequence[_Option]) -> _Outcome:
 
 
 def _confusion(forecast: Forecast, chosen: Sequence[_Option]) -> dict[tuple[int, int], float]:
-    contest = forecast.contest
-    if contest is None:
+    comparison = forecast.comparison
+    if comparison is None:
         return {}
-    sums = reduce(add, (one.sums for one in chosen if one.sums is not None), contest.at_hand)
-    return contest.confusions(contest.contrasts(sums))
+    sums = reduce(add, (one.sums for one in chosen if one.sums is not None), comparison.at_hand)
+    return comparison.confusions(comparison.contrasts(sums))
 
 
 def _distance(outcome: _Outcome, goal: Goal) -> float:
@@ -180,19 +182,19 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
     units = {q.name: q.unit for q in system.parameters}
     seconds = sum(design.seconds for design in found.designs)
     confusion: tuple[PlannedConfusion, ...] = ()
-    contest = forecast.contest
-    if contest is not None:
-        now, rivals = contest.confusions(contest.now), contest.rivals
+    comparison = forecast.comparison
+    if comparison is not None:
+        now, alternatives = comparison.confusions(comparison.now), comparison.alternatives
         confusion = tuple(
             PlannedConfusion(
-                between=tuple(rivals[k].name for k in pair),
+                between=tuple(alternatives[k].name for k in pair),
                 before=now[pair],
                 after=after,
             )
             for pair, after in found.confusion.items()
         )
     return Plan(
-        sentence=_sentence(found, seconds, "uncertainties" if contest is None else "confusion"),
+        sentence=_sentence(found, seconds, "uncertainties" if comparison is None else "confusion"),
         seconds=seconds,
         is_enough=found.is_enough,
         trials=tuple(
@@ -205,7 +207,7 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
             for design, times in _counted(found.designs)
         ),
         sd={}
-        if contest is not None
+        if comparison is not None
         else {
             name: PlannedSd(
                 before=precision.sd[k],

@@ -207,6 +207,10 @@ class Precision:
         taken = max(blocks, 2 * self._fitted)
         return float(np.sqrt(taken / (taken - self._fitted)))
 
+    def worth_of(self, motion: Motion, parameter: str = "") -> float:
+        """`worth` of one trial."""
+        return self.worth(self.of_motion(motion), float(motion.t[-1]), parameter)
+
     def worth(self, added: Array, seconds: float, parameter: str = "") -> float:
         """What trials are worth, nats: for one parameter, or where none is named for all.
 

@@ -15,18 +15,18 @@ Purpose = Literal["precision", "decision", "sensitivity"]
 that the trials at hand would not have shown."""
 
 NOTHING = "nothing missing"
-"""Name of the rival that no effect is missing."""
+"""Name of the alternative that no effect is missing."""
 AS_FORECAST = 1.3
 """Factor within which an uncertainty came as forecast."""
 
 
-def join_rival(effects: Iterable[str]) -> str:
-    """The name of effects that together are one rival."""
+def join_effects(effects: Iterable[str]) -> str:
+    """The name of effects that together are one alternative."""
     return " + ".join(effects) or NOTHING
 
 
-def split_rival(name: str) -> set[str]:
-    """The effects of a rival that is called so by `join_rival`."""
+def split_effects(name: str) -> set[str]:
+    """The effects of an alternative that is called so by `join_effects`."""
     return {*name.split(" + ")} - {NOTHING}
 
 
@@ -62,7 +62,7 @@ class ExpectedSd(Record):
 
 
 class ExpectedConfusion(Record):
-    """Chance of taking one rival for another."""
+    """Chance of taking one alternative for another."""
 
     between: Names = Field(description="Each by its effects, joined by +")
     weight: Share = Field(description="Box-Hill weight of the pair: product of the odds")

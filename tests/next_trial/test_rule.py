@@ -8,17 +8,21 @@ import numpy as np
 import pytest
 from diagnosis.sessions import TRUTH, bam, made
 
-from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.criteria import Criteria, most_probable
 from bampipe.diagnosis.dictionary import Dictionary, Key
+from bampipe.diagnosis.probability import chance_of, least_gain
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.session import Fit, Session, candidates_of
-from bampipe.next_trial.sensitivity import find_blindness, find_needed
-from bampipe.next_trial.suggestion import find_ambiguity, make_contest, suggest_trial
+from bampipe.next_trial.sensitivity import find_detectability, find_needed
+from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity, suggest_trial
 from bampipe.trials.folds import Folds
 from bampipe.trials.measured import MeasuredTrials
 
-NAMES = ("quadratic_drag:yaw", "return_spring:pitch", "force_bias:z", "shear_thinning:yaw")
+NAMES = (
+    "quadratic_drag:yaw", "return_spring:pitch", "force_bias:z", "shear_thinning:yaw",
+    "force_gain:z",
+)  # fmt: skip
 CRITERIA = Criteria()
 
 
@@ -53,16 +57,16 @@ def key_of(dictionary: Dictionary, name: str, values) -> Key:
 
 
 def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_it(session, fit):
-    blindness = find_blindness(session, fit)
-    found = {one.rival.name: one for one in blindness.found}
-    assert blindness.needed == find_needed(CRITERIA, len(session.candidate_names(fit.recipe)))
-    noise, scale = fit.likelihood.noise, blindness.contest.scale
+    detectability = find_detectability(session, fit)
+    found = {one.alternative.name: one for one in detectability.limits}
+    assert detectability.needed == find_needed(CRITERIA, len(session.candidate_names(fit.recipe)))
+    noise, scale = fit.likelihood.noise, detectability.comparison.scale
     plain = search_beside(fit, noise.bias)
     # Of the whole library each is less probable beforehand than of these few.
-    enough = blindness.needed + plain.log_prior
+    enough = detectability.needed + plain.log_prior
     for name in NAMES:
         one = found[name]
-        values = one.rival.values[0]
+        values = one.alternative.values[0]
         key = key_of(plain.dictionary, name, values)
         plain.ensure([key])
         atom = plain.atoms[key]
@@ -82,6 +86,18 @@ def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_
             shares.append(np.mean(is_found))
         assert shares[0] <= 0.1, name
         assert shares[1] >= 0.9, name
+
+
+@pytest.mark.parametrize("count", [12, 400])
+def test_what_is_needed_is_what_the_rule_of_the_diagnosis_takes(count):
+    by_chance = np.random.default_rng(0).gumbel(-3.0, 2.0, count)
+    least = least_gain(CRITERIA, by_chance)
+    for gain, is_missing in ((least - 0.01, False), (least + 0.01, True)):
+        surely = most_probable(chance_of(gain, by_chance)) >= CRITERIA.probability
+        assert (surely and gain > np.log(9.0)) == is_missing
+    assert least_gain(CRITERIA) == pytest.approx(np.log(9.0))
+    # No dozen of replays makes anything that sure.
+    assert least_gain(Criteria(probability=0.9999), by_chance) == np.inf
 
 
 def made_diagnosis(sets, verdict="undecided") -> SimpleNamespace:
@@ -111,12 +127,15 @@ def test_a_trial_is_suggested_that_tells_apart_what_small_motion_does_not():
     session = Session(trials, CRITERIA)
     final = session.fit(recipe, np.array([*TRUTH.values(), 0.6]))
     asked = made_diagnosis([(("quadratic_drag:yaw",), 0.6), (("stribeck:yaw",), 0.4)])
-    contest = make_contest(session, final, find_ambiguity(asked, CRITERIA))
-    assert [rival.name for rival in contest.rivals] == ["quadratic_drag:yaw", "stribeck:yaw"]
-    assert contest.confusions(contest.now) == {(0, 1): pytest.approx(0.4)}
+    comparison = compare_alternatives(session, final, find_ambiguity(asked, CRITERIA))
+    assert [alternative.name for alternative in comparison.alternatives] == [
+        "quadratic_drag:yaw",
+        "stribeck:yaw",
+    ]
+    assert comparison.confusions(comparison.now) == {(0, 1): pytest.approx(0.4)}
     # Twice the trials at hand leave twice the distance: nothing else is in a likelihood.
-    twice = contest.contrasts(contest.at_hand.scaled(2.0))[0, 1].distance
-    assert twice == pytest.approx(2.0 * contest.now[0, 1].distance, rel=0.05)
+    twice = comparison.contrasts(comparison.at_hand.scaled(2.0))[0, 1].distance
+    assert twice == pytest.approx(2.0 * comparison.now[0, 1].distance, rel=0.05)
     found = suggest_trial(session, final, asked)
     assert found is not None
     assert found.axis == "yaw"
