@@ -131,20 +131,14 @@ class Dictionary:
             for k in range(next(iter(found.values())).shape[1])
         ):
             return None
-        return Atom(found, *self.find_volume(item, values))
-
-    def find_volume(self, item: Candidate, values: Array) -> tuple[dict[int, Array], Array]:
-        """What a candidate takes off the measured quantity: `Atom.slopes` and `Atom.log_gain`.
-
-        Args:
-            item: the candidate; values: of its searched parameters.
-        """
         system, nothing = item.system, np.zeros(len(self.samples))
+        filters = not item.linear_indices and system.model.effects[-1].effect.kind == "input"
         if system.driven:
-            return self._slopes(item, values), nothing
-        if not item.linear_indices and system.model.effects[-1].effect.kind == "input":
-            return {}, self._log_gain(item, self._parameters(item, values, np.zeros(0)))
-        return {}, nothing
+            return Atom(found, self._slopes(item, values), nothing)
+        if filters:
+            p = self._parameters(item, values, np.zeros(0))
+            return Atom(found, {}, self._log_gain(item, p))
+        return Atom(found, {}, nothing)
 
     def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
         """`make` each."""

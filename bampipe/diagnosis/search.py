@@ -312,7 +312,10 @@ class Search:
             for axis, slope in atom.slopes.items():
                 moved[axis] = moved.get(axis, 0.0) + slope @ b
         for axis, slope in moved.items():
-            found[axis] = found[axis] + log_slope_left(self.p.likelihood.slopes[axis], slope)
+            plain = self.p.likelihood.slopes[axis]
+            bare = np.linalg.norm(plain, axis=1)
+            share = np.linalg.norm(plain + slope, axis=1) / np.where(bare > 0.0, bare, 1.0)
+            found[axis] = found[axis] + np.where(bare > 0.0, np.log(np.maximum(share, 1e-3)), 0.0)
         return found
 
     def penalty_of(self, keys: Sequence[Key]) -> float:
@@ -644,17 +647,6 @@ def penalise(information: Array, spread: Array, strengths: Array, shapes: int) -
     scaled = information * wide[..., :, None] * wide[..., None, :]
     found = 0.5 * np.linalg.slogdet(np.eye(len(information)) + scaled)[1]
     return np.asarray(found + _A_SHAPE * shapes)
-
-
-def log_slope_left(plain: Array, added: Array) -> Array:
-    """Log of what is left of the slope by the measured force, (n,), where ``added`` joins it.
-
-    Args:
-        plain, added: slopes, (n, n_forces).
-    """
-    bare = np.linalg.norm(plain, axis=1)
-    share = np.linalg.norm(plain + added, axis=1) / np.where(bare > 0.0, bare, 1.0)
-    return np.where(bare > 0.0, np.log(np.maximum(share, 1e-3)), 0.0)
 
 
 def added(keys: Sequence[Key]) -> tuple[Key, ...]:

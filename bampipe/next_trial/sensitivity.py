@@ -13,10 +13,9 @@ from scipy.stats import norm
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_residual
 from bampipe.diagnosis.criteria import Criteria
-from bampipe.diagnosis.dictionary import Dictionary
 from bampipe.diagnosis.probability import least_gain
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.search import log_prior, log_slope_left, penalise
+from bampipe.diagnosis.search import log_prior, penalise
 from bampipe.diagnosis.session import Fit, Session, candidates_of
 from bampipe.next_trial.discrimination import Alternative, Comparison, Sums
 from bampipe.physics.parameter import Parameter
@@ -112,26 +111,26 @@ def make_typical_alternative(item: Candidate, scale: MachineScale) -> Alternativ
     return Alternative((item,), (np.array(values),), slopes=tuple((0, i) for i in several))
 
 
-def find_limits(
-    comparison: Comparison, sums: Sums, needed: float, volumes: Sequence[Array]
-) -> list[DetectionLimit]:
+def find_limits(comparison: Comparison, sums: Sums, needed: float) -> list[DetectionLimit]:
     """From which strength on each alternative of ``comparison`` would be called missing.
 
-    Its log evidence, with volume and penalties as of `Search`, must be what is needed, or more,
-    with the probability that an effect must have to be called missing; and its size must matter.
+    Its log evidence, with the penalties of `Search`, must be what is needed, or more, with the
+    probability that an effect must have to be called missing; and its size must matter. What an
+    effect takes off the measured quantity it takes off the noise of its residual, too. Here noise
+    is that of what was measured, with the effect and without, and the two cancel.
 
     Args:
         comparison: effects at their typical strengths; sums: of the trials.
-        needed: log evidence, nats, see `find_needed`; volumes: see `find_volumes`.
+        needed: log evidence, nats, see `find_needed`.
     """
     criteria, found = comparison.session.criteria, []
     sure = norm.ppf(criteria.probability)
     remainders = comparison.find_remainders(sums)
-    every = zip(comparison.alternatives, remainders, volumes, strict=True)
-    for number, (alternative, left, volume) in enumerate(every):
+    pairs = zip(comparison.alternatives, remainders, strict=True)
+    for number, (alternative, left) in enumerate(pairs):
         expected = left.distance(sums.independent, _FACTORS)
         # Noise scatters a log likelihood ratio by the root of twice what is expected of it.
-        surely = expected - sure * np.sqrt(2.0 * expected) + volume @ sums.independent
+        surely = expected - sure * np.sqrt(2.0 * expected)
         excess = surely - needed - _find_penalty(comparison, sums, number)
         enough = np.flatnonzero(excess >= 0.0)
         factor = float("inf")
@@ -151,25 +150,6 @@ def find_limits(
 def _limit(factor: float) -> float:
     """A factor, infinite where no machine has such a size."""
     return factor if factor < _FACTORS[-1] else float("inf")
-
-
-def find_volumes(comparison: Comparison) -> list[Array]:
-    """Of each alternative, the log of what it leaves of the measured quantity.
-
-    The mean over the trials at hand by axis, at each factor of its strength, (n_factors, n_q).
-    """
-    e, likelihood = comparison.fit.evidence, comparison.fit.likelihood
-    items = {one.items[0].name: one.items[0] for one in comparison.alternatives}
-    dictionary, found = Dictionary(e, likelihood.samples, items, MachineScale.of_trials(e)), []
-    for item, values in ((one.items[0], one.values[0]) for one in comparison.alternatives):
-        slopes, log_gain = dictionary.find_volume(item, values[list(item.searched_indices)])
-        volume = np.outer(_FACTORS, log_gain)
-        for axis, slope in slopes.items():
-            added = slope @ (values[list(item.linear_indices)] if item.linear_indices else [1.0])
-            plain = likelihood.slopes[axis]
-            volume[:, axis] += [log_slope_left(plain, f * added).mean() for f in _FACTORS]
-        found.append(volume)
-    return found
 
 
 def _find_penalty(comparison: Comparison, sums: Sums, number: int) -> Array:
@@ -204,13 +184,12 @@ class Detectability:
     Attributes:
         comparison: every effect at its typical strength.
         limits: from which strength on each would have been found.
-        needed: log evidence, nats; volumes: see `find_volumes`.
+        needed: log evidence, nats.
     """
 
     comparison: Comparison
     limits: tuple[DetectionLimit, ...]
     needed: float
-    volumes: tuple[Array, ...]
 
     @property
     def hidden_numbers(self) -> list[int]:
@@ -232,8 +211,7 @@ class Detectability:
         """The same for some of the effects."""
         limits = tuple(self.limits[k] for k in chosen)
         comparison = replace(self.comparison, alternatives=tuple(one.alternative for one in limits))
-        volumes = tuple(self.volumes[k] for k in chosen)
-        return Detectability(comparison, limits, self.needed, volumes)
+        return Detectability(comparison, limits, self.needed)
 
     def gain(self, motion: Motion) -> float:
         """Sum of the logarithms by which a trial lowers what goes unnoticed of these effects."""
@@ -277,7 +255,7 @@ class Detectability:
         return self._factors(self.comparison.at_hand)
 
     def _factors(self, sums: Sums) -> Array:
-        found = find_limits(self.comparison, sums, self.needed, self.volumes)
+        found = find_limits(self.comparison, sums, self.needed)
         return np.array([one.factor for one in found])
 
 
@@ -295,13 +273,12 @@ def find_detectability(
     alternatives = tuple(alternative for alternative in typical if alternative is not None)
     comparison = Comparison(session, fit, fit, alternatives)
     needed = find_needed(session.criteria, len(names), by_chance)
-    volumes = find_volumes(comparison)
-    limits = find_limits(comparison, comparison.at_hand, needed, volumes)
+    limits = find_limits(comparison, comparison.at_hand, needed)
     limits = [
         replace(one, factor=_within(one, scale), growth=growth_of_jump(comparison, one))
         for one in _refine(comparison, limits, needed)
     ]
-    return Detectability(comparison, tuple(limits), needed, tuple(volumes))
+    return Detectability(comparison, tuple(limits), needed)
 
 
 def _refine(
@@ -316,7 +293,7 @@ def _refine(
         probe = replace(
             comparison, alternatives=tuple(_at_strength_found(refined[k]) for k in chosen)
         )
-        again = find_limits(probe, probe.at_hand, needed, find_volumes(probe))
+        again = find_limits(probe, probe.at_hand, needed)
         for k, one in zip(chosen, again, strict=True):
             refined[k] = replace(refined[k], factor=refined[k].factor * one.factor, axis=one.axis)
     return refined

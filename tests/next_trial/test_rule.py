@@ -19,10 +19,7 @@ from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity, 
 from bampipe.trials.folds import Folds
 from bampipe.trials.measured import MeasuredTrials
 
-NAMES = (
-    "quadratic_drag:yaw", "return_spring:pitch", "force_bias:z", "shear_thinning:yaw",
-    "force_gain:z",
-)  # fmt: skip
+NAMES = ("quadratic_drag:yaw", "return_spring:pitch", "force_bias:z", "shear_thinning:yaw")
 CRITERIA = Criteria()
 
 
