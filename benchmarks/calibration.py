@@ -56,7 +56,7 @@ def diagnose(name: str, run: bampipe.Run | Path, truth: Mapping[str, Any]) -> Sc
         found = bampipe.diagnose(run, "base", jobs=1, trust_setup=True)
     except bampipe.InputError as problem:
         return Scores(name, **known, failure=str(problem))
-    limit, axes = Criteria().probability, found["axes"]
+    axes = found["axes"]
     return Scores(
         name, **known,
         effects_found={
@@ -75,7 +75,6 @@ def diagnose(name: str, run: bampipe.Run | Path, truth: Mapping[str, Any]) -> Sc
             axis: round(e["rmse_after"] / e["noise_floor"], 3)
             for axis, e in axes.items() if e["noise_floor"]
         },
-        exceeds=[a for a, e in axes.items() if e["remains"] and e["unknown"] < limit],
         no_verdict=[a for a, e in axes.items() if e["verdict"] == "no_verdict"],
         seconds=round(time.perf_counter() - begun, 1),
     )  # fmt: skip

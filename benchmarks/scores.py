@@ -30,7 +30,6 @@ class Scores:
         beside: the same on the measured trials.
         unknown: probability of something unknown, by axis.
         over_floor: held-out error over the noise floor, by axis.
-        exceeds: axes that leave more than any model may, whatever that probability.
         no_verdict: axes without a verdict; seconds: of the diagnosis; failure: why there is none.
     """
 
@@ -44,7 +43,6 @@ class Scores:
     beside: float = 0.0
     unknown: Mapping[str, float] = field(default_factory=dict)
     over_floor: Mapping[str, float] = field(default_factory=dict)
-    exceeds: Sequence[str] = ()
     no_verdict: Sequence[str] = ()
     seconds: float = 0.0
     failure: str = ""
@@ -58,8 +56,7 @@ class Scores:
 
     def finds_unknown(self, criteria: Criteria) -> bool:
         """Whether something is said to be missing that no effect of the library is."""
-        sure = max(self.unknown.values(), default=0.0) >= criteria.probability
-        return sure or bool(self.exceeds)
+        return max(self.unknown.values(), default=0.0) >= criteria.probability
 
 
 def write_tables(scores: Sequence[Scores], criteria: Criteria) -> str:

@@ -27,6 +27,7 @@ SHORT = {
     "joint": Conditions(creep=True, trials=3, seconds=8.0),
     "axis": Conditions(creep=True, trials=3, seconds=5.0),
     "damper": Conditions(trials=3, seconds=6.0),
+    "drive": Conditions(trials=2, seconds=12.0),
     "wrist": Conditions(trials=3, seconds=4.0),
 }
 BUILT_IN = {"bam": "bam", "axis": "slider", "damper": "magnetic_damper"}

@@ -17,7 +17,7 @@ from bampipe.api.opened import Run
 from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
-from bampipe.lab.rows import of_run
+from bampipe.lab.rows import read_run
 from bampipe.report.results import Results
 from bampipe.results.compare import CompareResult
 from bampipe.results.floor import compare_with_floor
@@ -182,7 +182,7 @@ def test_every_command_takes_the_best_confirmed_model(
         "diagnose:base",
         f"diagnose:{better}",
     ]
-    row = of_run(root).tables["sessions"][0]
+    row = read_run(root).tables["sessions"][0]
     assert row["counting_model"] == better
     monkeypatch.setattr("bampipe.declarations.export.export_model", lambda run, name, form: name)
     code, out, err = command("export", "s1")

@@ -55,7 +55,7 @@ def test_following_judges_the_model_that_it_starts_from(
     content = {"axes": {"joint": {"verdict": "unknown_effect"}}}
     found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
     monkeypatch.setattr(loop.LoopOptions, "run", lambda _, *steps: ran.append(steps))
-    monkeypatch.setattr(loop, "_diagnosis", lambda *_: found)
+    monkeypatch.setattr(loop.RunFolder, "read", lambda *_: found)
     options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
     lines: list[str] = []
     assert loop.follow(options, "base", lines.append) == "base"
@@ -68,13 +68,13 @@ def test_following_judges_the_model_that_it_starts_from(
     [
         (
             {("actuator_delay",): 0.56, ("actuator_lag:joint",): 0.44},
-            "between actuator_delay (0.56) and actuator_lag:joint (0.44): which of them is added is"
-            " arbitrary, it is actuator_delay. A lag weakens",
+            "between actuator_delay (0.56) and actuator_lag:joint (0.44): the choice is arbitrary,"
+            " actuator_delay is added. A lag weakens",
         ),
         (
             {("a:joint", "b:joint"): 0.7, ("a:joint", "c:joint"): 0.296, (): 0.004},
-            "between b:joint (0.70) and c:joint (0.30) beside a:joint (> 0.99): which of them is"
-            " added is arbitrary, it is b:joint. No trial was found",
+            "between b:joint (0.70) and c:joint (0.30) beside a:joint (> 0.99): the choice is"
+            " arbitrary, b:joint is added. No trial was found",
         ),
         (
             {(): 0.6, ("a:joint",): 0.4},
@@ -88,9 +88,8 @@ def test_an_effect_that_is_added_undecided_is_called_arbitrary(
     lines = {}
     for verdict in ("undecided", "missing"):
         content = diagnosis({"joint": {"verdict": verdict}}, sets)
-        lines[verdict] = loop._unsettled(
-            DiagnoseResult.model_validate(filled(DiagnoseResult, content))
-        )
+        found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
+        lines[verdict] = list(loop._list_open_questions(found))
     assert lines["missing"] == []
     assert lines["undecided"][0].startswith(f"these trials do not decide {said}")
 
@@ -129,7 +128,7 @@ def test_what_came_to_nothing_is_not_weighed_again(
         return DiagnoseResult.model_validate(filled(DiagnoseResult, content))
 
     monkeypatch.setattr(loop.LoopOptions, "run", run)
-    monkeypatch.setattr(loop, "_diagnosis", diagnosed)
+    monkeypatch.setattr(loop.RunFolder, "read", diagnosed)
     monkeypatch.setattr(loop, "_add", lambda *_: "")
     lines: list[str] = []
     options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)

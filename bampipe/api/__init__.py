@@ -1,1 +1,1 @@
-"""What programs and notebooks call; exported, as it is needed, by :mod:`bampipe` itself."""
+"""The interface for programs and notebooks, exported lazily by :mod:`bampipe` itself."""

@@ -1,4 +1,4 @@
-"""The stages as functions: each runs what is stale, through the same cache as the command line."""
+"""The stages as functions, through the same cache as the command line."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def run_session(
     force: bool = False,
     settings: Mapping[str, Mapping[str, object]] | None = None,
 ) -> Run:
-    """From raw log to report: all stages of a pipeline, those that changed.
+    """Run the stages of a pipeline that changed, from raw log to report.
 
     Args:
         session: folder of the session.
@@ -42,7 +42,7 @@ def run_session(
         pipeline: name of a pipeline, or a file of your own.
         first: stage to start from; the first one where empty.
         last: stage to stop after; the last one where empty.
-        force: run even what did not change.
+        force: run unchanged stages, too.
         settings: by stage, then by name: ``{"identify": {"method": "least-squares"}}``.
 
     Raises:
@@ -56,7 +56,7 @@ def run_session(
             root=root,
             pipeline=pipelines.load(pipeline),
             session=folder,
-            settings=_settings(settings or {}),
+            settings=_drop_empty(settings or {}),
             first=first,
             last=last,
             force=force,
@@ -78,44 +78,44 @@ def ingest(session: Path_, *, runs: Path_ = RUNS, **settings: object) -> Run:
 
 def filter(run: Run | Path_, **settings: object) -> pd.DataFrame:
     """Differentiate the motion; returns `Run.kinematics`."""
-    return _stage(run, "filter", "", settings).kinematics
+    return _rerun(run, "filter", "", settings).kinematics
 
 
 def stiffness(run: Run | Path_, **settings: object) -> pd.DataFrame:
     """Stiffness of the locked axes; returns `Run.stiffness`."""
-    return _stage(run, "stiffness", "", settings).stiffness
+    return _rerun(run, "stiffness", "", settings).stiffness
 
 
 def identify(run: Run | Path_, model: str = "", **settings: object) -> pd.DataFrame:
     """Estimate the parameters of one model, or else of all; returns `Run.parameters`."""
-    return _stage(run, "identify", model, settings).parameters(model)
+    return _rerun(run, "identify", model, settings).parameters(model)
 
 
 def validate(run: Run | Path_, model: str = "", **settings: object) -> pd.DataFrame:
-    """Predict trials that the fit has not seen, by one model or all; returns `Run.validation`."""
-    return _stage(run, "validate", model, settings).validation(model)
+    """Predict held-out trials, by one model or all; returns `Run.validation`."""
+    return _rerun(run, "validate", model, settings).validation(model)
 
 
 def diagnose(run: Run | Path_, model: str = "", **settings: object) -> dict[str, Any]:
-    """Find what a model lacks (default: the best confirmed one); returns `Run.diagnosis`."""
-    chosen = model or _opened(run).model
-    return _stage(run, "diagnose", chosen, settings).diagnosis(chosen)
+    """Find the missing effects of a model (default: the best one); returns `Run.diagnosis`."""
+    chosen = model or _open(run).model
+    return _rerun(run, "diagnose", chosen, settings).diagnosis(chosen)
 
 
 def draft(run: Run | Path_, model: str = "", **settings: object) -> dict[str, Any]:
-    """Draft a formula for what no effect explains; returns `Run.drafts`."""
-    chosen = model or _opened(run).model
-    return _stage(run, "draft", chosen, settings).drafts(chosen)
+    """Draft a formula for an unexplained residual; returns `Run.drafts`."""
+    chosen = model or _open(run).model
+    return _rerun(run, "draft", chosen, settings).drafts(chosen)
 
 
 def compare(run: Run | Path_, **settings: object) -> pd.DataFrame:
-    """Put the models beside one another; returns `Run.ladder`."""
-    return _stage(run, "compare", "", settings).ladder
+    """Compare the models on the same held-out trials; returns `Run.ladder`."""
+    return _rerun(run, "compare", "", settings).ladder
 
 
 def write_report(run: Run | Path_, **settings: object) -> Path:
     """Write the report; returns the path of the PDF."""
-    return _stage(run, "report", "", settings).root / "report" / "report.pdf"
+    return _rerun(run, "report", "", settings).root / "report" / "report.pdf"
 
 
 def extend(run: Run | Path_, effect: str | Sequence[str], model: str = "") -> Run:
@@ -132,44 +132,44 @@ def extend(run: Run | Path_, effect: str | Sequence[str], model: str = "") -> Ru
     Raises:
         InputError: no such effect or parent, or one that the device cannot have.
     """
-    opened = _opened(run)
+    opened = _open(run)
     effects = (effect,) if isinstance(effect, str) else tuple(effect)
-    loop.extend(_options(opened), model or opened.model, effects)
+    loop.extend(_make_options(opened), model or opened.model, effects)
     return Run(opened.root)
 
 
 def follow(run: Run | Path_, model: str = "") -> Run:
-    """Diagnose and extend until the diagnosis says stop.
+    """Diagnose and extend until nothing is missing.
 
     Returns:
         The run, whose `Run.model` is the best one found.
     """
-    opened = _opened(run)
-    loop.follow(_options(opened), model or opened.model, lambda line: None)
+    opened = _open(run)
+    loop.follow(_make_options(opened), model or opened.model, lambda line: None)
     return Run(opened.root)
 
 
-def _settings(given: Mapping[str, Mapping[str, object]]) -> dict[str, Mapping[str, object]]:
+def _drop_empty(given: Mapping[str, Mapping[str, object]]) -> dict[str, Mapping[str, object]]:
     """The settings of stages that have any."""
     return {stage: values for stage, values in given.items() if values}
 
 
-def _opened(run: Run | Path_) -> Run:
+def _open(run: Run | Path_) -> Run:
     return run if isinstance(run, Run) else open_run(run)
 
 
-def _full_pipeline(root: Path) -> Pipeline:
+def _read_pipeline(root: Path) -> Pipeline:
     """The pipeline of a run, with every stage in it."""
     return pipelines.recorded(record.read(root)).with_every_stage()
 
 
-def _options(run: Run) -> loop.LoopOptions:
+def _make_options(run: Run) -> loop.LoopOptions:
     batch.limit_threads(1)
-    return loop.LoopOptions(run.root, _full_pipeline(run.root), False, True, unheard)
+    return loop.LoopOptions(run.root, _read_pipeline(run.root), False, True, unheard)
 
 
 def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object) -> dict[str, Any]:
-    """Run any stage on what the earlier ones left; returns what it reports, a plain record.
+    """Run any stage on the results of earlier ones; returns its summary, a plain record.
 
     Args:
         run: a run, or its folder.
@@ -181,18 +181,18 @@ def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object)
         InputError: no such stage, model or setting, or an earlier stage has not run.
     """
     base.check_stage_name(stage)
-    steps = _ran(_opened(run).root, stage, model, settings)
+    steps = _run_stage(_open(run).root, stage, model, settings)
     return steps[0] if len(steps) == 1 else {"steps": steps}
 
 
-def _stage(run: Run | Path_, stage: str, model: str, settings: Mapping[str, object]) -> Run:
+def _rerun(run: Run | Path_, stage: str, model: str, settings: Mapping[str, object]) -> Run:
     """Run one stage; the run with its results."""
-    root = _opened(run).root
-    _ran(root, stage, model, settings)
+    root = _open(run).root
+    _run_stage(root, stage, model, settings)
     return Run(root)
 
 
-def _ran(
+def _run_stage(
     root: Path, stage: str, model: str, settings: Mapping[str, object]
 ) -> list[dict[str, Any]]:
     """Run one stage, for one model or each; what it reports."""
@@ -200,8 +200,8 @@ def _ran(
     outcome = runner.run_session(
         Request(
             root=root,
-            pipeline=_full_pipeline(root),
-            settings=_settings({stage: settings}),
+            pipeline=_read_pipeline(root),
+            settings=_drop_empty({stage: settings}),
             first=stage,
             last=stage,
             model=model,

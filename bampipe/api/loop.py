@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
-from bampipe.files import is_normal
+from bampipe.files import is_normal, write_text
 from bampipe.lists import join_names
 from bampipe.run import models, record
 from bampipe.run.events import Listener
@@ -29,7 +29,7 @@ MOST_ROUNDS = 4
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """What every step of the loop needs.
+    """Options of every step of the loop.
 
     Attributes:
         root: the run folder.
@@ -96,20 +96,8 @@ def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
     return used
 
 
-def _diagnosis(root: Path, model: str) -> DiagnoseResult:
-    from bampipe.results.diagnose import DiagnoseResult
-
-    return RunFolder(root).read(DiagnoseResult, model)
-
-
-def _split_effect_file(text: str) -> tuple[Path, str] | None:
-    """Split ``file.toml[:target]``; None if ``text`` names no file."""
-    name, _, target = text.partition(":")
-    return (Path(name), target) if name.endswith(".toml") else None
-
-
-def drafts_of(root: Path, model: str) -> dict[str, Path]:
-    """Files of the effects drafted for ``model``, by ``name[:target]``."""
+def list_drafts(root: Path, model: str) -> dict[str, Path]:
+    """Return the files of the effects drafted for ``model``, by ``name[:target]``."""
     from bampipe.results.draft import DraftResult
 
     run = RunFolder(root)
@@ -119,7 +107,7 @@ def drafts_of(root: Path, model: str) -> dict[str, Path]:
     return {name: run.path(effect.file) for name, effect in effects.items()}
 
 
-def _named(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | None]:
+def _find_effect(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | None]:
     """Return the effect ``name[:target]`` and the file it comes from, if it is not built in.
 
     Args:
@@ -129,15 +117,14 @@ def _named(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | None]:
     for name, file in drafts.items():
         if text in (name, name.partition(":")[0]):
             return name, file
-    effect_file = _split_effect_file(text)
-    if effect_file is None:
+    path, _, target = text.partition(":")
+    if not path.endswith(".toml"):
         return text, None
-    path, target = effect_file
     from bampipe.declarations.files import read_effect
     from bampipe.physics import registry
 
-    effect = registry.effect_from(read_effect(str(path)), str(path))
-    return f"{effect.name}:{target}" if target else effect.name, path
+    effect = registry.effect_from(read_effect(path), path)
+    return f"{effect.name}:{target}" if target else effect.name, Path(path)
 
 
 def adopt_effect(file: Path, runs: Path) -> Path:
@@ -155,7 +142,7 @@ def adopt_effect(file: Path, runs: Path) -> Path:
             f"there is a built-in effect {effect.name!r}", where=str(file), remedy="rename yours"
         )
     target = runs / models.ADOPTED / f"{effect.name}.toml"
-    record.replace_text(target, file.read_text(encoding="utf-8"))
+    write_text(target, file.read_text(encoding="utf-8"))
     return target
 
 
@@ -176,8 +163,8 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
             has already; nothing is left behind.
     """
     root = options.root
-    drafts = drafts_of(root, parent)
-    named = dict(_named(effect, drafts) for effect in effects)
+    drafts = list_drafts(root, parent)
+    named = dict(_find_effect(effect, drafts) for effect in effects)
     child = models.child_name(parent, tuple(named))
     for name in named:
         if "/" in name or not is_normal(child):
@@ -231,7 +218,7 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
             effect_files[f"{effect.partition(':')[0]}.toml"] = file
     for name, source in sorted(effect_files.items()):
         text = source.read_text(encoding="utf-8")
-        record.replace_text(root / "models" / child / "effects" / name, text)
+        write_text(root / "models" / child / "effects" / name, text)
     effects = (*before.effects, *named)
     model = ModelFile(name=child, parent=parent, device=before.device, effects=effects)
     models.write(root, model)
@@ -241,42 +228,48 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
 def follow(
     options: LoopOptions, model: str, tell: Callable[[str], None], draft: bool = False
 ) -> str:
-    """Diagnose, add all that was found at once, and confirm it by one more diagnosis.
+    """Diagnose, add all missing effects at once, and confirm that by one more diagnosis.
 
-    What is drafted for the rest is added with the set, where that is asked for. An effect that the
-    identified model gives no strength is left out again, and what came to nothing when it was added
-    is not weighed again. Should the confirmation find more, that is added likewise.
+    Effects drafted for the rest are added with the set if ``draft`` is set. An effect to which the
+    identified model gives no strength is removed again, and effects that did not improve the model
+    are not weighed again. If the confirmation finds more, that is added likewise.
 
     Args:
         options: run folder, settings, listener.
         model: name of the model to start from.
-        tell: called with a line on each thing found and done.
-        draft: whether to draft a formula where the diagnosis finds no name.
+        tell: called with a line on each finding and each step.
+        draft: whether to draft a formula where the diagnosis finds no named effect.
 
     Returns:
         The name of the last model that is better than its parent.
     """
-    from bampipe.phrases import diagnosis as phrases
+    from bampipe.phrases.diagnosis import verdict
+    from bampipe.results.diagnose import DiagnoseResult
+    from bampipe.results.draft import DraftResult
 
-    options.run("identify", "validate", model)  # what a child is held against, and the ladder shows
+    run = RunFolder(options.root)
+    options.run("identify", "validate", model)  # the ladder compares each child with it
     left_out: dict[str, dict[str, object]] = {}
     for _ in range(MOST_ROUNDS):
         options.run("diagnose", "diagnose", model, left_out)
-        diagnosis = _diagnosis(options.root, model)
+        diagnosis = run.read(DiagnoseResult, model)
         for axis in sorted(diagnosis.axes):
-            tell(f"{model}, {axis}: {phrases.verdict(diagnosis, axis)}")
-        for line in _unsettled(diagnosis):
+            tell(f"{model}, {axis}: {verdict(diagnosis, axis)}")
+        for line in dict.fromkeys(_list_open_questions(diagnosis)):
             tell(line)
         found = diagnosis.selected
         if draft and diagnosis.unnamed_axes:
-            found = _drafted(options, model, tell) or found
+            options.run("draft", "draft", model)
+            drafted = run.read(DraftResult, model)
+            tell(drafted.sentence)
+            found = drafted.selected or found
         if not found:
             break
         child = _add(options, model, found, tell)
         if child:
             model, left_out = child, {}
         elif set(found) <= set(diagnosis.selected):
-            # Diagnosed once more: what came to nothing is no longer said to be missing.
+            # Diagnosed once more: effects that did not improve the model are not proposed again.
             left_out = {"diagnose": {"without": (*diagnosis.not_weighed, *found)}}
         else:
             break
@@ -286,45 +279,21 @@ def follow(
     return model
 
 
-def _unsettled(diagnosis: DiagnoseResult) -> list[str]:
-    """Say where effects are about as likely as others which of them are added, and what decides."""
+def _list_open_questions(diagnosis: DiagnoseResult) -> Iterator[str]:
+    """Say which of several likely effects is added, and which trial would decide."""
     from bampipe.phrases import diagnosis as phrases
 
-    said = []
     trial, open_effects = diagnosis.suggested_trial, phrases.find_open_effects(diagnosis)
     for axis, entry in diagnosis.axes.items():
         if entry.verdict != "undecided":
             continue
         known, parts = phrases.split_alternatives(diagnosis, axis)
-        taken = join_names(n for n in entry.effects if n in open_effects)
-        which = f"which of them is added is arbitrary, it is {taken}"
+        taken = join_names(name for name in entry.effects if name in open_effects)
+        added = f"the choice is arbitrary, {taken} is added" if taken else "none is added"
         beside = f" beside {known}" if known else ""
         asked = trial is not None and {*trial.between} & {*entry.probabilities}
-        said.append(
-            f"{phrases.open_question(parts)}{beside}: {which if taken else 'none is added'}. "
-            + (trial.sentence if trial is not None and asked else _what_decides(entry.likely))
-        )
-    return list(dict.fromkeys(said))
-
-
-def _what_decides(names: Sequence[str]) -> str:
-    """What to record where no trial was found that would tell effects apart."""
-    if any("delay" in name for name in names) and any("lag" in name for name in names):
-        return (
-            "A lag weakens what changes fast, a delay does not: log at a higher rate, and record"
-            " trials in which the force changes faster."
-        )
-    return "No trial was found that would tell them; `bampipe next --for decision` looks for one."
-
-
-def _drafted(options: LoopOptions, model: str, tell: Callable[[str], None]) -> tuple[str, ...]:
-    """Draft formulas for what ``model`` leaves; return the names of their effects."""
-    from bampipe.results.draft import DraftResult
-
-    options.run("draft", "draft", model)
-    found = RunFolder(options.root).read(DraftResult, model)
-    tell(found.sentence)
-    return found.selected
+        advice = trial.sentence if trial is not None and asked else phrases.advise_trial(entry)
+        yield f"{phrases.open_question(parts)}{beside}: {added}. {advice}"
 
 
 def _add(
@@ -335,10 +304,9 @@ def _add(
 
     tell(f"adding {', '.join(effects)}")
     child = extend(options, model, effects)
-    idle = _without_strength(options.root, child, effects)
-    if idle:
-        tell(f"{', '.join(idle)}: no strength beside the other parameters, left out")
-        effects = tuple(effect for effect in effects if effect not in idle)
+    if weak := _find_weak(options.root, child, effects):
+        tell(f"{', '.join(weak)}: no strength beside the other parameters, removed")
+        effects = tuple(effect for effect in effects if effect not in weak)
         _remove(options, child)
         if not effects:
             return ""
@@ -346,27 +314,23 @@ def _add(
     ladder = {rung.model: rung for rung in RunFolder(options.root).read(CompareResult).ladder}
     if ladder[child].improves_on(ladder[model]):
         return child
-    lost = ladder[child].has_lost_its_floor(ladder[model])
-    why = (
-        "no noise floor could be computed with it, so that its error cannot be judged"
-        if lost
-        else "the held-out error does not fall after all"
-    )
+    why = "the held-out error does not fall after all"
+    if ladder[child].has_lost_its_floor(ladder[model]):
+        why = "no noise floor could be computed with it, so that its error cannot be judged"
     tell(f"{', '.join(effects)}: {why}, stopped at {model}")
     return ""
 
 
-def _without_strength(root: Path, model: str, effects: Sequence[str]) -> tuple[str, ...]:
-    """Those of ``effects`` whose every strength in ``model`` is zero within two of its sd."""
+def _find_weak(root: Path, model: str, effects: Sequence[str]) -> list[str]:
+    """Return those of ``effects`` whose every strength in ``model`` is zero within two sd."""
     from bampipe.declarations.model_file import load_model
     from bampipe.results.identify import IdentifyResult
 
     run = RunFolder(root)
     found = run.read(IdentifyResult, model).parameters
-    idle = []
+    weak = []
     for effect in load_model(run, model).effects:
         strengths = [found[p.name] for p in effect.parameters if p.strength and p.name in found]
-        unsure = all(abs(p.estimate) < 2.0 * p.sd for p in strengths)
-        if effect.name in effects and strengths and unsure:
-            idle.append(effect.name)
-    return tuple(idle)
+        if effect.name in effects and strengths:
+            weak += [effect.name] * all(abs(p.estimate) < 2.0 * p.sd for p in strengths)
+    return weak

@@ -40,7 +40,7 @@ class Picture:
 
 
 class Run:
-    """The results of one session. Nothing here writes; results are read once, when first used.
+    """The results of one session. Nothing here writes; results are read once, at their first use.
 
     All values are in SI units. Models are named as in the run folder: ``base``,
     ``base+stribeck.yaw``; where a method takes a model, the default is the best confirmed one.
@@ -71,7 +71,7 @@ class Run:
 
     @property
     def session(self) -> dict[str, Any]:
-        """What ingest says of the session: axes, channels, units, sample rate."""
+        """The session as ingest read it: axes, channels, units, sample rate."""
         return self._results.session.model_dump(mode="json")
 
     @property
@@ -92,7 +92,7 @@ class Run:
     @cached_property
     def stiffness(self) -> pd.DataFrame:
         """One row an axis with a locked trial: stiffness, sd, bandwidth; empty without any."""
-        return _rows(self._read(StiffnessResult).axes)
+        return _make_frame(self._read(StiffnessResult).axes)
 
     @property
     def models(self) -> tuple[str, ...]:
@@ -106,11 +106,11 @@ class Run:
 
     def effects(self, model: str = "") -> tuple[str, ...]:
         """The effects that a model has beyond the bare device."""
-        return self._results.effects(self._known(model))
+        return self._results.effects(self._choose_model(model))
 
     def parameters(self, model: str = "") -> pd.DataFrame:
         """One row a parameter: estimate, sd, unit, and what else identification says."""
-        frame = _rows(self._read(IdentifyResult, model).parameters)
+        frame = _make_frame(self._read(IdentifyResult, model).parameters)
         first = [name for name in ("estimate", "sd", "unit") if name in frame]
         order = self._results.order_parameters(frame.index)
         return frame.loc[list(order), first + [c for c in frame if c not in first]]
@@ -122,11 +122,11 @@ class Run:
 
     def states(self, model: str = "") -> pd.DataFrame:
         """The filtered motion with standard deviations."""
-        return self._table(f"models/{self._known(model)}/states.parquet", "identify")
+        return self._table(f"models/{self._choose_model(model)}/states.parquet", "identify")
 
     def validation(self, model: str = "") -> pd.DataFrame:
         """One row an axis: error on all and on unseen trials, noise floor, fit, unit."""
-        return _rows(self._read(ValidateResult, model).axes)
+        return _make_frame(self._read(ValidateResult, model).axes)
 
     def free_run(self, model: str = "") -> dict[str, Any]:
         """How far the model left to itself ends up from the measurement, or why it cannot be."""
@@ -135,14 +135,14 @@ class Run:
 
     def residuals(self, model: str = "") -> pd.DataFrame:
         """Measured and predicted torque and force, by parameters that have not seen the trial."""
-        return self._table(f"models/{self._known(model)}/residuals.parquet", "validate")
+        return self._table(f"models/{self._choose_model(model)}/residuals.parquet", "validate")
 
     def diagnosis(self, model: str = "") -> dict[str, Any]:
-        """What the model lacks: verdict of each axis, ranking, residual maps, advice."""
+        """The diagnosis: verdict of each axis, ranking, residual maps, advice."""
         return self._read(DiagnoseResult, model).model_dump(mode="json")
 
     def drafts(self, model: str = "") -> dict[str, Any]:
-        """Formulas drafted for what no effect explains: curves, constants, p-values."""
+        """Formulas drafted for the unexplained residual: curves, constants, p-values."""
         return self._read(DraftResult, model).model_dump(mode="json")
 
     def ranking(self, model: str = "") -> pd.DataFrame:
@@ -167,23 +167,23 @@ class Run:
         paths = sorted((self.root / "report" / "figures").glob("*.svg"))
         return {path.stem: Picture(path) for path in paths}
 
-    def _known(self, model: str) -> str:
+    def _choose_model(self, model: str) -> str:
         return self._results.require_model(model) if model else self.model
 
     def _read(self, kind: type[R], model: str = "") -> R:
-        name = self._known(model) if "{model}" in kind.FILE else ""
+        name = self._choose_model(model) if "{model}" in kind.FILE else ""
         found = self._results.read(kind, name)
         if found is None:
-            raise self._missing(kind.file(name), kind.STAGE)
+            raise self._make_error(kind.file(name), kind.STAGE)
         return found
 
     def _table(self, relative: str, stage: str) -> pd.DataFrame:
         frame = self._results.table(relative)
         if frame is None:
-            raise self._missing(relative, stage)
+            raise self._make_error(relative, stage)
         return frame
 
-    def _missing(self, relative: str, stage: str) -> InputError:
+    def _make_error(self, relative: str, stage: str) -> InputError:
         return InputError(
             f"{relative} is not there yet",
             where=str(self.root),
@@ -191,7 +191,7 @@ class Run:
         )
 
 
-def _rows(entries: Mapping[str, Record]) -> pd.DataFrame:
+def _make_frame(entries: Mapping[str, Record]) -> pd.DataFrame:
     """One row an entry, its fields as columns."""
     plain = {name: entry.model_dump(mode="json") for name, entry in entries.items()}
     return pd.DataFrame.from_dict(plain, orient="index")

@@ -1,4 +1,4 @@
-"""``bampipe status`` and ``bampipe verify``: what is current, and what was touched."""
+"""``bampipe status`` and ``bampipe verify``: the state of steps, and files that were changed."""
 
 from __future__ import annotations
 

@@ -41,20 +41,12 @@ def list_(json: JsonOption = False) -> None:
     from bampipe.physics import registry
 
     found = [registry.device(name) for name in registry.device_names()]
+    rows = [(d.name, [c.name for c in d.coordinates], d.summary) for d in found]
     if json:
-        show.print_json(
-            [
-                {"name": d.name, "axes": [c.name for c in d.coordinates], "summary": d.summary}
-                for d in found
-            ]
-        )
+        show.print_json([dict(zip(("name", "axes", "summary"), row, strict=True)) for row in rows])
         return
-    show.print_table(
-        ["device", "axes", "summary"],
-        [[d.name, ", ".join(c.name for c in d.coordinates), d.summary] for d in found],
-    )
-    show.say("")
-    show.say("one in full: bampipe device show NAME")
+    show.print_table(["device", "axes", "summary"], rows)
+    show.say("\none in full: bampipe device show NAME")
 
 
 def show_(
@@ -82,15 +74,9 @@ def show_(
     inputs += [f"{name} (brake of {axis})" for axis, name in found.brakes.items()]
     inputs += [f"{name} ({unit or 'a pure number'})" for name, unit in found.channels.items()]
     if json:
-        show.print_json(
-            {
-                "declaration": dict(declaration),
-                "equations": equations.splitlines(),
-                "inputs": inputs,
-                "effects": names,
-                "faults": faults,
-            }
-        )
+        found_names = {"inputs": inputs, "effects": names, "faults": faults}
+        lines = equations.splitlines()
+        show.print_json({"declaration": dict(declaration), "equations": lines, **found_names})
         return
     show.say(equations)
     show.say(f"inputs: {', '.join(inputs) or 'none'}")
@@ -105,7 +91,7 @@ def check(
     json: JsonOption = False,
     quiet: FaultsOnlyOption = False,
 ) -> None:
-    """Check a device file: its equations of motion, and what is wrong with it.
+    """Check a device file, and print its equations of motion and its faults.
 
     Names, units, expressions and the derivation are checked. Exit 2 with one line a fault.
 
@@ -159,7 +145,7 @@ for _name, _command in COMMANDS.items():
 
 
 def _name_next_step(file: str) -> str:
-    """What to do once a device file is right: run the session it lies in, or name it in one."""
+    """Return the next step with a sound device file: run its session, or name it in one."""
     path = Path(file)
     if path.suffix != ".toml":
         return f'device = "{file}" in session.toml, then bampipe run SESSION'
@@ -176,7 +162,7 @@ def report_faults(faults: Sequence[str]) -> None:
 
 
 def check_effect_file(text: str, device_name: str, json: bool) -> None:
-    """Print what is wrong with the effect file ``text`` (``file.toml[:target]``), one line a fault.
+    """Print the faults of the effect file ``text`` (``file.toml[:target]``), a line each.
 
     Raises:
         InputError: there is no such file or device.

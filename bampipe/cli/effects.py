@@ -10,34 +10,30 @@ from bampipe.cli import show
 from bampipe.errors import InputError, choose_from
 
 if TYPE_CHECKING:
+    from bampipe.diagnosis.signature import Signature
     from bampipe.physics.effect import Effect
 
 COLUMNS, ROWS = 61, 13
 
 
 def list_all(json: bool) -> None:
-    """Print every built-in effect: its name, what it may act on, what it is."""
+    """Print every built-in effect: name, target, kind and summary."""
     from bampipe.physics import registry
 
     found = [registry.effect(name) for name in registry.effect_names()]
     if json:
-        show.print_json(
-            [
-                {"name": e.name, "scope": e.scope, "kind": e.kind, "summary": e.summary}
-                for e in found
-            ]
-        )
+        names = ("name", "scope", "kind", "summary")
+        show.print_json([{name: getattr(e, name) for name in names} for e in found])
         return
     show.print_table(
         ["effect", "acts on", "kind", "summary"],
         [[e.name, e.scope.replace("_", " "), e.kind, e.summary] for e in found],
     )
-    show.say("")
-    show.say("one in full: bampipe effects NAME")
+    show.say("\none in full: bampipe effects NAME")
 
 
 def show_one(text: str, device_name: str, json: bool) -> None:
-    """Print one effect: formula, parameters, what it looks like, its signature.
+    """Print one effect: formula, parameters, looks and signature.
 
     Args:
         text: ``name[:target]`` or ``file.toml[:target]``.
@@ -74,39 +70,17 @@ def show_one(text: str, device_name: str, json: bool) -> None:
 
     found = signature(device, effect, chosen)
     if json:
-        show.print_json(
-            {
-                "declaration": dict(effect.declaration),
-                "targets": [item for item in targets if item],
-                "signature": None
-                if found is None
-                else {
-                    "target": chosen,
-                    "axis": found.axis,
-                    "rms": dict(found.rms),
-                    "unit": found.unit,
-                    "against": found.against,
-                    "share": found.share,
-                },
-            }
-        )
+        shown = {"declaration": dict(effect.declaration), "targets": [t for t in targets if t]}
+        show.print_json({**shown, "signature": _describe_signature(found, chosen)})
         return
     show.say(f"{effect.name}: {effect.summary}")
     show.say("")
     for line in effect.formulas:
         show.say(f"  {line}")
     show.say("")
-    rows = list(parameter_rows(effect))
-    head = ["parameter", "axis", "unit", "prior", "sd", "lower", "upper", "typical", ""]
-    used = [
-        column
-        for column in range(len(head))
-        if column < 1 or any(row[column] not in (None, "") for row in rows)
-    ]
-    show.print_table([head[c] for c in used], [[row[c] for c in used] for row in rows])
-    show.say("")
+    _print_parameters(effect)
     names = [f"{effect.name}:{item}" if item else effect.name for item in targets]
-    show.say(f"on {device_name}: {', '.join(names)}")
+    show.say(f"\non {device_name}: {', '.join(names)}")
     show.say(f"looks like: {effect.looks_like}")
     if effect.on_the_machine:
         show.say(f"on the machine: {effect.on_the_machine}")
@@ -118,11 +92,25 @@ def show_one(text: str, device_name: str, json: bool) -> None:
         return
     brakes = ", brakes on" if found.braked else ""
     show.say(
-        f"what {title} leaves on {found.axis} ({found.unit}) in a model without it, "
+        f"the residual of {title} on {found.axis} ({found.unit}) in a model without it, "
         f"against {found.against} ({found.against_unit}){brakes}:"
     )
     for line in plot(found.abscissa.tolist(), found.residual.tolist()):
         show.say(line)
+
+
+def _describe_signature(found: Signature | None, target: str) -> dict[str, object] | None:
+    if found is None:
+        return None
+    names = ("axis", "unit", "against", "share")
+    return {"target": target, "rms": dict(found.rms), **{n: getattr(found, n) for n in names}}
+
+
+def _print_parameters(effect: Effect) -> None:
+    rows = list(parameter_rows(effect))
+    head = ["parameter", "axis", "unit", "prior", "sd", "lower", "upper", "typical", ""]
+    used = [k for k in range(len(head)) if k < 1 or any(row[k] not in (None, "") for row in rows)]
+    show.print_table([head[k] for k in used], [[row[k] for k in used] for row in rows])
 
 
 def parameter_rows(effect: Effect) -> Iterator[list[object]]:

@@ -1,4 +1,4 @@
-"""The entry point: what signals and errors mean to whoever called the program."""
+"""The entry point: signals and errors as exit codes."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def main() -> None:
     except BaseException as error:
         if not received or (isinstance(error, SystemExit) and not error.code):
             raise
-        print(f"bampipe: stopped{_what_is_kept()}", file=sys.stderr, flush=True)
-        # No joining of threads and processes at exit: nothing is left that could be lost.
+        print(f"bampipe: stopped{_tell_progress()}", file=sys.stderr, flush=True)
+        # Threads and processes are not joined: nothing is left that could be lost.
         os._exit(128 + received[0])
 
 
-def _what_is_kept() -> str:
-    """Say which steps were under way, what is kept, and how to go on; of a run, else nothing."""
+def _tell_progress() -> str:
+    """Say which steps of a run were under way, which results are kept, and how to resume."""
     show = sys.modules.get("bampipe.cli.show")
     known = getattr(show, "UNDER_WAY", {})
     if not known:

@@ -13,7 +13,7 @@ from bampipe.run import publish
 
 
 def fetch(
-    url: Annotated[str, typer.Argument(metavar="URL", help="Where runs were published.")],
+    url: Annotated[str, typer.Argument(metavar="URL", help="Place of published runs.")],
     sessions: Annotated[
         list[str] | None,
         typer.Argument(metavar="[SESSION...]", help="Sessions to fetch; all if omitted."),

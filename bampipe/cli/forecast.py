@@ -1,4 +1,4 @@
-"""What came of the trials that were proposed, after the session has been run with them."""
+"""Forecasts of proposed trials compared with their outcome."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from bampipe.cli import show
 from bampipe.data.run_folder import RunFolder
 
 
-def say_what_came(root: Path, model: str) -> None:
-    """Print forecasts beside what came, where trials are there that the proposals did not know.
+def print_forecasts(root: Path, model: str) -> None:
+    """Print forecasts beside their outcome, if there are trials that the proposals did not have.
 
     Args:
-        root: the run folder; model: that counts.
+        root: the run folder; model: of the proposals.
     """
     from bampipe.phrases.forecast import compare_forecasts, read_forecasts
     from bampipe.results.diagnose import DiagnoseResult

@@ -1,4 +1,4 @@
-"""`bampipe lab`: all runs side by side, and what is printed of them."""
+"""`bampipe lab`: all runs side by side."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def refresh(runs: Path, several: bool, quiet: bool) -> None:
 
 
 def table(found: Lab) -> None:
-    """Print the sessions that stand out, else that none does; then the trends."""
+    """Print the sessions, and the trends."""
     from bampipe.phrases import lab as phrases
 
     sessions = found.content.sessions
@@ -100,17 +100,12 @@ def table(found: Lab) -> None:
     many = "session" if len(sessions) == 1 else "sessions"
     stand = "stands" if len(odd) == 1 else "stand"
     show.say(f"{found.folder}: {len(sessions)} {many}, {len(odd)} {stand} out")
-    rows = [
-        [
-            one.session,
-            one.recorded[:16].replace("T", " "),
-            one.model,
-            f"{one.worst[0]:.3g} {one.worst[1]}" if one.worst else None,
-            phrases.verdict(found.content, one),
-            one.sentence,
-        ]
-        for one in (sessions if len(sessions) <= MOST_SESSIONS else odd)
-    ]
+    rows = []
+    for one in sessions if len(sessions) <= MOST_SESSIONS else odd:
+        when = one.recorded[:16].replace("T", " ")
+        worst = f"{one.worst[0]:.3g} {one.worst[1]}" if one.worst else None
+        verdict = phrases.verdict(found.content, one)
+        rows.append([one.session, when, one.model, worst, verdict, one.sentence])
     if rows:
         show.print_table(["session", "recorded", "model", "error / floor", "verdict", ""], rows)
     for line in phrases.list_trends(found.content.series):
@@ -123,7 +118,7 @@ def table(found: Lab) -> None:
 
 
 def advice(found: Lab) -> str:
-    """Return the command to go on with."""
+    """Return the next command."""
     for one in found.content.sessions:
         if one.remedy:
             return one.remedy

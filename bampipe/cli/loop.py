@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.forecast import say_what_came
+from bampipe.cli.forecast import print_forecasts
 from bampipe.cli.next_step import after_loop
 from bampipe.cli.one_stage import one_stage, print_settings, whole_pipeline
 from bampipe.cli.options import (
@@ -36,7 +36,7 @@ def diagnose(
     ] = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
-    """Find which effect a model lacks, axis by axis, with the evidence.
+    """Find the effects that a model lacks, axis by axis, with their probabilities.
 
     Example: bampipe diagnose 2026-10-03_s01
     """
@@ -49,8 +49,8 @@ def diagnose(
     chosen = models.choose_model(root, model)
     one_stage("diagnose", root, options, model=chosen)
     if not options.json:
-        say_what_came(root, chosen)
-    _advise_next(RunFolder(root).read(DiagnoseResult, chosen).next, root, options)
+        print_forecasts(root, chosen)
+    _print_next(RunFolder(root).read(DiagnoseResult, chosen).next, root, options)
 
 
 @with_stage_options
@@ -61,11 +61,11 @@ def draft(
     ] = "",
     curve: Annotated[
         bool,
-        typer.Option("--curve", help="A curve through points instead, where it is to predict."),
+        typer.Option("--curve", help="Draft a curve through points instead, for prediction alone."),
     ] = False,
     options: StageOptions = DEFAULTS,
 ) -> None:
-    """Draft a formula for what no effect explains, as an effect file, with its p-value.
+    """Draft a formula for a residual that no effect explains, as an effect file.
 
     Example: bampipe draft 2026-10-03_s01
     """
@@ -77,11 +77,11 @@ def draft(
     root = places.find_run(run, options.runs)
     chosen = models.choose_model(root, model)
     one_stage("draft", root, options, model=chosen, more={"curve": True} if curve else {})
-    _advise_next(RunFolder(root).read(DraftResult, chosen).next, root, options)
+    _print_next(RunFolder(root).read(DraftResult, chosen).next, root, options)
 
 
-def _advise_next(command: str, root: Path, options: StageOptions) -> None:
-    """Print the command that a result of the run folder ``root`` says comes next."""
+def _print_next(command: str, root: Path, options: StageOptions) -> None:
+    """Print the command that a result of the run folder ``root`` proposes."""
     run = places.next_to(root, options.runs)
     show.print_advice(command.replace("RUN", run), options.quiet, options.json)
 
@@ -101,7 +101,7 @@ def extend(
     auto: Annotated[
         bool,
         typer.Option(
-            "--auto", help="Add what the diagnosis finds, and confirm, until it says stop."
+            "--auto", help="Add the effects that diagnoses find, until nothing is missing."
         ),
     ] = False,
     draft: Annotated[

@@ -1,4 +1,4 @@
-"""`bampipe monitor`: the filter on samples as they come."""
+"""`bampipe monitor`: the filter on samples as they arrive."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from bampipe.run import models
 if TYPE_CHECKING:
     from bampipe.monitor.monitor import Monitor
     from bampipe.monitor.start import Stream
+    from bampipe.physics import System
 
 POLL_S = 0.02
 SCREEN_S = 0.25
@@ -74,9 +75,11 @@ def monitor(
 
     Example: logger | bampipe monitor - --run 2026-10-03_s01 --session sessions/2026-10-03_s01
     """
-    from bampipe.monitor.start import MonitorOptions
+    from bampipe.data.run_folder import RunFolder
+    from bampipe.monitor import monitor as monitoring
+    from bampipe.monitor import start as monitor_start
 
-    options = MonitorOptions(window_s, false_alarms, memory_s)
+    options = monitor_start.MonitorOptions(window_s, false_alarms, memory_s)
     options.check()
     if not every > 0.0:
         raise InputError("must be positive", where="--every")
@@ -87,48 +90,32 @@ def monitor(
         if not quiet:
             show.note(f"bampipe: {text}")
 
-    watch, stream = _prepare(samples, run, model, device, session, options, strict, remark, runs)
-    screen = sys.stdout.isatty() and not json
-    try:
-        with _Output(screen, every) as output:
-            follow(stream, watch, output, wait=not once and samples != "-")
-    finally:
-        if stream.descriptor != 0:
-            os.close(stream.descriptor)
-
-
-def _prepare(
-    samples: str,
-    run: str,
-    model: str,
-    device: str,
-    session: Path | None,
-    options: Any,
-    strict: bool,
-    remark: Any,
-    runs: Path,
-) -> tuple[Monitor, Stream]:
-    """Compile the model before the first sample is due, then open the stream."""
-    from bampipe.data.run_folder import RunFolder
-    from bampipe.declarations.files import read_device
-    from bampipe.monitor import monitor as monitoring
-    from bampipe.monitor import start as monitor_start
-    from bampipe.physics import Model, compile_model, registry
-
     if device:
-        system = compile_model(Model(registry.device_from(*read_device(device))))
-        start = None
+        system, start = _compile_device(device), None
     else:
         folder = RunFolder(places.find_run(run or None, runs))
         chosen = models.choose_model(folder.root, model)
         remark(f"model {chosen} of {folder.root}")
         system, start = monitor_start.start_from_run(folder, chosen, options)
     stream = monitor_start.open_stream(samples, system, session, strict, remark)
-    return monitoring.Monitor(system, start, options, remark), stream
+    watch = monitoring.Monitor(system, start, options, remark)
+    try:
+        with _Output(sys.stdout.isatty() and not json, every) as output:
+            follow(stream, watch, output, wait=not once and samples != "-")
+    finally:
+        if stream.descriptor != 0:
+            os.close(stream.descriptor)
+
+
+def _compile_device(name: str) -> System:
+    from bampipe.declarations.files import read_device
+    from bampipe.physics import Model, compile_model, registry
+
+    return compile_model(Model(registry.device_from(*read_device(name))))
 
 
 def follow(stream: Stream, watch: Monitor, output: _Output, wait: bool) -> None:
-    """Filter what comes until the end, or where ``wait``, until the user stops it."""
+    """Filter the stream to its end, or if ``wait``, until the user stops it."""
     try:
         while True:
             values = stream.read(last=not wait)
@@ -173,7 +160,7 @@ class _Output:
         if self._screen:
             if final or time.monotonic() - self._drawn > SCREEN_S:
                 self._drawn = time.monotonic()
-                self._screen.update(_table(watch.report(), stream.bad_lines), refresh=True)
+                self._screen.update(_draw_table(watch.report(), stream.bad_lines), refresh=True)
             return
         content = watch.report()
         t = content["t"]
@@ -187,40 +174,37 @@ class _Output:
         show.write_line(line)
 
 
-def _table(content: Mapping[str, Any], bad_lines: int) -> Any:
-    """The screen: state and parameters, and below them whether all is well."""
+def _draw_table(content: Mapping[str, Any], bad_lines: int) -> Any:
+    """Return the screen: state and parameters, and below them the consistency of the filter."""
     from rich.table import Table
-    from rich.text import Text
 
     table = Table.grid(padding=(0, 2))
     for justify in ("left", "right", "right", "left"):
         table.add_column(justify=justify)
-    for axis, state in content.get("state", BLANK).items():
-        table.add_row(
-            axis, f"{state['position']:.5f}", f"{state['velocity']:+.4f} /s",
-            f"± {2.0 * state['velocity_sd']:.2g}",
-        )  # fmt: skip
-    for name, item in content.get("parameters", BLANK).items():
-        table.add_row(
-            name, f"{item['estimate']:.4g}", f"{item['lower']:.4g} to {item['upper']:.4g}",
-            item["unit"],
-        )  # fmt: skip
+    for axis, one in content.get("state", BLANK).items():
+        sd = f"± {2.0 * one['velocity_sd']:.2g}"
+        table.add_row(axis, f"{one['position']:.5f}", f"{one['velocity']:+.4f} /s", sd)
+    for name, one in content.get("parameters", BLANK).items():
+        interval = f"{one['lower']:.4g} to {one['upper']:.4g}"
+        table.add_row(name, f"{one['estimate']:.4g}", interval, one["unit"])
+    clock = "–" if content["t"] is None else f"{content['t']:.2f} s"
+    table.add_row("t", clock, f"{content['samples']} samples", "")
+    table.add_row("innovations", "", "", _tell_consistency(content))
+    restarts = f"{content['restarts']} restarts"
+    table.add_row("alarms", str(content["alarms"]), f"{bad_lines} bad lines", restarts)
+    return table
+
+
+def _tell_consistency(content: Mapping[str, Any]) -> Any:
+    from rich.text import Text
+
     nis = content.get("nis", BLANK)
     ratio = nis.get("window")
     if content["alarm"] and ratio is None:
         axes = ", ".join(nis.get("useless", ()))
-        text = Text(f"ALARM: no usable data {axes}".strip(), style="bold red")
-    elif content["alarm"]:
-        text = Text(f"ALARM: {nis['worst']} is not explained ({ratio:.2f})", style="bold red")
-    elif ratio is None:
-        text = Text("waiting for a complete window")
-    else:
-        text = Text(f"consistent ({ratio:.2f}, alarm from {nis['threshold']:.2f})", style="green")
-    clock = "–" if content["t"] is None else f"{content['t']:.2f} s"
-    table.add_row("t", clock, f"{content['samples']} samples", "")
-    table.add_row("innovations", "", "", text)
-    table.add_row(
-        "alarms", str(content["alarms"]), f"{bad_lines} bad lines",
-        f"{content['restarts']} restarts",
-    )  # fmt: skip
-    return table
+        return Text(f"ALARM: no usable data {axes}".strip(), style="bold red")
+    if content["alarm"]:
+        return Text(f"ALARM: {nis['worst']} is not explained ({ratio:.2f})", style="bold red")
+    if ratio is None:
+        return Text("waiting for a complete window")
+    return Text(f"consistent ({ratio:.2f}, alarm from {nis['threshold']:.2f})", style="green")

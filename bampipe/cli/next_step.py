@@ -1,4 +1,4 @@
-"""What to do next, as the results of a run have it."""
+"""The next command or action, from the results of a run."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from bampipe.data.run_folder import RunFolder
 
 
 def after_run(root: Path, model: str, name: str) -> str:
-    """Return what to do after a run.
+    """Return the next step after a run.
 
     Args:
         root: the run folder; model: that counts; name: how to call the run in a command.
@@ -33,7 +33,7 @@ def after_run(root: Path, model: str, name: str) -> str:
 
 
 def _has_new_trials(run: RunFolder, model: str) -> bool:
-    """Whether the last diagnosis does not know all the trials that the model is fitted to."""
+    """Whether the model is fitted to trials that the last diagnosis did not have."""
     from bampipe.results.diagnose import DiagnoseResult
     from bampipe.results.identify import IdentifyResult
 
@@ -54,23 +54,23 @@ def _is_above_floor(run: RunFolder, model: str) -> bool:
 
 
 def after_loop(root: Path, model: str, name: str) -> str:
-    """Return what to do after the loop has ended with ``model``; arguments as for `after_run`."""
+    """Return the next step after the loop ended with ``model``; arguments as for `after_run`."""
     from bampipe.results.diagnose import DiagnoseResult
 
     run = RunFolder(root)
     if not run.exists(DiagnoseResult.file(model)):  # stopped after many rounds
         return f"bampipe diagnose {name}{run.model_option(model)}"
     found = run.read(DiagnoseResult, model)
-    # What a diagnosis selects and the loop has not added makes no better model.
+    # The loop has tried to add the selected effects: they do not improve the model.
     if found.selected or not found.lacking:
         return f"bampipe report {name} --open"
     return _after_diagnosis(run, model, found.next).replace("RUN", name)
 
 
 def after_proposal(root: Path, model: str, name: str) -> str:
-    """Return what to do after a trial has been proposed; arguments as for `after_run`.
+    """Return the next step after a trial has been proposed; arguments as for `after_run`.
 
-    What a diagnosis has found comes first, unless the trial is there to decide it.
+    Effects that a diagnosis has found come first, unless the trial is to decide about them.
     """
     from bampipe.results.diagnose import DiagnoseResult
     from bampipe.results.next import NextResult
@@ -87,7 +87,7 @@ def after_proposal(root: Path, model: str, name: str) -> str:
 
 
 def _after_diagnosis(run: RunFolder, model: str, said: str) -> str:
-    """Return what a diagnosis said; where that is to draft and it is done, what came of that."""
+    """Return the advice of a diagnosis, or that of the draft that it asked for."""
     from bampipe.results.draft import DraftResult
 
     if said.startswith("bampipe draft ") and run.exists(DraftResult.file(model)):

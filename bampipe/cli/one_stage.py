@@ -1,4 +1,4 @@
-"""One stage of a run as a command: its settings, its result, what to run next."""
+"""One stage of a run as a command: its settings, its result, the next command."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Pipeline
 
 _OF_DIAGNOSIS = ("draft", "next")
-"""Stages that go by what a diagnosis found."""
+"""Stages that use a diagnosis."""
 
 
 def parse_settings(given: Sequence[str] | None) -> dict[str, object]:
@@ -54,7 +54,7 @@ def one_stage(
     model: str = "",
     more: Mapping[str, object] | None = None,
 ) -> Outcome:
-    """Run one stage on what the earlier ones left, and print what it found.
+    """Run one stage on the results of earlier ones, and print its findings.
 
     Args:
         stage: its name.
@@ -62,7 +62,7 @@ def one_stage(
         options: of the command.
         session: the session folder, of a stage that reads it.
         model: the only model to run; all that the pipeline names, if empty.
-        more: settings from options of this stage alone.
+        more: settings from options that only this stage has.
     """
     batch.limit_threads(1)
     settings = parse_settings(options.settings) | dict(more or {})
@@ -94,9 +94,9 @@ def one_stage(
 
 
 def _say_if_outdated(root: Path, pipeline: Pipeline, model: str) -> None:
-    """Say so where a diagnosis that has just been used was made from other results."""
+    """Print a note if a diagnosis that has just been used was made from other results."""
     for step in status(root, pipeline):
-        # Other settings than the pipeline's do not make it wrong; other inputs do.
+        # Settings that differ from the pipeline's do not make it wrong; other inputs do.
         if step.step == f"diagnose:{model}" and step.state == "stale" and "/" in step.reason:
             show.say(
                 f"note: the diagnosis of {model} is older than what it was made from"

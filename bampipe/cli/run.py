@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.forecast import say_what_came
+from bampipe.cli.forecast import print_forecasts
 from bampipe.cli.lab import refresh
 from bampipe.cli.next_step import after_run
 from bampipe.cli.one_stage import parse_settings
@@ -29,6 +30,8 @@ from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome, Request
 from bampipe.run.session_name import session_id
 from bampipe.stages import base
+
+STATES = {0: "done", 1: "gate failed", 2: "bad input", 3: "crashed"}
 
 
 def run(
@@ -83,49 +86,25 @@ def run(
 
     Example: bampipe run 'sessions/*' --jobs 2 --junit gates.xml
     """
-    if engine not in ("local", "dask"):
-        raise InputError(f"no engine {engine!r}", remedy="choose local or dask")
-    if scheduler and engine != "dask":
-        raise InputError("--scheduler needs --engine dask")
+    _check_engine(engine, scheduler)
     folders = places.find_sessions(sessions)
-    batch.limit_threads(min(jobs, len(folders)))
-    chosen = pipelines.load(pipeline)
-    stage_settings = _stage_settings(settings)
-    requests: list[Request] = []
-    outcomes: list[Outcome] = []
-    taken: dict[Path, Path] = {}
-    for folder in folders:
-        try:
-            root = runs / session_id(folder)
-            if root in taken:
-                raise InputError(
-                    f"session_id {root.name!r} is that of {taken[root]} too",
-                    where=str(folder),
-                    remedy="give each session an id of its own",
-                )
-        except InputError as error:
-            if len(folders) == 1:
-                raise
-            outcomes.append(Outcome(folder, "refused", error=str(error)))
-            continue
-        taken[root] = folder
-        requests.append(
-            Request(
-                root=root,
-                pipeline=chosen,
-                session=folder,
-                settings=stage_settings,
-                first=first,
-                last=last,
-                force=force,
-                model=model,
-                judge=True,
-                accepted=accepted,
-                publish=publish,
-                processes=batch.share(min(jobs, len(folders))),
-                wait=not no_wait,
-            )
-        )
+    at_once = min(jobs, len(folders))
+    batch.limit_threads(at_once)
+    common = Request(
+        root=runs,
+        pipeline=pipelines.load(pipeline),
+        settings=_split_settings(settings),
+        first=first,
+        last=last,
+        force=force,
+        model=model,
+        judge=True,
+        accepted=accepted,
+        publish=publish,
+        processes=batch.share(at_once),
+        wait=not no_wait,
+    )
+    requests, outcomes = _make_requests(common, folders)
     several = len(folders) > 1
     with show.Watcher(quiet, several) as watcher:
         if engine == "dask":
@@ -136,23 +115,57 @@ def run(
             outcomes += batch.run_sessions(requests, jobs, watcher)
         else:
             outcomes.append(batch.run_and_publish(requests[0], watcher))
-    if junit is not None:
-        _write_junit(junit, outcomes)
-    if markdown is not None:
-        _add_markdown(markdown, outcomes)
+    _write_summaries(outcomes, junit, markdown)
     _report_runs(outcomes, several, json)
     refresh(runs, several, quiet or json)
-    if not several and not json:
-        say_what_came(outcomes[0].root, outcomes[0].model)
     if not several:
-        name = places.next_to(requests[0].root, runs)
-        show.print_advice(after_run(outcomes[0].root, outcomes[0].model, name), quiet, json)
+        root, chosen = outcomes[0].root, outcomes[0].model
+        if not json:
+            print_forecasts(root, chosen)
+        command = after_run(root, chosen, places.next_to(requests[0].root, runs))
+        show.print_advice(command, quiet, json)
     code = max(outcome.exit_code for outcome in outcomes)
     if code:
         raise typer.Exit(code)
 
 
-def _stage_settings(given: Sequence[str] | None) -> dict[str, dict[str, object]]:
+def _check_engine(engine: str, scheduler: str) -> None:
+    if engine not in ("local", "dask"):
+        raise InputError(f"no engine {engine!r}", remedy="choose local or dask")
+    if scheduler and engine != "dask":
+        raise InputError("--scheduler needs --engine dask")
+
+
+def _make_requests(common: Request, folders: Sequence[Path]) -> tuple[list[Request], list[Outcome]]:
+    """Return a request for each session folder, and an outcome for each that is refused.
+
+    Args:
+        common: what all requests share; its ``root`` is the folder of run folders.
+
+    Raises:
+        InputError: the only session is refused.
+    """
+    requests: dict[Path, Request] = {}
+    refused: list[Outcome] = []
+    for folder in folders:
+        try:
+            root = common.root / session_id(folder)
+            if root in requests:
+                raise InputError(
+                    f"session_id {root.name!r} is that of {requests[root].session} too",
+                    where=str(folder),
+                    remedy="give each session an id of its own",
+                )
+        except InputError as error:
+            if len(folders) == 1:
+                raise
+            refused.append(Outcome(folder, "refused", error=str(error)))
+            continue
+        requests[root] = replace(common, root=root, session=folder)
+    return list(requests.values()), refused
+
+
+def _split_settings(given: Sequence[str] | None) -> dict[str, dict[str, object]]:
     found: dict[str, dict[str, object]] = {}
     for name, value in parse_settings(given).items():
         stage, dot, setting = name.partition(".")
@@ -165,24 +178,23 @@ def _stage_settings(given: Sequence[str] | None) -> dict[str, dict[str, object]]
     return found
 
 
-def _write_junit(path: Path, outcomes: Sequence[Outcome]) -> None:
-    suites = [junit_xml.Suite(item.root.name, item.verdicts, item.error) for item in outcomes]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(junit_xml.junit(suites))
-    except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
-
-
-def _add_markdown(path: Path, outcomes: Sequence[Outcome]) -> None:
+def _write_summaries(
+    outcomes: Sequence[Outcome], junit: Path | None, markdown: Path | None
+) -> None:
+    """Write the verdicts of the gates as JUnit XML, and add a summary in Markdown, where asked."""
     from bampipe.run.markdown import summary
 
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", encoding="utf-8") as stream:
-            stream.write(summary(outcomes))
-    except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
+    suites = [junit_xml.Suite(one.root.name, one.verdicts, one.error) for one in outcomes]
+    for path, mode in ((junit, "wb"), (markdown, "ab")):
+        if path is None:
+            continue
+        content = junit_xml.junit(suites) if path is junit else summary(outcomes).encode()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open(mode) as stream:
+                stream.write(content)
+        except OSError as error:
+            raise InputError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
 
 def _report_runs(outcomes: Sequence[Outcome], several: bool, json: bool) -> None:
@@ -192,21 +204,16 @@ def _report_runs(outcomes: Sequence[Outcome], several: bool, json: bool) -> None
     if json:
         show.print_json({"sessions": [outcome.content() for outcome in outcomes]})
     elif several:
-        words = {0: "done", 1: "gate failed", 2: "bad input", 3: "crashed"}
-        rows = [
-            [
-                outcome.root.name,
-                words[outcome.exit_code],
-                sum(step.seconds for step in outcome.steps),
-                outcome.error
-                or "; ".join(
-                    f"{verdict.gate} {verdict.key}: {verdict.message}".replace(" :", ":")
-                    for verdict in outcome.verdicts
-                    if verdict.state in ("failed", "warned")
-                ),
-            ]
-            for outcome in outcomes
-        ]
+        rows = []
+        for outcome in outcomes:
+            gates = (
+                f"{verdict.gate} {verdict.key}: {verdict.message}".replace(" :", ":")
+                for verdict in outcome.verdicts
+                if verdict.state in ("failed", "warned")
+            )
+            seconds = sum(step.seconds for step in outcome.steps)
+            state = STATES[outcome.exit_code]
+            rows.append([outcome.root.name, state, seconds, outcome.error or "; ".join(gates)])
         show.print_table(["session", "state", "seconds", ""], rows)
     else:
         show.print_outcome(outcomes[0])

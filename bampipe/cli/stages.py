@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.forecast import say_what_came
+from bampipe.cli.forecast import print_forecasts
 from bampipe.cli.one_stage import one_stage, plain_stage, print_settings
 from bampipe.cli.options import (
     DEFAULTS,
@@ -129,7 +129,7 @@ def next_(
         float, typer.Option(help="Length of the trial; 20 if omitted.", show_default=False)
     ] = 0.0,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Also a set of trials, as a sheet to print.")
+        bool, typer.Option("--plan", help="Also plan a set of trials, as a sheet to print.")
     ] = False,
     sd: Annotated[
         str,
@@ -140,7 +140,7 @@ def next_(
     ] = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
-    """Say which trial to record next, in one sentence, and what it is expected to give.
+    """Propose the trial to record next, in one sentence, with its expected result.
 
     Example: bampipe next 2026-10-03_s01
 
@@ -149,21 +149,21 @@ def next_(
     Example: bampipe next 2026-10-03_s01 --plan --sd 2%
     """
     if sd and not plan:
-        raise InputError("--sd is what a plan is to reach", remedy="give --plan with it")
+        raise InputError("--sd needs --plan", remedy="give --plan with it")
     chosen = model
     if not options.list_settings and not model:
         chosen = models.counting_model(places.find_run(run, options.runs))
-    more: dict[str, object] = {"sd": _share(sd)} if sd else {}
+    more: dict[str, object] = {"sd": _parse_share(sd)} if sd else {}
     if not options.list_settings and not options.json:
-        # A new proposal closes those that a recorded trial has followed: say first what came.
-        say_what_came(places.find_run(run, options.runs), chosen)
+        # A new proposal closes forecasts that a recorded trial has followed: compare these first.
+        print_forecasts(places.find_run(run, options.runs), chosen)
     plain_stage("next", run, options, chosen, purpose=purpose, seconds=seconds, plan=plan, **more)
     if plan and not (options.json or options.quiet or options.list_settings):
         show.say(f"sheet: {places.find_run(run, options.runs)}/models/{chosen}/protocol.pdf")
 
 
-def _share(text: str) -> float:
-    """The number that ``5%`` or ``0.05`` means."""
+def _parse_share(text: str) -> float:
+    """Return the number that ``5%`` or ``0.05`` means."""
     with contextlib.suppress(ValueError):
         share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
         if 0.0 < share < 1.0:
@@ -191,7 +191,7 @@ def report(
     ] = False,
     options: StageOptions = DEFAULTS,
 ) -> None:
-    """Write PDF, web page and page for exploring of everything found so far.
+    """Write the report: PDF, web page, and a page for exploring.
 
     Example: bampipe report 2026-10-03_s01 --open
     """

@@ -1,10 +1,11 @@
-"""A chain of joints out of a tree of links, as the plain tables that a device file holds."""
+"""A chain of joints out of a robot's file, as the plain tables that a device file holds."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bampipe.data.lumping import LumpedBodies
+from bampipe.data.mjcf import mjcf_tree
 from bampipe.data.rigid_body import Body
 from bampipe.data.robot_tree import MOVING, DriveLimits, Tree, TreeJoint, gravity_at, identifier
-from bampipe.data.robot_xml import DEEPEST
+from bampipe.data.robot_xml import DEEPEST, read_xml
+from bampipe.data.urdf import urdf_tree
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names
 
@@ -68,6 +71,34 @@ class Chain:
     notes: tuple[str, ...]
     gravity: tuple[float, float, float] | None = None
     gravity_note: str = ""
+
+
+def read_chain(
+    path: Path, base: str = "", tip: str = "", payload: Mapping[str, Any] | None = None
+) -> Chain:
+    """Read the chain of joints from ``base`` to ``tip``; arguments are those of `select_chain`.
+
+    Raises:
+        InputError: neither URDF nor MJCF, or none from which there is such a chain.
+    """
+    return select_chain(read_tree(path), base, tip, payload, str(path))
+
+
+def read_tree(path: Path) -> Tree:
+    """Read the links and joints of a robot's file.
+
+    Raises:
+        InputError: neither URDF nor MJCF, or one with wrong entries.
+    """
+    root = read_xml(path)
+    if root.tag == "mujoco":
+        return mjcf_tree(root, str(path))
+    if root.tag == "robot":
+        return urdf_tree(root, path)
+    raise InputError(
+        f"found <{root.tag}>, expected <robot> of a URDF or <mujoco> of an MJCF",
+        where=str(path),
+    )
 
 
 def select_chain(

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bampipe.data.chain import read_chain
 from bampipe.data.rigid_body import Body, symmetric
-from bampipe.data.robot_file import read_chain
 from bampipe.data.robot_tree import DriveLimits, Tree, fixed_joint, tree_of_tables
 from bampipe.errors import InputError
 from bampipe.files import read_toml

@@ -10,11 +10,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.data.chain import read_tree
 from bampipe.data.device_file import tree_of_robot
 from bampipe.data.lumping import put_bodies
 from bampipe.data.mjcf import mjcf_text
 from bampipe.data.rigid_body import Body, symmetric
-from bampipe.data.robot_file import read_tree
 from bampipe.data.robot_tree import (
     UPRIGHT,
     DriveLimits,

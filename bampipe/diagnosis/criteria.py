@@ -31,6 +31,8 @@ class Criteria:
         tails: degrees of freedom of Student's t distribution of the errors.
         block_s: length of stretches of time that count as independent, s: one must not decide.
         beam: number of sets of effects that are pursued side by side.
+        doubt: scale of what is left on an axis, in units of noise and discrepancy, from which on it
+            is something unknown, which effects that take less than it leaves may resemble.
     """
 
     probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.9
@@ -43,6 +45,7 @@ class Criteria:
     tails: Positive = 4.0
     block_s: Positive = 2.0
     beam: Annotated[int, Field(ge=1)] = 10
+    doubt: Positive = 6.0
 
     @property
     def largest_p_value(self) -> float:

@@ -21,10 +21,12 @@ Array = NDArray[np.float64]
 
 _ALONE, _SEVERAL = 7, 5
 """Values of a shape on the grid: of an effect with one, and of each of an effect with several."""
-_WIDE = 1e3
+_WIDE = 300.0
 """Ratio of the ends of a range from which on its grid has `_MORE` values more."""
-_MORE = 4
-_MOST = 60
+_MORE = 6
+_MOST, _MOST_OF_STATES = 60, 300
+"""Shapes on a grid: of an effect without and with internal states, whose shape decides when things
+happen, not only how large they are."""
 _DIVERGED = 1e30
 """An internal state that is too stiff to be integrated at the sampling rate ends above this."""
 _SEGMENT = 128
@@ -84,12 +86,16 @@ class Dictionary:
 
     def grid(self, name: str) -> list[Key]:
         """The shapes of a candidate at which its columns are made to begin with."""
-        axes, ranges = [], self.ranges[name]
-        for r in ranges:
-            count = _ALONE if len(ranges) == 1 else _SEVERAL
-            count += _MORE * (r.by_ratio and r.high / r.low > _WIDE)
-            axes.append(np.linspace(0.0, 1.0, count).tolist())
-        return [(name, shape) for shape in itertools.islice(itertools.product(*axes), _MOST)]
+        ranges = self.ranges[name]
+        each = _ALONE if len(ranges) == 1 else _SEVERAL
+        counts = [each + _MORE * (r.by_ratio and r.high / r.low > _WIDE) for r in ranges]
+        states = self.candidates[name].system.model.effects[-1].effect.states
+        while np.prod(counts) > (_MOST_OF_STATES if states else _MOST):
+            dense = [(n - 1) / r.extent for n, r in zip(counts, ranges, strict=True)]
+            counts[int(np.argmax(dense))] -= 1
+        # Few values are better off amid the parts of a range than at its ends.
+        axes = [np.linspace(0.0, 1.0, n) if n > 3 else (np.arange(n) + 0.5) / n for n in counts]
+        return [(name, tuple(map(float, shape))) for shape in itertools.product(*axes)]
 
     def values(self, key: Key) -> Array:
         """The searched parameters of a candidate, in its unit."""

@@ -124,7 +124,31 @@ def weigh_sets(
                     drops[effect] = _losses(with_unknown).get(effect, 0.0)
         if unknown[axis] == unknown.max():
             sets = with_unknown
+    far = np.sqrt(_squares(search, ()) / np.maximum(search.p.count, 1)) > criteria.doubt
+    unknown[far] = 1.0
+    for effect in own if far.any() else ():
+        # In doubt is not absent: the model keeps it, and the report mentions it.
+        most = max(_share_explained(search, effect, far), 1.0 - criteria.probability)
+        effects[effect] = min(effects[effect], most)
     return Weighed(sets, effects, unknown, tuple(functions), drops)
+
+
+def _squares(search: Search, keys: tuple[Key, ...]) -> Array:
+    """Sum of squares that a set leaves, in units of the noise, (n_q,)."""
+    return np.array([max(float(rows @ rows), 1e-300) for rows in search.residual_rows(keys)])
+
+
+def _share_explained(search: Search, effect: str, far: NDArray[np.bool_]) -> float:
+    """Of the mean square without an effect, what it takes on axes that are ``far``; the largest.
+
+    What is missing there may resemble an effect that takes less than that leaves. 1 of an effect
+    that the other axes show, or show more than these.
+    """
+    now, without = _squares(search, ()), _squares(search, ((f"-{effect}", ()),))
+    gain = 0.5 * search.p.independent * np.log(without / now)
+    if gain[~far].sum() >= min(gain[far].sum(), _NEAR):
+        return 1.0
+    return float(np.max(1.0 - now[far] / without[far]))
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ _GIVE = (1e-4, 0.1)
 samples where friction changes its sign."""
 _LOSS = (1e-2, 3.0)
 """Of the load, at the highest load."""
+_LIGHTEST = 6.0
+"""Inertia of an axis over that of the lightest part of it that matters."""
 _TIME = (2.0, 3.0)
 """In samples, in trials: the time in which something settles."""
 _PARTS = {"travel": (0.02, 0.98), "upper half": (0.5, 0.98), "lower half": (0.02, 0.5)}
@@ -59,6 +61,11 @@ class SearchRange:
     by_ratio: bool
     around: float | None = None
     farthest: float = np.inf
+
+    @property
+    def extent(self) -> float:
+        """Natural logarithm of the ratio of its ends; as of a ratio of 20 where not by ratios."""
+        return float(np.log(self.high / self.low if self.by_ratio else 20.0))
 
     def value_at(self, searched: float) -> float:
         """The value of the parameter for a number between ``low`` and ``high``."""
@@ -95,6 +102,7 @@ class MachineScale:
         lowest, highest: ends of the travel by coordinate, (n_q,), rad or m.
         speed: the highest, (n_q,), rad/s or m/s.
         load: the highest generalised force applied, (n_q,), N.m or N.
+        inertia: of each coordinate alone, by the model, amid the travel, (n_q,), kg.m2 or kg.
         coordinates: names and units of these and of their forces.
         interval, duration: time between samples, and of the longest trial, s.
         band_hz: highest frequency of the residual, (n_q,), Hz.
@@ -104,6 +112,7 @@ class MachineScale:
     highest: Array
     speed: Array
     load: Array
+    inertia: Array
     coordinates: dict[str, tuple[str, str]]
     interval: float
     duration: float
@@ -119,8 +128,11 @@ class MachineScale:
             qd.append(np.abs(motion.qd).max(axis=0))
             load.append(np.abs(applied).max(axis=0))
         times = [motion.t for motion in evidence.motions]
+        middle = 0.5 * (np.min(q, axis=0) + np.max(q, axis=0))[None, :]
+        inertia = np.diagonal(system.mass_matrix(middle, evidence.p)[0])
         return cls(
             np.min(q, axis=0), np.max(q, axis=0), np.max(qd, axis=0), np.max(load, axis=0),
+            inertia,
             {c.name: (c.unit, c.torque_unit) for c in system.model.device.coordinates},
             float(np.median(np.diff(times[0]))), max(float(np.ptp(t)) for t in times),
             evidence.band.cutoff_hz,
@@ -170,6 +182,7 @@ class MachineScale:
         speed, load = float(self.speed[i]), float(self.load[i])
         if not travel > 0.0 or not load > 0.0:
             return found
+        lightness = 1.0 / max(float(self.inertia[i]), 1e-300)
         highest = 2.0 * np.pi * _RESONANCE * self.band_hz[i]
         per_force = force.replace(".", "/")
         return found | {
@@ -179,4 +192,5 @@ class MachineScale:
             f"1/{unit}": (2 * np.pi * _WAVES[0] / travel, 2 * np.pi * _WAVES[1] / travel),
             f"{unit}/{per_force}": (_GIVE[0] * travel / load, _GIVE[1] * travel / load),
             f"1/{per_force}": (_LOSS[0] / load, _LOSS[1] / load),
+            "1/kg/m2" if unit == "rad" else "1/kg": (lightness, _LIGHTEST * lightness),
         }

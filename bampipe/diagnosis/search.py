@@ -38,6 +38,9 @@ _BESIDE, _PROMISING, _SWAPPED = 24, 8, 5
 """Candidates weighed exactly beside a set that grows, beside one that lost a member, and of those
 the ones whose shapes are refined."""
 _SWAPS, _POLISHED = 3, 4
+_ROUNDS = 12
+"""Of the refinement of shapes, as long as each gains: an impact moves with the width of its gap,
+and one that comes too late looks like none."""
 
 Pool = dict[tuple[str, ...], tuple[float, tuple[Key, ...]]]
 """Sets by the names of their members, each with its cost and shapes."""
@@ -620,7 +623,8 @@ class Search:
                     self.keep(pool, keys)
                 if min(pool.values())[1] == lead:
                     break
-            for keys in self.refine([keys for _, keys in sorted(pool.values())[:_POLISHED]], 4):
+            best = [keys for _, keys in sorted(pool.values())[:_POLISHED]]
+            for keys in self.refine(best, _ROUNDS):
                 self.keep(pool, keys)
             beam = sorted(pool.values())[:wide]
             yield beam

@@ -164,8 +164,10 @@ def select_effects(
                 members = frozenset(wider.effects)
                 if members in fits:
                     # By its own noise the set is not the better one: the earlier one is the last.
-                    moved = fits[members]
-                    last = moved is not None
+                    earlier = fits[members]
+                    if earlier is None or not is_better(current, earlier, search.solve(keys)):
+                        continue
+                    moved, last = earlier, True
                     break
                 progress(0.15 + 0.1 * number, f"fitting {', '.join(names(keys))}")
                 fits[members] = moved = session.try_fit(wider, start_of(search, keys, wider))

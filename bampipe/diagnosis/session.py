@@ -188,12 +188,15 @@ class Session:
             return nothing
         return residuals_of(evidence, replays)
 
-    def fit(self, recipe: Recipe, start: Array, noise: Noise | None = None) -> Fit:
+    def fit(
+        self, recipe: Recipe, start: Array, noise: Noise | None = None, lacking: float = np.inf
+    ) -> Fit:
         """Fit a model under the likelihood, with noise by replays of itself.
 
         Args:
             recipe: the model; start: parameters to start from, (n_p,).
             noise: by replays of another model; by default of this one, at ``start``.
+            lacking: scale from which on all samples of an axis weigh alike.
 
         Raises:
             Runaway: the simulated motion grows without bounds.
@@ -208,6 +211,7 @@ class Session:
         likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
         evidence, problem = self._descend(recipe, evidence, likelihood)
         likelihood = likelihood.with_heavy_tails(problem, c.tails)
+        likelihood = likelihood.with_equal_weights(problem, lacking)
         evidence, problem = self._descend(recipe, evidence, likelihood)
         return Fit(recipe, evidence, likelihood, problem)
 

@@ -90,7 +90,7 @@ def _judge(
     open_question = [e for e, p in listed.items() if p < c.probability]
     # At the floor, an unknown function follows what the bias is off, not the machine.
     asked = unknown if against_floor == "above_floor" else 0.0
-    remains = asked >= c.probability or _exceeds_any_model(final, axis)
+    remains = asked >= c.probability
     verdict: Verdict
     if against_floor == "floor_missing":
         verdict = "no_verdict"
@@ -126,16 +126,6 @@ def _judge(
         remains=bool(remains),
         sentence="",
     )
-
-
-_BEYOND_MODELS = 3.0
-"""Scale of the noise, in units of sensors, filters and the discrepancy of any model together."""
-
-
-def _exceeds_any_model(fit: Fit, axis: int) -> bool:
-    """Whether an axis leaves more than sensors, filters and any model's discrepancy explain."""
-    solved = fit.solved
-    return bool(np.sqrt(solved.left[axis] / fit.problem.count[axis]) > _BEYOND_MODELS)
 
 
 def effect_axes(initial: Fit, final: Fit, effect: str) -> tuple[int, ...]:

@@ -88,7 +88,10 @@ def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None
             p[j, i] = total
 
 
-@njit("UniTuple(float64, 2)(float64[::1], float64[:, ::1], float64, float64[::1])", cache=True)
+@njit(
+    "UniTuple(float64, 2)(float64[::1], float64[:, ::1], float64, float64[::1])",
+    cache=True,
+)
 def _update(x: Array, p: Array, y: float, gain: Array) -> tuple[float, float]:
     """Take in one sample ``y`` of noise 1, in place; return innovation and its variance."""
     n = x.shape[0]

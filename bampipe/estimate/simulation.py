@@ -75,8 +75,14 @@ class Plant(NamedTuple):
 
 
 class _Arm(NamedTuple):
-    """The arm: columns of the inputs with its force and derivatives, and its `Impedance`."""
+    """The arm: columns of the inputs with its force and derivatives, and its `Impedance`.
 
+    Attributes:
+        at, moving: (n,) places in the state of what it moves by each coordinate, and of its rate.
+    """
+
+    at: NDArray[np.int64]
+    moving: NDArray[np.int64]
     force: NDArray[np.int64]
     rate: NDArray[np.int64]
     curvature: NDArray[np.int64]
@@ -113,7 +119,7 @@ class _Workspace(NamedTuple):
 
 
 PLANT = record_type(Plant, _V, _V, _V, float64)
-_ARM = record_type(_Arm, _I, _I, _I, float64, float64, float64)
+_ARM = record_type(_Arm, _I, _I, _I, _I, _I, float64, float64, float64)
 _WORKSPACE = record_type(_Workspace, _M, _M, _M, _M, _V, _V, _V, _V)
 
 
@@ -172,7 +178,7 @@ def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, work):  # type: ign
         derivative(x, u, p, w, moved)
         u[force[j]] -= 1.0
         for i in range(n):
-            response[i, j] = moved[n + i] - still[n + i]
+            response[i, j] = moved[arm.moving[i]] - still[arm.moving[i]]
     trace = 0.0
     for j in range(nf):
         out[j] = 0.0
@@ -183,8 +189,8 @@ def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, work):  # type: ign
             normal[j, k] = total
         trace += normal[j, j]
     for i in range(n):
-        error = frequency * frequency * (q_ref[i] - x[i])
-        error += 2.0 * damping * frequency * (qd_ref[i] - x[n + i])
+        error = frequency * frequency * (q_ref[i] - x[arm.at[i]])
+        error += 2.0 * damping * frequency * (qd_ref[i] - x[arm.moving[i]])
         for j in range(nf):
             out[j] += response[i, j] * error
     for j in range(nf):  # keeps the solution finite where a force moves nothing
@@ -279,9 +285,9 @@ def simulate(
         Runaway: the motion grows without bounds.
     """
     nobody = np.zeros((0, 0))
-    return _integrate(
-        derivative, x0, u, p, dt, nobody, nobody, width, n_noise, max_step, hold=hold,
-        smooth=smooth,
+    return simulate_tracking(
+        derivative, x0, u, p, dt, nobody, nobody, width=width, n_noise=n_noise, force=(), hold=hold,
+        smooth=smooth, max_step=max_step,
     )[0]  # fmt: skip
 
 
@@ -305,6 +311,8 @@ def simulate_tracking(
     brake_time: float = 0.01,
     smooth: Sequence[int] = (),
     max_step: float = 2.5e-4,
+    moved_first: NDArray[np.int64] | None = None,
+    hold: bool = False,
 ) -> tuple[Array, Array]:
     """Integrate the model under given inputs plus an arm that holds it near a given motion.
 
@@ -313,11 +321,11 @@ def simulate_tracking(
     the returned inputs, so these with the returned motion are one consistent recording.
 
     Args:
-        derivative, x0, p, dt, width, n_noise, smooth, max_step: as in `simulate`.
+        derivative, x0, p, dt, width, n_noise, smooth, max_step, hold: as in `simulate`.
         u: (T, nu) inputs without the arm's share; copied.
         q_ref, qd_ref: (T, n_q) motion that the arm wants.
         force: columns of ``u`` with the handle force, N. They may be fewer than coordinates; the
-            arm's force is then the least-squares one.
+            arm's force is then the least-squares one. Without any there is no arm.
         rate, curvature: columns with its first and second derivative, where the model has them;
             they receive those of the arm's force. In the order of ``force``, -1 for one
             that the model does not use.
@@ -325,6 +333,8 @@ def simulate_tracking(
         brake: columns with the brake command of each coordinate, in their order, or none.
         brake_gain: (T, n_q) damping that the brakes render: each command is this times the
             speed, low-passed over ``brake_time`` (s) as a controller sees it. N.m.s/rad or N.s/m.
+        moved_first: (n_q, 2) places in the state of the positions that the arm leads along
+            ``q_ref``, and of their rates; by default those of the coordinates.
 
     Returns:
         states (T, nx) and inputs (T, nu) with the total handle force and the brake commands.
@@ -332,37 +342,6 @@ def simulate_tracking(
     Raises:
         Runaway: the motion grows without bounds.
     """
-    return _integrate(
-        derivative, x0, u, p, dt, q_ref, qd_ref, width, n_noise, max_step,
-        force=force, rate=rate, curvature=curvature, arm=impedance or Impedance(),
-        brake=brake if brake_gain is not None else (), brake_gain=brake_gain,
-        brake_time=brake_time, smooth=smooth,
-    )  # fmt: skip
-
-
-def _integrate(
-    derivative: Any,
-    x0: Array,
-    u: Array,
-    p: Array,
-    dt: float,
-    q_ref: Array,
-    qd_ref: Array,
-    width: Array,
-    n_noise: int,
-    max_step: float,
-    *,
-    hold: bool = False,
-    force: Sequence[int] = (),
-    rate: Sequence[int] = (),
-    curvature: Sequence[int] = (),
-    arm: Impedance = Impedance(),
-    brake: Sequence[int] = (),
-    brake_gain: Array | None = None,
-    brake_time: float = 0.01,
-    smooth: Sequence[int] = (),
-) -> tuple[Array, Array]:
-    """Give `_run` its arrays and its memory; return states (T, nx) and inputs (T, nu)."""
     finer = int(np.ceil(dt / _WIDEST_GRID_S - 1e-6)) if len(smooth) else 1
     if finer > 1:
         dt /= finer
@@ -374,15 +353,18 @@ def _integrate(
     x[0] = x0
     total = np.array(u, dtype=np.float64, order="C")
     gain = np.zeros((0, 0)) if brake_gain is None else np.ascontiguousarray(brake_gain)
-    n, nf = len(width), len(force)
+    n, nf, arm = len(width), len(force), impedance or Impedance()
+    if moved_first is None:
+        moved_first = np.arange(2 * n).reshape(2, n).T
     _run(
         derivative, x, total, make_plant(p, n_noise, width, max_step),
         _Arm(
+            moved_first[:, 0].copy(), moved_first[:, 1].copy(),
             np.array(force, dtype=np.int64), np.array(rate, dtype=np.int64),
             np.array(curvature, dtype=np.int64),
             arm.natural_frequency, arm.damping_ratio, arm.bandwidth,
         ),
-        _Brakes(np.array(brake, dtype=np.int64), gain, brake_time),
+        _Brakes(np.array(brake[: gain.shape[1]], dtype=np.int64), gain, brake_time),
         np.array(q_ref, dtype=np.float64, order="C"),  # a copy: columns of a table are read-only
         np.array(qd_ref, dtype=np.float64, order="C"), dt, hold,
         _Workspace(

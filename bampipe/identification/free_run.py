@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
-from bampipe.estimate.closed_loop import simulate_controlled
 from bampipe.estimate.simulation import simulate
 from bampipe.identification.drift import why_not_free
 from bampipe.physics import System
@@ -119,6 +118,8 @@ def _lacks(run: RunFolder, system: System, law: ControlLaw) -> str:
 
 
 def _closed(run: RunFolder, system: System, motion: Motion, p: Array, law: ControlLaw) -> _Run:
+    from bampipe.estimate.closed_loop import simulate_controlled  # compiles: for few machines
+
     path = run.require("filter/kinematics.parquet", "filter")
     frame = read_parquet(path, trial=motion.trial_id)
     r = np.empty((len(motion.t), len(law.inputs)))

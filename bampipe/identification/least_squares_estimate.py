@@ -39,6 +39,9 @@ from bampipe.trials.residuals import problem_of
 Array = NDArray[np.float64]
 
 _REPLICATES = 6
+_LACKING = 3.0
+"""What is left over what sensors, filters and the discrepancy explain, from which on weights by
+these say nothing: a verdict has it that something unknown remains there."""
 _PASSES = 3
 """Most fits of a model that is nonlinear in its parameters, each with replicates of the last."""
 _SETTLED = 0.3
@@ -234,13 +237,14 @@ def fit_squares(
     system: System,
     start: Array,
     block_s: float,
+    remove_bias: bool = True,
 ) -> SquaresFit:
     """Fit a model under the likelihood.
 
     Args:
         trials: to be fitted, whose `timing` says how late inputs may be.
         recipe, system: the model; start: (n_p,) parameters to start from.
-        block_s: as of `SquaresFit`.
+        block_s: as of `SquaresFit`; remove_bias: whether replicates give weights and bias.
 
     Raises:
         ValueError: fewer samples are clear of standstill than there are parameters.
@@ -252,8 +256,10 @@ def fit_squares(
     problem = problem_of(system, trials.motions, trials.band, timing=trials.timed)
     at, found = plain.p, None
     with suppress(Runaway):
-        for _ in range(1 if problem.linear else _PASSES):
-            again = _with_values(session.fit(recipe, at), trials, problem, block_s)
+        for _ in range(0 if not remove_bias else 1 if problem.linear else _PASSES):
+            again = _with_values(
+                session.fit(recipe, at, lacking=_LACKING), trials, problem, block_s
+            )
             settled = found is not None and _is_settled(found, again)
             found, at = again, again.fit.evidence.p
             if settled:
@@ -323,7 +329,8 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
 
 def require_enough(squares: SquaresFit, where: str) -> None:
     """Raise :class:`InputError` where fewer than two independent samples a number would count."""
-    moving = int(sum(here.independent for here in squares.fit.likelihood.samples))
+    samples = lay_out_samples(squares.fit.evidence, squares.block_s)
+    moving = int(sum(here.independent for here in samples))
     if moving < 2 * squares.free.size:
         raise InputError(
             f"of the free trials, {moving} independent samples are clear of standstill, fewer than"

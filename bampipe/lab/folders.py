@@ -1,4 +1,4 @@
-"""Where a lab's folder is, and whether it is up to date; imports nothing slow."""
+"""The place of a lab's folder, and whether it is up to date; imports nothing slow."""
 
 from __future__ import annotations
 

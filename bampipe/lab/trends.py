@@ -220,7 +220,7 @@ def _refit_outside(
     outside: Mapping[ControlChart, ChartPoint],
     mine: Mapping[str, Sequence[TableRow]],
 ) -> tuple[list[str], list[str]]:
-    """Return which parameters the missing effect brings back, and for which it cannot account.
+    """Return the parameters for which the missing effect accounts, and the others.
 
     With a model that has the effect, its estimates decide; without one, the effect accounts neither
     for a parameter of an axis on which nothing is missing, nor for a stiffness, which no model has.

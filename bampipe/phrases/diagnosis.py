@@ -38,7 +38,8 @@ def share_of_force(entry: AxisVerdict) -> str:
 
 def times_floor(error: float, floor: float) -> str:
     """Return an error as a multiple of its noise floor."""
-    return f"{error / floor:.3g} times the noise floor" if floor > 0.0 else "without a noise floor"
+    ratio = f"{significant(error / floor)} times the noise floor" if floor > 0.0 else ""
+    return ratio or "without a noise floor"
 
 
 def list_effects(entry: AxisVerdict, effects: Iterable[str], mark: str = "") -> str:
@@ -96,6 +97,19 @@ def open_question(parts: Sequence[str]) -> str:
     return f"these trials do not decide {'between' if parts[1:] else 'on'} {join_names(parts)}"
 
 
+def advise_trial(entry: AxisVerdict) -> str:
+    """Return the trial to record if none was found that would distinguish effects of an axis."""
+    if all(any(kind in name for name in entry.likely) for kind in ("delay", "lag")):
+        return (
+            "A lag weakens fast changes, a delay does not: log at a higher rate, and record trials"
+            " in which the force changes faster."
+        )
+    return (
+        "No trial was found that would distinguish them; `bampipe next --for decision` looks for"
+        " one."
+    )
+
+
 def missing_effects(found: DiagnoseResult, axis: str, mark: str = "") -> str:
     """Return the effects that an axis lacks, or the alternatives among them."""
     if found.axes[axis].verdict == "undecided":
@@ -120,15 +134,15 @@ def limits(found: DiagnoseResult) -> str:
 
 
 def null_distribution(null: NullDistribution | None) -> str:
-    """Return the gains of candidates on replays that lack nothing, in a sentence."""
+    """Return the gains of candidates on replicates that lack nothing, in a sentence."""
     if null is None:
         return (
-            "Replays of the model do not resemble the measurement, so that the gain of a candidate"
-            " by chance is not known."
+            "Replicates of the model do not resemble the measurement, so that the gain of a"
+            " candidate by chance is not known."
         )
     return (
-        f"On {null.replicates} replays of the final model, which lack nothing, the largest gain of"
-        f" any candidate is {min(null.largest):.3g} to {max(null.largest):.3g} nats; on"
+        f"On {null.replicates} replicates of the final model, which lack nothing, the largest gain"
+        f" of any candidate is {min(null.largest):.3g} to {max(null.largest):.3g} nats; on"
         f" the measured trials it is {null.measured:.3g} nats, of {null.effect}"
         f" (p = {null.p_value:.2g})."
     )
@@ -212,9 +226,9 @@ def _explain_refusal(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> s
         why = f"its held-out error of {error} is {STANDINGS[entry.standing]}{of}."
     else:
         why = (
-            "replays of the model do not resemble the measurement, so that the gain of a candidate"
-            f" by chance is not known; the held-out error is {error}, that of replays {floor}, and"
-            f" the model explains {share_of_force(entry)}."
+            "replicates of the model do not resemble the measurement, so that the gain of a"
+            f" candidate by chance is not known; the held-out error is {error}, that of replicates"
+            f" {floor}, and the model explains {share_of_force(entry)}."
         )
         windows = [one for one in result.worst_windows if one.axis == axis]
         if windows:

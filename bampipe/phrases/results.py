@@ -32,7 +32,7 @@ TIMING_AT_LIMIT = (
     "the model lacks something that shifts the force in time, such as a delay, a lag, a command"
     " held from sample to sample or friction that builds up"
 )
-"""What a timing at its limit points to."""
+"""The likely cause of a timing at its limit."""
 _TIMING_LIMIT = 0.95
 """Share of half a sample beyond which the timing of the inputs counts as at its limit."""
 

@@ -51,6 +51,7 @@ def effects_code(model: Model) -> Generation:
         ],
         "driven": any(e.has(*forces) for e in added)
         and not any(e.has(*forces) for e in equations.rates),
+        "moved_first": moved_first(equations, forces),
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
         "delays": equations.delays,
         "memory_uses": {},
@@ -91,6 +92,23 @@ def whole_code(model: Model) -> Generation:
         title = generated_code.module_title("compiled_bodies", here.source)
     sources["compiled"] = scalar_source(equations, here, title)
     return facts, sources
+
+
+def moved_first(e: Equations, forces: list[Any]) -> list[list[int]]:
+    """By axis, the places in a state of the position and rate that a force there acts on first.
+
+    Those of the axis itself, or internal states: of a motor that moves the axis through play.
+    """
+    n, found = len(e.q), []
+    for i, other in enumerate(e.other):
+        at = [i, n + i]
+        for place, rate in enumerate(e.rates):
+            if rate in e.z and other.has(e.z[place]):
+                through = e.z.index(rate)
+                if e.rates[through].has(*forces):
+                    at = [2 * n + place, 2 * n + through]
+        found.append(at)
+    return found
 
 
 _derived: dict[str, Equations] = {}

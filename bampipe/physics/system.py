@@ -61,6 +61,8 @@ class System:
         moved_by: numbers of the parameters of its `offset`.
         driven: whether what the effects add to the residual depends on the measured force of
             the same moment.
+        moved_first: by axis, the places among `states` of the position and rate that a force there
+            acts on first, (n_q, 2).
         compensated: axes on which the device has something against gravity; see `compensation`.
         delays: names of the parameters that shift measured forces in time.
         braked: whether what the effects add depends on a brake's command.
@@ -91,6 +93,7 @@ class System:
         self.moves_sensors: bool = meta["moves_sensors"]
         self.moved_by: tuple[int, ...] = tuple(meta["moved_by"])
         self.driven: bool = meta["driven"]
+        self.moved_first: NDArray[np.int64] = np.array(meta["moved_first"], dtype=np.int64)
         self.compensated: tuple[int, ...] = tuple(meta["compensated"])
         self.delays: tuple[str, ...] = tuple(meta["delays"])
         self.braked: bool = meta["braked"]

@@ -1,4 +1,4 @@
-"""What a report is made of, before it is typeset: sections of text, tables and figures.
+"""The document of a report before it is typeset: sections of text, tables and figures.
 
 Text may hold three kinds of inline mark: ``**strong**``, code between backticks, and a link to
 a page of our own, ``[words](../s01/report/report.html)``.
@@ -13,6 +13,7 @@ from typing import Literal
 
 from bampipe.report.wording import format_prose
 
+Tone = Literal["good", "attention", "unknown", "note"]
 Span = tuple[Literal["plain", "strong", "code", "link"], str]
 """Kind and text; of a link its words and its target, with a line break between."""
 
@@ -25,7 +26,7 @@ _MARK = re.compile(
 _COLUMN = re.compile(r"(?P<right>>?)(?P<title>.*?)(?: ~(?P<width>[\d.]+))?", re.DOTALL)
 
 
-def spans(text: str) -> list[Span]:
+def split_spans(text: str) -> list[Span]:
     """Split ``text`` at its inline marks, in order."""
     found: list[Span] = []
     end = 0
@@ -44,9 +45,9 @@ def spans(text: str) -> list[Span]:
     return found
 
 
-def plain_text(text: str) -> str:
+def strip_marks(text: str) -> str:
     """Return ``text`` as printed, without its marks."""
-    return "".join(body.partition("\n")[0] for _, body in spans(text))
+    return "".join(body.partition("\n")[0] for _, body in split_spans(text))
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class Callout:
         text: one to three sentences, or a line for each axis.
     """
 
-    tone: Literal["good", "attention", "unknown", "note"]
+    tone: Tone
     title: str
     text: str
 

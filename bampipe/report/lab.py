@@ -14,7 +14,7 @@ from bampipe.lists import join_names
 from bampipe.phrases import lab as phrases
 from bampipe.report import style
 from bampipe.report.build import Report
-from bampipe.report.document import Block, Callout, Document, Paragraph, Section, Table
+from bampipe.report.document import Block, Callout, Document, Paragraph, Section, Table, Tone
 from bampipe.report.wording import (
     NONE,
     choose_scale,
@@ -100,8 +100,8 @@ def _show_session(one: SessionVerdict) -> Callout:
     if "." not in sentence.partition(" ")[0]:  # else it begins with the name of a parameter
         sentence = sentence[:1].upper() + sentence[1:]
     remedy = f" Next: `{one.remedy}`." if one.remedy else ""
-    tone = "unknown" if one.verdict == "not diagnosed" else "attention"
-    return Callout(tone, f"{one.session}: {one.verdict}", f"{sentence}.{remedy}")  # type: ignore[arg-type]
+    tone: Tone = "unknown" if one.verdict == "not diagnosed" else "attention"
+    return Callout(tone, f"{one.session}: {one.verdict}", f"{sentence}.{remedy}")
 
 
 def _link_session(session: str, pages: Mapping[str, str]) -> str:

@@ -20,7 +20,7 @@ from bampipe.report.document import (
     Subheading,
     Table,
     number_blocks,
-    spans,
+    split_spans,
 )
 
 _TEMPLATE = Path(__file__).parent / "templates" / "page.html"
@@ -40,7 +40,7 @@ def page(document: Document, beside: str = "") -> str:
     for section, numbered in number_blocks(document):
         anchor = re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")
         contents.append(f'<li><a href="#{anchor}">{html.escape(section.title)}</a></li>')
-        blocks = "\n".join(_block(*pair) for pair in numbered)
+        blocks = "\n".join(_render_block(*pair) for pair in numbered)
         body.append(
             f'<section aria-labelledby="{anchor}">\n'
             f'<h2 id="{anchor}">{html.escape(section.title)}</h2>\n{blocks}\n</section>'
@@ -53,10 +53,10 @@ def page(document: Document, beside: str = "") -> str:
     )
 
 
-def _rich(text: str, *, breaking: bool = False) -> str:
+def _render_spans(text: str, *, breaking: bool = False) -> str:
     """Return HTML for text with marks; ``breaking``: names may break behind their marks."""
     parts = []
-    for kind, body in spans(text):
+    for kind, body in split_spans(text):
         if kind == "link":
             words, _, target = body.partition("\n")
             parts.append(f'<a href="{html.escape(target)}">{html.escape(words)}</a>')
@@ -68,52 +68,56 @@ def _rich(text: str, *, breaking: bool = False) -> str:
     return "".join(parts)
 
 
-def _block(block: Block, number: str) -> str:
+def _render_block(block: Block, number: str) -> str:
     match block:
         case Paragraph(text):
-            return f"<p>{_rich(text)}</p>"
+            return f"<p>{_render_spans(text)}</p>"
         case Subheading(text):
-            return f"<h3>{_rich(text)}</h3>"
+            return f"<h3>{_render_spans(text)}</h3>"
         case Bullets(items):
-            return "<ul>" + "".join(f"<li>{_rich(item)}</li>" for item in items) + "</ul>"
+            rows = "".join(f"<li>{_render_spans(item)}</li>" for item in items)
+            return f"<ul>{rows}</ul>"
         case Formulas(lines):
             rows = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
             return f'<div class="formulas">{rows}</div>'
         case Callout(tone, title, text):
-            rest = "".join(f"<p>{_rich(line)}</p>" for line in text.splitlines())
-            return f'<div class="callout {tone}"><p class="verdict">{_rich(title)}</p>{rest}</div>'
+            rest = "".join(f"<p>{_render_spans(line)}</p>" for line in text.splitlines())
+            verdict = f'<p class="verdict">{_render_spans(title)}</p>'
+            return f'<div class="callout {tone}">{verdict}{rest}</div>'
         case Table():
-            return _table(block, number)
+            return _render_table(block, number)
         case Figure(name, caption, svg):
             return (
-                f"<figure>{_inline(svg, name, caption)}"
-                f"<figcaption><strong>{number}</strong> {_rich(caption)}</figcaption></figure>"
+                f"<figure>{_embed_drawing(svg, name, caption)}"
+                f"<figcaption><strong>{number}</strong> {_render_spans(caption)}"
+                "</figcaption></figure>"
             )
 
 
-def _table(table: Table, number: str) -> str:
+def _render_table(table: Table, number: str) -> str:
     columns = table.read_columns()
     head = "".join(
-        f'<th scope="col" class="{column.side}">{_rich(column.title)}</th>' for column in columns
+        f'<th scope="col" class="{column.side}">{_render_spans(column.title)}</th>'
+        for column in columns
     )
     looks = [column.side if column.width else f"{column.side} whole" for column in columns]
-    rows = "\n".join(f"<tr>{_cells(looks, row)}</tr>" for row in table.rows)
-    note = f'<p class="remark">{_rich(table.note)}</p>' if table.note else ""
+    rows = "\n".join(f"<tr>{_render_cells(looks, row)}</tr>" for row in table.rows)
+    note = f'<p class="remark">{_render_spans(table.note)}</p>' if table.note else ""
     return (
         f'<div class="scroll"><table><caption class="caption"><strong>{number}</strong> '
-        f"{_rich(table.caption)}</caption><thead><tr>{head}</tr></thead>\n"
+        f"{_render_spans(table.caption)}</caption><thead><tr>{head}</tr></thead>\n"
         f"<tbody>{rows}</tbody></table></div>{note}"
     )
 
 
-def _cells(looks: Sequence[str], row: Sequence[str]) -> str:
+def _render_cells(looks: Sequence[str], row: Sequence[str]) -> str:
     return "".join(
-        f'<td class="{look}">{_rich(cell, breaking=True)}</td>'
+        f'<td class="{look}">{_render_spans(cell, breaking=True)}</td>'
         for look, cell in zip(looks, row, strict=True)
     )
 
 
-def _inline(svg: str, name: str, caption: str) -> str:
+def _embed_drawing(svg: str, name: str, caption: str) -> str:
     """Return the drawing for use inside a page: ids of its own, colours from the style sheet."""
     drawing = svg[svg.index("<svg") :]
     drawing = re.sub(r"<metadata>.*?</metadata>", "", drawing, flags=re.DOTALL)

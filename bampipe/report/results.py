@@ -101,7 +101,7 @@ class Results:
                 if step not in found
                 for name, digest in made.inputs.items()
                 if name in makers
-                and (makers[name] in found or _differs(name, stages[makers[name]], digest))
+                and (makers[name] in found or _is_changed(name, stages[makers[name]], digest))
             } - {"report"}
             if not more:
                 return tuple(sorted(found))
@@ -116,7 +116,7 @@ class Results:
         """
         found = self.read(IngestResult)
         if found is None:
-            raise self._not_ingested(IngestResult.FILE)
+            raise self._make_error(IngestResult.FILE)
         return found
 
     @cached_property
@@ -128,10 +128,10 @@ class Results:
         """
         frame = self.table("ingest/trials.parquet")
         if frame is None:
-            raise self._not_ingested("ingest/trials.parquet")
+            raise self._make_error("ingest/trials.parquet")
         return frame
 
-    def _not_ingested(self, relative: str) -> InputError:
+    def _make_error(self, relative: str) -> InputError:
         remedy = f"run `bampipe ingest SESSION` for {self.root} first"
         return InputError(f"{relative} is missing", where=str(self.root), remedy=remedy)
 
@@ -196,7 +196,11 @@ class Results:
 
     def make_section(self, title: str, said: str, stage: str) -> Section:
         """Return the section of a stage that has not run, with the command that runs it."""
-        return Section(title, (Paragraph(f"{said}: `bampipe {stage} {self.root.name}` does it."),))
+        return Section(title, (self.state_undone(said, stage),))
+
+    def state_undone(self, said: str, stage: str) -> Paragraph:
+        """Return the paragraph on a stage that has not run, with the command that runs it."""
+        return Paragraph(f"{said}: `bampipe {stage} {self.root.name}` does it.")
 
     def state_next(self, advice: str) -> Paragraph:
         """Return the paragraph on what to do next: a command for ``RUN``, or words."""
@@ -266,7 +270,7 @@ class Results:
         return f" (the paper's {item})" if self.paper else ""
 
 
-def _differs(name: str, maker: StepRecord, digest: str) -> bool:
+def _is_changed(name: str, maker: StepRecord, digest: str) -> bool:
     """Whether an input is not what its maker left.
 
     Inputs in TOML count by what they say, outputs by their bytes: those two cannot be compared, and

@@ -23,7 +23,7 @@ from bampipe.report.document import (
     Span,
     Table,
     number_blocks,
-    spans,
+    split_spans,
 )
 
 _TEMPLATE = Path(__file__).parent / "templates" / "report.typ"
@@ -80,39 +80,42 @@ def _print(document: Document, recorded: int) -> tuple[bytes, int]:
                     (root / f"figures/{block.name}.svg").write_text(block.svg, encoding="utf-8")
         source = root / _TEMPLATE.name
         shutil.copyfile(_TEMPLATE, source)
-        (root / "document.json").write_text(json.dumps(_content(document)), encoding="utf-8")
+        (root / "document.json").write_text(
+            json.dumps(_describe_document(document)), encoding="utf-8"
+        )
         compiler = typst.Compiler(source, root=root, ignore_system_fonts=True)
         printed = compiler.compile(format="pdf", timestamp=int(stamp))
         assert isinstance(printed, bytes)  # a list of pages comes for other formats
         return printed, json.loads(compiler.query("<pages>", field="value"))[0]
 
 
-def _content(document: Document) -> dict[str, Any]:
+def _describe_document(document: Document) -> dict[str, Any]:
     """Return the document as the template reads it: blocks numbered, text split into spans."""
     return {
         "title": document.title,
         "subtitle": document.subtitle,
         "scale": document.scale,
         "sections": [
-            {"title": section.title, "blocks": [_block(*pair) for pair in blocks]}
+            {"title": section.title, "blocks": [_describe_block(*pair) for pair in blocks]}
             for section, blocks in number_blocks(document)
         ],
     }
 
 
-def _block(block: Block, number: str) -> dict[str, Any]:
+def _describe_block(block: Block, number: str) -> dict[str, Any]:
     shown: dict[str, Any] = {"kind": type(block).__name__.lower(), "number": number}
     for field in fields(block):
         value = getattr(block, field.name)
         if isinstance(block, Callout) and field.name == "text":
             value = value.splitlines()
         if field.name != "svg":
-            shown[field.name] = value if field.name in _VERBATIM else _printed(value)
+            is_verbatim = field.name in _VERBATIM
+            shown[field.name] = value if is_verbatim else _split_spans(value)
     if isinstance(block, Table):
         columns = block.read_columns()
         letters = sum(len(cell) for row in block.rows for cell in row)
         shown |= {
-            "head": [_printed(column.title) for column in columns],
+            "head": [_split_spans(column.title) for column in columns],
             "align": [column.side for column in columns],
             "widths": [column.width for column in columns],
             "size": _NORMAL_SIZE if len(columns) < _MANY_COLUMNS else _SMALL_SIZE,
@@ -121,12 +124,12 @@ def _block(block: Block, number: str) -> dict[str, Any]:
     return shown
 
 
-def _printed(text: str | Sequence[Any]) -> list[Any]:
+def _split_spans(text: str | Sequence[Any]) -> list[Any]:
     """Return the spans of a text, or of each in a sequence: a link is its words."""
     if not isinstance(text, str):
-        return [_printed(item) for item in text]
+        return [_split_spans(item) for item in text]
     shown: list[Span] = []
-    for kind, body in spans(text):
+    for kind, body in split_spans(text):
         if kind == "link":
             shown.append(("plain", body.partition("\n")[0]))
         else:  # no line starts with a per cent sign

@@ -18,7 +18,7 @@ _MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.])")
 _POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]\d+)\b")
 _BASE_PARAMETERS = {"viscous": "viscous damping", "coulomb": "Coulomb friction"}
 NONE = "–"
-"""What stands for a number that there is not."""
+"""In place of a number that is not known."""
 
 
 def format_unit(text: str) -> str:

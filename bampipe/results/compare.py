@@ -59,7 +59,7 @@ class Rung(Record):
         """Whether its held-out error is lower, and can be judged where that of ``other`` can.
 
         A version that has lost its noise floor is no better, whatever its error: nothing says what
-        the sensors alone would leave of it, most often since its replays run away.
+        the sensors alone would leave of it, most often since its replicates run away.
         """
         return self.has_lower_error_than(other) and not self.has_lost_its_floor(other)
 

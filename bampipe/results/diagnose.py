@@ -1,4 +1,4 @@
-"""``models/<model>/diagnose.json``: what the model lacks, axis by axis, and how sure that is."""
+"""``models/<model>/diagnose.json``: effects that the model lacks, by axis, with probabilities."""
 
 from __future__ import annotations
 
@@ -16,22 +16,20 @@ UpToOne = Annotated[float, Field(le=1)]
 
 
 class AxisVerdict(Record):
-    """What one axis lacks."""
+    """The effects that one axis lacks."""
 
     verdict: Verdict
     effects: Names = Field(description="Of the most probable set, on this axis; `extend` adds them")
-    probabilities: dict[str, Share] = Field(
-        description="Effects of any probable set on this axis, by their probability"
-    )
+    probabilities: dict[str, Share] = Field(description="Effects of any probable set on this axis")
     unknown: Share = Field(
-        description="Probability that something is missing which no effect of the library is"
+        description="Probability that an effect is missing that the library does not have"
     )
     rmse_before: Size = Field(description="On held-out trials")
     rmse_after: Size = Field(description="With the most probable set")
     rmse_beyond_bias: Size = Field(
-        description="With it, but for the bias that filters leave where friction turns"
+        description="With it, without the bias that filters leave where friction changes its sign"
     )
-    noise_floor: Size = Field(description="The error of replays of the final model")
+    noise_floor: Size = Field(description="Error of replicates of the final model")
     noise_floor_sd: Size
     standing: FloorStatus = Field(description="rmse_after against noise_floor")
     unit: str
@@ -47,17 +45,17 @@ class AxisVerdict(Record):
     explained_by_effects: UpToOne = Field(
         description="Share of the excess mean square that the most probable set removes"
     )
-    remains: bool = Field(description="Whether more is missing than the set explains")
+    remains: bool = Field(description="Whether the set leaves something unexplained")
     sentence: str
 
     @property
     def likely(self) -> list[str]:
-        """The effects that may be missing, the likeliest first."""
+        """The effects that may be missing, the most probable first."""
         return sorted(self.probabilities, key=lambda name: -self.probabilities[name])
 
 
 class RankedEffect(Record):
-    """A candidate effect on the axis that it helps most."""
+    """A candidate effect on the axis whose error it lowers most."""
 
     effect: str
     axis: str
@@ -69,8 +67,8 @@ class RankedEffect(Record):
     )
     unit: str
     probability: Share
-    p_value: Share = Field(description="Chance that replays give a gain as large to any candidate")
-    score: float = Field(description="Log evidence that it gains, nats")
+    p_value: Share = Field(description="Probability that replicates give any candidate such a gain")
+    score: float = Field(description="Gain in log evidence, nats")
     parameters: dict[str, float]
     indistinguishable_from: Names
 
@@ -79,36 +77,30 @@ class WeighedSet(Record):
     """A set of effects and how probable it is."""
 
     effects: Names = Field(description="Beyond those of the model diagnosed")
-    unknown: str | None = Field(
-        default=None, description="Axis on which something unknown stands beside them"
-    )
+    unknown: str | None = Field(default=None, description="Axis with an unknown effect beside them")
     probability: Share
     log_evidence: float = Field(description="Over that of the first set, nats")
 
 
 class NullDistribution(Record):
-    """What chance gives to candidates where nothing is missing: replays of the final model."""
+    """Gains of candidates on replicates of the final model, in which nothing is missing."""
 
     replicates: Count
-    largest: tuple[float, ...] = Field(
-        description="On each replay, the largest gain of any candidate, nats"
-    )
-    measured: float = Field(description="The same on the measured trials, beside the final model")
-    effect: str = Field(description="Of which candidate")
+    largest: tuple[float, ...] = Field(description="Largest gain of any candidate, nats")
+    measured: float = Field(description="Largest gain on the measured trials, final model")
+    effect: str = Field(description="The candidate with that gain")
     p_value: Share
 
 
 class SuggestedTrial(Record):
-    """What to record to tell a group apart."""
+    """A trial that would distinguish effects."""
 
     between: Names
-    axis: str = Field(description="Where it shows most")
+    axis: str = Field(description="On which they differ most")
     design: str
-    separation: Size = Field(
-        description="Error there of the wrong one, refitted, in noise floors; on that trial"
-    )
-    separation_now: Size = Field(description="The same on the trials at hand")
-    confusion: Share = Field(description="Chance of taking one for the other, with that trial")
+    separation: Size = Field(description="Error of the wrong one there, refitted, in noise floors")
+    separation_now: Size = Field(description="The same on the present trials")
+    confusion: Share = Field(description="Probability of taking one for the other, with that trial")
     confusion_now: Share
     sentence: str
 
@@ -134,44 +126,44 @@ class WorstWindow(Record):
     t_end: float
     rmse: Size
     unit: str
-    doing: str = Field(description="What the device was doing")
+    doing: str = Field(description="Motion of the device")
 
 
 class DiagnoseResult(Result):
-    """What the model lacks, axis by axis, and how sure that is."""
+    """Effects that the model lacks, by axis, with probabilities."""
 
     FILE: ClassVar[str] = "models/{model}/diagnose.json"
     STAGE: ClassVar[str] = "diagnose"
 
     model: str
-    trials: Names = Field(default=(), description="By which effects were weighed")
+    trials: Names = Field(default=(), description="From which effects were weighed")
     sentence: str = Field(description="The verdicts in words")
-    next: str = Field(description="What to do now")
+    next: str = Field(description="The command or action that follows")
     axes: dict[str, AxisVerdict] = Field(min_length=1)
     ranking: tuple[RankedEffect, ...] = Field(description="Best first")
     descriptions: dict[str, EffectText] = Field(
-        default={}, description="By name of an effect in the ranking: what its file says"
+        default={}, description="Text of the effect file, by name of an effect in the ranking"
     )
     selected: Names
     sets: tuple[WeighedSet, ...] = Field(description="The most probable first")
     chance: NullDistribution | None = Field(
-        default=None, description="null where replays are not like the measurement"
+        default=None, description="null where replicates do not resemble the measurement"
     )
     cut_short: bool = Field(
         default=False, description="Whether more effects were wanted than may be added"
     )
     suggested_trial: SuggestedTrial | None
-    not_weighed: Names = Field(default=(), description="Effects that the search was to leave out")
+    not_weighed: Names = Field(default=(), description="Effects left out of the search on request")
     maps: dict[str, dict[str, ResidualMap]] = Field(description="By axis, then variable")
     worst_windows: tuple[WorstWindow, ...]
 
     @property
     def lacking(self) -> Names:
-        """Axes whose verdict is another one than that nothing is missing."""
+        """Axes with another verdict than ``nothing_missing``."""
         return tuple(a for a, entry in self.axes.items() if entry.verdict != "nothing_missing")
 
     def sets_on(self, axis: str) -> list[tuple[Names, float]]:
-        """What the sets come to on one axis, by probability: the most probable first."""
+        """Return the sets restricted to one axis, the most probable first."""
         known, found = self.axes[axis].probabilities, dict[Names, float]()
         for one in self.sets:
             here = tuple(name for name in known if name in one.effects)
@@ -180,7 +172,7 @@ class DiagnoseResult(Result):
 
     @property
     def alternatives(self) -> dict[str, Names]:
-        """By effect of the most probable set, those that stand in its place in other sets."""
+        """By effect of the most probable set, those that replace it in other sets."""
         found = {}
         for effect in self.selected:
             rest = {*self.selected} - {effect}
@@ -191,7 +183,7 @@ class DiagnoseResult(Result):
 
     @property
     def unnamed_axes(self) -> Names:
-        """Axes on which something is left that no effect of the library explains."""
+        """Axes with a residual that no effect of the library explains."""
         return tuple(
             axis
             for axis, entry in self.axes.items()

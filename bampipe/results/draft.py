@@ -1,4 +1,4 @@
-"""``models/<model>/draft.json``: a formula for what no effect of the library explains."""
+"""``models/<model>/draft.json``: a formula for a residual that no effect explains."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class DraftCurve(Record):
     low: tuple[float, ...] = Field(description="95 % band by the constants' covariance")
     high: tuple[float, ...]
     beside: dict[str, float] = Field(
-        description="What else the formula follows, with the value at which the curve is drawn"
+        description="Other variables of the formula, with the value at which the curve is drawn"
     )
 
 
@@ -52,10 +52,10 @@ class DraftedEffect(Record):
 
 
 class ChanceOfDraft(Record):
-    """What the same search finds where nothing is missing: on replays of the model."""
+    """Gains of the same search on replicates of the model, in which nothing is missing."""
 
     gain: float = Field(description="Of the best formula on the grid, log evidence in nats")
-    gains: tuple[float, ...] = Field(description="Of the best formula on each replay")
+    gains: tuple[float, ...] = Field(description="Of the best formula on each replicate")
     p_value: Share
 
 
@@ -77,7 +77,7 @@ class NearestEffect(Record):
 
 
 class AxisDraft(Record):
-    """What was searched on one axis, and found."""
+    """The search on one axis and its result."""
 
     verdict: DraftVerdict
     effects: Names = Field(description="Drafted; they are what `extend` adds")
@@ -87,21 +87,21 @@ class AxisDraft(Record):
     options: tuple[DraftOption, ...] = Field(description="Shortest first")
     rmse_before: Size = Field(description="On held-out trials")
     rmse_after: Size
-    noise_floor: Size = Field(description="Median error of replays of the final model")
+    noise_floor: Size = Field(description="Median error of replicates of the final model")
     unit: str
     nearest: tuple[NearestEffect, ...]
     sentence: str
 
 
 class DraftResult(Result):
-    """A formula for what no effect of the library explains, axis by axis."""
+    """Formulas for residuals that no effect of the library explains, by axis."""
 
     FILE: ClassVar[str] = "models/{model}/draft.json"
     STAGE: ClassVar[str] = "draft"
 
     model: str
     sentence: str = Field(description="The findings in words")
-    next: str = Field(description="What to do now")
+    next: str = Field(description="The command or action that follows")
     axes: dict[str, AxisDraft] = Field(min_length=1)
     effects: dict[str, DraftedEffect] = Field(description="By name, as a model has it")
     selected: Names

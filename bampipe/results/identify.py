@@ -10,25 +10,23 @@ from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
 Method = Literal["ukf", "least-squares", "output-error"]
-"""How parameters are estimated."""
+"""How parameters are estimated; by output error in runs of earlier versions only."""
 
 
 class ParameterEstimate(Record):
     """One parameter."""
 
     estimate: float
-    sd: Size = Field(
-        description="Standard deviation: block-wise sandwich, and spread between the methods"
-    )
+    sd: Size = Field(description="Standard deviation: block-wise sandwich, and the parts below")
     unit: str
     at_bound: bool = Field(description="Within one sd of its physical bound")
     filter_sd: Size | None = Field(
         default=None,
-        description="What the filter alone believes, which holds for white noise only",
+        description="Of the filter alone, valid for white noise only",
     )
     systematic_sd: Size | None = Field(
         default=None,
-        description="Part of sd by which methods that predict alike disagree beyond noise",
+        description="Part of sd by which methods disagree, in runs of earlier versions",
     )
     smoothing_sd: Size | None = Field(
         default=None,
@@ -45,7 +43,7 @@ class ParameterEstimate(Record):
     )
     least_squares_bias: float | None = Field(
         default=None,
-        description="What filtering adds to least squares, found by replaying the fit",
+        description="What filters and friction that stops would add to least squares",
     )
     bound_sd: Size | None = Field(
         description="Cramer-Rao bound: least sd that the sensors allow; null where there is none"
@@ -78,7 +76,7 @@ class MethodTried(Record):
         description="Parameters that lie farther from the published ones than twice the "
         "uncertainty of both",
     )
-    doubts: Names = Field(default=(), description="Why it may not be believed")
+    doubts: Names = Field(default=(), description="Reasons to distrust it")
 
 
 class WorstSecond(Record):
@@ -90,9 +88,7 @@ class WorstSecond(Record):
     move: float = Field(
         description="Change of it without that second, in standard deviations that the rest leaves"
     )
-    sentence: str = Field(
-        default="", description="In words, where it stands out as a transient or an outlier does"
-    )
+    sentence: str = Field(default="", description="In words, if it is a transient or an outlier")
 
 
 class Influence(Record):
@@ -190,7 +186,7 @@ class NoiseLevels(Record):
 
 
 class Convergence(Record):
-    """Whether the search, or the filter along the data, came to rest."""
+    """Whether the search, or the filter along the data, converged."""
 
     converged: bool
     iterations: Count | None = Field(default=None, description="Of least squares")
@@ -203,7 +199,7 @@ class Convergence(Record):
 
 
 class ParameterBound(Record):
-    """bound_sd; alone_sd, were all others known; partner whose error goes with it."""
+    """bound_sd; alone_sd if all others were known; partner with the most correlated error."""
 
     bound_sd: Size | None
     alone_sd: Size | None
@@ -220,7 +216,7 @@ class WeakDirection(Record):
 
 
 class DeviceNumber(Record):
-    """A constant of the device file, or a sum of them, were it estimated too."""
+    """A constant of the device file, or a sum of them, as if it were estimated too."""
 
     name: str
     value: float
@@ -249,7 +245,7 @@ class TrialGrowth(Record):
 
 
 class IdentifiabilityReport(Record):
-    """What these trials could say of each number, at best."""
+    """The least uncertainty of each number that these trials allow."""
 
     parameters: dict[str, ParameterBound]
     weak_directions: tuple[WeakDirection, ...]
@@ -260,7 +256,7 @@ class IdentifiabilityReport(Record):
 
 
 class BaseEstimate(Record):
-    """A combination of a robot's inertial numbers that motion shows, and no part of it alone."""
+    """A combination of a robot's inertial numbers that motion determines, but no part of it."""
 
     combination: str = Field(description="Of the names of parameters, with factors")
     members: Names
@@ -269,7 +265,7 @@ class BaseEstimate(Record):
     drawn: float = Field(description="By the numbers of the drawing")
     drawn_sd: Size
     unit: str
-    shown: bool = Field(description="Whether the trials say more of it than the drawing")
+    shown: bool = Field(description="Whether the trials determine it better than the drawing")
 
 
 class IdentifyResult(Result):
@@ -281,9 +277,7 @@ class IdentifyResult(Result):
     model: str
     headline: str
     method: Method = Field(description="That of the published parameters")
-    methods: dict[Method, MethodTried] = Field(
-        description="Every method tried, the published one first"
-    )
+    methods: dict[Method, MethodTried] = Field(description="Every method tried, published first")
     engine: Literal["compiled", "filterpy"]
     trials: Names = Field(description="Free trials used")
     parameters: dict[str, ParameterEstimate] = Field(
@@ -308,13 +302,13 @@ class IdentifyResult(Result):
         description="Width of the smoothed sign of the velocities over the device's `sign_width`: "
         "less where the trials of a test bench are likelier so. What is made of the model has it",
     )
-    notes: Names = Field(default=(), description="What to know before believing a number")
+    notes: Names = Field(default=(), description="Limits of the estimates")
     nis: Consistency | None = None
     innovations: dict[str, InnovationTests] | None = Field(default=None, description="By axis")
     noise: NoiseLevels | None = None
     position_error: dict[str, Size] | None = Field(
         default=None,
-        description="Output error: position error that is left, by axis, rad or m",
+        description="Of output error, by earlier versions: position error by axis, rad or m",
     )
     residual_sd: dict[str, Size] | None = Field(
         default=None, description="Least squares: low-passed residual by axis, N.m or N"
@@ -322,13 +316,11 @@ class IdentifyResult(Result):
     blocks: Annotated[int, Field(ge=1)] | None = Field(
         default=None, description="Independent blocks of time"
     )
-    restarts: Count | None = Field(
-        default=None, description="Searches before the filter held on to the motion"
-    )
+    restarts: Count | None = Field(default=None, description="Searches until the filter followed")
 
     @property
     def inertial(self) -> frozenset[str]:
-        """Inertial numbers of a robot's bodies, of which motion shows combinations only."""
+        """Inertial numbers of a robot's bodies, of which motion determines only combinations."""
         return frozenset(name for base in self.base_parameters or () for name in base.members)
 
     repeats: Count | None = Field(

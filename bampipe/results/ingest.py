@@ -1,4 +1,4 @@
-"""``ingest/session.json``: what the session says, in SI units."""
+"""``ingest/session.json``: channels and sensors of the session, in SI units."""
 
 from __future__ import annotations
 
@@ -42,9 +42,7 @@ class ForceChannels(Record):
     )
     zero: tuple[float, ...] = Field(default=(), description="Raw readings without force")
     raw_unit: str = Field(default="", description="Unit of the raw columns")
-    gain_sd: Size = Field(
-        default=0.0, description="Standard uncertainty of each component's gain, as a share"
-    )
+    gain_sd: Size = Field(default=0.0, description="Standard uncertainty of each gain, as a share")
     crosstalk_sd: Size = Field(
         default=0.0, description="That of how much of another component each shows, as a share"
     )
@@ -77,44 +75,40 @@ class MainsHum(Record):
 
 
 class DeadStretch(Record):
-    """Where a sensor reads one value while the machine moves, or is at the end of its range."""
+    """A stretch in which a sensor reads one value in motion, or the end of its range."""
 
     column: str
     start_s: Size = Field(description="Since the start of the trial")
     end_s: Size
-    rail: float | None = Field(default=None, description="That value, where the range ends with it")
+    rail: float | None = Field(default=None, description="That value, at the end of the range")
 
 
 class IngestResult(Result):
-    """What the session says, in SI units."""
+    """Channels and sensors of the session, in SI units."""
 
     FILE: ClassVar[str] = "ingest/session.json"
     STAGE: ClassVar[str] = "ingest"
 
     session_id: str = Field(min_length=1)
     device: str = Field(min_length=1)
-    device_file: str | None = Field(
-        description="The session's own device file; null for a built-in device"
-    )
+    device_file: str | None = Field(description="The session's own; null for a built-in device")
     device_digest: str = Field(
         default="",
         pattern="^([0-9a-f]{64})?$",
-        description="SHA-256 of what the session's own device file says",
+        description="SHA-256 of the content of the session's own device file",
     )
     driven: bool = Field(default=False, description="Whether a motor drives the device, not a hand")
     default_effects: Names = Field(
         default=(), description="Effects that the device file gives the base model"
     )
-    placeholders: Names = Field(
-        default=(), description="Numbers of the device file whose source still says `fill in`"
-    )
+    placeholders: Names = Field(default=(), description="Numbers whose source still says `fill in`")
     recorded_at: str | None = Field(description="ISO 8601, or null")
     operator: str = Field(default="", description="Who recorded it")
     device_serial: str = ""
     notes: str = ""
     simulated: bool = Field(default=False, description="Whether a simulator made it")
     sample_rate_hz: Positive = Field(description="Median over the trials, from their clocks")
-    announced_rate_hz: Positive | None = Field(description="What session.toml says, or null")
+    announced_rate_hz: Positive | None = Field(description="By session.toml, or null")
     kept_every: int = Field(default=1, ge=1, description="Samples of a log for one that is kept")
     axes: dict[str, EncoderChannel] = Field(min_length=1)
     force: ForceChannels

@@ -1,4 +1,4 @@
-"""``models/<model>/next.json``: the trial to record next, and what it is expected to give."""
+"""``models/<model>/next.json``: the trial to record next, and its expected result."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
 Purpose = Literal["precision", "decision", "sensitivity"]
-"""What a trial is for: smaller uncertainties, one effect distinguished from others, effects shown
-that the trials at hand would not have shown."""
+"""Purpose of a trial: smaller uncertainties, one effect distinguished from others, or effects
+revealed that the present trials would not have revealed."""
 
 NOTHING = "nothing missing"
-"""Name of the alternative that no effect is missing."""
+"""Name of the alternative without any missing effect."""
 AS_FORECAST = 1.3
-"""Factor within which an uncertainty came as forecast."""
+"""Factor within which an uncertainty counts as forecast."""
 
 
 def join_effects(effects: Iterable[str]) -> str:
-    """The name of effects that together are one alternative."""
+    """Return the name of effects that together are one alternative."""
     return " + ".join(effects) or NOTHING
 
 
 def split_effects(name: str) -> set[str]:
-    """The effects of an alternative that is called so by `join_effects`."""
+    """Return the effects of an alternative from its name by `join_effects`."""
     return {*name.split(" + ")} - {NOTHING}
 
 
@@ -46,18 +46,18 @@ class ExpectedSd(Record):
 
     before: Size = Field(description="As published")
     after: Size = Field(description="Median")
-    low: Size = Field(description="What comes lies between this and")
+    low: Size = Field(description="The outcome lies between this and")
     high: Size = Field(description="this, in eight of ten cases")
     unit: str
 
     @property
     def is_sharp(self) -> bool:
-        """Whether one number says it: both ends are within `AS_FORECAST` of the median."""
+        """Whether one number is enough: both ends are within `AS_FORECAST` of the median."""
         return self.high <= AS_FORECAST * self.after and self.after <= AS_FORECAST * self.low
 
     @property
     def number(self) -> str:
-        """What is forecast without its unit: one number where it can be trusted, else a range."""
+        """The forecast without its unit: one number where it can be trusted, else a range."""
         return f"{self.after:.2g}" if self.is_sharp else f"{self.low:.2g} to {self.high:.2g}"
 
 
@@ -81,11 +81,9 @@ class Proposal(Record):
     sentence: str
     seconds: Size = Field(description="Of all its trials together")
     parts: Count = Field(default=1, description="Trials in which it is recorded, each as long")
-    like: str = Field(
-        default="", description="The trial at hand that is imitated; there are no moves then"
-    )
-    moves: dict[str, Move] = Field(description="By axis; the first is the one that it is about")
-    pose: dict[str, float] = Field(description="Where the other axes are held, rad or m")
+    like: str = Field(default="", description="The present trial that is imitated, without moves")
+    moves: dict[str, Move] = Field(description="By axis; the trial is designed for the first")
+    pose: dict[str, float] = Field(description="Positions at which other axes are held, rad or m")
     brakes: Share = Field(default=0.0, description="Share of the commands of the viscous trials")
     levels: dict[str, float] = Field(default={}, description="Of further channels")
     worth: float = Field(description="By which proposals are ranked; of nine versions in ten")
@@ -95,8 +93,8 @@ class Proposal(Record):
         description="By parameter; none where the model lacks something or is not fitted to it",
     )
     confusion: tuple[ExpectedConfusion, ...] = ()
-    farther: Names = Field(default=(), description="Axes moved farther than in the trials at hand")
-    faster: Names = Field(default=(), description="Axes moved faster than there")
+    farther: Names = Field(default=(), description="Axes moved farther than in the present trials")
+    faster: Names = Field(default=(), description="Axes moved faster than in the present trials")
 
 
 class Detectable(Record):
@@ -106,10 +104,8 @@ class Detectable(Record):
     smallest: Size | None = Field(description="null where they do not excite it")
     typical: float = Field(description="Size at which the effect is clearly there")
     unit: str
-    axis: str = Field(description="Where it shows first; empty where it shows nowhere")
-    with_proposal: Size | None = Field(
-        default=None, description="The same once the first proposal has been recorded"
-    )
+    axis: str = Field(description="Axis on which it is revealed first; empty if on none")
+    with_proposal: Size | None = Field(default=None, description="With the first proposal recorded")
 
 
 class PlannedTrial(Record):
@@ -118,7 +114,7 @@ class PlannedTrial(Record):
     sentence: str
     seconds: Size
     times: Count = Field(description="How often it is recorded")
-    moves: dict[str, Move] = Field(description="By axis; the first is the one that it is about")
+    moves: dict[str, Move] = Field(description="By axis; the trial is designed for the first")
 
 
 class PlannedSd(ExpectedSd):
@@ -149,7 +145,7 @@ class Plan(Record):
 
 
 class NextResult(Result):
-    """The trial to record next, and what it is expected to give."""
+    """The trial to record next, and its expected result."""
 
     FILE: ClassVar[str] = "models/{model}/next.json"
     STAGE: ClassVar[str] = "next"
@@ -158,11 +154,11 @@ class NextResult(Result):
 
     model: str
     purpose: Purpose
-    parameter: str = Field(default="", description="The one that is to become precise")
-    trials: Names = Field(description="At hand when this was proposed")
-    sentence: str = Field(description="What to record")
+    parameter: str = Field(default="", description="The parameter whose uncertainty is to fall")
+    trials: Names = Field(description="Present when this was proposed")
+    sentence: str = Field(description="The motion to record")
     why: str
-    expected: str = Field(description="What it is expected to give")
+    expected: str = Field(description="Its expected result")
     proposals: tuple[Proposal, ...] = Field(description="Best first")
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
     unpromised: Names = Field(
@@ -170,6 +166,7 @@ class NextResult(Result):
         description="Effects that change the motion too much for such a number",
     )
     shows: Names = Field(
-        default=(), description="Effects that the first proposal is to show, and the trials not"
+        default=(),
+        description="Effects that the first proposal would reveal, and the present trials do not",
     )
     plan: Plan | None = None

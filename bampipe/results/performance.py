@@ -1,4 +1,4 @@
-"""``models/<model>/performance.json``: what a hand feels, and the numbers of the device file."""
+"""``models/<model>/performance.json``: the device at its handle, and its constants."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class DeviceConstant(Record):
 
 
 class Handle(Record):
-    """Where the handle can be pushed as many ways as there are axes."""
+    """The handle, if it can be pushed in as many directions as there are axes."""
 
     directions: Names
     workspace: Quantity = Field(description="Swept in the session")
@@ -54,7 +54,7 @@ class Handle(Record):
 
 
 class PerformanceResult(Result):
-    """What a hand feels, and the numbers of the device file."""
+    """Stiffness, friction and inertia at the handle, and the numbers of the device file."""
 
     FILE: ClassVar[str] = "models/{model}/performance.json"
     STAGE: ClassVar[str] = "performance"
@@ -62,9 +62,7 @@ class PerformanceResult(Result):
     model: str
     headline: str
     constants: dict[str, DeviceConstant]
-    range: dict[str, Range] = Field(
-        min_length=1, description="By axis: what the moving trials covered"
-    )
+    range: dict[str, Range] = Field(min_length=1, description="By axis, over the moving trials")
     resolution: dict[str, Resolution] = Field(description="By axis")
     largest_force: Quantity | None = Field(
         description="Largest that the sensor read (99.9 % quantile); null where there is none"

@@ -1,4 +1,4 @@
-"""What a record is: typed, immutable, read and written whole."""
+"""Base classes of records: typed, immutable, read and written whole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``run.json``: what was run on what, with what, and what came out."""
+"""``run.json``: steps, settings, inputs and outputs of a run."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ GateState = Literal["passed", "failed", "warned", "absent"]
 
 
 class Place(Record):
-    """Where it was made; no result depends on it."""
+    """The machine and session of the run; no result depends on it."""
 
     machine: str | None = None
     session: str | None = None
@@ -66,7 +66,7 @@ class PipelineUsed(Record):
 
 
 class StepRecord(Record):
-    """What one step was made of and what it wrote."""
+    """Inputs, settings and outputs of one step."""
 
     key: Digest = Field(description="Hash of everything the step depends on")
     config: dict[str, Any] = Field(description="Every setting, defaults included")
@@ -96,7 +96,7 @@ class Commit(Record):
 
 
 class GateVerdict(Record):
-    """What came of one quality gate."""
+    """The verdict of one quality gate."""
 
     gate: str
     model: str = Field(default="", description='The model that was judged, or ""')
@@ -107,7 +107,7 @@ class GateVerdict(Record):
 
 
 class RunResult(Result):
-    """What was run on what, with what, and what came out."""
+    """Provenance: steps, settings, inputs and outputs of a run."""
 
     FILE: ClassVar[str] = "run.json"
     STAGE: ClassVar[str] = "run"

@@ -20,11 +20,11 @@ class PossibleMistake(Record):
         description="Axes, force channels and other channels that it concerns; none of a clock or"
         " of gravity"
     )
-    sentence: str = Field(description="What is wrong, and what to write instead")
+    sentence: str = Field(description="The mistake and its correction")
 
 
 class SetupMistake(PossibleMistake):
-    """A mistake that was found, with what speaks for it."""
+    """A mistake that was found, with its evidence."""
 
     factor: float = Field(
         default=1.0, description="By which their readings must be multiplied, of a scale or clock"
@@ -34,18 +34,18 @@ class SetupMistake(PossibleMistake):
         default=None, description="In the frame of a robot's base, m/s2, where that is mistaken"
     )
     axes: Names = Field(description="Whose equations it spoils")
-    evidence: str = Field(description="What changes once it is set right")
+    evidence: str = Field(description="The change once it is corrected")
     error_before: dict[str, Size] = Field(
         description="Error of the fit by axis, per cent of the applied force"
     )
-    error_after: dict[str, Size] = Field(description="The same with it set right")
+    error_after: dict[str, Size] = Field(description="The same after its correction")
     alternatives: tuple[PossibleMistake, ...] = Field(
         default=(), description="Other mistakes that the trials cannot tell from this one"
     )
 
 
 class AxisSetup(Record):
-    """What the trials say of the set-up of one axis."""
+    """The state of the set-up of one axis."""
 
     state: Literal["sound", "mistaken", "hardly_moves"]
     error_percent: Size | None = Field(
@@ -63,6 +63,6 @@ class SetupResult(Result):
 
     headline: str = Field(description="Empty where nothing is wrong")
     mistakes: tuple[SetupMistake, ...]
-    warnings: Names = Field(description="What makes results doubtful without being a mistake")
-    tested: Count = Field(description="Set-ups that were held against the one stated")
+    warnings: Names = Field(description="Reasons to doubt results that are no mistakes")
+    tested: Count = Field(description="Set-ups that were compared with the stated one")
     axes: dict[str, AxisSetup] = Field(min_length=1)

@@ -36,15 +36,11 @@ class LockedTrial(Record):
 
     stiffness: Positive
     standard_error: Size
-    transition: float = Field(
-        description="Torque after a reversal from which the loop is post-yield"
-    )
+    transition: float = Field(description="Torque after a reversal at which the loop is post-yield")
     slope_change: float = Field(
         description="Stiffness of the first half of the post-yield part over the second, less 1"
     )
-    drift: float = Field(
-        description="Wandering of the loops from first to last cycle, share of their range"
-    )
+    drift: float = Field(description="Drift of the loops from first to last, share of their range")
 
 
 class AxisStiffness(Record):
@@ -62,7 +58,7 @@ class AxisStiffness(Record):
         "could change by"
     )
     calibration_sd: Size = Field(
-        description="Part that what is stated of sensors makes, and the zeros of encoders"
+        description="Part from the stated uncertainties of sensors, and the zeros of encoders"
     )
     cycle_scatter: Size = Field(description="Standard deviation over the cycles")
     unit: str = Field(description="Of the stiffness: N.m/rad or N/m")
@@ -78,9 +74,7 @@ class AxisStiffness(Record):
     loop_width_deflection_unit: str
     energy_per_cycle: float = Field(description="Energy lost, mean over the cycles")
     energy_unit: Literal["J"]
-    yielded: bool = Field(
-        description="Whether the load overcame the friction, so that the slope is the stiffness"
-    )
+    yielded: bool = Field(description="Whether the load overcame the friction")
     cycles: tuple[LoopCycle, ...] = Field(min_length=1)
     trials: dict[str, LockedTrial]
 
@@ -99,8 +93,8 @@ class GearStiffness(Record):
     )
     play_sd: Size | None
     play_unit: str
-    side: Literal["motor", "load"] = Field(description="Where the second encoder sits")
-    late_s: float = Field(description="By how much the second encoder is read after the first, s")
+    side: Literal["motor", "load"] = Field(description="Side of the second encoder")
+    late_s: float = Field(description="Delay of the second encoder's reading after the first, s")
     late_sd: Size
     explained: float = Field(
         description="By stiffness and play, of what timing and the drive's own losses leave of the"
@@ -116,9 +110,7 @@ class StiffnessResult(Result):
     STAGE: ClassVar[str] = "stiffness"
 
     headline: str
-    notes: Names = Field(
-        description="What a reader must know: trials without loops, slipping brakes, small loads"
-    )
+    notes: Names = Field(description="Trials without loops, slipping brakes, small loads")
     axes: dict[str, AxisStiffness] = Field(
         description="One entry for each axis with a locked trial; none where there is no such trial"
     )

@@ -10,12 +10,12 @@ from bampipe.results.record import Names, Record, Result, Share
 
 
 class EffectText(Record):
-    """What an effect file says of its effect."""
+    """The text of an effect file."""
 
     summary: str
     formulas: Names
     looks_like: str
-    on_the_machine: str = Field(description="What to do on the machine about it; may be empty")
+    on_the_machine: str = Field(description="Remedy on the machine; may be empty")
     source: str
 
 

@@ -10,7 +10,7 @@ from bampipe.results.record import Result
 
 
 class TruthResult(Result):
-    """What `bampipe simulate` put into a session."""
+    """The hidden effects and parameters of a simulated session."""
 
     FILE: ClassVar[str] = "{session}.truth.json"
     STAGE: ClassVar[str] = "simulate"

@@ -17,12 +17,8 @@ class AxisError(Record):
     rmse: Size = Field(description="Parameters as identified")
     rmse_without_friction: Size
     held_out_rmse: Size = Field(description="Each trial by the fit to the others")
-    published_rmse: Size = Field(
-        description="Parameters and timing as published, on the same trials"
-    )
-    relative_error_percent: Size = Field(
-        description="100 rmse / root mean square of the measured torque"
-    )
+    published_rmse: Size = Field(description="With the published parameters, on the same trials")
+    relative_error_percent: Size = Field(description="100 rmse / RMS of the measured torque")
     held_out_relative_error_percent: Size = Field(
         description="100 held_out_rmse / root mean square of the measured torque"
     )
@@ -37,15 +33,15 @@ class JudgedError(AxisError):
     """Error of one axis over all trials, held against its noise floor."""
 
     noise_floor: Size | None = Field(
-        description="held_out_rmse of the fitted model's own replays, same sensors and filters; "
+        description="held_out_rmse of the fitted model's own replicates, same sensors and filters; "
         "null where none was computed"
     )
-    noise_floor_sd: Size = Field(description="Scatter of one replay")
+    noise_floor_sd: Size = Field(description="Scatter of one replicate")
     standing: FloorStatus
     expected_ratio: Annotated[float, Field(ge=1)] = Field(
         default=1.0,
         description="published_rmse over held_out_rmse if the published parameters were true, from "
-        "a replay; asked where it is above 1.2 on the trials",
+        "a replicate; asked where it is above 1.2 on the trials",
     )
     estimate: Literal["accepted", "refused"] = Field(
         description="Refused where published_rmse is more than 1.2 times held_out_rmse and more "
@@ -105,7 +101,7 @@ class AxisDrift(Record):
 
     unit: str = Field(description="rad or m")
     horizons: tuple[Drift, ...] = Field(description="Shortest first")
-    reason: str = Field(default="", description="Why there is none at the longer horizons")
+    reason: str = Field(default="", description="Reason for a lack of longer horizons")
 
 
 class FreeRun(Record):
@@ -132,10 +128,8 @@ class ValidateResult(Result):
     model: str
     headline: str
     cutoff_hz: dict[str, Positive] = Field(description="Low-pass of both sides by axis, Hz")
-    floor_replays: Count = Field(description="Replays that the noise floor is the mean of")
-    failed_checks: Names = Field(
-        description="Of data, estimate and floor, a sentence each; a model is sound without any"
-    )
+    floor_replays: Count = Field(description="Replicates that the noise floor is the mean of")
+    failed_checks: Names = Field(description="Of data, estimate and floor; a sound model has none")
     notes: Names
     axes: dict[str, JudgedError] = Field(
         description="Over all free trials and those in a viscous field, stretches at rest left out"

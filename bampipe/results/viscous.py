@@ -18,7 +18,7 @@ class Damping(Record):
     felt: float = Field(description="Both together")
     unit: Literal["N.s/m"]
     commanded: float | None = Field(
-        default=None, description="Where it is recorded; what follows is then there too"
+        default=None, description="null where it is not recorded, as the following are then"
     )
     p_value: Share | None = None
     differs: bool | None = None

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, choose_from
-from bampipe.files import read_toml
-from bampipe.run import record
+from bampipe.files import read_toml, write_text
 
 if TYPE_CHECKING:
     from bampipe.declarations.model import ModelFile
@@ -74,7 +73,7 @@ def write(root: Path, model: ModelFile) -> None:
                 return
         except InputError:
             path.unlink()
-    record.replace_text(path, text)
+    write_text(path, text)
 
 
 def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
@@ -105,7 +104,7 @@ def _bring_adopted_effects(root: Path) -> None:
         text = source.read_text(encoding="utf-8")
         target = root / "models" / BASE / "effects" / source.name
         if not target.is_file() or target.read_text(encoding="utf-8") != text:
-            record.replace_text(target, text)
+            write_text(target, text)
 
 
 def child_name(parent: str, effects: tuple[str, ...]) -> str:

@@ -6,15 +6,15 @@ import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from bampipe.errors import InputError
 from bampipe.files import (
     STORAGE_FAULTS,
     digest_file,
     is_inside,
-    json_text,
     refuse_links,
+    write_json,
 )
 from bampipe.run.events import Event, Listener, unheard
 from bampipe.run.lock import hold
@@ -80,38 +80,9 @@ def touched(root: Path, name: str, step: str) -> InputError:
     return InputError(f"{name} was changed since {step} wrote it", where=str(root), remedy=remedy)
 
 
-def replace_json(path: Path, content: dict[str, Any]) -> None:
-    """Write ``content`` to ``path``, in one step: it appears complete or not at all."""
-    replace_text(path, json_text(content))
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write ``text`` to ``path``, in one step: it appears complete or not at all."""
-    with _drafted(path) as draft:
-        draft.write_text(text, encoding="utf-8")
-
-
-@contextlib.contextmanager
-def _drafted(path: Path) -> Iterator[Path]:
-    """A file that takes the place of ``path`` once the block has written it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = draft_of(path)
-    try:
-        yield draft
-        draft.replace(path)
-    except OSError:
-        draft.unlink(missing_ok=True)
-        raise
-
-
-def draft_of(path: Path) -> Path:
-    """Return where ``path`` is written before it counts."""
-    return path.with_name(f".{path.name}.part")
-
-
 def write(root: Path, content: RunResult) -> None:
     """Write ``run.json``, in one step: it appears complete or not at all."""
-    replace_json(root / FILE, content.model_dump(mode="json"))
+    write_json(root / FILE, content.model_dump(mode="json"))
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bampipe.errors import InputError
-from bampipe.files import digest_file, is_inside, read_json_table
+from bampipe.files import digest_file, is_inside, read_json_table, write_json
 from bampipe.run import record
 from bampipe.run.request import Step
 from bampipe.run.state import RunState
@@ -72,7 +72,7 @@ def written(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, s
 
 def seal(staging: Path, sealed: Commit) -> None:
     """Write the commit file: from here on the step counts as done."""
-    record.replace_json(staging / COMMIT, sealed.model_dump(mode="json"))
+    write_json(staging / COMMIT, sealed.model_dump(mode="json"))
 
 
 def commit(state: RunState, staging: Path, sealed: Commit) -> None:
@@ -93,9 +93,9 @@ def commit(state: RunState, staging: Path, sealed: Commit) -> None:
 
 def recover(state: RunState) -> None:
     """Finish what a killed run had completed, drop what it had not."""
-    record.draft_of(state.root / record.FILE).unlink(missing_ok=True)
-    for draft in state.root.glob("models/*/.model.toml.part"):
-        draft.unlink()
+    for pattern in (f".{record.FILE}.*.partial", "models/*/.model.toml.*.partial"):
+        for draft in state.root.glob(pattern):
+            draft.unlink()
     parent = state.root / record.PRIVATE / "staging"
     for staging in sorted(parent.glob("*")):
         if not staging.is_dir():

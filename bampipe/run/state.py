@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, MissingResultError
-from bampipe.files import digest_content, digest_file, digest_input
+from bampipe.files import digest_content, digest_file, digest_input, write_json
 from bampipe.run import hashing, models, record
 from bampipe.run.request import Request, Step
 from bampipe.run.settings import configure, plain
@@ -210,7 +210,7 @@ class RunState:
         if noted != self.written:
             self._write(noted)
         if self.memory.changed:
-            record.replace_json(self.memory.path, self.memory.notes)
+            write_json(self.memory.path, self.memory.notes)
 
     def _noted(self) -> RunResult:
         """What is known by now; versions and machine as they were written."""

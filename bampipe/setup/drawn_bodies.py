@@ -93,7 +93,8 @@ class JointMotion:
         return self.reread(np.diag(factor))
 
 
-def _keep(values: Array, axes: Sequence[int]) -> Array:
+def keep(values: Array, axes: Sequence[int]) -> Array:
+    """Columns as they are: what is compared at every sample."""
     return values
 
 
@@ -118,7 +119,7 @@ class Comparison:
     motions: Sequence[JointMotion]
     drives: Array
     ratio: Array
-    thin: Callable[[Array, Sequence[int]], Array] = _keep
+    thin: Callable[[Array, Sequence[int]], Array] = keep
     used: Flags | None = None
     shared: Sequence[Array] = ()
     has_offset: bool = True

@@ -15,8 +15,8 @@ from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, Setu
 from bampipe.setup.finding import Finding, spoilt_axes
 from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
-from bampipe.setup.robot_search import drawn_robot
-from bampipe.setup.search import CorrectionSearch, shorten
+from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, drawn_robot, is_drawn
+from bampipe.setup.search import Search, shorten
 from bampipe.setup.words import describe_correction, describe_evidence, describe_lack, describe_size
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -46,8 +46,10 @@ def inspect_setup(
     _require_scale(system, short)
     signals = Signals.of_session(system, session)
     placeholders = find_placeholders(system, session)
-    search = CorrectionSearch(system, short, band, folds, signals)
+    search = Search(system, short, band, folds, signals)
     held = search.judge(())
+    if is_drawn(system):
+        search = DrawnSearch(system, shorten(short, DRAWN_SAMPLES), band, folds, signals)
     findings = search.find_mistakes(tuple(n for p in placeholders for n in p.signals))
     mistakes = tuple(_record(system, session, found, placeholders) for found in findings)
     axes = {

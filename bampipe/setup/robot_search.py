@@ -5,29 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
-from bampipe.estimate.heavier_body import HeavierBody
-from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
 from bampipe.physics.robot import Robot
-from bampipe.setup.drawn_bodies import Bounds, Comparison, Drive, JointMotion
-from bampipe.setup.finding import ALIKE, LEAST_GAIN, Finding, conclude, score_of
+from bampipe.setup.drawn_bodies import Bounds, Comparison, Drive, JointMotion, keep
+from bampipe.setup.finding import LEAST_GAIN
 from bampipe.setup.heavier import find_heavy, with_heavier_body
 from bampipe.setup.hypotheses import (
-    JOINT_SPANS,
-    MOST_TRAVEL,
     Correction,
     clock_corrections,
     combine,
     exchange_corrections,
     quarter_turns,
     resized,
-    scaled,
     shifted,
     sign_corrections,
     turned,
@@ -36,12 +31,14 @@ from bampipe.setup.hypotheses import (
 )
 from bampipe.setup.mounting import Mounting, find_mounting
 from bampipe.setup.plausibility import FARTHEST, WEIGHT, Plausibility
-from bampipe.trials.motion import Motion
+from bampipe.setup.search import MOST_AXES, Corrections, Family, Search, gears
 from bampipe.trials.residuals import standstill_of
-from bampipe.trials.signals import Change, Signals
+from bampipe.trials.signals import Change
 
 Array = NDArray[np.float64]
 
+DRAWN_SAMPLES = 4_000
+"""Of all trials together, that the bodies as drawn are held against."""
 _STATED: Bounds = (1.0 / 3.0, 3.0)
 """How many times lighter or heavier than drawn what hangs on a joint may be."""
 _SUSPICIOUS = 0.15
@@ -49,8 +46,6 @@ _SUSPICIOUS = 0.15
 least."""
 _ALIKE_SHARES, _FAR_SHARE = np.log(1.5), np.log(1.5)
 """Within what logarithm drives are off alike, as of one unit, and from what on that is too much."""
-_NEXT = 0.3
-"""Logarithm within which the turns of a motor are sought from those on the grid."""
 _UNSURE = 0.3
 """Relative uncertainty of what a drawing asks of a drive, at least."""
 
@@ -71,39 +66,35 @@ def drawn_robot(system: System) -> Robot:
 
 
 @dataclass
-class DrawnSearch:
+class DrawnSearch(Search):
     """Tries set-ups with bodies as drawn.
 
-    Each drive has besides an inertia and friction of its own, and one factor for its bodies.
-
-    Attributes:
-        system: the bare device; motions: the trials as they are stated, short enough.
-        band: of the residual; signals: of the session.
-        tested: number of set-ups tried.
+    Bodies that are free take on much of a mistake. Each drive has besides an inertia and friction
+    of its own, and one factor for its bodies.
     """
 
-    system: System
-    motions: Sequence[Motion]
-    band: Band
-    signals: Signals
-    tested: int = field(default=0, init=False)
+    is_drawn: ClassVar[bool] = True
     _reread: dict[bytes, Comparison] = field(default_factory=dict, init=False)
 
     @cached_property
     def stated(self) -> Comparison:
         """The drives beside what the drawn bodies require, all as stated but for a heavy body."""
-        return (
-            replace(self._as_drawn, robot=with_heavier_body(self._as_drawn.robot, self.heavier))
-            if self.heavier is not None
-            else self._as_drawn
-        )
+        drawn = self._as_drawn
+        if self.system.model.device.force_unit != "A":
+            self.heavier = find_heavy(drawn, drawn.drawn)
+        if self.heavier is None:
+            return drawn
+        return replace(drawn, robot=with_heavier_body(drawn.robot, self.heavier))
 
     @cached_property
-    def heavier(self) -> HeavierBody | None:
-        """The body that alone is far heavier than drawn."""
-        if self.system.model.device.force_unit == "A":
-            return None
-        return find_heavy(self._as_drawn, self._as_drawn.drawn)
+    def roughly(self) -> Comparison:
+        """The same at the samples that are compared: joints move more slowly than the band ends."""
+        kept = [self.band.thinned_rows(len(motion.t)) for motion in self.motions]
+        motions = [
+            JointMotion(m.position[rows], m.rate[rows], m.change[rows])
+            for m, rows in zip(self.stated.motions, kept, strict=True)
+        ]
+        return replace(self.stated, motions=motions, thin=keep, _required={})
 
     @cached_property
     def _as_drawn(self) -> Comparison:
@@ -151,69 +142,53 @@ class DrawnSearch:
         places = [self.system.inputs.index(name) for name in self.signals.forces]
         return np.asarray((found[1:] - found[0])[places].T)
 
-    def find_mistakes(self) -> tuple[Finding, ...]:
-        """The mistakes of the set-up, the one that gains most first; none if one is left over."""
-        held = self.judge(())
-        if held is None or not _is_suspicious(held):
-            return ()
-        readings = [(one,) for one in self._readings()]
-        weighed = [(self._misfit(option), option) for option in ((), *readings)]
-        best = self._geared(min(weighed, key=lambda one: one[0])[1])
-        options = [self._departures(start) for start in ([(), best] if best else [()])]
-        chosen = min(options, key=lambda option: score_of(self.judge, option))
-        others = (
+    def screen(self, chosen: Corrections, correction: Correction) -> float:
+        # Signs and sizes of drives are free here: the shares tell them.
+        held = self._hold((*chosen, correction), self.roughly)
+        return np.inf if held is None else held[0].misfit(held[1]) + 2.0 * correction.cost / WEIGHT
+
+    def is_suspicious(self, now: Plausibility | None, placeholders: Sequence[str] = ()) -> bool:
+        if now is None:
+            return False
+        return now.worst_error > _SUSPICIOUS or float(now.objections.sum()) > LEAST_GAIN
+
+    def rivals(self, tried: list[Correction]) -> list[Correction]:
+        down = [-g for g in self.stated.robot.gravity]
+        return [
             *sign_corrections(self.signals),
             *quarter_turns(self.signals),
-            under_gravity(self.signals, [-g for g in self.stated.robot.gravity], 1.0),
-        )
-        return conclude(self.judge, chosen, others if len(chosen) == 1 else (), drawn=True)
+            under_gravity(self.signals, down, 1.0),
+        ]
 
-    def _readings(self) -> Iterator[Correction]:
-        """Hypotheses about what a column is, rather than how a joint is counted."""
+    def discrete(self) -> Iterator[Correction]:
         axes = set(self.signals.axes)
         for correction in (
             *exchange_corrections(self.signals),
             *unit_corrections(self.signals),
             *clock_corrections(self.signals),
-            *self._gears(),
         ):
             # Of a drive in another unit, the share tells.
-            if correction.kind != "scale" or axes.issuperset(correction.signals):
+            of_drive = correction.kind == "scale" and not axes.issuperset(correction.signals)
+            cycle = correction.kind == "exchange" and len(correction.signals) > 2
+            if not (of_drive or (cycle and len(axes) > MOST_AXES)):
                 yield correction
 
-    def _gears(self) -> Iterator[Correction]:
-        """Positions of motors: what they turn for one of the joint, on a grid."""
-        ends = [(m.position.min(axis=0), m.position.max(axis=0)) for m in self.stated.motions]
-        travel = np.max([high for _, high in ends], axis=0) - np.min(
-            [low for low, _ in ends], axis=0
-        )
-        for axis, turns, far in zip(self.signals.axes, self.stated.turning, travel, strict=True):
-            for span in JOINT_SPANS if turns and far > MOST_TRAVEL else ():
-                yield scaled(self.signals, [axis], float(span / far), 3.0)
+    def families(self, chosen: Corrections) -> Iterator[tuple[Family, Array]]:
+        position = np.concatenate([motion.position for motion in self.stated.motions])
+        for axis, turns, q in zip(self.signals.axes, self.stated.turning, position.T, strict=True):
+            if turns:
+                yield from gears(self.signals, axis, float(np.ptp(q)))
 
-    def _geared(self, best: tuple[Correction, ...]) -> tuple[Correction, ...]:
-        """``best`` with the turns that explain most, where it is a position of a motor."""
-        if not best or best[0].kind != "scale":
-            return best
-
-        def tried(x: float) -> tuple[Correction, ...]:
-            return (scaled(self.signals, best[0].signals, best[0].factor * float(np.exp(x)), 3.0),)
-
-        found = minimize_scalar(
-            lambda x: self._misfit(tried(x)), bounds=(-_NEXT, _NEXT), method="bounded"
-        )
-        gain = self._misfit(best) - self._misfit(tried(found.x))
-        return tried(found.x) if gain > 2.0 * ALIKE / WEIGHT else best
-
-    def _departures(self, start: tuple[Correction, ...]) -> tuple[Correction, ...]:
-        """What ``start``, the best mounting under it and the drives' shares say is mistaken."""
-        found = list(start)
-        compared = self._compare(combine(self.signals, start))
-        if compared is None:
-            return start
+    def together(self, chosen: Corrections) -> Corrections:
+        # What the best mounting and the drives' shares say is mistaken besides.
+        found: list[Correction] = []
+        change = combine(self.signals, chosen)
+        compared, rough = (self._compare(change, one) for one in (self.stated, self.roughly))
+        if compared is None or rough is None:
+            return ()
         mounting = compared.drawn
         if max(drive.left for drive in compared.hold(mounting)) > _SUSPICIOUS**2:
-            mounting = find_mounting(compared.turning, compared.drawn, compared.misfit)
+            mounting = find_mounting(rough.turning, rough.drawn, rough.misfit)
         for k, (axis, (direction, zero)) in enumerate(
             zip(self.signals.axes, mounting.by_joint, strict=True)
         ):
@@ -225,6 +200,9 @@ class DrawnSearch:
             found.append(under_gravity(self.signals, mounting.gravity, 1.0))
         drives = compared.hold(mounting)
         return (*found, *self._by_share(drives))
+
+    def lacks_pose(self, best: Corrections) -> bool:
+        return False
 
     def _by_share(self, drives: Sequence[Drive]) -> Iterator[Correction]:
         """Drives whose sign or size is not that of the bodies, each by itself or all alike."""
@@ -255,8 +233,8 @@ class DrawnSearch:
             if abs(size) > np.log(_STATED[1]):
                 yield resized(self.signals, [name], np.exp(-size))
 
-    def _compare(self, change: Change) -> Comparison | None:
-        """The comparison with what ``change`` makes of readings and drives, zeros apart.
+    def _compare(self, change: Change, stated: Comparison) -> Comparison | None:
+        """The comparison ``stated`` with other readings and drives, zeros apart.
 
         None where a force is to stand for a position.
         """
@@ -265,9 +243,9 @@ class DrawnSearch:
         beside = change.gain[:n, n:].any() or change.gain[n:, :n].any()
         if beside:
             return None
-        key = readings.tobytes() + np.float64(change.time).tobytes()
+        key = readings.tobytes() + np.array([change.time, id(stated)]).tobytes()
         if key not in self._reread:
-            self._reread[key] = self.stated.reread(readings, change.time)
+            self._reread[key] = stated.reread(readings, change.time)
         found = self._reread[key]
         if np.array_equal(drives, np.eye(forces)):
             return found
@@ -276,33 +254,24 @@ class DrawnSearch:
         return found.driven(into)
 
     def _hold(
-        self, corrections: Sequence[Correction], bounds: Bounds
+        self, corrections: Sequence[Correction], stated: Comparison
     ) -> tuple[Comparison, Mounting, list[Drive]] | None:
         self.tested += 1
         change = combine(self.signals, corrections)
-        compared = self._compare(change)
+        compared = self._compare(change, stated)
         if compared is None:
             return None
         n = len(self.signals.axes)
         gravity = np.array(change.gravity or compared.robot.gravity)
         mounting = Mounting(np.ones(n), change.offset[:n], gravity, change.gravity is not None)
         with np.errstate(all="ignore"):
-            drives = compared.hold(mounting, bounds)
+            drives = compared.hold(mounting, _STATED)
         if not np.isfinite([drive.left for drive in drives]).all():
             return None
         return compared, mounting, drives
 
-    def _misfit(self, corrections: Sequence[Correction]) -> float:
-        """How little is explained where signs and sizes of drives are free, as `init` counts it."""
-        held = self._hold(corrections, _STATED)
-        if held is None:
-            return np.inf
-        compared, mounting, _ = held
-        return compared.misfit(mounting) + 2.0 * sum(one.cost for one in corrections) / WEIGHT
-
-    def judge(self, corrections: tuple[Correction, ...]) -> Plausibility | None:
-        """What a set-up explains, all else as stated."""
-        held = self._hold(corrections, _STATED)
+    def judge(self, corrections: Corrections) -> Plausibility | None:
+        held = self._hold(corrections, self.stated)
         if held is None:
             return None
         compared, _, drives = held
@@ -313,7 +282,3 @@ class DrawnSearch:
         error = np.sqrt([drive.left for drive in drives])
         objections = 0.5 * np.minimum(off**2, FARTHEST**2)
         return Plausibility(error, compared.used.mean(axis=0), self.system.prior, objections)
-
-
-def _is_suspicious(held: Plausibility) -> bool:
-    return held.worst_error > _SUSPICIOUS or float(held.objections.sum()) > LEAST_GAIN

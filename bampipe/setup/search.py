@@ -6,11 +6,11 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.estimate.heavier_body import HeavierBody
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.setup.finding import (
@@ -27,6 +27,7 @@ from bampipe.setup.finding import (
     score_of,
     spoils_sound_axes,
 )
+from bampipe.setup.heavier import HeavierBody
 from bampipe.setup.hypotheses import (
     JOINT_SPANS,
     MOST_TRAVEL,
@@ -42,7 +43,6 @@ from bampipe.setup.hypotheses import (
     unit_corrections,
 )
 from bampipe.setup.plausibility import Plausibility, axes_without_pose, judge_setup
-from bampipe.setup.robot_search import DrawnSearch, is_drawn
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
@@ -61,7 +61,7 @@ exchanged, shifted or scaled grows faster than what a fit of a robot's bodies le
 HIGHEST_HZ = 10.0
 """Set-ups are compared below this: gross as they are, they show there, and an input that is taken
 for a position has derivatives up to no more than some 25 Hz."""
-_SAMPLES, _SCREENED_SAMPLES, _DRAWN_SAMPLES = 12_000, 3_000, 4_000
+_SAMPLES, _SCREENED_SAMPLES = 12_000, 3_000
 _SCREENING_STEPS = 3
 _SHORTLIST = 6
 _DECADES = np.arange(-10, 11) / 2.0
@@ -71,13 +71,15 @@ _SAME_FACTOR = 0.05
 """Logarithm within which the factor that explains most is a usual one."""
 _HALVINGS = 11
 
-
 Family = Callable[[float], Correction]
+Corrections = tuple[Correction, ...]
 
 
 @dataclass
-class CorrectionSearch:
-    """Tries set-ups on a part of the trials; all on a small part, the best of them on more.
+class Search:
+    """One search over hypotheses about signals: what each makes better is what speaks for it.
+
+    Parameters are free; all are tried on a small part of the trials, the best on more.
 
     Attributes:
         system: the bare device; motions: the trials as they are stated, short enough.
@@ -96,166 +98,76 @@ class CorrectionSearch:
     tested: int = field(default=0, init=False)
     over_position: Plausibility | None = field(default=None, init=False)
     heavier: HeavierBody | None = field(default=None, init=False)
-    _judged: dict[tuple[int, ...], tuple[Plausibility | None, tuple[Correction, ...]]] = field(
+    _judged: dict[tuple[int, ...], tuple[Plausibility | None, Corrections]] = field(
         default_factory=dict, init=False
     )
+    is_drawn: ClassVar[bool] = False
 
-    @property
-    def has_few_axes(self) -> bool:
-        """Whether every kind of mistake can be tried in a few seconds."""
-        return len(self.signals.axes) <= MOST_AXES
+    def together(self, chosen: Corrections) -> Corrections:
+        """Several corrections that only together explain more; none where there are none."""
+        return ()
 
-    @cached_property
-    def screened(self) -> tuple[Sequence[Motion], Folds]:
-        """The part of the trials that every set-up is tried on: two that are fitted, one braked."""
-        folds = self.folds
-        fitted = [k for k, fits in enumerate(folds.fitted) if fits]
-        others = [k for k, fits in enumerate(folds.fitted) if not fits]
-        chosen = [*dict.fromkeys([*fitted[:1], *fitted[-1:]]), *others[:1]]
-        part = folds.subset(chosen)
-        most = _SCREENED_SAMPLES if self.has_few_axes else _SCREENED_SAMPLES // 2
-        return shorten([self.motions[k] for k in chosen], most), part
+    def rivals(self, tried: list[Correction]) -> list[Correction]:
+        """Corrections that may do as well as the one that was found, of those ``tried``."""
+        return tried
 
-    def judge(self, corrections: tuple[Correction, ...]) -> Plausibility | None:
-        """What a set-up explains of the trials; None where it cannot be computed with."""
-        key = tuple(id(one) for one in corrections)
-        if key not in self._judged:
-            found = self._judge(corrections, self.motions, self.folds, 12)
-            self._judged[key] = found, corrections
-        return self._judged[key][0]
-
-    def _judge(
-        self,
-        corrections: tuple[Correction, ...],
-        motions: Sequence[Motion],
-        folds: Folds,
-        steps: int,
-        posed: Sequence[int] = (),
-    ) -> Plausibility | None:
-        change = combine(self.signals, corrections)
-        with np.errstate(all="ignore"):
-            changed = [change.of_motion(motion, self.signals) for motion in motions]
-        return judge_setup(self.system, changed, change.of_band(self.band), folds, steps, posed)
-
-    def screen(self, chosen: tuple[Correction, ...], correction: Correction) -> float:
-        """Score and cost of one correction more; infinite where it makes no sense."""
-        if not _is_gross(correction, self.motions, self.signals):
-            return math.inf
-        self.tested += 1
-        found = self._judge((*chosen, correction), *self.screened, _SCREENING_STEPS)
-        return math.inf if found is None else found.score(RANKED_ERROR) + correction.cost
-
-    def find_mistakes(self, placeholders: Sequence[str]) -> tuple[Finding, ...]:
+    def find_mistakes(self, placeholders: Sequence[str] = ()) -> tuple[Finding, ...]:
         """The mistakes of the set-up, the one that gains most first.
 
         Args:
             placeholders: signals whose scale stands at exactly 1.
         """
-        if is_drawn(self.system):
-            # Bodies that are free take on much of a mistake.
-            drawn = DrawnSearch(
-                self.system, shorten(self.motions, _DRAWN_SAMPLES), self.band, self.signals
-            )
-            mistakes = drawn.find_mistakes()
-            self.tested += drawn.tested
-            self.heavier = drawn.heavier
-            return mistakes
-        chosen: tuple[Correction, ...] = ()
+        chosen: Corrections = ()
         tried: list[Correction] = []
-        while len(chosen) < MOST_MISTAKES and self._is_suspicious(self.judge(chosen), placeholders):
-            options = self._shortlist(chosen, self._discrete())
+        while len(chosen) < MOST_MISTAKES and self.is_suspicious(self.judge(chosen), placeholders):
+            singles = self._shortlist(chosen, self.discrete())
+            options = [*((one,) for one in singles), self.together(chosen)]
             best = self._best(chosen, options, placeholders)
-            after = self.judge((*chosen, best) if best else chosen)
-            if self.has_few_axes and self._is_suspicious(after, ()):
-                options += self._shortlist(chosen, self._continuous(chosen))
+            if self.is_suspicious(self.judge((*chosen, *best))):
+                singles += self._continuous(chosen)
+                with_first = self.together((*chosen, *singles[:1]))
+                options += [*((one,) for one in singles), (*singles[:1], *with_first)]
                 best = self._best(chosen, options, placeholders)
-            if (not chosen and self._lacks_pose(best)) or best is None:
+            if (not chosen and self.lacks_pose(best)) or not best:
                 break
-            tried += options
-            chosen = (*chosen, self._refined_factor(chosen, best))
-        return conclude(self.judge, chosen, tried, placeholders)
+            tried += singles
+            chosen = (*chosen, *self._with_refined_factor(chosen, best))
+        return conclude(self.judge, chosen, self.rivals(tried), placeholders, self.is_drawn)
 
     def _best(
-        self,
-        chosen: tuple[Correction, ...],
-        options: Sequence[Correction],
-        placeholders: Sequence[str],
-    ) -> Correction | None:
-        """The correction that sets most right, of those that gain enough and spoil no axis."""
+        self, chosen: Corrections, options: Sequence[Corrections], placeholders: Sequence[str]
+    ) -> Corrections:
+        """What sets most right, of those that gain enough and spoil no axis."""
         before = self.judge(chosen)
-        for one in sorted(options, key=lambda one: score_of(self.judge, (*chosen, one))):
-            after = self.judge((*chosen, one))
+        ranked = sorted(options, key=lambda option: score_of(self.judge, (*chosen, *option)))
+        for option in filter(None, ranked):
+            after = self.judge((*chosen, *option))
             if after is None:
                 continue
             stated = before or after.with_nothing_explained()
-            gain = gain_of(stated, after, one.cost)
-            if gain >= least_gain(one, placeholders) and not spoils_sound_axes(stated, after):
-                return one
-        return None
+            gain = gain_of(stated, after, sum(one.cost for one in option))
+            least = max(least_gain(one, placeholders) for one in option)
+            if gain >= least and not spoils_sound_axes(stated, after):
+                return option
+        return ()
 
-    def _refined_factor(self, chosen: tuple[Correction, ...], best: Correction) -> Correction:
+    def _with_refined_factor(self, chosen: Corrections, best: Corrections) -> Corrections:
         """``best`` with the factor that explains most, where that is none of a unit or a gain."""
-        if best.kind != "scale" or not self.has_few_axes:
+        first, *rest = best
+        if first.kind != "scale":
             return best
-        family = partial(_scaled_by_power, self.signals, best.signals)
-        start = math.log10(best.factor)
-        found = self._refine(chosen, family, start, math.inf, float(_DECADES[1] - _DECADES[0]))
-        far = abs(math.log(found.factor / best.factor)) > _SAME_FACTOR
-        gain = score_of(self.judge, (*chosen, best)) - score_of(self.judge, (*chosen, found))
+        family = partial(scaled_by_power, self.signals, first.signals)
+        start = math.log10(first.factor)
+        refined = self._refine(chosen, family, start, math.inf, float(_DECADES[1] - _DECADES[0]))
+        found = (refined, *rest)
+        far = abs(math.log(refined.factor / first.factor)) > _SAME_FACTOR
+        gain = score_of(self.judge, (*chosen, *best)) - score_of(self.judge, (*chosen, *found))
         return found if far and gain > ALIKE else best
 
-    def _lacks_pose(self, best: Correction | None) -> bool:
-        """Whether a torque over position explains as much of the stated set-up as ``best`` does.
-
-        That of gravity on a link or of a spring, where the device has none: no column is mistaken.
-        """
-        axes = axes_without_pose(self.system, self.motions) if self.has_few_axes else []
-        stated = self.judge(())
-        found = self._judge((), self.motions, self.folds, 12, axes) if axes else None
-        if found is None or stated is None:
-            return False
-        after = self.judge((best,)) if best is not None else None
-        gain = gain_of(stated, after, best.cost) if best is not None and after is not None else 0.0
-        if gain_of(stated, found, 0.0) < (gain - ALIKE if gain else LEAST_GAIN):
-            return False
-        self.over_position = found
-        return True
-
-    def _is_suspicious(self, now: Plausibility | None, placeholders: Sequence[str]) -> bool:
-        if now is None or now.error.max() > SUSPICIOUS_ERROR:
-            return True
-        most = LEAST_GAIN_PLACEHOLDER if placeholders else SUSPICIOUS_PRIORS
-        return bool(now.objections.sum() > most)
-
-    def _discrete(self) -> Iterator[Correction]:
-        yield from sign_corrections(self.signals)
-        yield from clock_corrections(self.signals)
-        for correction in unit_corrections(self.signals):
-            if self.has_few_axes or len(correction.signals) > 1:
-                yield correction
-        if self.has_few_axes:
-            yield from exchange_corrections(self.signals)
-            yield from quarter_turns(self.signals)
-
-    def _continuous(self, chosen: tuple[Correction, ...]) -> list[Correction]:
+    def _continuous(self, chosen: Corrections) -> list[Correction]:
         """Scales and zeros of any size: the best families on a grid, then refined."""
-        change = combine(self.signals, chosen)
-        families: list[tuple[Family, Array]] = [
-            (partial(_scaled_by_power, self.signals, names), _DECADES)
-            for names in groups_of_like(self.signals)
-        ]
-        changed = [change.of_motion(motion, self.signals) for motion in self.screened[0]]
-        for place, axis in enumerate(self.signals.axes):
-            q = np.concatenate([motion.q[:, place] for motion in changed])
-            if self.signals.units[place] == "rad" and np.ptp(q) > MOST_TRAVEL:
-                gear = partial(_scaled_by_power, self.signals, (axis,))
-                families.append((gear, np.log10(JOINT_SPANS / np.ptp(q))))
-            reach = 2.0 * max(float(np.ptp(q)), float(np.abs(np.median(q))))
-            size = math.pi if self.signals.units[place] == "rad" else reach
-            grid = size * np.linspace(-1.0, 1.0, _STEPS)
-            families.append((partial(_shifted_by, self.signals, axis), grid))
         coarse = []
-        for family, grid in families:
+        for family, grid in self.families(chosen):
             scores = [self.screen(chosen, family(x)) for x in grid]
             best = int(np.argmin(scores))
             coarse.append((scores[best], family, float(grid[best]), float(grid[1] - grid[0])))
@@ -290,6 +202,104 @@ class CorrectionSearch:
         screened.sort(key=lambda one: one[0])
         return [one for score, one in screened[:_SHORTLIST] if math.isfinite(score)]
 
+    @property
+    def has_few_axes(self) -> bool:
+        """Whether every kind of mistake can be tried in a few seconds."""
+        return len(self.signals.axes) <= MOST_AXES
+
+    @cached_property
+    def screened(self) -> tuple[Sequence[Motion], Folds]:
+        """The part of the trials that every set-up is tried on: two that are fitted, one braked."""
+        folds = self.folds
+        fitted = [k for k, fits in enumerate(folds.fitted) if fits]
+        others = [k for k, fits in enumerate(folds.fitted) if not fits]
+        chosen = [*dict.fromkeys([*fitted[:1], *fitted[-1:]]), *others[:1]]
+        part = folds.subset(chosen)
+        most = _SCREENED_SAMPLES if self.has_few_axes else _SCREENED_SAMPLES // 2
+        return shorten([self.motions[k] for k in chosen], most), part
+
+    def judge(self, corrections: Corrections) -> Plausibility | None:
+        """What a set-up explains of the trials; None where it cannot be computed with."""
+        key = tuple(id(one) for one in corrections)
+        if key not in self._judged:
+            found = self._judge(corrections, self.motions, self.folds, 12)
+            self._judged[key] = found, corrections
+        return self._judged[key][0]
+
+    def _judge(
+        self,
+        corrections: Corrections,
+        motions: Sequence[Motion],
+        folds: Folds,
+        steps: int,
+        posed: Sequence[int] = (),
+    ) -> Plausibility | None:
+        change = combine(self.signals, corrections)
+        with np.errstate(all="ignore"):
+            changed = [change.of_motion(motion, self.signals) for motion in motions]
+        return judge_setup(self.system, changed, change.of_band(self.band), folds, steps, posed)
+
+    def screen(self, chosen: Corrections, correction: Correction) -> float:
+        """Score and cost of one correction more; infinite where it makes no sense."""
+        if not _is_gross(correction, self.motions, self.signals):
+            return math.inf
+        self.tested += 1
+        found = self._judge((*chosen, correction), *self.screened, _SCREENING_STEPS)
+        return math.inf if found is None else found.score(RANKED_ERROR) + correction.cost
+
+    def lacks_pose(self, best: Corrections) -> bool:
+        """Whether a torque over position explains as much of the stated set-up as ``best`` does.
+
+        That of gravity on a link or of a spring, where the device has none: no column is mistaken.
+        """
+        axes = axes_without_pose(self.system, self.motions) if self.has_few_axes else []
+        stated = self.judge(())
+        found = self._judge((), self.motions, self.folds, 12, axes) if axes else None
+        if found is None or stated is None:
+            return False
+        after = self.judge(best) if best else None
+        cost = sum(one.cost for one in best)
+        gain = gain_of(stated, after, cost) if after is not None else 0.0
+        if gain_of(stated, found, 0.0) < (gain - ALIKE if gain else LEAST_GAIN):
+            return False
+        self.over_position = found
+        return True
+
+    def is_suspicious(self, now: Plausibility | None, placeholders: Sequence[str] = ()) -> bool:
+        """Whether so much is left that other set-ups are tried."""
+        if now is None or now.error.max() > SUSPICIOUS_ERROR:
+            return True
+        most = LEAST_GAIN_PLACEHOLDER if placeholders else SUSPICIOUS_PRIORS
+        return bool(now.objections.sum() > most)
+
+    def discrete(self) -> Iterator[Correction]:
+        """Mistakes that are usual."""
+        yield from sign_corrections(self.signals)
+        yield from clock_corrections(self.signals)
+        for correction in unit_corrections(self.signals):
+            if self.has_few_axes or len(correction.signals) > 1:
+                yield correction
+        if self.has_few_axes:
+            yield from exchange_corrections(self.signals)
+            yield from quarter_turns(self.signals)
+
+    def families(self, chosen: Corrections) -> Iterator[tuple[Family, Array]]:
+        """Scales and zeros of any size, each with the sizes to begin with."""
+        if not self.has_few_axes:
+            return
+        for names in groups_of_like(self.signals):
+            yield partial(scaled_by_power, self.signals, names), _DECADES
+        change = combine(self.signals, chosen)
+        changed = [change.of_motion(motion, self.signals) for motion in self.screened[0]]
+        for place, axis in enumerate(self.signals.axes):
+            q = np.concatenate([motion.q[:, place] for motion in changed])
+            turns = self.signals.units[place] == "rad"
+            if turns:
+                yield from gears(self.signals, axis, float(np.ptp(q)))
+            reach = 2.0 * max(float(np.ptp(q)), float(np.abs(np.median(q))))
+            grid = (math.pi if turns else reach) * np.linspace(-1.0, 1.0, _STEPS)
+            yield partial(_shifted_by, self.signals, axis), grid
+
 
 def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:
     """The middle of each trial, so that all have ``most`` samples together at most."""
@@ -307,8 +317,14 @@ def _middle(motion: Motion, most: int) -> Motion:
     return motion.rows(slice(first, first + most))
 
 
-def _scaled_by_power(signals: Signals, names: tuple[str, ...], power: float) -> Correction:
+def scaled_by_power(signals: Signals, names: tuple[str, ...], power: float) -> Correction:
     return scaled(signals, names, 10.0**power, 3.0)
+
+
+def gears(signals: Signals, axis: str, travel: float) -> Iterator[tuple[Family, Array]]:
+    """What a motor turns for one of its joint, where a position travels that far, rad."""
+    if travel > MOST_TRAVEL:
+        yield partial(scaled_by_power, signals, (axis,)), np.log10(JOINT_SPANS / travel)
 
 
 def _shifted_by(signals: Signals, axis: str, offset: float) -> Correction:

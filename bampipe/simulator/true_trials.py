@@ -91,6 +91,7 @@ def simulate_moving_trial(
             width=np.array([c.sign_width for c in device.coordinates]),
             n_noise=len(system.noise), force=force, rate=slopes[0], curvature=slopes[1],
             impedance=arm, brake=brakes, brake_gain=gain if viscous else None,
+            moved_first=system.moved_first,
         )  # fmt: skip
         pose = x[:, :n]
     brake = [system.inputs.index(b) for b in device.brakes.values()]

@@ -83,6 +83,8 @@ class Config(FilterChoice):
             agrees with least squares and is more precise, see `bampipe.identification.choice`.
         start_factor: multiplies every starting value: estimates must not depend on it.
         input_timing: whether the time by which inputs were sampled after positions is estimated.
+        remove_bias: whether replicates of the model say how samples weigh, and what filters and
+            friction that stops add to the residual; else all samples of an axis weigh alike.
         choose_sign_width: whether, on a test bench, the trials may make the sign of the velocity
             narrower than the device's `sign_width`.
     """
@@ -91,6 +93,7 @@ class Config(FilterChoice):
     method: Literal["auto", "ukf", "least-squares"] = "auto"
     start_factor: Positive = 1.0
     input_timing: bool = True
+    remove_bias: bool = True
     choose_sign_width: bool = True
 
 
@@ -135,7 +138,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     published, others = _choose(task, by_squares, by_filter)
     methods = tabulate_methods(system, squares, published, others, lost)
     if published.method == "least-squares":
-        notes += _describe_squares(system, squares)
+        notes += _describe_squares(task, squares)
         if by_filter is not None:
             # What its innovations say of model and noise is kept whatever is published.
             published = replace(published, report={**by_filter.evidence, **published.report})
@@ -208,9 +211,10 @@ def _fit(task: _Task, start: Array) -> tuple[SquaresFit, InputTiming | None]:
     which one drive acts late and all of them hold their commands leaves the others half a sample
     late.
     """
-    system, trials, block_s = task.system, task.trials, task.config.block_s
+    system, trials, config = task.system, task.trials, task.config
+    how = config.block_s, config.remove_bias
     try:
-        squares = fit_squares(trials, task.recipe, system, start, block_s)
+        squares = fit_squares(trials, task.recipe, system, start, *how)
     except ValueError as error:
         raise InputError(
             f"the free trials are too short to identify from ({error})",
@@ -227,7 +231,7 @@ def _fit(task: _Task, start: Array) -> tuple[SquaresFit, InputTiming | None]:
     late_s = float(np.clip(late_s, -trials.limit_s, trials.limit_s))
     moved = trials.with_input_timing(late_s)
     held = InputTiming(estimate=late_s, sd=sd, unit="s", limit=trials.limit_s)
-    return fit_squares(moved, task.recipe, system, squares.p[:-1], block_s), held
+    return fit_squares(moved, task.recipe, system, squares.p[:-1], *how), held
 
 
 def _filter(
@@ -284,10 +288,10 @@ def _find_timing(task: _Task, squares: SquaresFit, held: InputTiming | None) -> 
     return find_robot_timing(task.system, trials.motions, trials.band, squares.p[:-1])
 
 
-def _describe_squares(system: System, squares: SquaresFit) -> list[str]:
+def _describe_squares(task: _Task, squares: SquaresFit) -> list[str]:
     """What to know of least squares: no replicates, an axis that nothing drives."""
-    notes = []
-    if not squares.replayed:
+    notes, system = [], task.system
+    if task.config.remove_bias and not squares.replayed:
         notes.append(
             "The model cannot be replayed along the trials: all samples weigh alike, and no bias of"
             " filters was taken off."

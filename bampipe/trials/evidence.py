@@ -57,6 +57,8 @@ class Evidence:
         by_timing: derivative of ``residual`` by the time by which inputs were sampled after
             positions, by trial, (K, n_q), N.m/s or N/s; nothing where that is not open.
         timing: least and largest change of that time, s.
+        factors: by which parameters multiply the measured force of each axis, (n_q,), as a torque
+            constant does a current; nothing where none does.
     """
 
     system: System
@@ -75,6 +77,7 @@ class Evidence:
     known: Array
     by_timing: tuple[Array, ...] = ()
     timing: tuple[float, float] = (0.0, 0.0)
+    factors: tuple[float, ...] = ()
 
     def subset(self, trials: Sequence[int]) -> Evidence:
         """The same on some trials, given by number, linearised where it is."""
@@ -245,7 +248,19 @@ def gather_evidence(
         problem.known - value,
         _slopes_by_timing(fitted_trials, band, used, timing),
         timing,
+        _factors(problem, found.p, len(system.coordinates)),
     )
+
+
+def _factors(problem: Problem, p: Array, axes: int) -> tuple[float, ...]:
+    """`Evidence.factors`."""
+    if problem.multiplied is None:
+        return ()
+    found = np.ones(axes)
+    for place, axis in zip(problem.free, problem.multiplied, strict=True):
+        if axis >= 0:
+            found[axis] = max(abs(p[place]), 1e-300)
+    return tuple(found.tolist())
 
 
 def _slopes_by_timing(

@@ -169,6 +169,7 @@ class Likelihood:
         bias_variance: how far the bias may be off where the machine turns, by axis, each (n,).
         applied: the applied force, by axis, each (n,), N.m or N.
         slopes: its derivative by each measured force, by axis, each (n, n_forces).
+        factors: of what is measured where the weights are those of the residual; see `Evidence`.
     """
 
     samples: tuple[Samples, ...]
@@ -177,6 +178,7 @@ class Likelihood:
     bias_variance: tuple[Array, ...]
     applied: tuple[Array, ...]
     slopes: tuple[Array, ...]
+    factors: tuple[float, ...] = ()
 
     @classmethod
     def of(
@@ -213,7 +215,25 @@ class Likelihood:
         return cls(
             samples, noise, tuple(root), tuple(bias_variance), tuple(force),
             tuple(take_samples(plain, here, axis) for axis, here in enumerate(samples)),
+            e.factors,
         )  # fmt: skip
+
+    def with_equal_weights(self, problem: Problem, lacking: float) -> Likelihood:
+        """The same where all samples of an axis weigh alike on which the model lacks much.
+
+        Noise of replays says nothing of an error that is many times as large. Nor is that noise: it
+        repeats with the path, and each sample counts against what is known beforehand.
+
+        Args:
+            problem: the fit, its solution at zero; lacking: scale from which on an axis does.
+        """
+        scale = np.sqrt(problem.solve().left / problem.count)
+        root, samples = list(self.root), list(self.samples)
+        for axis in np.flatnonzero(scale > lacking):
+            rows = samples[axis].rows.size
+            root[axis] = np.full(rows, np.sqrt(np.mean(self.root[axis] ** 2)))
+            samples[axis] = replace(samples[axis], independent=float(rows))
+        return replace(self, root=tuple(root), samples=tuple(samples))
 
     def with_heavy_tails(self, problem: Problem, tails: float) -> Likelihood:
         """Weights of samples as under Student's t distribution, at a fit of the model.
@@ -288,6 +308,7 @@ class Problem:
             ones, the change that takes it away.
         spread: of each, the standard deviations of these strengths before any data; shapes: the
             places of the parameters that it has beside them.
+        prior_cost: negative log density of what is known beforehand, where nothing changes.
     """
 
     likelihood: Likelihood
@@ -301,6 +322,7 @@ class Problem:
     absence: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     spread: Mapping[str, Array] = field(default_factory=dict)
     shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    prior_cost: float = 0.0
 
     @property
     def independent(self) -> Array:
@@ -376,6 +398,10 @@ def _pose(
     likelihood: Likelihood, evidence: Evidence, residual: Sequence[Array], bias: Sequence[Array]
 ) -> Problem:
     samples, n_q = likelihood.samples, len(likelihood.samples)
+    weights = likelihood.root
+    if evidence.factors:  # in units of what is measured: small factors explain nothing
+        ratio = np.array(likelihood.factors) / np.array(evidence.factors)
+        weights = tuple(root * by for root, by in zip(weights, ratio, strict=True))
     jacobian: Sequence[Array] = evidence.jacobian
     timing = evidence.timing if evidence.by_timing else ()
     if timing:
@@ -388,7 +414,7 @@ def _pose(
         columns[:, :n] = take_samples(jacobian, here, axis)
         columns[:, n + axis] = -bias[axis]
         columns[:, n + n_q + axis] = -likelihood.noise.stopping[axis]
-        full.append(columns * likelihood.root[axis][:, None])
+        full.append(columns * weights[axis][:, None])
     # What lies evenly between two bounds has a standard deviation of 0.29 of their distance.
     of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
     n_timing, none = len(of_timing), np.zeros(n_q)
@@ -396,7 +422,7 @@ def _pose(
     known = np.concatenate([evidence.known, np.zeros(n_timing), none + 1.0, none])
     lower = np.concatenate([evidence.lower, timing[:1], none - np.inf, none])
     upper = np.concatenate([evidence.upper, timing[1:], none + np.inf, none + _MOST_STOPPING])
-    y = [r * w for r, w in zip(residual, likelihood.root, strict=True)]
+    y = [r * w for r, w in zip(residual, weights, strict=True)]
     weight = [s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)]
     normal = sum(w * (x.T @ x) for w, x in zip(weight, full, strict=True)) + np.diag(precision)
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -410,6 +436,7 @@ def _pose(
         {item.name: _absence(evidence, item) for item in effects},
         {item.name: _spread(item) for item in effects},
         {item.name: _shapes(evidence, item) for item in effects},
+        0.5 * float(precision @ known**2),
     )  # fmt: skip
 
 
@@ -508,7 +535,7 @@ def solve_bounded(
         fixed_at |= {k: float(p.lower[k] if below[k] else p.upper[k]) for k in fresh}
     cost = float(independent @ (0.5 * np.log(left / p.count)))
     off = b[:nb]
-    cost += 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
+    cost += p.prior_cost + 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
     return Solved(b, held, left, weight, cost)
 
 

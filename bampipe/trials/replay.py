@@ -154,7 +154,7 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
             force=columns,
             rate=[at.get(derivative(f, 1), -1) for f in forces],
             curvature=[at.get(derivative(f, 2), -1) for f in forces],
-            smooth=system.forced,
+            smooth=system.forced, moved_first=system.moved_first,
         )  # fmt: skip
     except Runaway:
         if not _is_controlled(system):
@@ -447,9 +447,11 @@ def _reference(
     Where play or wind-up lies between encoder and handle, the handle's motion is the encoder's
     plus what the model puts between them. That jumps where a gap is crossed, a little before or
     after the logged jump; a handle with inertia does not follow the difference of the two.
+    Where the force moves a part first that an internal state follows, it is that state.
     """
     if not system.moves_sensors:
-        return motion.q, motion.qd
+        x = np.hstack([motion.q, motion.qd, system.memory(*motion.kinematics, u, p, motion.t)])
+        return x[:, system.moved_first[:, 0]], x[:, system.moved_first[:, 1]]
     q = motion.q + system.offset(motion.q, u, p)
     smooth = [zero_phase(column, rate_hz, min(FOLLOWED_HZ, 0.2 * rate_hz)) for column in q.T]
     return np.column_stack([c[0] for c in smooth]), np.column_stack([c[1] for c in smooth])

@@ -44,6 +44,7 @@ EFFECTS = (
     *(f"{name}:carriage" for name in LAWS if name not in OUTSIDE),
     "actuator_delay", "actuator_lag:motor", "flexible_load:carriage",
 )  # fmt: skip
+BY_NAME = ("loose_load:carriage", "loose_drive:carriage")
 UNKNOWN = tuple(f"{name}:carriage" for name in OUTSIDE)
 
 
@@ -56,7 +57,7 @@ def _draw_specimen(
     friction = {"viscous": rng.uniform(150.0, 260.0), "coulomb": rng.uniform(15.0, 27.0),
                 "creep": c.creep * SIGN_WIDTH}  # fmt: skip
     machine = {"inertia": mechanism["mass"], "offset": mechanism["offset"]} | control
-    specimen = Specimen("carriage", machine, friction)
+    specimen = Specimen("carriage", machine, friction, play=0.0024)
     specimen.truth |= mechanism
     specimen.hide(effects, LAWS, MOTOR, rng)
     # What hangs behind a coupling is not in the mass that moves with the encoder.

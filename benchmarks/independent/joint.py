@@ -54,6 +54,7 @@ EFFECTS = (
     *(f"{name}:joint" for name in LAWS if name not in OUTSIDE),
     "actuator_delay", "actuator_lag:current", "drive_sag:joint",
 )  # fmt: skip
+BY_NAME = ("loose_load:joint", "loose_drive:joint")
 UNKNOWN = tuple(f"{name}:joint" for name in OUTSIDE)
 DEVICE = f"""schema = "bampipe.device/1"
 name = "joint"
@@ -109,9 +110,11 @@ def _draw_specimen(
                "limit": 150.0, "hold": 1e-3 if c.hold else STEP}  # fmt: skip
     friction = {"viscous": rng.uniform(5.0, 12.0), "coulomb": rng.uniform(4.0, 8.0),
                 "creep": c.creep * SIGN_WIDTH}  # fmt: skip
-    specimen = Specimen("joint", mechanism | control, friction)
+    specimen = Specimen("joint", mechanism | control, friction, play=0.024)
     specimen.truth |= mechanism
     specimen.hide(effects, LAWS, MOTOR, rng)
+    # What lies behind play is not in the inertia that moves with the encoder.
+    specimen.truth["inertia"] = mechanism["inertia"] - float(specimen.machine["load_inertia"])
     return specimen
 
 

@@ -1,6 +1,7 @@
 """One axis moved by a motor under position and velocity loops: a joint with gravity, or a carriage.
 
-A part of what moves may hang behind an elastic coupling; the motor may be late, slow or weak, and
+A part of what moves may hang behind an elastic coupling, or behind play: the load, with the encoder
+on the motor, or the motor, with the encoder on the load. The motor may be late, slow or weak, and
 the controller may hold its command for a while.
 """
 
@@ -21,12 +22,15 @@ MACHINE = np.dtype(
         for name in (
             "inertia", "moment", "moment_across", "offset",          # of the mechanism
             "load_inertia", "load_frequency", "load_damping",        # of what hangs behind it
+            "gap", "driven",             # play before that; whether the motor is what hangs there
             "delay", "lag", "sag",                                   # of the motor
             "position_gain", "velocity_gain", "feed_forward", "limit", "hold",  # of the controller
         )
     ]
 )  # fmt: skip
 
+GENTLE = 0.2
+"""Gains of a controller that sees the load through play, over those of one that sees the motor."""
 MOTOR = {
     "actuator_delay": ("delay", "delay"),
     "actuator_lag": ("lag", "time_constant"),
@@ -71,19 +75,32 @@ def move(m, law, goal, goal_rate, kick, log_at):
             acting, delivered = 0.5 * (delivered + new), new
         acting /= 1.0 + m.sag * abs(acting)
         half = q + 0.5 * h * v
-        push = acting - m.offset + push_along(law, half, memory)
-        push -= m.moment * np.sin(half) + m.moment_across * np.cos(half)
+        push = push_along(law, half, memory) - m.offset
         own = m.inertia - m.load_inertia
+        at_load = half
+        if m.gap > 0.0 and m.driven == 0.0:
+            at_load = load_q + 0.5 * h * load_v
+        weight = m.moment * np.sin(at_load) + m.moment_across * np.cos(at_load)
         if m.load_inertia > 0.0:
             stretch = load_q + 0.5 * h * load_v - half
+            closing = load_v - v if abs(stretch) > 0.5 * m.gap else 0.0
+            pressed = stretch - min(max(stretch, -0.5 * m.gap), 0.5 * m.gap)
             pull = m.load_inertia * (
-                m.load_frequency**2 * stretch
-                + 2.0 * m.load_damping * m.load_frequency * (load_v - v)
+                m.load_frequency**2 * pressed + 2.0 * m.load_damping * m.load_frequency * closing
             )
+            far = -pull
+            if m.driven > 0.0:
+                far, push = far + acting, push - weight
+            elif m.gap > 0.0:
+                far, push = far - weight, push + acting
+            else:
+                push += acting - weight
             push += pull
             load_q += 0.5 * h * load_v
-            load_v -= h * pull / m.load_inertia
+            load_v += h * far / m.load_inertia
             load_q += 0.5 * h * load_v
+        else:
+            push += acting - weight
         free = v + h * push / own
         impulse = resist(law, memory, free, v, h, own, half, acting, 0.0, 0.0)
         v = free + impulse / own
@@ -96,13 +113,19 @@ class Specimen:
     """One axis with its hidden effects.
 
     Attributes:
-        machine: record of dtype MACHINE; law: of dtype ``friction.AXIS``.
+        machine: record of dtype MACHINE; law: of dtype ``friction.AXIS``; play: a typical gap.
         truth: what an identification of the right model must find.
         hidden_laws: by effect, the laws of ``friction`` that it switched on.
     """
 
-    def __init__(self, axis: str, values: Mapping[str, float], friction: Mapping[str, float]):
-        self.axis = axis
+    def __init__(
+        self,
+        axis: str,
+        values: Mapping[str, float],
+        friction: Mapping[str, float],
+        play: float,
+    ):
+        self.axis, self.play = axis, play
         self.machine = np.zeros(1, MACHINE)[0]
         for name, value in values.items():
             self.machine[name] = value
@@ -138,6 +161,21 @@ class Specimen:
                 self.machine["load_inertia"] = min(0.25 * size, 0.6) * self.machine["inertia"]
                 self.machine["load_frequency"] = 75.0 * rng.uniform(0.85, 1.15)
                 self.machine["load_damping"] = 0.04
+            elif name in ("loose_load", "loose_drive"):
+                m, share = self.machine, rng.uniform(0.2, 0.8)
+                m["load_inertia"], m["gap"] = share * m["inertia"], self.play * size
+                # A gear is as stiff whatever it moves.
+                stiffness = 130.0**2 * m["inertia"] / 4.0 * rng.uniform(0.7, 1.4)
+                m["load_frequency"] = np.sqrt(stiffness / m["load_inertia"])
+                m["load_damping"] = rng.uniform(0.1, 0.3)
+                m["driven"] = float(name == "loose_drive")
+                if m["driven"]:  # with gains for a stiff drive, the loop would hammer in the gap
+                    for gain in ("velocity_gain", "position_gain"):
+                        m[gain] *= GENTLE
+                names = {"gap": "gap", "load_inertia": "inertia"}
+                names |= {"load_frequency": "frequency", "load_damping": "damping"}
+                found = {f"{full.replace(':', '.')}.{n}": float(m[k]) for k, n in names.items()}
+                self.truth |= found
             else:
                 raise ValueError(f"the machine has no effect {full!r}")
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bampipe.data.chain import read_chain
 from bampipe.data.device_file import read_device_file
-from bampipe.data.robot_file import read_chain
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model
 from bampipe.physics.registry import device_from

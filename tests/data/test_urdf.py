@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bampipe.data.chain import read_chain
 from bampipe.data.device_file import read_device_file
-from bampipe.data.robot_file import read_chain
 from bampipe.errors import InputError
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from

@@ -18,7 +18,6 @@ NUMERICAL = {
     "verdict": {
         "0.001": "less probable sets are not listed, whatever is said",
         "2": "effects in which two sets differ by an exchange",
-        "_BEYOND_MODELS": "what `remains` means, beside the verdict",
     },
     "probability": {
         "_NEAR": "what is less probable by a factor of a million changes no probability",

@@ -133,9 +133,7 @@ def test_what_no_effect_of_the_library_is_is_called_unknown(record, machine, see
     assert {v for k, v in enumerate(verdicts(found)) if k != axis} <= {"nothing_missing"}
 
 
-@pytest.mark.parametrize(
-    "criteria", [{"size": 0.5}, {"probability": 0.99999}]
-)
+@pytest.mark.parametrize("criteria", [{"size": 0.5}, {"probability": 0.99999}])
 def test_the_numbers_that_decide_are_those_that_are_given(record, criteria):
     """A dozen replays make nobody surer than one in ten thousand; half the force nothing is."""
     trials, recipe = record("joint", 41, "shear_thinning:joint")

@@ -15,7 +15,7 @@ from bampipe.trials.evidence import gather_evidence
 
 AXIS = MachineScale(
     np.array([-0.05]), np.array([0.2]), np.array([0.3]), np.array([100.0]),
-    {"carriage": ("m", "N")}, 1e-3, 20.0, (8.0,),
+    np.array([50.0]), {"carriage": ("m", "N")}, 1e-3, 20.0, (8.0,),
 )  # fmt: skip
 """A positioning axis: 0.25 m, 0.3 m/s, 100 N, 1 kHz, a band up to 8 Hz."""
 
@@ -36,6 +36,8 @@ def range_of(effect, parameter, scale=AXIS):
         ("drive_sag:carriage", "sag", 1e-4, 0.03),
         ("actuator_delay", "delay", 2e-4, 0.08),
         ("thermal_damping:carriage", "time_constant", 1.0, 60.0),
+        ("loose_drive:carriage", "gap", 25e-6, 0.0625),
+        ("loose_drive:carriage", "lightness", 0.02, 0.12),
     ],
 )
 def test_a_range_follows_travel_speed_load_and_sampling(effect, parameter, low, high):

@@ -133,7 +133,7 @@ def test_an_error_above_its_floor_with_nothing_missing_says_what_filters_leave()
     [
         (0.3, 1.0, "its held-out error of 0.300 N.m is far below its noise floor, which is"),
         (0.3, 0.0, "its held-out error of 0.300 N.m is without a noise floor to be held against."),
-        (20.0, 1.0, "replays of the model do not resemble the measurement"),
+        (20.0, 1.0, "replicates of the model do not resemble the measurement"),
     ],
 )
 def test_no_verdict_says_why_and_what_to_do(after: float, floor: float, why: str) -> None:

@@ -75,7 +75,7 @@ def test_a_full_disk_is_said_and_costs_nothing(
     for name, content in toy.files().items():
         if name.endswith(".json"):
             json.loads(content)
-    assert not list(toy.root.rglob("*.part"))
+    assert not list(toy.root.rglob("*.partial"))
     ballast.unlink()
     assert bampipe(toy).returncode == 0
     whole = toy.files()

@@ -11,8 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bampipe.data.readers.text import opened
-from bampipe.data.readers.trial import Dialect
 from bampipe.errors import InputError
 from bampipe.report import typeset
 from bampipe.report.document import Document
@@ -47,16 +45,6 @@ def test_stored_trials(full: Path) -> None:
         store_motions(iter([motion()]))
     assert caught.value.where == str(full) and "TMPDIR" in caught.value.remedy
     assert [path.name for path in full.iterdir()] == ["filler"]
-
-
-def test_a_log_in_another_encoding(full: Path, tmp_path: Path) -> None:
-    log = tmp_path / "log.csv"
-    log.write_text("t,q\n" + "0.1,2.5\n" * 20000, encoding="utf-16")
-    with (
-        pytest.raises(InputError, match="no temporary files can be written"),
-        opened(log, Dialect(), "log.csv"),
-    ):
-        pass
 
 
 def test_the_report(full: Path) -> None:

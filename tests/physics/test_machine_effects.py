@@ -8,6 +8,7 @@ from motions import of_mechanism
 from scipy.optimize import least_squares
 from small_arm import ARM
 
+from bampipe.estimate.simulation import simulate_tracking
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.effect import unit_of
 from bampipe.physics.system import STABLE, STIFF_STEPS
@@ -132,6 +133,8 @@ def test_units_are_consistent(machine, case):
         ("slider", "actuator_delay"),
         ("slider", "drive_sag:carriage"),
         ("slider", "flexible_load:carriage"),
+        ("slider", "loose_load:carriage"),
+        ("slider", "loose_drive:carriage"),
         ("slider", "force_delay"),
         ("magnetic_damper", "channel_lag:current"),
         ("magnetic_damper", "channel_saturation:current"),
@@ -167,7 +170,10 @@ def test_is_absent_at_zero_and_recovered_from_a_wrong_guess(machine, case):
 
 
 def test_motor_effects_are_offered_to_motors_only():
-    motors = ("torque_ripple", "actuator_lag", "actuator_delay", "drive_sag", "flexible_load")
+    motors = (
+        "torque_ripple", "actuator_lag", "actuator_delay", "drive_sag", "flexible_load",
+        "loose_load", "loose_drive",
+    )  # fmt: skip
     for name in motors:
         assert registry.effect(name).targets(registry.device("slider"))
         assert not registry.effect(name).targets(registry.device("bam"))
@@ -309,6 +315,59 @@ def test_a_flexible_load_is_rigid_below_its_frequency_and_left_behind_above_it()
         spring = 60.0**2 + 2j * 0.05 * 60.0 * w
         ratio = spring / (spring - w**2)
         assert mass == pytest.approx(70.0 + 25.0 * ratio.real, rel=2e-3)
+
+
+GAP, BEHIND, PUSH = 2e-3, 25.0, 50.0
+
+
+@pytest.mark.parametrize("effect", ["loose_load", "loose_drive"])
+def test_what_is_loose_flies_free_for_as_long_as_it_crosses_half_the_gap(effect):
+    system = compile_model(Model(registry.device("slider"), [f"{effect}:carriage"]))
+    p = {x.name: x.prior for x in system.parameters}
+    p |= dict.fromkeys(("viscous.carriage", "coulomb.carriage", "offset"), 0.0) | {"mass": 70.0}
+    own = {"inertia": BEHIND, "gap": GAP, "frequency": 120.0, "damping": 1.0}
+    p |= {f"{effect}.carriage.{name}": value for name, value in own.items()}
+    if effect == "loose_drive":
+        p["loose_drive.carriage.lightness"] = 1.0 / BEHIND
+    values = np.array([p[x.name] for x in system.parameters])
+    t = np.arange(0.0, 1.0, 1e-3)[:, None]
+    # The load is left behind by what the motor moves; or the motor leaves what is held.
+    acceleration = PUSH / BEHIND
+    moved = acceleration if effect == "loose_load" else 0.0
+    q, qd, qdd = 0.5 * moved * t**2, moved * t, moved + 0.0 * t
+    u = np.zeros((t.size, len(system.inputs)))
+    u[:, system.inputs.index("force_motor")] = PUSH
+    z = system.memory(q, qd, qdd, u, values, t[:, 0])
+    carried = PUSH - system.residual(q, qd, qdd, z, u, values)[:, 0] - 70.0 * moved
+    if effect == "loose_drive":
+        carried = system.residual(q, qd, qdd, z, u, values)[:, 0]
+    flies = t[:, 0] < np.sqrt(GAP / acceleration)
+    np.testing.assert_allclose(carried[flies], 0.0, atol=1e-9)
+    assert carried[np.flatnonzero(~flies)[1]] > 0.0
+    np.testing.assert_allclose(carried[-1], PUSH, rtol=1e-6)
+
+
+def test_an_arm_leads_the_motor_that_moves_the_axis_through_play():
+    device = registry.device("slider")
+    assert compile_model(Model(device, ["loose_load:carriage"])).moved_first.tolist() == [[0, 1]]
+    system = compile_model(Model(device, ["loose_drive:carriage"]))
+    own = ["loose_drive.carriage.place", "loose_drive.carriage.rate"]
+    assert [system.states[i] for i in system.moved_first[0]] == own
+    p, t = typical(system), np.arange(0.0, 3.0, 2e-3)
+    wanted, rate = 0.05 * (1.0 - np.cos(2.0 * t)), 0.1 * np.sin(2.0 * t)
+    u = np.zeros((t.size, len(system.inputs)))
+    start = np.concatenate([[0.0, 0.0], system.initial_memory(np.zeros(1), u[0], p)])
+    x, _ = simulate_tracking(
+        system.derivative, start, u, p, 2e-3, wanted[:, None], rate[:, None],
+        width=np.array([c.sign_width for c in device.coordinates]), n_noise=len(system.noise),
+        force=[system.inputs.index("force_motor")], moved_first=system.moved_first,
+    )  # fmt: skip
+    gap = p[system.index("loose_drive.carriage.gap")]
+    behind = x[:, 2] - x[:, 0]
+    # The motor drags the carriage along from the ends of the gap, pressed as far as friction takes.
+    assert np.abs(behind).max() < 0.5 * gap + 1e-3
+    assert np.ptp(behind) > 0.9 * gap
+    assert np.abs(x[:, 2] - wanted).max() < 0.02
 
 
 def delivered(current: np.ndarray, lag: float) -> np.ndarray:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from bampipe.lists import join_names
 from bampipe.report import wording
-from bampipe.report.document import spans
+from bampipe.report.document import split_spans
 
 
 @pytest.mark.parametrize(
@@ -109,4 +109,7 @@ def test_prose_has_printed_numbers_and_leaves_names_alone(stored: str, printed: 
 
 
 def test_code_is_printed_as_it_is_to_be_typed() -> None:
-    assert spans("by -2 with `--set x=-2`") == [("plain", "by −2 with "), ("code", "--set x=-2")]
+    assert split_spans("by -2 with `--set x=-2`") == [
+        ("plain", "by −2 with "),
+        ("code", "--set x=-2"),
+    ]

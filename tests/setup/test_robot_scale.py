@@ -15,7 +15,8 @@ from bampipe.physics.registry import device_from
 from bampipe.setup.finding import Finding, conclude
 from bampipe.setup.hypotheses import scaled
 from bampipe.setup.plausibility import Plausibility
-from bampipe.setup.search import CorrectionSearch
+from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch
+from bampipe.setup.search import shorten
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
@@ -79,12 +80,13 @@ def motions(
 FORCES = tuple(f"torque_{name}" for name in JOINTS)
 
 
-def search_in(given: list[Motion]) -> CorrectionSearch:
+def search_in(given: list[Motion]) -> DrawnSearch:
     units = ("rad",) * 4 + ("N.m",) * 4
     eye, none = np.eye(8), np.zeros(8)
     signals = Signals(JOINTS, FORCES, (), (), units, units, eye, none, 0.0 * eye, none)
     folds = Folds.of_trials(["t0", "t1"], [], ["t0", "t1"])
-    return CorrectionSearch(arm(), given, Band(RATE, (10.0,) * 4), folds, signals)
+    given = shorten(given, DRAWN_SAMPLES)
+    return DrawnSearch(arm(), given, Band(RATE, (10.0,) * 4), folds, signals)
 
 
 def find_mistakes(given: list[Motion]) -> tuple[Finding, ...]:

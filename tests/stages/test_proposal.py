@@ -207,7 +207,9 @@ def test_duty_cycle_and_supply_make_a_motor(tmp_path):
     duty, supply = session["channels"]["duty"], session["channels"]["supply"]
     assert duty == {"column": "pwm_percent", "unit": "percent"}
     assert supply == {"column": "vbat", "unit": "V"}
-    assert any("torque_constant is not yours yet" in line for line in proposal.check)
+    assert any(
+        "torque_constant and resistance are not yours yet" in line for line in proposal.check
+    )
     device = registry.device_from(tomllib.loads((tmp_path / "arm/device.toml").read_text()))
     assert check_device(device) == [] and device.force_unit == ""
 
@@ -693,7 +695,7 @@ def test_sign_bits_of_a_servo_are_taken_off_and_its_counts_shown_by_its_weight(t
     session, proposal = proposed(tmp_path)
     encoder = session["encoders"]["joint"]
     assert encoder["sign_bit"] == 15
-    assert encoder["counts_per_unit"] == pytest.approx(4096 / (2.0 * np.pi), rel=0.02)
+    assert encoder["counts_per_unit"] == pytest.approx(4096 / (2.0 * np.pi), rel=1e-4)
     assert session["channels"]["duty"]["sign_bit"] == 10
     assert "pos is sign and magnitude: bit 15 stands for minus" in proposal.check
     assert [ask.split(",")[0] for ask in proposal.fill_in] == ["the scale of duty"]

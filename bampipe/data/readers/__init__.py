@@ -49,6 +49,16 @@ EXTENSIONS = tuple(_READERS)
 _HEAD = 1 << 10
 _MOST_UNPACKED, _LEAST_ROOM = 100, 2 << 30
 """Of the size of a file, and bytes, which it may take in memory while it is read, if it is free."""
+_AGAIN = "copy it again from the logger"
+_FOREIGN = {
+    ".parquet": ("Parquet file", _AGAIN),
+    ".mat": ("MATLAB file", "save it again from MATLAB"),
+    **dict.fromkeys((".h5", ".hdf5", ".hdf"), ("HDF5 file", _AGAIN)),
+    ".tdms": ("TDMS file", _AGAIN),
+    **dict.fromkeys((".bag", ".db3"), ("bag", f"{_AGAIN}, with the message definitions in it")),
+    ".mcap": ("MCAP file", f"{_AGAIN}, with the message definitions in it"),
+}
+"""What libraries read, and what to do where they cannot: they have no one error for damage."""
 _KINDS = (
     (b"PAR1", (".parquet",), "a Parquet file"),
     (b"TDSm", (".tdms",), "a TDMS file"),
@@ -89,7 +99,7 @@ def read_trial(
     path, name = Path(path), name or str(path)
     reader = _READERS[_checked_extension(path, name)]
     wanted = Wanted(tuple(columns), datetimes or {}, dialect or Dialect(), largest_bytes)
-    with _limited_memory(path, name):
+    with _safely(path, name):
         trial: RawTrial = reader.read(path, wanted, name)
     if columns and len(trial) == 0:
         raise InputError("a header but no samples", where=name)
@@ -107,7 +117,7 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
     """
     path, name = Path(path), name or str(path)
     reader = _READERS[_checked_extension(path, name)]
-    with _limited_memory(path, name):
+    with _safely(path, name):
         if reader is text and dialect is not None:
             return text.columns(path, name, dialect)
         columns: dict[str, str] = reader.columns(path, name)
@@ -115,11 +125,11 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
 
 
 @contextmanager
-def _limited_memory(path: Path, name: str) -> Iterator[None]:
+def _safely(path: Path, name: str) -> Iterator[None]:
     """Let this process take as much memory as the file may; where Linux is not, it takes any.
 
     Raises:
-        InputError: it does not suffice.
+        InputError: it does not suffice, or the library that reads such files fails.
     """
     try:
         import resource
@@ -142,6 +152,13 @@ def _limited_memory(path: Path, name: str) -> Iterator[None]:
             where=name,
             remedy="is it damaged? else split it, or export the columns that are wanted",
         ) from error
+    except InputError:
+        raise
+    except Exception as error:
+        if path.suffix.lower() not in _FOREIGN:
+            raise
+        kind, remedy = _FOREIGN[path.suffix.lower()]
+        raise InputError(f"not a sound {kind}", where=name, remedy=remedy) from error
     finally:
         if resource is not None:
             resource.setrlimit(resource.RLIMIT_AS, before)

@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.extras import need
 from bampipe.data.readers.nested import MISSING, as_number, find, items, leaves, names_in, spread
 from bampipe.data.readers.trial import (
     RawTrial,
@@ -34,6 +33,7 @@ from bampipe.data.readers.trial import (
     check_columns,
     check_size,
     interpolated,
+    need,
 )
 from bampipe.errors import InputError
 
@@ -41,11 +41,6 @@ RECORDED = "@time"
 STAMP = "header.stamp"
 _LISTS = ("position", "velocity", "effort")
 """Of a message with names of joints: what may be empty."""
-_FILLER = "structure_needs_at_least_one_member"
-"""What rosbags puts into a type without fields; ROS 1 messages do not have it."""
-
-_MOST_ITEMS = 10_000
-"""Items of an array of messages or texts, nested ones counted in; robots have some dozen joints."""
 
 
 @dataclass(frozen=True)
@@ -300,20 +295,10 @@ def _messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[st
         InputError: not installed, damaged, would unpack to too much, or a topic is missing.
     """
     need("rosbags.highlevel", "ros", name)
-    ending = path.suffix.lower()
-    try:
-        if ending == ".db3":
-            _check_tables(path)
-        source = _json_messages if ending == ".mcap" and _holds_json(path, name) else _ros_messages
-        yield from source(path, topics, name)
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # rosbags, apsw, mcap and codecs have no one type for damage
-        raise InputError(
-            f"not a sound {'MCAP file' if ending == '.mcap' else 'bag'}",
-            where=name,
-            remedy="copy it again from the robot, or record with the message definitions in it",
-        ) from error
+    if path.suffix.lower() == ".db3":
+        _check_tables(path)
+    in_json = path.suffix.lower() == ".mcap" and _holds_json(path, name)
+    yield from (_json_messages if in_json else _ros_messages)(path, topics, name)
 
 
 def _ros_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
@@ -323,35 +308,8 @@ def _ros_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tupl
         chosen = [c for c in reader.connections if not topics or c.topic in topics]
         if not chosen:
             raise InputError("holds no messages", where=name)
-        for connection in chosen:
-            _count_items(("NAME", connection.msgtype), reader.typestore.fielddefs)
         for connection, moment, raw in reader.messages(connections=chosen):
             yield connection.topic, moment, reader.deserialize(raw, connection.msgtype)
-
-
-def _count_items(kind: Any, types: Mapping[str, Any]) -> int:
-    """Items that every message of a type has, nested ones counted in.
-
-    Raises:
-        ValueError: a few bytes can make it endless: a list of types without fields, or a vast
-            array, whose items rosbags goes through one by one.
-    """
-    node, content = getattr(kind[0], "name", kind[0]), kind[1]
-    if node == "NAME":
-        fields = types[content][1]
-        return sum(_count_items(field, types) for label, field in fields if label != _FILLER)
-    if node == "BASE":
-        return 1
-    inner, count = content
-    items = _count_items(inner, types)
-    if node == "SEQUENCE" and items == 0:
-        raise ValueError("a list of a type without fields")
-    numbers = inner[0].name == "BASE" and inner[1][0] != "string"
-    if node == "SEQUENCE" or numbers:  # read at once
-        return 1
-    if count * max(items, 1) > _MOST_ITEMS:
-        raise ValueError("an array with too many items")
-    return int(count) * items
 
 
 def _check_tables(path: Path) -> None:

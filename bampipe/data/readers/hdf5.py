@@ -19,16 +19,6 @@ from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns,
 from bampipe.errors import InputError
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
-FAULTS = (
-    OSError,
-    ValueError,
-    TypeError,
-    LookupError,
-    ArithmeticError,
-    RuntimeError,
-)
-"""What reading a damaged file raises: h5py has no one error type for it."""
-
 _MOST_DATASETS = 2000
 _BLOCK_ROWS = 1 << 14
 
@@ -48,33 +38,25 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
     import h5py  # heavy: only for these files
 
     matlab = what == "variable"
-    try:
-        with h5py.File(path, "r") as file:
-            values: dict[str, np.ndarray] = {}
-            units: dict[str, str] = {}
-            for column in wanted.columns:
-                where = f"{name}, {what} '{column}'"
-                data, field, index = _found(file, column, wanted.columns, name, where)
-                kind = data.dtype if field is None else data.dtype[field]
-                moment = column in wanted.datetimes
-                _check(data, kind, moment, where)
-                count = math.prod(data.shape)
-                check_size(count, wanted, name)
-                if moment:
-                    stamps = _stamps(data, field, index, wanted.datetimes[column], where)
-                    values[column] = moments.seconds(stamps)
-                else:
-                    cells = data[()] if field is None else data[field]
-                    values[column] = np.asarray(pick(cells, index, where), dtype=np.float64)
-                unit = "" if matlab else _unit(data)
-                units |= {column: unit} if unit else {}
-    except FAULTS as error:
-        words = "MATLAB" if matlab else "HDF5"
-        raise InputError(
-            f"not a sound {words} file",
-            where=name,
-            remedy="save it again from MATLAB" if matlab else "copy it again from the logger",
-        ) from error
+    with h5py.File(path, "r") as file:
+        values: dict[str, np.ndarray] = {}
+        units: dict[str, str] = {}
+        for column in wanted.columns:
+            where = f"{name}, {what} '{column}'"
+            data, field, index = _found(file, column, wanted.columns, name, where)
+            kind = data.dtype if field is None else data.dtype[field]
+            moment = column in wanted.datetimes
+            _check(data, kind, moment, where)
+            count = math.prod(data.shape)
+            check_size(count, wanted, name)
+            if moment:
+                stamps = _stamps(data, field, index, wanted.datetimes[column], where)
+                values[column] = moments.seconds(stamps)
+            else:
+                cells = data[()] if field is None else data[field]
+                values[column] = np.asarray(pick(cells, index, where), dtype=np.float64)
+            unit = "" if matlab else _unit(data)
+            units |= {column: unit} if unit else {}
     return RawTrial(aligned(values, name, what), first_row=1, units=units)
 
 
@@ -88,17 +70,14 @@ def columns(path: Path, name: str) -> dict[str, str]:
 
     shapes: dict[str, tuple[int, ...]] = {}
     units: dict[str, str] = {}
-    try:
-        with h5py.File(path, "r") as file:
-            for label, data in _datasets(file):
-                for field in data.dtype.names or (None,):
-                    kind = data.dtype if field is None else data.dtype[field]
-                    if kind.kind in "iufb" and data.attrs.get("MATLAB_class") != b"char":
-                        column = label if field is None else f"{label}.{field}"
-                        shapes[column] = data.shape
-                        units |= dict.fromkeys(labels(column, data.shape), _unit(data))
-    except FAULTS as error:
-        raise InputError("not a sound HDF5 file", where=name) from error
+    with h5py.File(path, "r") as file:
+        for label, data in _datasets(file):
+            for field in data.dtype.names or (None,):
+                kind = data.dtype if field is None else data.dtype[field]
+                if kind.kind in "iufb" and data.attrs.get("MATLAB_class") != b"char":
+                    column = label if field is None else f"{label}.{field}"
+                    shapes[column] = data.shape
+                    units |= dict.fromkeys(labels(column, data.shape), _unit(data))
     return {column: units[column] for column in recorded(shapes)}
 
 

@@ -100,23 +100,18 @@ def _arrays(path: Path, name: str) -> dict[str, np.ndarray | None]:
     scipy.io reads the same files, but past its buffers where a damaged one lies about a length,
     which ends the process without a word. Source: MathWorks, MAT-File Format, level 5.
     """
-    try:
-        data = memoryview(path.read_bytes())
-        order = "<" if bytes(data[126:128]) == b"IM" else ">"
-        found: dict[str, np.ndarray | None] = {}
-        at = _HEADER
-        while at + 8 <= len(data):
-            kind, size = struct.unpack_from(order + "II", data, at)
-            body, at = data[at + 8 : at + 8 + size], at + 8 + size
-            if kind == _COMPRESSED:
-                kind, body = _Elements(memoryview(zlib.decompress(body)), order).take()
-            if kind != _MATRIX or at > len(data):
-                raise ValueError("an element is not what it says")
-            found |= {label: a for label, a in _Elements(body, order).arrays("", 0) if label}
-    except (ValueError, IndexError, struct.error, zlib.error) as error:
-        raise InputError(
-            "not a sound MATLAB file", where=name, remedy="save it again from MATLAB"
-        ) from error
+    data = memoryview(path.read_bytes())
+    order = "<" if bytes(data[126:128]) == b"IM" else ">"
+    found: dict[str, np.ndarray | None] = {}
+    at = _HEADER
+    while at + 8 <= len(data):
+        kind, size = struct.unpack_from(order + "II", data, at)
+        body, at = data[at + 8 : at + 8 + size], at + 8 + size
+        if kind == _COMPRESSED:
+            kind, body = _Elements(memoryview(zlib.decompress(body)), order).take()
+        if kind != _MATRIX or at > len(data):
+            raise ValueError("an element is not what it says")
+        found |= {label: a for label, a in _Elements(body, order).arrays("", 0) if label}
     return found
 
 

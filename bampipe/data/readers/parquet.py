@@ -25,37 +25,28 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     Raises:
         InputError: damaged, too large, a column missing or not of numbers.
     """
-    try:
-        # Text stays as a dictionary, so that it takes as much memory as in the file.
-        with pq.ParquetFile(
-            path, memory_map=False, buffer_size=_BUFFER, read_dictionary=[*wanted.datetimes]
-        ) as file:
-            schema = file.schema_arrow
-            check_columns(schema.names, wanted.columns, name)
+    # Text stays as a dictionary, so that it takes as much memory as in the file.
+    with pq.ParquetFile(
+        path, memory_map=False, buffer_size=_BUFFER, read_dictionary=[*wanted.datetimes]
+    ) as file:
+        schema = file.schema_arrow
+        check_columns(schema.names, wanted.columns, name)
+        for column in wanted.columns:
+            _check_kind(schema.field(column).type, column in wanted.datetimes, name, column)
+        rows = file.metadata.num_rows
+        check_size(rows, wanted, name)
+        values = {
+            column: np.empty(rows, np.int64 if column in wanted.datetimes else np.float64)
+            for column in wanted.columns
+        }
+        done = 0
+        for batch in file.iter_batches(BATCH_ROWS, columns=list(wanted.columns), use_threads=False):
             for column in wanted.columns:
-                _check_kind(schema.field(column).type, column in wanted.datetimes, name, column)
-            rows = file.metadata.num_rows
-            check_size(rows, wanted, name)
-            values = {
-                column: np.empty(rows, np.int64 if column in wanted.datetimes else np.float64)
-                for column in wanted.columns
-            }
-            done = 0
-            for batch in file.iter_batches(
-                BATCH_ROWS, columns=list(wanted.columns), use_threads=False
-            ):
-                for column in wanted.columns:
-                    cells = batch.column(column)
-                    values[column][done : done + batch.num_rows] = _numbers(
-                        cells, wanted.datetimes.get(column), f"{name}, column '{column}'", done + 1
-                    )
-                done += batch.num_rows
-    except MemoryError:
-        raise
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise InputError(
-            "not a sound Parquet file", where=name, remedy="copy it again from the logger"
-        ) from error
+                cells = batch.column(column)
+                values[column][done : done + batch.num_rows] = _numbers(
+                    cells, wanted.datetimes.get(column), f"{name}, column '{column}'", done + 1
+                )
+            done += batch.num_rows
     if done != rows:
         raise InputError(f"{done} rows, where it claims {rows}", where=name)
     for column in wanted.datetimes:
@@ -69,12 +60,8 @@ def columns(path: Path, name: str) -> dict[str, str]:
     Raises:
         InputError: not a sound Parquet file.
     """
-    try:
-        schema = pq.read_schema(path)
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise InputError("not a sound Parquet file", where=name) from error
     found = {}
-    for field in schema:
+    for field in pq.read_schema(path):
         if any(check(field.type) for check in _NUMBERS):
             stated = (field.metadata or {}).get(b"unit") or b""
             found[field.name] = stated.decode("utf-8", "replace")

@@ -7,7 +7,6 @@ properties give it, for files without a time channel.
 from __future__ import annotations
 
 import logging
-import struct
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,16 +14,10 @@ from typing import Any
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.extras import need
-from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
+from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size, need
 from bampipe.errors import InputError
 
 TIME = "@time"
-_FAULTS = (
-    OSError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError,
-    OverflowError, RuntimeError, struct.error,
-)  # fmt: skip
-"""What npTDMS raises on a damaged file: it has no one error type for it."""
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
@@ -37,23 +30,20 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     library = _library(name)
     values: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
-    try:
-        # A stream: by its path, npTDMS would take an index file beside it for the truth.
-        with path.open("rb") as stream, library.TdmsFile.open(stream) as file:
-            known = _channels(file)
-            timed = [label + TIME for label, channel in known.items() if _increment(channel)]
-            check_columns([*known, *timed], wanted.columns, name)
-            for column in wanted.columns:
-                channel = known[column.removesuffix(TIME)]
-                check_size(len(channel), wanted, name)
-                if column not in known:
-                    values[column] = np.asarray(channel.time_track(), dtype=np.float64)
-                    continue
-                where = f"{name}, channel '{column}'"
-                values[column] = _values(channel, wanted.datetimes.get(column), where)
-                units |= {column: _unit(channel)} if _unit(channel) else {}
-    except _FAULTS as error:
-        raise _unsound(name) from error
+    # A stream: by its path, npTDMS would take an index file beside it for the truth.
+    with path.open("rb") as stream, library.TdmsFile.open(stream) as file:
+        known = _channels(file)
+        timed = [label + TIME for label, channel in known.items() if _increment(channel)]
+        check_columns([*known, *timed], wanted.columns, name)
+        for column in wanted.columns:
+            channel = known[column.removesuffix(TIME)]
+            check_size(len(channel), wanted, name)
+            if column not in known:
+                values[column] = np.asarray(channel.time_track(), dtype=np.float64)
+                continue
+            where = f"{name}, channel '{column}'"
+            values[column] = _values(channel, wanted.datetimes.get(column), where)
+            units |= {column: _unit(channel)} if _unit(channel) else {}
     return RawTrial(aligned(values, name, "channel"), first_row=1, units=units)
 
 
@@ -65,18 +55,15 @@ def columns(path: Path, name: str) -> dict[str, str]:
     """
     library = _library(name)
     found = {}
-    try:
-        # A stream: by its path, npTDMS would take an index file beside it for the truth.
-        with path.open("rb") as stream, library.TdmsFile.open(stream) as file:
-            for label, channel in _channels(file).items():
-                if channel.dtype.kind == "M":
-                    found[label] = "datetime"
-                elif channel.dtype.kind in "iufb" and len(channel):
-                    found[label] = _unit(channel)
-                    if _increment(channel):
-                        found[label + TIME] = "s"
-    except _FAULTS as error:
-        raise _unsound(name) from error
+    # A stream: by its path, npTDMS would take an index file beside it for the truth.
+    with path.open("rb") as stream, library.TdmsFile.open(stream) as file:
+        for label, channel in _channels(file).items():
+            if channel.dtype.kind == "M":
+                found[label] = "datetime"
+            elif channel.dtype.kind in "iufb" and len(channel):
+                found[label] = _unit(channel)
+                if _increment(channel):
+                    found[label + TIME] = "s"
     return found
 
 
@@ -116,7 +103,3 @@ def _values(channel: Any, form: str | None, where: str) -> np.ndarray:
             remedy='is it the time? then say unit = "datetime" under [time]' if stamped else "",
         )
     return data.astype(np.float64)
-
-
-def _unsound(name: str) -> InputError:
-    return InputError("not a sound TDMS file", where=name, remedy="copy it again from the logger")

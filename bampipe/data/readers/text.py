@@ -6,10 +6,10 @@ Rows are counted as an editor does: the first line of the file is row 1.
 from __future__ import annotations
 
 import codecs
+import io
 import re
-import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
@@ -23,7 +23,6 @@ from bampipe.data.readers import moments
 from bampipe.data.readers.dialect import HEAD, NULLS, TableLayout
 from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, joined
 from bampipe.errors import InputError
-from bampipe.files import temporary_space
 
 BLOCK = 1 << 20
 _MOST_CHATTER = 50
@@ -122,7 +121,7 @@ def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, 
 
 @contextmanager
 def opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO, tuple[str, ...]]]:
-    """The file as UTF-8, itself or a copy of it in a file without a name; and what to say of it.
+    """The file as UTF-8, itself or a copy of it in memory; and what to say of it.
 
     Raises:
         InputError: it is not in the encoding that it claims.
@@ -134,12 +133,16 @@ def opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO, 
         if encoding == "utf-8":
             yield stream, ()
             return
-        with ExitStack() as stack:
-            with temporary_space():
-                copy = stack.enter_context(tempfile.TemporaryFile())
-                _transcode(stream, copy, encoding, name)
-                copy.seek(0)
-            yield copy, (_TAKEN_AS,) if encoding == _WESTERN and not dialect.encoding else ()
+        try:
+            text = stream.read().decode(encoding)
+        except UnicodeDecodeError as error:
+            raise InputError(
+                f"not sound {encoding.upper()} text ({error.reason})",
+                where=name,
+                remedy="save it as UTF-8, or say another encoding under [csv]",
+            ) from error
+        said = (_TAKEN_AS,) if encoding == _WESTERN and not dialect.encoding else ()
+        yield io.BytesIO(text.encode("utf-8", "replace")), said
 
 
 def _encoding(head: bytes) -> str:
@@ -160,20 +163,6 @@ def _encoding(head: bytes) -> str:
             continue
         return encoding
     return "utf-8"
-
-
-def _transcode(stream: BinaryIO, copy: BinaryIO, encoding: str, name: str) -> None:
-    decoder = codecs.getincrementaldecoder(encoding)()
-    try:
-        while block := stream.read(BLOCK):
-            copy.write(decoder.decode(block).encode("utf-8", "replace"))
-        copy.write(decoder.decode(b"", final=True).encode("utf-8", "replace"))
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"not sound {encoding.upper()} text ({error.reason})",
-            where=name,
-            remedy="save it as UTF-8, or say another encoding under [csv]",
-        ) from error
 
 
 def _head(stream: BinaryIO, name: str) -> bytes:

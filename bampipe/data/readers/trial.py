@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import ModuleType
 from typing import Literal
 
 import numpy as np
@@ -170,3 +172,25 @@ def joined(parts: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
         chunks = parts.pop(column)
         columns[column] = np.concatenate(chunks) if chunks else np.empty(0)
     return columns
+
+
+def need(module: str, extra: str, name: str) -> ModuleType:
+    """The module, which belongs to an optional extra of bampipe.
+
+    Args:
+        module: full name of what to import.
+        extra: the extra of bampipe that brings it.
+        name: the file that needs it, for the message.
+
+    Raises:
+        InputError: it is not installed; names the pip command.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        raise InputError(
+            f"reading this file needs {package}, which is not installed",
+            where=name,
+            remedy=f"pip install 'bampipe[{extra}]'",
+        ) from error

@@ -1,4 +1,4 @@
-"""What the page for exploring shows of a run: stored records as plain tables, columns packed."""
+"""Content of the page for exploring a run: stored records as plain tables, columns packed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Content = dict[str, Any]
 
 @dataclass(frozen=True)
 class _Span:
-    """Where a trial lies on the session's one axis of time: ``t`` of the trial plus ``offset``."""
+    """Place of a trial on the session's one axis of time: ``t`` of the trial plus ``offset``."""
 
     id: str
     kind: str
@@ -320,7 +320,7 @@ def _make_candidates(diagnosis: DiagnoseResult, label: str) -> Content:
         "Indistinguishable from",
     ]
     note = (
-        "Held-out error without and with each effect; p: probability that replays give any "
+        "Held-out error without and with each effect; p: probability that replicates give any "
         "candidate as large a gain."
     )
     return {"title": f"Candidate effects, {label}", "note": note, "head": head, "rows": rows}

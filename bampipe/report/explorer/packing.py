@@ -55,15 +55,15 @@ class Packer:
         codes[finite] = np.rint((values[finite] - low) / step).astype(np.uint16)
         once = np.diff(codes, prepend=codes.dtype.type(0))
         twice = np.diff(once, prepend=once.dtype.type(0))
-        order = 1 + int(_size(twice) < _size(once))
+        order = 1 + int(_sum_steps(twice) < _sum_steps(once))
         steps = (once, twice)[order - 1].view(np.int16)
-        return PackedColumn(self._add(_fold(steps)), order, low, step)
+        return PackedColumn(self._add(_fold_bytes(steps)), order, low, step)
 
     def pack_times(self, seconds: NDArray[np.float64]) -> int:
         """Return the number of the block of ``seconds``: microseconds, differences taken twice."""
         ticks = np.rint(1e6 * seconds).astype(np.int64)
         twice = np.diff(np.diff(ticks, prepend=0), prepend=0)
-        return self._add(_fold(twice))
+        return self._add(_fold_bytes(twice))
 
     def _add(self, raw: bytes) -> int:
         if raw not in self._known:
@@ -73,11 +73,11 @@ class Packer:
         return self._known[raw]
 
 
-def _size(steps: NDArray[np.uint16]) -> float:
+def _sum_steps(steps: NDArray[np.uint16]) -> float:
     return float(np.abs(steps.view(np.int16).astype(np.float64)).sum())
 
 
-def _fold(steps: NDArray[np.signedinteger]) -> bytes:
+def _fold_bytes(steps: NDArray[np.signedinteger]) -> bytes:
     """Return small numbers of either sign with their zero bytes side by side."""
     size = steps.dtype.itemsize
     folded = ((steps << 1) ^ (steps >> (8 * size - 1))).astype(f"<i{size}")

@@ -130,7 +130,7 @@ def _tabulate_verdicts(found: DiagnoseResult, names: Sequence[str]) -> Table:
         "Probabilities are in brackets. Explained: share of the mean square of the applied force "
         "that the model with the most probable set of effects explains. Errors are RMSE on "
         "held-out trials. Beyond bias: with the set, without the bias that filters leave where "
-        "friction changes its sign. Floor: of replays of the model with the set. Explainable: "
+        "friction changes its sign. Floor: of replicates of the model with the set. Explainable: "
         "share of the present residual that a smooth function of motion and load predicts on "
         "unseen trials.",
     )
@@ -178,8 +178,8 @@ def tabulate_candidates(
             )
             for one, more in rows
         ],
-        f"{note} Without and with: RMSE on held-out trials. p: probability that replays give any "
-        "candidate as large a gain.".lstrip(),
+        f"{note} Without and with: RMSE on held-out trials. p: probability that replicates give "
+        "any candidate as large a gain.".lstrip(),
     )
 
 

@@ -67,7 +67,7 @@ def _draw(
         caption = (
             f"The search on {axis}: error on held-out trials against the number of constants, with "
             "the noise floor, and the gain of the best formula on the measured trials and on "
-            "replays that lack nothing."
+            "replicates that lack nothing."
         )
         return style.finish(figure, name, caption)
     places = {n: _tell_place(effect) for n, effect in effects.items()}
@@ -76,7 +76,7 @@ def _draw(
         f"The draft for {axis} with its 95 % band over the residual of the model (with the sign "
         "of a force: the residual has the opposite one). Error on held-out trials against the "
         "number of constants; the line is the noise floor. Gain in log likelihood of the best "
-        f"formula on the measured trials and on replays that lack nothing.{drawn}"
+        f"formula on the measured trials and on replicates that lack nothing.{drawn}"
     )
     return style.finish(figure, name, caption, panels[:1])
 
@@ -119,11 +119,11 @@ def _draw_length(panel: Axes, entry: AxisDraft) -> None:
 
 def _draw_gains(panel: Axes, entry: AxisDraft) -> None:
     for number, one in enumerate(entry.chance):
-        replays = np.full(len(one.gains), float(number))
-        panel.plot(replays, one.gains, "o", color=style.BLUE, ms=3.0, alpha=0.6)
+        replicates = np.full(len(one.gains), float(number))
+        panel.plot(replicates, one.gains, "o", color=style.BLUE, ms=3.0, alpha=0.6)
         panel.plot([number], [one.gain], "D", color=style.VERMILLION, ms=4.0)
     first = entry.chance[0]
-    for words, value in (("measured", first.gain), ("replays", max(first.gains))):
+    for words, value in (("measured", first.gain), ("replicates", max(first.gains))):
         panel.annotate(words, (0.0, value), (6, 0), textcoords="offset points", va="center")
     panel.set_yscale("symlog", linthresh=10.0)
     names = ["first formula", "second"][: len(entry.chance)]

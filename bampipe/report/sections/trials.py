@@ -24,7 +24,7 @@ from bampipe.results.filter import FilterResult
 
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 _BLANK = "\0"
-"""Where a number was taken out."""
+"""The place of a number that was taken out."""
 _LONG = 60
 """Letters from which on a remark shared by several trials is printed once, below the table."""
 _SAME_RATE = 0.02
@@ -42,7 +42,7 @@ def section(results: Results) -> Section:
         blocks += _describe_filter(results, filtered)
     else:
         said = "Velocities and accelerations have not been computed"
-        blocks += results.make_section("", said, "filter").blocks
+        blocks.append(results.state_undone(said, "filter"))
     return Section("Data", tuple(blocks))
 
 

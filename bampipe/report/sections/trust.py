@@ -47,7 +47,7 @@ def _summarise(identified: IdentifyResult, known: IdentifiabilityReport) -> str:
         )
     else:
         words = (
-            "These trials tell every parameter from the others. The remaining limits follow from "
+            "No two parameters are confounded in these trials. The remaining limits follow from "
             "the equations and from the numbers of the device file."
         )
     if identified.inertial:

@@ -31,7 +31,7 @@ from bampipe.setup.proposal.encoders import encoders_table
 from bampipe.setup.proposal.inputs import input_tables
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import Notes, quoted
-from bampipe.setup.proposal.readings import fresh_readings, signed_readings
+from bampipe.setup.proposal.positions import fresh_readings, signed_readings
 from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
 from bampipe.setup.proposal.trials import trials_tables
 
@@ -88,17 +88,13 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
                 f"{positions} columns are positions: of a robot? put its URDF beside the logs"
             )
     elif chosen.device.robot is not None:
-        several = len(chosen.device.robot.joints) > 1
         columns = find_robot_columns(
             folder, chosen.device, chosen.device.robot, found, clock.t, notes
         )
         chosen = _with_guessed_motors(folder, chosen, columns)
-        match.joints, match.of_robot = columns.columns, several
-        match.turned, match.gears = columns.turned, columns.gears
+        match.robot = columns
         if columns.mounting is not None:
             chosen = _hung(folder, chosen, columns.mounting, notes)
-            joints = [c.name for c in chosen.device.coordinates]
-            match.counting = dict(zip(joints, columns.mounting.by_joint, strict=True))
         _check_robot(chosen, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)

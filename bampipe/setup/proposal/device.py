@@ -18,6 +18,7 @@ from bampipe.data.urdf import unexpanded
 from bampipe.errors import InputError
 from bampipe.estimate.white_noise import counting_step, white_noise_sd
 from bampipe.files import read_toml
+from bampipe.lists import join_names
 from bampipe.physics import registry
 from bampipe.physics.device import KINDS, Device
 from bampipe.setup.hypotheses import MOST_TRAVEL
@@ -250,9 +251,11 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         f"{DEVICE}: one {kind} axis '{starter.axis}' driven by a {what}{doubt}; put in what you"
         " know of it"
     )
-    for constant in starter.placeholders:
+    if starter.placeholders:
+        several = len(starter.placeholders) > 1
         notes.check.append(
-            f"{DEVICE}: {constant} is not yours yet: all forces and inertias scale with it"
+            f"{DEVICE}: {join_names(starter.placeholders)} {'are' if several else 'is'} not yours"
+            f" yet: all forces and inertias scale with {'them' if several else 'it'}"
         )
     if on_gravity:
         notes.check.append(f"{DEVICE}: on '{starter.axis}', {on_gravity}")

@@ -15,6 +15,8 @@ from bampipe.setup.proposal.positions import in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
 _MANY = 6
+_SURE = 2.0
+"""Standard errors within which a power of two, as most encoders count, is what a turn counts."""
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
 
 
@@ -75,37 +77,26 @@ def _encoder(
             f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
             " the angle; put in the ratio of the gear"
         )
-    if axis.name in match.gears:
-        turns = match.gears[axis.name]
-        said = spelled(column.unit, _POSITION_UNITS) or guesses.likely_unit(
-            axis.unit, column.values
-        )
-        fields, how = _counting(axis, said or axis.unit, match, turns)
-        return entry(column.name, said or axis.unit, fields) + notes.guess(
-            f"{column.name} is the position of the motor of {axis.name}, in {said or axis.unit}"
-            + (f"; it {how}" if how else "")
-        )
-    velocity = _velocity_beside(axis, alone, match, notes)
-    known = column.conversion
-    if known is not None and known.si == axis.unit:
-        said = spelled(column.unit, _POSITION_UNITS) or axis.unit
-        counted, how = _counting(axis, said, match)
-        table = entry(column.name, said, counted + velocity)
-        if how:
-            return table + notes.guess(f"{column.name} {how}")
-        return table + ("" if column.stated else notes.guess(f"{column.name} in {column.unit}"))
-    if column.by_looks:
+    known, geared = column.conversion, axis.name in match.robot.gears
+    right = known is not None and known.si == axis.unit
+    if column.by_looks and not right:
         note = notes.ask(
             f"the unit of {column.name}, which looks like the position of {axis.name}",
             "who wrote the logger, or by how far the machine moves; rad, deg, m and mm are usual",
         )
-        return entry(column.name, UNKNOWN, velocity) + note
-    by_size = guesses.likely_unit(axis.unit, column.values)
-    likely, why = (by_size, ", by its size") if by_size else (axis.unit, "")
-    counted, how = _counting(axis, likely, match)
-    return entry(column.name, likely, counted + velocity) + notes.guess(
-        f"{column.name} is the position of {axis.name}, in {likely}{why}"
-        + (f"; it {how}" if how else "")
+        return entry(column.name, UNKNOWN, _velocity_beside(axis, alone, match, notes)) + note
+    by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
+    said = (spelled(column.unit, _POSITION_UNITS) if right else by_size) or axis.unit
+    fields, how = _counting(axis, said, match, match.robot.gears.get(axis.name, 1.0))
+    fields += "" if geared else _velocity_beside(axis, alone, match, notes)
+    guess = f"is the position of {axis.name}, in {said}" + (", by its size" if by_size else "")
+    if geared:
+        guess = f"is the position of the motor of {axis.name}, in {said}"
+    elif right:
+        guess = "" if column.stated or how else f"in {column.unit}"
+    guess += ("; it " if guess and how else "") + how
+    return entry(column.name, said, fields) + (
+        notes.guess(f"{column.name} {guess}") if guess else ""
     )
 
 
@@ -116,7 +107,7 @@ def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -
         axis: whose encoder it is; said: its unit; match: the columns.
         turns: of what the encoder sits on, for one of the axis.
     """
-    direction, zero = match.counting.get(axis.name, (1.0, 0.0))
+    direction, zero = match.robot.counting.get(axis.name, (1.0, 0.0))
     fields, ways = "", []
     if direction * turns != 1.0:
         fields = f", gear_ratio = {direction * turns:.10g}"
@@ -144,13 +135,16 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: No
     """The entry of an encoder that counts; the weight of a joint may show what a count is worth."""
     worth = match.turning.get(column.name)
     zero = worth.zero if worth is not None else float(np.median(column.values))
-    size = f"{worth.size:.5g}" if worth is not None else "0.0"
+    turn, sd = (2.0 * np.pi * x for x in ((worth.size, worth.sd) if worth is not None else (0, 0)))
+    power = 2.0 ** round(np.log2(turn)) if turn > 0.0 else 0.0
+    is_power = abs(turn - power) < _SURE * sd
+    size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}" if turn > 0.0 else "0.0"
     counting = f"counts_per_unit = {size}, zero_counts = {zero:.0f}"
     table = f'{{ column = {quoted(column.name)}, {counting}, unit = "{axis.unit}" }}'
     if worth is not None:
-        turn, sd = 2.0 * np.pi * worth.size, 2.0 * np.pi * worth.sd
+        taken = f" ({power:.0f}, a power of two, is taken)" if is_power else ""
         return table + notes.guess(
-            f"{column.name} counts {turn:.5g} ± {_rounded(sd)} a turn of {axis.name}, and"
+            f"{column.name} counts {turn:.5g} ± {_rounded(sd)} a turn of {axis.name}{taken}, and"
             f" {zero:.0f} where it hangs, by its weight, which goes with the sine of the angle; put"
             " in the encoder's counts a turn, times the gear, by 2 pi"
         )

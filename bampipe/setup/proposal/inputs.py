@@ -9,6 +9,7 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.survey import SurveyedColumn, words
 from bampipe.data.units import spelled, unit
+from bampipe.lists import join_names
 from bampipe.physics.device import Device
 from bampipe.setup.proposal.device import ChosenDevice
 from bampipe.setup.proposal.matching import Match, Matcher
@@ -37,10 +38,7 @@ def input_tables(
     lines = []
     sensed = all(name.startswith("force_") for name in device.forces)
     forces = [column for name in device.forces if (column := given[name][0]) is not None]
-    if sensed and not forces:
-        lines += _open_force_table(device, notes)
-        wanted = dict(device.channels)
-    elif sensed and len(forces) == len(device.forces):
+    if sensed and len(forces) in (0, len(device.forces)):
         match.used |= {column.name for column in forces}
         lines += _force_table(device, forces, given[device.forces[0]][1], notes)
         wanted = dict(device.channels)
@@ -51,27 +49,16 @@ def input_tables(
 def _force_table(
     device: Device, columns: list[SurveyedColumn], why: str, notes: Notes
 ) -> list[str]:
-    names = ", ".join(quoted(column.name) for column in columns)
+    names = [column.name for column in columns] or [UNKNOWN] * len(device.forces)
     components = ", ".join(f'"{name}"' for name in device.components)
-    return [
-        "[force]",
-        f"columns = [{names}]",
-        f"components = [{components}]",
-        *_force_unit(device, columns, why, notes),
-        "",
-    ]
-
-
-def _open_force_table(device: Device, notes: Notes) -> list[str]:
-    """The lines of a force table of which no column could be found."""
-    unknown = ", ".join([quoted(UNKNOWN)] * len(device.forces))
-    components = ", ".join(quoted(name) for name in device.components)
     which = " and ".join(device.forces)
+    ask = "" if columns else notes.ask_column(which, device.force_unit)
+    stated = [f'unit = "{device.force_unit}"']
     return [
         "[force]",
-        f"columns = [{unknown}]" + notes.ask_column(which, device.force_unit),
+        f"columns = [{', '.join(quoted(name) for name in names)}]{ask}",
         f"components = [{components}]",
-        f'unit = "{device.force_unit}"',
+        *(_force_unit(device, columns, why, notes) if columns else stated),
         "",
     ]
 
@@ -88,6 +75,12 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             f'unit = "{common}"'
             + ("" if stated else notes.guess(f"{names} is a {_QUANTITY[known.si]} in {common}"))
         ]
+    if len({unit(column.unit) for column in columns if column.unit}) > 1:
+        note = notes.ask(
+            f"one unit of {names}, which are logged in {join_names([c.unit for c in columns])}",
+            "export them in one, as a force has one unit; it goes here",
+        )
+        return [f'unit = "{UNKNOWN}"{note}']
     needs_gain = any(_needs_gain(column) for column in columns)
     if common == "V" or needs_gain:
         row = f"[{', '.join(['0.0'] * len(columns))}]"
@@ -174,7 +167,7 @@ def _channel(
     """Column and unit of one input; its register or its scale, where the unit does not do."""
     register = match.registers.get(column.name)
     fields = register.fields if register else ""
-    fields += ", scale = -1.0" if name in match.turned else ""
+    fields += ", scale = -1.0" if name in match.robot.turned else ""
     known = column.conversion
     slides = known is not None and (known.si, si) == ("N", "N.m")  # the drive of a sliding joint
     if known is not None and (known.si == si or slides):

@@ -11,6 +11,7 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
 from bampipe.setup.proposal.positions import travelled
+from bampipe.setup.proposal.robot import RobotColumns
 
 _DRIVEN = 0.5
 """Share of a column that the motion must explain for it to pass as what drives it."""
@@ -29,30 +30,21 @@ class Matcher:
         t: (T,) time stamps of the first log, s.
         used: names of the columns that have a meaning already; grows as tables are proposed.
         registers: columns that hold signed numbers in a register, and how.
-        joints: columns of a robot's joints and drives, by name of joint or input; of what stands
-            there no other column is thought.
-        turned: inputs that are logged with the other sign.
-        of_robot: whether the device is a robot of several joints.
-        gears: joints whose position is that of a motor, which turns so often for one of theirs.
+        robot: columns of a robot of which the drawing tells, and how they are counted.
         turning: what the readings of a position are worth, by the weight on it, by name of column.
-        counting: of a robot's joints, direction and zero against the drawing, see `RobotColumns`.
     """
 
     found: Survey
     t: np.ndarray
     used: set[str]
     registers: Mapping[str, guesses.Register]
-    joints: Mapping[str, SurveyedColumn] = field(default_factory=dict)
-    turned: frozenset[str] = frozenset()
-    gears: Mapping[str, float] = field(default_factory=dict)
+    robot: RobotColumns = field(default_factory=RobotColumns)
     turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
-    counting: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    of_robot: bool = False
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""
-        if name in self.joints:
-            return self.joints[name]
+        if name in self.robot.columns:
+            return self.robot.columns[name]
         wanted, numbers = set(words(name)), set(_numbers(name))
         for column in self.found.of(*roles):
             counted = set(_numbers(column.name))
@@ -104,15 +96,15 @@ class Matcher:
 
     def _input(self, name: str, si: str, axes: tuple[SurveyedColumn, ...]) -> Match:
         role = _INPUT_ROLE.get(si, "")
-        if name in self.joints:
-            return self.joints[name], ""
+        if name in self.robot.columns:
+            return self.robot.columns[name], ""
         free = [c for c in self.found.columns if c.name not in self.used]
         exact = next((c for c in free if c.name == name), None)
         named = exact or self.named(name, role) or self.named(name.removeprefix("force_"), role)
         if named is not None and named in free:
             return named, ""
-        if self.of_robot:  # a column left over is another joint's as well as this one's
-            return None, ""
+        if len(self.robot.joints) > 1:
+            return None, ""  # a column left over is another joint's as well as this one's
         fitting = [c for c in free if c.role == role and not c.is_constant and (si or not c.unit)]
         if len(fitting) == 1 and _compatible(fitting[0], si):
             return fitting[0], ""
@@ -132,8 +124,7 @@ class Matcher:
         if best is not None and not best.unit and best.name in self.registers:
             # What a servo calls its load is the share of the supply that its bridge is on: no force
             # comes as a register, and a current is called one.
-            load = best.role != "current" or self.supply(best) is not None
-            return best, "duty" if load else "current"
+            return best, "current" if best.role == "current" else "duty"
         if best is None or best.role not in DRIVERS:
             return best, "force"
         duty = best.role == "voltage" and {"pwm", "duty"} & set(words(best.name))

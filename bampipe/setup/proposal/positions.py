@@ -1,13 +1,17 @@
-"""What a column that stands for a position is, and its values in SI."""
+"""What the readings of a log stand for, and positions in SI."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.survey import Survey, SurveyedColumn, words
+from bampipe.data.quality.stamps import find_fresh_rows
+from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
 from bampipe.data.units import unit
 from bampipe.data.velocity import integral
+from bampipe.setup.proposal.notes import Notes
 
 SLIDING = frozenset(["stroke", "displacement", "disp", "dist", "weg", "hub", "carriage", "piston"])
 _FEWEST_COUNTS = 100
@@ -61,3 +65,33 @@ def scale_to(si: str, column: SurveyedColumn) -> float:
     if known is None or known.si != si:
         known = unit(guesses.likely_unit(si, column.values) or si)
     return known.scale if known is not None else 1.0
+
+
+def fresh_readings(found: Survey, notes: Notes) -> Survey:
+    """The log without rows that repeat positions, as a logger that is too fast writes them."""
+    positions = [c.values for c in found.of("position") if not c.is_constant]
+    kept = find_fresh_rows(positions)
+    if kept is None:
+        return found
+    held = 1.0 - len(kept) / len(positions[0])
+    notes.check.append(f"{held:.0%} of the rows repeat the positions before them and are left out")
+    columns = tuple(replace(c, values=c.values[kept]) for c in found.columns)
+    return replace(found, columns=columns)
+
+
+def signed_readings(found: Survey) -> tuple[Survey, dict[str, guesses.Register]]:
+    """The log with its registers as signed numbers, and how each of them holds its sign.
+
+    A position that counts on where a counter starts anew is no register: ingest unwraps it.
+    """
+    registers = {
+        column.name: register
+        for column in found.of(*DRIVERS, "position", "velocity", "")
+        if (register := guesses.find_register(column.values)) is not None
+        and (register.sign_bit or column.role != "position")
+    }
+    columns = tuple(
+        replace(c, values=registers[c.name].signed(c.values)) if c.name in registers else c
+        for c in found.columns
+    )
+    return replace(found, columns=columns), registers

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.data.chain import frame_of_tip
-from bampipe.data.robot_file import read_tree
+from bampipe.data.chain import frame_of_tip, read_tree
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
@@ -40,16 +39,24 @@ class RobotColumns:
     """What a robot's log was found to hold.
 
     Attributes:
-        columns: by name of joint or input.
+        joints: names of the joints.
+        columns: by name of joint or input; of what stands there no other column is thought.
         drives: by name of input, where drawing and log can be compared.
         gears: by joint whose position is that of a motor, its turns for one of the joint.
         mounting: of the joints and the base against the drawing; None where nothing tells.
     """
 
-    columns: Mapping[str, SurveyedColumn]
-    drives: Mapping[str, Drive]
+    joints: Sequence[str] = ()
+    columns: Mapping[str, SurveyedColumn] = field(default_factory=dict)
+    drives: Mapping[str, Drive] = field(default_factory=dict)
     gears: Mapping[str, float] = field(default_factory=dict)
     mounting: Mounting | None = None
+
+    @property
+    def counting(self) -> Mapping[str, tuple[float, float]]:
+        """Direction and zero of each joint against the drawing, where that tells."""
+        by_joint = self.mounting.by_joint if self.mounting is not None else []
+        return dict(zip(self.joints, by_joint, strict=False))
 
     @property
     def turned(self) -> frozenset[str]:
@@ -77,15 +84,15 @@ def find_robot_columns(
         if chosen is not None and others:
             listed = "; ".join(str(other) for other in others)
             notes.check.append(f"of several {what}, {chosen} are taken, not {listed}")
-    turns, logged = _turns(device, robot), Logged(device, robot, t)
+    turns, logged, joints = _turns(device, robot), Logged(device, robot, t), _joints(device)
     columns: dict[str, SurveyedColumn] = {}
     if positions is not None:
         columns |= dict(zip(_joints(device), positions.columns, strict=True))
     if drives is None:
-        return RobotColumns({**columns, **pairing.some_drives}, {})
+        return RobotColumns(joints, {**columns, **pairing.some_drives})
     columns |= dict(zip(device.forces, drives.columns, strict=True))
     if positions is None:
-        return RobotColumns(columns, {})
+        return RobotColumns(joints, columns)
 
     def explain(positions: Group, drives: Group) -> Gears | None:
         """How the drawing explains the drives; None where they cannot be compared."""
@@ -121,7 +128,7 @@ def find_robot_columns(
             return _geared(device, columns, group, gears, notes, given=known)
     notes.check += beyond
     if best is None or (beyond and not sound):
-        return RobotColumns(columns, {})
+        return RobotColumns(joints, columns)
     if not (positions.named or drives.named or sound):
         ordered = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
         other = explain(*ordered)
@@ -143,7 +150,7 @@ def find_robot_columns(
         notes.check.append(describe_heavy(compared, best.mounting, heavy, in_tip))
     by_input = dict(zip(device.forces, best.drives, strict=True))
     notes.check += _sentences(device, columns, by_input)
-    return RobotColumns(columns, by_input, mounting=best.mounting)
+    return RobotColumns(joints, columns, by_input, mounting=best.mounting)
 
 
 def _placed_in_tip(folder: Path, robot: Robot) -> Callable[[Array], Array]:
@@ -180,7 +187,7 @@ def _geared(
         f"drawing, drives' inertia and friction explain {explained:.1%} of the drives"
     )
     drives = dict(zip(device.forces, found.drives, strict=True))
-    return RobotColumns(paired, drives, gears, found.mounting)
+    return RobotColumns(joints, paired, drives, gears, found.mounting)
 
 
 def _in_si(device: Device, group: Group) -> Group:

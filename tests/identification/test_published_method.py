@@ -1,0 +1,82 @@
+"""Which estimate is published: least squares, or the filter where it agrees and is more precise."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from independent_runs import record_trials
+
+from bampipe.data.run_folder import RunFolder
+from bampipe.files import write_text
+from bampipe.identification.choice import find_objections
+from bampipe.identification.estimates import Estimate
+from bampipe.progress import silent
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
+from bampipe.results.validate import ValidateResult
+from bampipe.stages import identify, validate
+
+NAMED: Any = SimpleNamespace(parameters=[SimpleNamespace(name=f"p{k}") for k in range(3)])
+
+
+def estimate(value: list[float], sd: float, doubts: tuple[str, ...] = ()) -> Estimate:
+    """Three parameters with one standard deviation."""
+    problem: Any = SimpleNamespace(free=np.arange(3))
+    return Estimate(
+        "ukf", np.array([*value, 0.0]), problem, sd**2 * np.eye(3), np.zeros(3, dtype=bool),
+        [], [{}] * 3, {}, lambda: (None, None), doubts,  # type: ignore[arg-type, return-value]
+    )  # fmt: skip
+
+
+SQUARES = estimate([1.0, 2.0, 3.0], 0.1)
+
+
+def test_a_filter_that_agrees_and_is_more_precise_is_published() -> None:
+    assert find_objections(NAMED, estimate([1.1, 1.9, 3.1], 0.05), SQUARES) == ()
+
+
+@pytest.mark.parametrize(
+    ("filtered", "words"),
+    [
+        (estimate([1.0, 2.5, 3.0], 0.05), r"the latter puts `p1` at 2\.5.* than by chance"),
+        (estimate([1.0, 2.0, 3.0], 0.12), r"standard deviations are 1\.20 times the former's"),
+        (estimate([1.0, 2.0, 3.0], 0.05, ("it is off",)), "it is off"),
+    ],
+    ids=["far", "loose", "doubted"],
+)
+def test_what_speaks_against_a_filter_is_said(filtered: Estimate, words: str) -> None:
+    (said,) = find_objections(NAMED, filtered, SQUARES)
+    assert re.search(words, said)
+
+
+def test_many_parameters_may_differ_by_more_than_few() -> None:
+    """The largest of several differences by chance is larger than one of them."""
+    far = replace(SQUARES, p=np.array([1.0, 2.0, 3.39, 0.0]), covariance=0.09**2 * np.eye(3))
+    assert find_objections(NAMED, far, SQUARES) == ()
+
+
+def test_a_drive_that_friction_stops_at_once_is_not_simulated(tmp_path) -> None:
+    """Its friction is a hundred times its inertia: steps of a simulation would be of 0.1 us."""
+    _, _, truth = record_trials(tmp_path, "drive", 99201)
+    run = RunFolder(tmp_path / "run")
+    device = run.read(IngestResult).device
+    text = f'schema = "bampipe.model/1"\nname = "base"\ndevice = "{device}"\neffects = []\n'
+    write_text(run.path("models/base/model.toml"), text)
+    identify.execute(run, run.root, identify.Config(), silent)
+    found = run.read(IdentifyResult, "base")
+    assert found.method == "least-squares"
+    assert any("by the unscented filter: to follow the motion" in note for note in found.notes)
+    assert found.parameters["coulomb.rotor"].estimate == pytest.approx(
+        truth["coulomb.rotor"], rel=0.01
+    )
+    inertia = found.parameters["inertia"]
+    assert abs(inertia.estimate - truth["inertia"]) < 3.0 * inertia.sd
+    validate.execute(run, run.root, validate.Config(), silent)
+    judged = run.read(ValidateResult, "base")
+    assert judged.axes["rotor"].noise_floor is not None
+    assert "its drive gives the motion" in judged.free_run.reason
