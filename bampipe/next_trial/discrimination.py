@@ -69,21 +69,11 @@ class Sums:
     applied: Array
 
     def __add__(self, other: Sums) -> Sums:
-        return Sums(
-            self.squares + other.squares,
-            self.independent + other.independent,
-            self.added + other.added,
-            self.applied + other.applied,
-        )
+        return Sums(*map(add, vars(self).values(), vars(other).values()))
 
     def scaled(self, factor: float) -> Sums:
         """The sums of trials that are ``factor`` times as long."""
-        return Sums(
-            factor * self.squares,
-            factor * self.independent,
-            factor * self.added,
-            factor * self.applied,
-        )
+        return Sums(*(factor * values for values in vars(self).values()))
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ class _Option:
     information: Array
     sums: Sums | None
 
-    def lasting(self, seconds: float) -> _Option:
+    def scale_to(self, seconds: float) -> _Option:
         """The same for another time: what a trial adds is in proportion to that."""
         share = seconds / self.design.seconds
         return _Option(
@@ -115,7 +115,7 @@ def _trimmed(forecast: Forecast, chosen: list[_Option], goal: Goal) -> list[_Opt
             chosen = fewer
             continue
         while (seconds := _SHORTER * chosen[k].design.seconds) >= _shortest(chosen[k].design):
-            shorter = [*chosen[:k], chosen[k].lasting(seconds), *chosen[k + 1 :]]
+            shorter = [*chosen[:k], chosen[k].scale_to(seconds), *chosen[k + 1 :]]
             if _distance(_outcome(forecast, shorter), goal) > 0.0:
                 break
             chosen = shorter
@@ -199,7 +199,10 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
         is_enough=found.is_enough,
         trials=tuple(
             PlannedTrial(
-                sentence=describe(_part_of(design), seen, system.model.device),
+                # One trial of the design: a sheet has how often it is recorded beside it.
+                sentence=describe(
+                    replace(design, seconds=design.part_s, parts=1), seen, system.model.device
+                ),
                 seconds=design.part_s,
                 times=times * design.parts,
                 moves=describe_moves(design, forecast.rehearsal),
@@ -223,21 +226,12 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
     )
 
 
-def _part_of(design: Primitive) -> Primitive:
-    """One trial of a design: a sheet has how often it is recorded beside it."""
-    return replace(design, seconds=design.part_s, parts=1)
-
-
 def _counted(designs: Sequence[Primitive]) -> list[tuple[Primitive, int]]:
     """Each design once, with how often it is recorded."""
-    counted: list[tuple[Primitive, int]] = []
+    counted: dict[int, tuple[Primitive, int]] = {}
     for design in designs:
-        known = [k for k, (other, _) in enumerate(counted) if other is design]
-        if known:
-            counted[known[0]] = design, counted[known[0]][1] + 1
-        else:
-            counted.append((design, 1))
-    return counted
+        counted[id(design)] = design, counted.get(id(design), (design, 0))[1] + 1
+    return list(counted.values())
 
 
 def _sentence(found: TrialPlan, seconds: float, what: str) -> str:

@@ -236,20 +236,27 @@ def _rank(
 ) -> list[RankedDesign]:
     """The designs that serve the purpose best."""
 
-    def report(fraction: float, message: str) -> None:
-        progress(0.2 + 0.6 * fraction, message)
+    def report(first: float, fraction: float, message: str) -> None:
+        progress(first + 0.3 * fraction, message)
 
     comparison, detectability = forecast.comparison, forecast.detectability
     if comparison is not None:
-        return rank_designs(space, lambda motion: -comparison.confusion_with(motion), report)
+        return rank_designs(
+            space, lambda motion: -comparison.confusion_with(motion), partial(report, 0.2)
+        )
     if detectability is not None:
         watched = detectability.restrict(detectability.hidden_numbers[:_WATCHED])
-        ranked = rank_designs(space, watched.gain, report, _LITTLE) if watched.limits else []
+        ranked = (
+            rank_designs(space, watched.gain, partial(report, 0.2), _LITTLE)
+            if watched.limits
+            else []
+        )
         if ranked and ranked[0].utility >= _LITTLE:
             return ranked
         # Nothing that a person could do here shows more: then for the parameters.
         space = replace(space, with_rests=False, with_brakes=forecast.rehearsal.system.braked)
-    return rank_designs(space, partial(forecast.precision.worth_of, parameter=parameter), report)
+    utility = partial(forecast.precision.worth_of, parameter=parameter)
+    return rank_designs(space, utility, partial(report, 0.5))
 
 
 def _record(

@@ -13,7 +13,7 @@ from bampipe.diagnosis.dictionary import Dictionary, Key
 from bampipe.diagnosis.probability import chance_of, least_gain
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import Search
-from bampipe.diagnosis.session import Fit, Session, candidates_of
+from bampipe.diagnosis.session import Fit, Session, candidates_of, system_of
 from bampipe.next_trial.sensitivity import find_detectability, find_needed
 from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity, suggest_trial
 from bampipe.trials.folds import Folds
@@ -140,6 +140,29 @@ def test_a_trial_is_suggested_that_tells_apart_what_small_motion_does_not():
     assert found.confusion < 0.1 < found.confusion_now == pytest.approx(0.4)
     assert "fall from 40 % to" in found.sentence
     assert suggest_trial(session, final, made_diagnosis([(("quadratic_drag:yaw",), 1.0)])) is None
+
+
+def test_where_both_alternatives_fit_badly_a_trial_tells_no_more_than_the_diagnosis_counts():
+    """What both lack comes back with the motion: sample after sample says the same thing."""
+    values = {"quadratic_drag.yaw.coefficient": 0.6, "return_spring.yaw.stiffness": 3.0}
+    trials = made(bam(["quadratic_drag:yaw", "return_spring:yaw"]), values, trials=2, seconds=6.0)
+    session, distances = Session(trials, CRITERIA), []
+    asked = made_diagnosis([(("quadratic_drag:yaw",), 0.6), (("stribeck:yaw",), 0.4)])
+    for more in ((), ("return_spring:yaw",)):
+        recipe = bam(["quadratic_drag:yaw", *more])
+        start = [(TRUTH | values).get(q.name, q.prior) for q in system_of(recipe).parameters]
+        final = session.fit(recipe, np.array(start))
+        comparison = compare_alternatives(session, final, find_ambiguity(asked, CRITERIA))
+        counted = [here.independent for here in final.count_independent(CRITERIA)]
+        assert comparison.at_hand.independent == pytest.approx(counted)
+        # A new trial is counted as those at hand are.
+        again = comparison.sums(final.evidence.motions)
+        assert again.independent == pytest.approx(counted)
+        distances.append((comparison.now[0, 1].distance, comparison.scale[0], counted[0]))
+    (distance, scale, count), (complete, scale_then, count_then) = distances
+    assert scale > 4.0 * scale_then
+    assert count < 0.7 * count_then
+    assert distance < 0.01 * complete
 
 
 def test_effects_are_weighed_by_trials_with_brakes_on_too_but_by_none_held_out():
