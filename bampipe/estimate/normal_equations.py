@@ -73,48 +73,6 @@ class NormalEquations:
         ]
         return cls(np.array(xx), np.array(xy), np.array(yy), count, *prior)
 
-    def bordered(
-        self,
-        slopes: Sequence[Array],
-        columns: Sequence[Array],
-        change: Sequence[Array],
-        residuals: Sequence[Array],
-    ) -> NormalEquations:
-        """The sums with further columns, and with a residual that has changed.
-
-        Of the products only those with something new are taken: with many coefficients, as a
-        robot has, that is a hundredth of all.
-
-        Args:
-            slopes: X by trial, of which these sums are, each (T, n_q, P).
-            columns: what is added to it, each (T, n_q, m).
-            change: what is added to the residual, each (T, n_q).
-            residuals: r by trial, of which these sums are, each (T, n_q).
-        """
-        (trials, n_q, size), more = self.xy.shape, columns[0].shape[2]
-        xx = np.zeros((trials, n_q, size + more, size + more))
-        xx[:, :, :size, :size] = self.xx
-        xy = np.zeros((trials, n_q, size + more))
-        yy = np.empty((trials, n_q))
-        for k, (slope, column, moved, residual) in enumerate(
-            zip(slopes, columns, change, residuals, strict=True)
-        ):
-            new, right = column.transpose(1, 2, 0), (residual + moved).T
-            # Most effects act on one axis.
-            for axis in np.flatnonzero(column.any(axis=(0, 2))):
-                cross = new[axis] @ slope[:, axis]
-                xx[k, axis, size:, :size], xx[k, axis, :size, size:] = cross, cross.T
-                xx[k, axis, size:, size:] = new[axis] @ column[:, axis]
-                xy[k, axis, size:] = -(new[axis] @ right[axis])
-            shift = np.einsum("tap,ta->ap", slope, moved) if moved.any() else 0.0
-            xy[k, :, :size] = self.xy[k] - shift
-            yy[k] = np.sum(right**2, axis=1)
-        nothing = np.zeros(more)
-        return NormalEquations(
-            xx, xy, yy, self.count,
-            np.append(self.precision, nothing), np.append(self.known, nothing),
-        )  # fmt: skip
-
     def subset(self, trials: Sequence[int]) -> NormalEquations:
         """The sums of some trials."""
         chosen = list(trials)

@@ -50,6 +50,9 @@ _FARTHEST = 3.0
 """Standard deviations that a nonlinear fit moves at most where a trial is left out."""
 _PERIODS = 10
 """Periods of the band in the shortest block that is taken as independent of the next."""
+_TAILED = 0.75
+"""Slope of the score of a sample under Student's t distribution over its weight, on average over
+normal errors, four degrees of freedom: as weights follow the errors, they overstate information."""
 _STRETCH_S = 1.0
 _STATES = 500_000
 """Samples, spread over all, that the typical uncertainty of a state is taken from."""
@@ -148,9 +151,10 @@ class SquaresFit:
         inverse = invert_scaled(self.normal)
         fitted = float(np.trace(inverse @ (self.normal - pose.precision)))
         samples = lay_out_samples(self.fit.evidence, self._block_length(fitted))
-        found = covariance_by_blocks(
-            self.rows, pose.precision, [s.block for s in samples], [s.independent for s in samples]
-        )
+        tailed = [_TAILED if np.ptp(root) > 0.0 else 1.0 for root in self.fit.likelihood.root]
+        rows = [(x, left / by) for (x, left), by in zip(self.rows, tailed, strict=True)]
+        independent = [s.independent * by**2 for s, by in zip(samples, tailed, strict=True)]
+        found = covariance_by_blocks(rows, pose.precision, [s.block for s in samples], independent)
         to = pose.to_parameters[: self.free.size]
         return np.asarray(to @ found @ to.T)
 

@@ -61,8 +61,8 @@ _LATEST = 8
 """Samples by which a drive may act after its log says so, or be read after it acts: its jumps then
 stand in the log before or behind those of friction."""
 _FEW_REVERSALS = 5
-_PROBED = 300
-"""Samples of a trial at which the steps of integration are counted."""
+_PROBED, _FEW = 300, 50
+"""Samples of a trial at which the steps of integration are counted; to tell ten from one, a few."""
 LONGEST_STEP_S = 2.5e-4
 _STIFFEST = 10.0
 """Steps of integration over those of `LONGEST_STEP_S` from which on friction holds a machine so
@@ -169,13 +169,17 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
 
 
 def steps_to_follow(
-    system: System, p: Array, motion: Motion, longest_step_s: float = LONGEST_STEP_S
+    system: System,
+    p: Array,
+    motion: Motion,
+    longest_step_s: float = LONGEST_STEP_S,
+    probed: int = _PROBED,
 ) -> float:
     """Steps of integration that a model takes along a motion, from sample to sample on average."""
     u = motion.inputs(system.inputs)
     true = motion.of_mechanism(system, u, p)
     memory = system.memory(*true.kinematics, u, p, true.t)
-    rows = slice(None, None, -(-len(u) // _PROBED))
+    rows = slice(None, None, -(-len(u) // probed))
     return count_steps(
         system.derivative, np.hstack([true.q, true.qd, memory])[rows], u[rows],
         np.ascontiguousarray(p), float(motion.t[1] - motion.t[0]),
@@ -237,7 +241,7 @@ def _is_motion_given(fitted: ModelOnTrial, u: Array) -> bool:
 def is_stiff(system: System, p: Array, motion: Motion) -> bool:
     """Whether friction would stop a machine within a small part of a sample, all along a motion."""
     usual = max(float(motion.t[1] - motion.t[0]) / LONGEST_STEP_S, 1.0)
-    return steps_to_follow(system, p, motion) > _STIFFEST * usual
+    return steps_to_follow(system, p, motion, probed=_FEW) > _STIFFEST * usual
 
 
 def _is_controlled(system: System) -> bool:

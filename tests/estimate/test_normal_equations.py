@@ -1,4 +1,4 @@
-"""Sums of products with further columns, and with what is known beforehand."""
+"""Sums of products with what is known beforehand."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from bampipe.estimate.normal_equations import NormalEquations
 
 RNG = np.random.default_rng(2)
-TRIALS, COUNT, AXES, P, NEW = 3, 40, 2, 5, 2
+TRIALS, COUNT, AXES, P = 3, 40, 2, 5
 FREE = np.full(P, np.inf)
 
 
@@ -17,19 +17,6 @@ def samples(width: int) -> list[np.ndarray]:
 
 def residuals() -> list[np.ndarray]:
     return [RNG.normal(size=(COUNT, AXES)) for _ in range(TRIALS)]
-
-
-def test_bordered_sums_are_those_of_all_columns() -> None:
-    slopes, columns, left, change = samples(P), samples(NEW), residuals(), residuals()
-    used = [np.ones((COUNT, AXES), dtype=bool)] * TRIALS
-    precision, known = RNG.uniform(0.0, 1.0, P), RNG.normal(size=P)
-    sums = NormalEquations.from_samples(slopes, left, used, precision, known)
-    found = sums.bordered(slopes, columns, change, left)
-    joined = [np.concatenate(parts, axis=2) for parts in zip(slopes, columns, strict=True)]
-    moved = [a + b for a, b in zip(left, change, strict=True)]
-    expected = NormalEquations.from_samples(joined, moved, used, precision, known)
-    for name in ("xx", "xy", "yy", "count", "precision", "known"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-12)
 
 
 def test_what_is_known_beforehand_counts_as_so_many_samples() -> None:
