@@ -55,7 +55,8 @@ LAWS = {
         "schema errors lists results phrases progress physics estimate data trials diagnosis",
     ),
     "next_trial": law(
-        "numpy scipy", "errors lists results physics estimate trials identification diagnosis"
+        "numpy scipy",
+        "errors lists results phrases physics estimate trials identification diagnosis",
     ),
     "declarations": law(
         "numpy pydantic", "errors files lists schema stages.base results physics data"

@@ -42,14 +42,18 @@ class Candidate:
 
 
 def list_candidates(
-    device: Device, present: Sequence[str], extra: Sequence[Effect] = ()
+    device: Device, present: Sequence[str], extra: Sequence[Effect] = (), on_request: bool = False
 ) -> tuple[str, ...]:
-    """Return the names of effects that could be added to ``device``, without those ``present``."""
+    """Return the names of effects that could be added to ``device``, without those ``present``.
+
+    And without those that are weighed ``on_request`` only, unless that is set.
+    """
     known = {name: built_in(name) for name in effect_names()} | {e.name: e for e in extra}
     names = [
         f"{name}:{target}" if target else name
         for name, effect in sorted(known.items())
         for target in effect.targets(device)
+        if on_request or not effect.on_request
     ]
     return tuple(name for name in names if name not in present)
 

@@ -23,7 +23,7 @@ _ALONE, _SEVERAL = 7, 5
 """Values of a shape on the grid: of an effect with one, and of each of an effect with several."""
 _WIDE = 300.0
 """Ratio of the ends of a range from which on its grid has `_MORE` values more."""
-_MORE = 6
+_MORE = 4
 _MOST, _MOST_OF_STATES = 60, 300
 """Shapes on a grid: of an effect without and with internal states, whose shape decides when things
 happen, not only how large they are."""

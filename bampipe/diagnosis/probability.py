@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import softmax
+from scipy.special import logit, softmax
 
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Key
@@ -267,16 +267,38 @@ def _by_block(search: Search, keys: tuple[Key, ...], unknown: Unknown | None) ->
     return found
 
 
+def least_gain(criteria: Criteria, by_chance: Sequence[float] = ()) -> float:
+    """The log evidence from which on an effect alone is called missing, nats.
+
+    Its probability is what the criteria ask for, and chance gives as much rarely enough, see
+    `chance_of` (infinite where no replays can say so).
+    """
+    odds, p = float(logit(criteria.probability)), criteria.largest_p_value
+    if not len(by_chance):
+        return odds
+    if p < LEAST_CHANCE:
+        return float("inf")
+    middle, scale = _law_of_largest(by_chance)
+    by_law = middle + scale * (np.log(np.log(2.0)) - np.log(-np.log1p(-p)))
+    by_count = np.sort(by_chance)[-1 - int(p * len(by_chance))]
+    return max(odds, float(by_law), float(by_count))
+
+
 def chance_of(gain: float, by_chance: Sequence[float]) -> float:
     """Probability that chance gives a largest gain of ``gain`` or more, from those of replays.
 
     By the law of largest values (Gumbel 1935), with their median and quartiles, and no less than
     the share of the replays that gave as much.
     """
-    values = np.asarray(by_chance, dtype=float)
+    middle, scale = _law_of_largest(by_chance)
+    beyond = (gain - middle) / scale - np.log(np.log(2.0))
+    by_law = float(-np.expm1(-np.exp(-max(beyond, -50.0))))
+    return max(by_law, float(np.mean(np.asarray(by_chance) >= gain)), LEAST_CHANCE)
+
+
+def _law_of_largest(values: Sequence[float]) -> tuple[float, float]:
+    """Median and scale of the law of largest values."""
     low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
     # The evidence of one candidate alone scatters by half a nat a strength.
     scale = max(float(high - low) / (np.log(np.log(4.0)) - np.log(np.log(4.0 / 3.0))), 1.0)
-    beyond = (gain - float(middle)) / scale - np.log(np.log(2.0))
-    by_law = float(-np.expm1(-np.exp(-max(beyond, -50.0))))
-    return max(by_law, float(np.mean(values >= gain)), LEAST_CHANCE)
+    return float(middle), scale

@@ -118,17 +118,21 @@ class Session:
         trials: the measured trials.
         criteria: what it takes for an effect to be called missing.
         jobs: worker processes; seed: of the noise of replicates.
+        also: effects that are weighed on request only.
     """
 
     trials: MeasuredTrials
     criteria: Criteria
     jobs: int = 1
     seed: int = 0
+    also: tuple[str, ...] = ()
 
     def candidate_names(self, recipe: Recipe, without: Collection[str] = ()) -> tuple[str, ...]:
         """Effects that the model of ``recipe`` could have and has not."""
         extra = [effect_from(e) for e in recipe.extra]
-        return list_candidates(recipe.model().device, (*recipe.effects, *without), extra)
+        present = (*recipe.effects, *without)
+        names = list_candidates(recipe.model().device, present, extra)
+        return (*names, *(name for name in self.also if name not in (*present, *names)))
 
     def linearise(
         self, recipe: Recipe, p: Array, like: Evidence | None = None, judged: bool = False

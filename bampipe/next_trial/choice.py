@@ -32,163 +32,167 @@ _FOLLOWED = 4
 _VARIED = 2
 """Of the best, so many are tried in other surroundings."""
 _QUANTILE = 0.1
-"""Of the worth over versions, by which designs are ranked: a bad day must still do."""
-_CLOSE = 0.05
-"""Share of its worth that the best design must have before one that stays within what has been
-seen, or that one comes first: going beyond has to pay."""
+"""Of the utility over versions, by which designs are ranked: a bad day must still do."""
+_PREMIUM = 0.05
+"""Share of its utility by which a design that leaves what has been seen must be better than one
+that stays within: what is new to machine and model has to pay, and less than that is lost in the
+scatter between people."""
 
-Worth = Callable[[Motion], float]
-"""What a motion is worth: larger is better."""
+Utility = Callable[[Motion], float]
+"""Utility of a motion: larger is better."""
+Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
-class Tried:
-    """A design, and what it is worth.
+class DesignSpace:
+    """The designs that are tried.
+
+    Attributes:
+        rehearsal: what they are tried with.
+        seconds: how long each is; axes: that they are about.
+        examples: designs that are tried beside the primitives.
+        with_rests: whether an axis may rest at the turns; with_brakes: whether brakes may be on.
+    """
+
+    rehearsal: Rehearsal
+    seconds: float
+    axes: Sequence[int]
+    examples: Sequence[Primitive] = ()
+    with_rests: bool = False
+    with_brakes: bool = False
+
+    def list_designs(self) -> tuple[list[Primitive], bool]:
+        """The designs to try, and whether that takes so little that none was left out."""
+        rehearsal = self.rehearsal
+        designs = list_primitives(rehearsal.seen, self.seconds, self.axes, self.with_rests)
+        work = self.seconds * rehearsal.sensors.rate_hz * len(rehearsal.system.parameters)
+        most = max(_FEWEST, int(_WORK / work))
+        return [*designs[:: -(-len(designs) // most)], *self.examples], len(designs) <= most
+
+    def vary(self, design: Primitive) -> Iterator[Primitive]:
+        """The same design in other surroundings."""
+        every = vary_surroundings(self.rehearsal.seen, design)
+        return (other for other in every if self.with_brakes or not other.field)
+
+    def goes_beyond(self, design: Primitive) -> bool:
+        """Whether a design leaves what the trials at hand have shown."""
+        return any(find_beyond(design, self.rehearsal.seen))
+
+    def follow(self, design: Primitive) -> tuple[Motion, ...]:
+        """A design as different people follow it, somebody hasty last."""
+        return tuple(self.rehearsal.record(design, version) for version in _VERSIONS)
+
+
+@dataclass(frozen=True)
+class RankedDesign:
+    """A design that has been tried.
 
     Attributes:
         design: the primitive.
-        worth: the quantile by which designs are ranked.
+        utility: the quantile over versions by which designs are ranked.
         motions: its versions, that of somebody hasty last.
     """
 
     design: Primitive
-    worth: float
+    utility: float
     motions: tuple[Motion, ...]
 
     @property
-    def usual(self) -> tuple[Motion, ...]:
+    def expected_motions(self) -> tuple[Motion, ...]:
         """The versions that are expected; the hasty one is only guarded against."""
         return self.motions[:-1]
 
 
 def rank_designs(
-    rehearsal: Rehearsal,
-    worth: Worth,
-    seconds: float,
-    axes: Sequence[int],
-    with_rests: bool,
-    with_brakes: bool,
-    progress: Callable[[float, str], None] = lambda fraction, message: None,
-    others: Sequence[Primitive] = (),
+    space: DesignSpace,
+    utility: Utility,
+    progress: Progress = lambda fraction, message: None,
     least: float = -np.inf,
-) -> list[Tried]:
-    """Try primitives about ``axes`` of so many seconds; the best ones as followed, best first.
+) -> list[RankedDesign]:
+    """Try the designs of a space, and the best ones as people follow them; best first.
 
     What is best when it is followed exactly may be worth little to somebody hasty, so that the
     finalists are those that are good both ways. One of them at least stays within what the trials
-    at hand have shown. ``others`` are tried beside these primitives. Nothing is returned where none
-    is worth ``least`` when it is followed exactly. ``with_brakes``, they may be on.
+    at hand have shown. Nothing is returned if no utility reaches ``least`` when a design is
+    followed exactly.
     """
+    rehearsal = space.rehearsal
 
     def try_design(design: Primitive) -> float:
-        return worth(rehearsal.record(design, 0))
+        return utility(rehearsal.record(design, 0))
 
-    def follow_hastily(value: float, design: Primitive) -> float:
-        return _robust([value, worth(rehearsal.record(design, HASTY))])
+    def follow_hastily(value: float, design: Primitive) -> tuple[float, Primitive]:
+        return _take_low([value, utility(rehearsal.record(design, HASTY))]), design
 
-    def surroundings(design: Primitive) -> Iterator[Primitive]:
-        every = vary_surroundings(rehearsal.seen, design)
-        return (other for other in every if with_brakes or not other.field)
-
-    designs, is_quick = _list_designs(rehearsal, seconds, axes, with_rests, others)
-    finalists = _FINALISTS if is_quick else _OF_FEW
+    designs, is_quick = space.list_designs()
+    finalists, varied = (_FINALISTS, _VARIED) if is_quick else (_OF_FEW, 0)
     exact = []
     for k, design in enumerate(designs):
         progress(0.5 * k / len(designs), f"trying {len(designs)} designs")
         exact.append((try_design(design), design))
     exact.sort(key=lambda pair: -pair[0])
     if exact[0][0] < least:
-        varied = (
-            try_design(other)
-            for _, design in exact[: _VARIED * is_quick]
-            for other in surroundings(design)
-        )
-        if all(value < least for value in varied):
+        others = (other for _, design in exact[:varied] for other in space.vary(design))
+        if all(try_design(other) < least for other in others):
             return []
-    inside = [pair for pair in exact if not any(find_beyond(pair[1], rehearsal.seen))]
     progress(0.5, "following them hastily")
     ahead = exact[: _FOLLOWED * finalists]
-    if all(any(find_beyond(design, rehearsal.seen)) for _, design in ahead):
-        ahead += inside[:1]
-    best = [(follow_hastily(*pair), pair[1]) for pair in ahead]
-    best.sort(key=lambda pair: -pair[0])
-    near = next((d for _, d in best if not any(find_beyond(d, rehearsal.seen))), None)
-    for _, design in best[: _VARIED * is_quick]:
-        for other in surroundings(design):
-            best.append((follow_hastily(try_design(other), other), other))
+    if all(space.goes_beyond(design) for _, design in ahead):
+        ahead += [pair for pair in exact if not space.goes_beyond(pair[1])][:1]
+    best = sorted((follow_hastily(*pair) for pair in ahead), key=lambda pair: -pair[0])
+    inside = next((design for _, design in best if not space.goes_beyond(design)), None)
+    others = (other for _, design in best[:varied] for other in space.vary(design))
+    best += [follow_hastily(try_design(other), other) for other in others]
     best.sort(key=lambda pair: -pair[0])
     chosen = [design for _, design in best[:finalists]]
-    if near is not None and all(any(find_beyond(design, rehearsal.seen)) for design in chosen):
-        chosen[-1] = near
-    tried = []
+    if inside is not None and all(space.goes_beyond(design) for design in chosen):
+        chosen[-1] = inside
+    ranked = []
     for k, design in enumerate(chosen):
         progress(0.75 + 0.25 * k / finalists, "following the best ones roughly")
-        tried.append(_follow(rehearsal, design, worth))
-    tried.sort(key=lambda one: -one.worth)
-    least = tried[0].worth - _CLOSE * abs(tried[0].worth)
-    for k, one in enumerate(tried):
-        if one.worth >= least and not any(find_beyond(one.design, rehearsal.seen)):
-            return [one, *tried[:k], *tried[k + 1 :]]
-    return tried
+        motions = space.follow(design)
+        ranked.append(RankedDesign(design, _take_low([utility(m) for m in motions]), motions))
+    best_utility = max(one.utility for one in ranked)
+    enough = best_utility - _PREMIUM * abs(best_utility)
+
+    def order(one: RankedDesign) -> tuple[bool, float]:
+        return one.utility < enough or space.goes_beyond(one.design), -one.utility
+
+    ranked.sort(key=lambda one: -one.utility)
+    first = min(ranked, key=order)
+    return [first, *(one for one in ranked if one is not first)]
 
 
 def find_best_of_each(
-    rehearsal: Rehearsal,
+    space: DesignSpace,
     inform: Callable[[Motion], Array],
-    worths: Sequence[Callable[[Array], float]],
-    seconds: float,
-    axes: Sequence[int],
-    others: Sequence[Primitive] = (),
-) -> list[Tried]:
-    """The best designs by each of several worths, each once; all are recorded once for them all.
+    utilities: Sequence[Callable[[Array], float]],
+) -> list[RankedDesign]:
+    """The best designs by each of several utilities, each once; each design is recorded once.
 
     Args:
-        inform: the information (m, m) of a motion; worths: of it, larger is better.
-        rehearsal, seconds, axes, others: as of `rank_designs`.
+        inform: the information (m, m) of a motion; utilities: of it, larger is better.
+        space: the designs.
     """
-    designs, is_quick = _list_designs(rehearsal, seconds, axes, False, others)
-    known = [inform(rehearsal.record(design, 0)) for design in designs]
+    designs, is_quick = space.list_designs()
+    informed = [inform(space.rehearsal.record(design, 0)) for design in designs]
     counted = Counter(
         k
-        for worth in worths
-        for k in sorted(range(len(designs)), key=lambda k: -worth(known[k]))[:_OF_FEW]
+        for utility in utilities
+        for k in sorted(range(len(designs)), key=lambda k: -utility(informed[k]))[:_OF_FEW]
     )
-    # Where that takes long, only the designs that are good by most worths are followed.
+    # Where that takes long, only the designs that are good by most utilities are followed.
     chosen = [k for k, _ in counted.most_common(None if is_quick else _OF_FEW)]
-    motions = {k: _versions(rehearsal, designs[k]) for k in chosen}
-    informed = {k: [inform(motion) for motion in motions[k]] for k in chosen}
-    found: dict[int, Tried] = {}
-    for worth in worths:
-        values = {k: _robust([worth(one) for one in informed[k]]) for k in chosen}
+    motions = {k: space.follow(designs[k]) for k in chosen}
+    versions = {k: [inform(motion) for motion in motions[k]] for k in chosen}
+    found: dict[int, RankedDesign] = {}
+    for utility in utilities:
+        values = {k: _take_low([utility(one) for one in versions[k]]) for k in chosen}
         best = max(chosen, key=lambda k: values[k])
-        found.setdefault(best, Tried(designs[best], values[best], motions[best]))
+        found.setdefault(best, RankedDesign(designs[best], values[best], motions[best]))
     return list(found.values())
 
 
-def _list_designs(
-    rehearsal: Rehearsal,
-    seconds: float,
-    axes: Sequence[int],
-    with_rests: bool,
-    others: Sequence[Primitive],
-) -> tuple[list[Primitive], bool]:
-    """The designs to try, and whether that takes so little that none was left out."""
-    designs = list_primitives(rehearsal.seen, seconds, axes, with_rests)
-    work = seconds * rehearsal.sensors.rate_hz * len(rehearsal.system.parameters)
-    most = max(_FEWEST, int(_WORK / work))
-    return [*designs[:: -(-len(designs) // most)], *others], len(designs) <= most
-
-
-def _follow(rehearsal: Rehearsal, design: Primitive, worth: Worth) -> Tried:
-    """A design as different people follow it."""
-    motions = _versions(rehearsal, design)
-    return Tried(design, _robust([worth(motion) for motion in motions]), motions)
-
-
-def _versions(rehearsal: Rehearsal, design: Primitive) -> tuple[Motion, ...]:
-    return tuple(rehearsal.record(design, version) for version in _VERSIONS)
-
-
-def _robust(worths: Sequence[float]) -> float:
-    """What a design is worth on a bad day."""
-    return float(np.quantile(worths, _QUANTILE))
+def _take_low(utilities: Sequence[float]) -> float:
+    """The utility of a design on a bad day."""
+    return float(np.quantile(utilities, _QUANTILE))

@@ -1,4 +1,4 @@
-"""How well trials tell rival effects apart: what is left when the wrong one is refitted."""
+"""How well trials tell alternative effects apart: what is left when the wrong one is refitted."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scipy.special import ndtr
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_residual
 from bampipe.diagnosis.session import Fit, Session
-from bampipe.results.next import join_rival
+from bampipe.results.next import ExpectedConfusion, join_effects
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import Folds
 from bampipe.trials.likelihood import Likelihood, Noise, lay_out_samples, take_samples
@@ -29,7 +29,7 @@ _STEP = 1e-3
 
 
 @dataclass(frozen=True)
-class Rival:
+class Alternative:
     """Effects that may be what a model lacks.
 
     Attributes:
@@ -47,7 +47,7 @@ class Rival:
     @property
     def name(self) -> str:
         """Canonical names of its effects."""
-        return join_rival(item.name for item in self.items)
+        return join_effects(item.name for item in self.items)
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ class Sums:
     Attributes:
         squares: (n_q, m, m) of all columns over the standard deviation of the noise, by
             independent samples: the nuisance and the free parameters of the model, then what each
-            rival adds, and its slopes by its own parameters.
+            alternative adds, and its slopes by its own parameters.
         independent: (n_q,) samples.
-        added: (n_q, rivals) of what each adds with itself; applied: (n_q,) of the applied force,
-            both of all samples, N.m or N squared.
+        added: (n_q, alternatives) of what each adds with itself; applied: (n_q,) of the applied
+            force, both of all samples, N.m or N squared.
     """
 
     squares: Array
@@ -69,25 +69,15 @@ class Sums:
     applied: Array
 
     def __add__(self, other: Sums) -> Sums:
-        return Sums(
-            self.squares + other.squares,
-            self.independent + other.independent,
-            self.added + other.added,
-            self.applied + other.applied,
-        )
+        return Sums(*map(add, vars(self).values(), vars(other).values()))
 
     def scaled(self, factor: float) -> Sums:
         """The sums of trials that are ``factor`` times as long."""
-        return Sums(
-            factor * self.squares,
-            factor * self.independent,
-            factor * self.added,
-            factor * self.applied,
-        )
+        return Sums(*(factor * values for values in vars(self).values()))
 
 
 @dataclass(frozen=True)
-class Left:
+class Remainder:
     """What fitted columns leave of a target.
 
     Attributes:
@@ -112,7 +102,7 @@ class Left:
 
 @dataclass(frozen=True)
 class Contrast:
-    """How two rivals differ on some trials.
+    """How two alternatives differ on some trials.
 
     Attributes:
         distance: expected log likelihood ratio of the right one over the wrong one refitted, nats,
@@ -126,20 +116,34 @@ class Contrast:
 
 
 @dataclass(frozen=True)
-class Contest:
-    """Rival effects beside one model, under the likelihood of the trials at hand.
+class Comparison:
+    """Alternative effects beside one model, under the likelihood of the trials at hand.
 
     Attributes:
-        session: the trials, and what decides; fit: the model without any of the rivals.
-        scale: (n_q,) mean square that the model leaves with what it lacks, in the variance of
-            replays.
-        rivals: the effects.
+        session: the trials, and what decides; fit: the model without any of the alternatives.
+        final: the model by whose error they are weighed: the better one, fitted.
+        alternatives: the effects.
     """
 
     session: Session
     fit: Fit
-    scale: Array
-    rivals: tuple[Rival, ...]
+    final: Fit
+    alternatives: tuple[Alternative, ...]
+
+    @cached_property
+    def scale(self) -> Array:
+        """Mean square that the better model leaves, in variances of the noise, (n_q,)."""
+        return self.final.solved.left / self.final.problem.count
+
+    @cached_property
+    def independent_share(self) -> Array:
+        """Independent samples over those by the noise alone, (n_q,), as the diagnosis counts.
+
+        What the better model lacks comes back with the motion: many samples then say one thing.
+        """
+        counted = self.final.count_independent(self.session.criteria)
+        pairs = zip(counted, self.final.likelihood.samples, strict=True)
+        return np.array([ours.independent / max(all_.independent, 1e-300) for ours, all_ in pairs])
 
     @cached_property
     def at_hand(self) -> Sums:
@@ -188,7 +192,9 @@ class Contest:
     def _sums_of(self, evidence: Evidence, likelihood: Likelihood) -> Sums:
         e, n_q = evidence, len(likelihood.samples)
         rows = [
-            np.concatenate([row for r in self.rivals for row in self._added_by(r, base)], axis=1)
+            np.concatenate(
+                [row for r in self.alternatives for row in self._added_by(r, base)], axis=1
+            )
             for base in e.fitted
         ]
         width = rows[0].shape[1] // n_q
@@ -199,33 +205,36 @@ class Contest:
             columns = columns * e.used[k][:, :, None]
             by_trial.append(np.concatenate([e.jacobian[k], *timing, columns], axis=2))
         squares, plain, applied = [], [], []
+        independent = self.independent_share * [s.independent for s in likelihood.samples]
         for axis, here in enumerate(likelihood.samples):
             x = take_samples(by_trial, here, axis)
             nuisance = np.zeros((len(x), 2 * n_q))
             nuisance[:, axis] = likelihood.noise.bias[axis]
             nuisance[:, n_q + axis] = likelihood.noise.stopping[axis]
-            share = here.independent / (max(len(x), 1) * self.scale[axis])
             joined = np.concatenate([nuisance, x], axis=1)
             targets = [target for target, _ in self._places(joined.shape[1])]
             plain.append(np.sum(joined[:, targets] ** 2, axis=0))
             applied.append(float(likelihood.applied[axis] @ likelihood.applied[axis]))
+            share = independent[axis] / (max(len(x), 1) * self.scale[axis])
             joined *= likelihood.root[axis][:, None] * np.sqrt(share)
             squares.append(joined.T @ joined)
-        independent = np.array([here.independent for here in likelihood.samples])
         return Sums(np.array(squares), independent, np.array(plain), np.array(applied))
 
-    def _added_by(self, rival: Rival, base: ModelOnTrial) -> list[Array]:
-        """What a rival adds to the residual, and the slopes of that by its parameters, (T, n_q)."""
+    def _added_by(self, alternative: Alternative, base: ModelOnTrial) -> list[Array]:
+        """What an alternative adds to the residual, its slopes by its parameters, each (T, n_q)."""
 
         def residual(number: int, values: Array) -> Array:
-            item = rival.items[number]
+            item = alternative.items[number]
             count = len(item.system.parameters) - len(values)
             return added_residual(item, np.append(base.p[:count], values), base)
 
-        here = [residual(k, values) for k, values in enumerate(rival.values)]
+        here = [residual(k, values) for k, values in enumerate(alternative.values)]
         rows = [np.sum(here, axis=0) if here else np.zeros(base.motion.q.shape)]
-        for number, place in rival.slopes:
-            q, moved = rival.items[number].parameters[place], rival.values[number].copy()
+        for number, place in alternative.slopes:
+            q, moved = (
+                alternative.items[number].parameters[place],
+                alternative.values[number].copy(),
+            )
             step = _STEP * max(abs(moved[place]), _STEP * q.sd)
             step = -step if moved[place] + step > q.upper else step
             moved[place] += step
@@ -233,8 +242,8 @@ class Contest:
         return rows
 
     def _places(self, width: int) -> list[tuple[int, list[int]]]:
-        """For each rival, the column of what it adds and those of its slopes."""
-        widths = [1 + len(rival.slopes) for rival in self.rivals]
+        """For each alternative, the column of what it adds and those of its slopes."""
+        widths = [1 + len(alternative.slopes) for alternative in self.alternatives]
         ends = width - sum(widths) + np.cumsum(widths)
         firsts = [int(end) - w for end, w in zip(ends, widths, strict=True)]
         return [(k, [*range(k + 1, k + w)]) for k, w in zip(firsts, widths, strict=True)]
@@ -246,13 +255,13 @@ class Contest:
         of_timing = [12.0 / (e.timing[1] - e.timing[0]) ** 2] if e.by_timing else []
         return np.concatenate([np.ones(2 * len(self.scale)), e.precision, of_timing])
 
-    def left_by_model(self, total: Sums) -> list[Left]:
-        """What the model alone leaves of each rival."""
+    def find_remainders(self, total: Sums) -> list[Remainder]:
+        """What the model alone leaves of each alternative."""
         targets = [target for target, _ in self._places(total.squares.shape[1])]
-        return self._left(total, targets, [])
+        return self._find_remainders(total, targets, [])
 
     def information(self, total: Sums, number: int) -> Array:
-        """On the parameters of a rival by which there are slopes, else on a factor of it."""
+        """On the parameters of an alternative by which there are slopes, else on a factor of it."""
         target, slopes = self._places(total.squares.shape[1])[number]
         columns = slopes or [target]
         nb = len(self._precision)
@@ -261,7 +270,7 @@ class Contest:
         return np.asarray(squares[np.ix_(columns, columns)] - taken)
 
     def contrasts(self, total: Sums, on: Sums | None = None) -> dict[tuple[int, int], Contrast]:
-        """How each pair of rivals differs once the trials of ``total`` are fitted.
+        """How each pair of alternatives differs once the trials of ``total`` are fitted.
 
         Args:
             total: of all trials that the fit sees.
@@ -269,13 +278,13 @@ class Contest:
         """
         places, on = self._places(total.squares.shape[1]), on or total
         found = {}
-        for i, j in combinations(range(len(self.rivals)), 2):
+        for i, j in combinations(range(len(self.alternatives)), 2):
             ways = []
             for right, wrong in ((i, j), (j, i)):
-                if self.rivals[right].items:
+                if self.alternatives[right].items:
                     target, fitted = places[right][0], places[wrong][1]
-                    (left,) = self._left(total, [target], fitted)
-                    (shown,) = self._left(total, [target], fitted, on)
+                    (left,) = self._find_remainders(total, [target], fitted)
+                    (shown,) = self._find_remainders(total, [target], fitted, on)
                     each = np.sqrt(shown.squares / np.maximum(on.independent, 1e-300))
                     ways.append((float(left.distance(total.independent)), each))
             found[i, j] = Contrast(
@@ -283,9 +292,9 @@ class Contest:
             )
         return found
 
-    def _left(
+    def _find_remainders(
         self, total: Sums, targets: Sequence[int], fitted: Sequence[int], on: Sums | None = None
-    ) -> list[Left]:
+    ) -> list[Remainder]:
         """What the model and ``fitted`` columns leave of each target on some trials."""
         on, nb = on or total, len(self._precision)
         taken, columns = self._fit(total, targets, fitted), [*range(nb), *fitted]
@@ -297,7 +306,7 @@ class Contest:
         prior = np.einsum("pr,p,pr->r", taken[:nb], self._precision, taken[:nb])
         share = (left.sum(axis=1) + prior) / np.maximum(whole.sum(axis=1), 1e-300)
         every = zip(left, prior, share, strict=True)
-        return [Left(squares, float(p), float(s)) for squares, p, s in every]
+        return [Remainder(squares, float(p), float(s)) for squares, p, s in every]
 
     def _fit(self, total: Sums, targets: Sequence[int], fitted: Sequence[int]) -> Array:
         """Coefficients with which model and ``fitted`` columns come closest to targets, (k, m)."""
@@ -312,31 +321,54 @@ class Contest:
 
     def weights(self) -> dict[tuple[int, int], float]:
         """Weight of each pair, after Box and Hill (1967): the product of their odds, sum one."""
-        pairs = list(combinations(range(len(self.rivals)), 2))
-        products = [self.rivals[i].odds * self.rivals[j].odds for i, j in pairs]
+        pairs = list(combinations(range(len(self.alternatives)), 2))
+        products = [self.alternatives[i].odds * self.alternatives[j].odds for i, j in pairs]
         total = sum(products) or 1.0
         return {pair: product / total for pair, product in zip(pairs, products, strict=True)}
 
     @cached_property
     def now(self) -> dict[tuple[int, int], Contrast]:
-        """How each pair of rivals differs on the trials at hand."""
+        """How each pair of alternatives differs on the trials at hand."""
         return self.contrasts(self.at_hand)
 
     def confusions(
         self, contrasts: Mapping[tuple[int, int], Contrast]
     ) -> dict[tuple[int, int], float]:
-        """Chance of taking one of each pair of rivals for the other, with more trials."""
+        """Chance of taking one of each pair of alternatives for the other, with more trials."""
         return {
             (i, j): chance_of_confusion(
-                self.rivals[i].odds, self.rivals[j].odds, found.distance - self.now[i, j].distance
+                self.alternatives[i].odds,
+                self.alternatives[j].odds,
+                found.distance - self.now[i, j].distance,
             )
             for (i, j), found in contrasts.items()
         }
 
-    def confusion(self, contrasts: Mapping[tuple[int, int], Contrast]) -> float:
-        """The same over all pairs."""
-        weights = self.weights()
-        return sum(weights[pair] * chance for pair, chance in self.confusions(contrasts).items())
+    def confusion_with(self, motion: Motion) -> float:
+        """Chance over all pairs, by their weights, once ``motion`` has been recorded, too."""
+        found = self.confusions(self.contrasts(self.at_hand + self.sums([motion])))
+        return sum(weight * found[pair] for pair, weight in self.weights().items())
+
+    def expect(self, motions: Sequence[Motion]) -> tuple[ExpectedConfusion, ...]:
+        """What one trial says of each pair, the median over ``motions``, its versions."""
+        sums = [self.sums([motion]) for motion in motions]
+        then = [self.contrasts(self.at_hand + new, new) for new in sums]
+        chances, weights = [self.confusions(found) for found in then], self.weights()
+        before, axes = self.confusions(self.now), self.fit.evidence.system.coordinates
+        return tuple(
+            ExpectedConfusion(
+                between=tuple(self.alternatives[k].name for k in pair),
+                weight=weights[pair],
+                before=before[pair],
+                after=float(np.median([found[pair] for found in chances])),
+                distance_before=now.distance,
+                distance_after=float(np.median([found[pair].distance for found in then])),
+                left=dict(
+                    zip(axes, np.median([f[pair].left for f in then], axis=0).tolist(), strict=True)
+                ),
+            )
+            for pair, now in self.now.items()
+        )
 
 
 _ZERO = np.zeros(1)

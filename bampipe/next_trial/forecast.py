@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.next_trial.choice import Tried
-from bampipe.next_trial.discrimination import Contest
+from bampipe.next_trial.choice import RankedDesign
+from bampipe.next_trial.discrimination import Comparison
 from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import Primitive, find_beyond
+from bampipe.next_trial.sensitivity import Detectability
 from bampipe.next_trial.words import describe
-from bampipe.results.next import ExpectedConfusion, ExpectedSd, Move, Proposal
-from bampipe.trials.motion import Motion
+from bampipe.results.next import ExpectedSd, Move, Proposal, Purpose
 
 Array = NDArray[np.float64]
 
@@ -27,38 +27,41 @@ class Forecast:
     Attributes:
         rehearsal: the fitted model that designs are tried with.
         precision: what is known of its parameters.
-        contest: effects to distinguish, if there are any.
+        comparison: alternatives to distinguish, if that is the purpose.
+        detectability: of the effects of the library, if that is.
     """
 
     rehearsal: Rehearsal
     precision: Precision
-    contest: Contest | None = None
+    comparison: Comparison | None = None
+    detectability: Detectability | None = None
 
-    def confusion_with(self, motion: Motion) -> float:
-        """Chance of confusing the rivals once ``motion`` has been recorded, over all pairs."""
-        contest = self.contest
-        assert contest is not None
-        return contest.confusion(contest.contrasts(contest.at_hand + contest.sums([motion])))
+    @property
+    def purpose(self) -> Purpose:
+        """What a trial is for."""
+        if self.comparison is not None:
+            return "decision"
+        return "precision" if self.detectability is None else "sensitivity"
 
-    def added_by(self, tried: Tried) -> list[Array]:
+    def added_by(self, ranked: RankedDesign) -> list[Array]:
         """The information (m, m) that each usual version of a design adds on the parameters.
 
         None on a model to which the trial is not fitted.
         """
-        if self.is_fitted_to(tried.design):
-            return [self.precision.of_motion(motion) for motion in tried.usual]
-        return [np.zeros_like(self.precision.information)] * len(tried.usual)
+        if self.is_fitted_to(ranked.design):
+            return [self.precision.of_motion(motion) for motion in ranked.expected_motions]
+        return [np.zeros_like(self.precision.information)] * len(ranked.expected_motions)
 
     def is_fitted_to(self, design: Primitive) -> bool:
         """Whether the model is fitted to such a trial: with brakes on, if it has their effects."""
         return self.rehearsal.system.braked or not design.field
 
-    def proposal(self, tried: Tried) -> Proposal:
-        """The record of a design that has been tried."""
-        system, design = self.rehearsal.system, tried.design
+    def proposal(self, ranked: RankedDesign) -> Proposal:
+        """The record of a design that has been ranked."""
+        system, design = self.rehearsal.system, ranked.design
         device = system.model.device
         axes = device.coordinates
-        added = self.added_by(tried)
+        added = self.added_by(ranked)
         held = [i for i in range(len(axes)) if i not in design.strokes and not design.example]
         farther, faster = (
             tuple(axes[i].name for i in found) for found in find_beyond(design, self.rehearsal.seen)
@@ -72,13 +75,13 @@ class Forecast:
             parts=design.parts,
             brakes=design.field,
             levels=dict(design.levels or {}),
-            worth=tried.worth,
+            worth=ranked.utility,
             information_gain=float(np.median([self.precision.gain(one) for one in added])),
             # Of a model that lacks something, uncertainties are not worth a forecast.
             sd=self._sd(added, design.seconds)
-            if self.contest is None and self.is_fitted_to(design)
+            if self.comparison is None and self.is_fitted_to(design)
             else {},
-            confusion=self._confusion(tried.usual),
+            confusion=self.comparison.expect(ranked.expected_motions) if self.comparison else (),
             farther=farther,
             faster=faster,
         )
@@ -96,30 +99,6 @@ class Forecast:
             )
             for k, name in enumerate(found.names)
         }
-
-    def _confusion(self, motions: Sequence[Motion]) -> tuple[ExpectedConfusion, ...]:
-        if self.contest is None:
-            return ()
-        contest, axes = self.contest, self.rehearsal.system.coordinates
-        sums = [contest.sums([motion]) for motion in motions]
-        then = [contest.contrasts(contest.at_hand + new, new) for new in sums]
-        weights, confusion = contest.weights(), contest.confusions(contest.now)
-        chances = [contest.confusions(found) for found in then]
-        return tuple(
-            ExpectedConfusion(
-                between=tuple(contest.rivals[i].name for i in pair),
-                weight=weights[pair],
-                before=confusion[pair],
-                after=float(np.median([found[pair] for found in chances])),
-                distance_before=before.distance,
-                distance_after=float(np.median([found[pair].distance for found in then])),
-                left={
-                    axis: float(np.median([found[pair].left[k] for found in then]))
-                    for k, axis in enumerate(axes)
-                },
-            )
-            for pair, before in contest.now.items()
-        )
 
 
 def describe_moves(design: Primitive, rehearsal: Rehearsal) -> dict[str, Move]:

@@ -10,7 +10,7 @@ from operator import add
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.next_trial.choice import Tried
+from bampipe.next_trial.choice import RankedDesign
 from bampipe.next_trial.discrimination import Sums
 from bampipe.next_trial.forecast import Forecast, describe_moves
 from bampipe.next_trial.precision import Expected
@@ -35,7 +35,7 @@ class Goal:
 
     Attributes:
         sd: most standard deviation of each parameter, (n,); infinite where nothing is asked.
-        confusion: most chance of confusing two rivals.
+        confusion: most chance of confusing two alternatives.
     """
 
     sd: Array
@@ -50,7 +50,7 @@ class _Option:
     information: Array
     sums: Sums | None
 
-    def lasting(self, seconds: float) -> _Option:
+    def scale_to(self, seconds: float) -> _Option:
         """The same for another time: what a trial adds is in proportion to that."""
         share = seconds / self.design.seconds
         return _Option(
@@ -67,7 +67,7 @@ class TrialPlan:
     Attributes:
         designs: what to do.
         sd: standard deviations expected in the end.
-        confusion: chance of confusing each pair of rivals in the end.
+        confusion: chance of confusing each pair of alternatives in the end.
         is_enough: whether the goal is reached.
         is_full: whether more trials would bring it nearer, and there are only too many already.
     """
@@ -79,13 +79,13 @@ class TrialPlan:
     is_full: bool
 
 
-def plan_trials(forecast: Forecast, tried: Sequence[Tried], goal: Goal) -> TrialPlan:
+def plan_trials(forecast: Forecast, ranked: Sequence[RankedDesign], goal: Goal) -> TrialPlan:
     """Choose trials greedily until the goal is reached, then leave out and shorten what can be.
 
     Args:
-        forecast: of what trials give; tried: the designs to choose from; goal: what is asked.
+        forecast: of what trials give; ranked: the designs to choose from; goal: what is asked.
     """
-    options = [_option(forecast, one) for one in tried]
+    options = [_option(forecast, one) for one in ranked]
     chosen: list[_Option] = []
     outcome, is_full = _at_hand(forecast), False
     is_enough = _distance(outcome, goal) <= 0.0
@@ -115,7 +115,7 @@ def _trimmed(forecast: Forecast, chosen: list[_Option], goal: Goal) -> list[_Opt
             chosen = fewer
             continue
         while (seconds := _SHORTER * chosen[k].design.seconds) >= _shortest(chosen[k].design):
-            shorter = [*chosen[:k], chosen[k].lasting(seconds), *chosen[k + 1 :]]
+            shorter = [*chosen[:k], chosen[k].scale_to(seconds), *chosen[k + 1 :]]
             if _distance(_outcome(forecast, shorter), goal) > 0.0:
                 break
             chosen = shorter
@@ -131,17 +131,19 @@ def _shortest(design: Primitive) -> float:
     return design.parts * max(_SHORTEST_S, FEWEST_STROKES * stroke_s)
 
 
-def _option(forecast: Forecast, tried: Tried) -> _Option:
+def _option(forecast: Forecast, ranked: RankedDesign) -> _Option:
     """A design by the version whose information is the median one."""
-    added = forecast.added_by(tried)
+    added = forecast.added_by(ranked)
     order = np.argsort([forecast.precision.gain(one) for one in added])
     middle = int(order[(len(order) - 1) // 2])
-    sums = forecast.contest.sums([tried.usual[middle]]) if forecast.contest else None
-    return _Option(tried.design, added[middle], sums)
+    sums = (
+        forecast.comparison.sums([ranked.expected_motions[middle]]) if forecast.comparison else None
+    )
+    return _Option(ranked.design, added[middle], sums)
 
 
 _Outcome = tuple[Expected, dict[tuple[int, int], float]]
-"""Standard deviations, and the chance of confusing each pair of rivals."""
+"""Standard deviations, and the chance of confusing each pair of alternatives."""
 
 
 def _at_hand(forecast: Forecast) -> _Outcome:
@@ -160,11 +162,11 @@ def _outcome(forecast: Forecast, chosen: Sequence[_Option]) -> _Outcome:
 
 
 def _confusion(forecast: Forecast, chosen: Sequence[_Option]) -> dict[tuple[int, int], float]:
-    contest = forecast.contest
-    if contest is None:
+    comparison = forecast.comparison
+    if comparison is None:
         return {}
-    sums = reduce(add, (one.sums for one in chosen if one.sums is not None), contest.at_hand)
-    return contest.confusions(contest.contrasts(sums))
+    sums = reduce(add, (one.sums for one in chosen if one.sums is not None), comparison.at_hand)
+    return comparison.confusions(comparison.contrasts(sums))
 
 
 def _distance(outcome: _Outcome, goal: Goal) -> float:
@@ -180,24 +182,27 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
     units = {q.name: q.unit for q in system.parameters}
     seconds = sum(design.seconds for design in found.designs)
     confusion: tuple[PlannedConfusion, ...] = ()
-    contest = forecast.contest
-    if contest is not None:
-        now, rivals = contest.confusions(contest.now), contest.rivals
+    comparison = forecast.comparison
+    if comparison is not None:
+        now, alternatives = comparison.confusions(comparison.now), comparison.alternatives
         confusion = tuple(
             PlannedConfusion(
-                between=tuple(rivals[k].name for k in pair),
+                between=tuple(alternatives[k].name for k in pair),
                 before=now[pair],
                 after=after,
             )
             for pair, after in found.confusion.items()
         )
     return Plan(
-        sentence=_sentence(found, seconds, "uncertainties" if contest is None else "confusion"),
+        sentence=_sentence(found, seconds, "uncertainties" if comparison is None else "confusion"),
         seconds=seconds,
         is_enough=found.is_enough,
         trials=tuple(
             PlannedTrial(
-                sentence=describe(_part_of(design), seen, system.model.device),
+                # One trial of the design: a sheet has how often it is recorded beside it.
+                sentence=describe(
+                    replace(design, seconds=design.part_s, parts=1), seen, system.model.device
+                ),
                 seconds=design.part_s,
                 times=times * design.parts,
                 moves=describe_moves(design, forecast.rehearsal),
@@ -205,7 +210,7 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
             for design, times in _counted(found.designs)
         ),
         sd={}
-        if contest is not None
+        if comparison is not None
         else {
             name: PlannedSd(
                 before=precision.sd[k],
@@ -221,21 +226,12 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
     )
 
 
-def _part_of(design: Primitive) -> Primitive:
-    """One trial of a design: a sheet has how often it is recorded beside it."""
-    return replace(design, seconds=design.part_s, parts=1)
-
-
 def _counted(designs: Sequence[Primitive]) -> list[tuple[Primitive, int]]:
     """Each design once, with how often it is recorded."""
-    counted: list[tuple[Primitive, int]] = []
+    counted: dict[int, tuple[Primitive, int]] = {}
     for design in designs:
-        known = [k for k, (other, _) in enumerate(counted) if other is design]
-        if known:
-            counted[known[0]] = design, counted[known[0]][1] + 1
-        else:
-            counted.append((design, 1))
-    return counted
+        counted[id(design)] = design, counted.get(id(design), (design, 0))[1] + 1
+    return list(counted.values())
 
 
 def _sentence(found: TrialPlan, seconds: float, what: str) -> str:

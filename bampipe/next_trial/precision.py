@@ -48,25 +48,25 @@ class Precision:
         names: of the estimated parameters, in order.
         sd: (n,) published standard deviations.
         formal_sd: (n,) those of the estimator alone, were noise as it assumes.
-        systematic: (n,) the part of ``sd`` by which methods disagree.
-        lasting: (n,) the part that no further trial takes away: of sensors known so well only, and
-            of friction that is smoothed.
+        systematic_sd: (n,) the part of ``sd`` by which methods disagree.
+        irreducible_sd: (n,) the part that no further trial takes away: of sensors known so well
+            only, and of friction that is smoothed.
         blocks: of time in the trials at hand, of which the scatter is in ``sd``.
         information: (m, m) of the trials at hand with what was assumed beforehand; the timing of
             the inputs last where it is estimated, m is then n + 1.
-        weighed: (m,) part of its diagonal that the fit weighs as data; zero for what the trials
-            alone determine.
+        prior_precision: (m,) part of its diagonal that the fit weighs as data; zero for what the
+            trials alone determine.
         of_motion: information (m, m) of a motion.
     """
 
     names: tuple[str, ...]
     sd: Array
     formal_sd: Array
-    systematic: Array
-    lasting: Array
+    systematic_sd: Array
+    irreducible_sd: Array
     blocks: int
     information: Array
-    weighed: Array
+    prior_precision: Array
     of_motion: Callable[[Motion], Array]
 
     @classmethod
@@ -161,7 +161,7 @@ class Precision:
             self._variance(matrix) for matrix in (self.information, self.information + added)
         )
         share, new = after / before, max(1, int(seconds / _BLOCK_S))
-        rest = self.systematic**2 + self.lasting**2
+        rest = self.systematic_sd**2 + self.irreducible_sd**2
         statistical = np.maximum(self.sd**2 - rest, 1e-300) / self.formal_sd**2
         scattered = np.maximum(statistical - (1.0 - by_data), 1e-12)
         scatter = 0.5 * np.log(scattered / np.maximum(by_data, 1e-12))
@@ -181,11 +181,11 @@ class Precision:
             return np.asarray(least * np.sqrt(by_data_then * data**2 + (1.0 - by_data_then)))
 
         low, median, high = (
-            np.hypot(np.hypot(size, disagreement), self.lasting)
+            np.hypot(np.hypot(size, disagreement), self.irreducible_sd)
             for size, disagreement in (
                 (noise(np.exp(-wide)), 0.0),
-                (np.maximum(noise(1.0), least), share**2 * self.systematic),
-                (np.maximum(noise(np.exp(wide)), least), share * self.systematic),
+                (np.maximum(noise(1.0), least), share**2 * self.systematic_sd),
+                (np.maximum(noise(np.exp(wide)), least), share * self.systematic_sd),
             )
         )
         return Expected(low, median, high)
@@ -194,18 +194,22 @@ class Precision:
         """Variances of the parameters, (n,), and the share of each that trials alone make."""
         covariance, n = _covariance(information), len(self.names)
         variance = np.diag(covariance)[:n]
-        weighed = np.einsum("ij,j,ij->i", covariance, self.weighed, covariance)[:n]
+        weighed = np.einsum("ij,j,ij->i", covariance, self.prior_precision, covariance)[:n]
         return variance, np.clip(1.0 - weighed / variance, 0.0, 1.0)
 
     @property
     def _fitted(self) -> int:
         """How many numbers the trials alone determine."""
-        return int(np.count_nonzero(self.weighed == 0.0))
+        return int(np.count_nonzero(self.prior_precision == 0.0))
 
     def _few(self, blocks: int) -> float:
         """By how much few blocks widen a standard deviation; for very few, shorter ones count."""
         taken = max(blocks, 2 * self._fitted)
         return float(np.sqrt(taken / (taken - self._fitted)))
+
+    def worth_of(self, motion: Motion, parameter: str = "") -> float:
+        """`worth` of one trial."""
+        return self.worth(self.of_motion(motion), float(motion.t[-1]), parameter)
 
     def worth(self, added: Array, seconds: float, parameter: str = "") -> float:
         """What trials are worth, nats: for one parameter, or where none is named for all.

@@ -8,47 +8,47 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logit
 from scipy.stats import norm
 
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_residual
 from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.probability import least_gain
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import log_prior, penalise
 from bampipe.diagnosis.session import Fit, Session, candidates_of
-from bampipe.next_trial.discrimination import Contest, Rival, Sums
+from bampipe.next_trial.discrimination import Alternative, Comparison, Sums
 from bampipe.physics.parameter import Parameter
+from bampipe.results.next import Detectable
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
 
 Array = NDArray[np.float64]
 
-HOPELESS = 100.0
-"""Of the typical strength: what shows from there on only shows at no size that a machine has."""
-ROUGHER = 0.15
+_FACTORS = np.geomspace(1e-4, 100.0, 241)
+"""Of the typical strength: a factor of 1.06 from one to the next, with straight lines between. What
+shows from the last one on only shows at no size that a machine has."""
+_MOST_GROWTH = 0.15
 """Growth of the jump of friction at a reversal from which on no strength is promised. The joint of
 the independent simulator, at the strength that was: friction by load (0.07, 0.08) showed in three
 sessions of four, Stribeck friction (0.24 to 0.53) in none of four."""
 _POSES, _SLIDING = 50, 5.0
 """At which that jump is looked at, and the speed on either side, in widths of the sign."""
-_FACTORS = np.geomspace(1e-4, HOPELESS, 241)
-"""Of the typical strength: a factor of 1.06 from one to the next, with straight lines between."""
 
 
 @dataclass(frozen=True)
-class Visibility:
+class DetectionLimit:
     """How large an effect must be to be found.
 
     Attributes:
-        rival: the effect with its typical strengths and shape.
+        alternative: the effect with its typical strengths and shape.
         factor: of the typical strength, from which on it is found; infinite where the trials do
             not excite it.
         axis: where it shows first.
         growth: of the jump of friction as that axis turns round, at the typical strength.
     """
 
-    rival: Rival
+    alternative: Alternative
     factor: float
     axis: int
     growth: float = 0.0
@@ -56,7 +56,7 @@ class Visibility:
     @property
     def item(self) -> Candidate:
         """The effect."""
-        return self.rival.items[0]
+        return self.alternative.items[0]
 
     @property
     def parameter(self) -> Parameter:
@@ -66,7 +66,7 @@ class Visibility:
     @property
     def typical(self) -> float:
         """Its typical size, in its unit."""
-        return float(abs(self.rival.values[0][_strengths(self.item)[0]]))
+        return float(abs(self.alternative.values[0][_strengths(self.item)[0]]))
 
     @property
     def is_promised(self) -> bool:
@@ -75,7 +75,7 @@ class Visibility:
         When friction jumps between two samples no log says, and what that leaves grows with the
         jump; while a joint sticks and breaks free, it is not where it was without the effect.
         """
-        return self.factor >= HOPELESS or self.factor * self.growth <= ROUGHER
+        return np.isinf(self.factor) or self.factor * self.growth <= _MOST_GROWTH
 
     @property
     def is_hidden(self) -> bool:
@@ -91,7 +91,7 @@ def _is_linear(item: Candidate) -> bool:
     return len(item.linear_indices) == len(_strengths(item))
 
 
-def typical_rival(item: Candidate, scale: MachineScale) -> Rival | None:
+def make_typical_alternative(item: Candidate, scale: MachineScale) -> Alternative | None:
     """An effect at its typical strength, its shape within the range that the trials show.
 
     None where it has no strength.
@@ -108,29 +108,30 @@ def typical_rival(item: Candidate, scale: MachineScale) -> Rival | None:
             value = scale.range_of(effect, q).value_like(value)
         values.append(value)
     several = item.linear_indices if len(item.linear_indices) > 1 else ()
-    return Rival((item,), (np.array(values),), slopes=tuple((0, i) for i in several))
+    return Alternative((item,), (np.array(values),), slopes=tuple((0, i) for i in several))
 
 
-def weigh_visibility(contest: Contest, sums: Sums, needed: float) -> list[Visibility]:
-    """From which strength on each rival of ``contest`` would be called missing.
+def find_limits(comparison: Comparison, sums: Sums, needed: float) -> list[DetectionLimit]:
+    """From which strength on each alternative of ``comparison`` would be called missing.
 
     Its log evidence, with the penalties of `Search`, must be what is needed, or more, with the
-    probability that an effect must have to be called missing; and its size must matter. What a set
-    takes off the measured quantity is left out: at the smallest strength that shows it is little.
+    probability that an effect must have to be called missing; and its size must matter. What an
+    effect takes off the measured quantity it takes off the noise of its residual, too. Here noise
+    is that of what was measured, with the effect and without, and the two cancel.
 
     Args:
-        contest: effects at their typical strengths; sums: of the trials.
+        comparison: effects at their typical strengths; sums: of the trials.
         needed: log evidence, nats, see `find_needed`.
     """
-    criteria, found = contest.session.criteria, []
+    criteria, found = comparison.session.criteria, []
     sure = norm.ppf(criteria.probability)
-    for number, (rival, left) in enumerate(
-        zip(contest.rivals, contest.left_by_model(sums), strict=True)
-    ):
+    remainders = comparison.find_remainders(sums)
+    pairs = zip(comparison.alternatives, remainders, strict=True)
+    for number, (alternative, left) in enumerate(pairs):
         expected = left.distance(sums.independent, _FACTORS)
         # Noise scatters a log likelihood ratio by the root of twice what is expected of it.
         surely = expected - sure * np.sqrt(2.0 * expected)
-        excess = surely - needed - _find_penalty(contest, sums, number)
+        excess = surely - needed - _find_penalty(comparison, sums, number)
         enough = np.flatnonzero(excess >= 0.0)
         factor = float("inf")
         if enough.size:
@@ -142,21 +143,25 @@ def weigh_visibility(contest: Contest, sums: Sums, needed: float) -> list[Visibi
         size = np.sqrt(float(added.max()) * left.share)
         scatter = sure / np.sqrt(max(float(left.squares.sum()) + left.prior, 1e-300))
         factor = max(factor, float(criteria.size / max(size, 1e-300) + scatter))
-        factor = factor if factor < HOPELESS else float("inf")
-        found.append(Visibility(rival, factor, int(np.argmax(left.squares))))
+        found.append(DetectionLimit(alternative, _limit(factor), int(np.argmax(left.squares))))
     return found
 
 
-def _find_penalty(contest: Contest, sums: Sums, number: int) -> Array:
-    """What the priors of a rival's parameters take off its log evidence, at each factor, nats."""
-    rival = contest.rivals[number]
-    item, values = rival.items[0], rival.values[0]
-    linear, information = list(item.linear_indices), contest.information(sums, number)
+def _limit(factor: float) -> float:
+    """A factor, infinite where no machine has such a size."""
+    return factor if factor < _FACTORS[-1] else float("inf")
+
+
+def _find_penalty(comparison: Comparison, sums: Sums, number: int) -> Array:
+    """What the priors of an alternative take off its log evidence, at each factor, nats."""
+    alternative = comparison.alternatives[number]
+    item, values = alternative.items[0], alternative.values[0]
+    linear, information = list(item.linear_indices), comparison.information(sums, number)
     typical, spread, factors = np.ones(1), np.ones(1), np.ones_like(_FACTORS)
     if linear:
         typical, factors = np.abs(values[linear]), _FACTORS
         spread = np.array([item.parameters[i].sd for i in linear]) / typical
-    if rival.slopes:
+    if alternative.slopes:
         information = information * np.outer(values[linear], values[linear])
     strengths = factors[:, None] * np.ones_like(typical)
     return penalise(information, spread, strengths, len(item.searched_indices))
@@ -167,65 +172,96 @@ def find_needed(criteria: Criteria, candidates: int, by_chance: Sequence[float] 
 
     Args:
         criteria: of the diagnosis; candidates: that are weighed.
-        by_chance: what replays of a model give to any candidate, which it must exceed.
+        by_chance: the most that each replay of a model gives to any candidate, nats.
     """
-    return max([float(logit(criteria.probability)), *by_chance]) - log_prior(criteria, candidates)
+    return least_gain(criteria, by_chance) - log_prior(criteria, candidates)
 
 
 @dataclass(frozen=True)
-class Blindness:
+class Detectability:
     """What the trials at hand would have shown of the library's effects.
 
     Attributes:
-        contest: every effect at its typical strength.
-        found: from which strength on each would have been found.
+        comparison: every effect at its typical strength.
+        limits: from which strength on each would have been found.
         needed: log evidence, nats.
     """
 
-    contest: Contest
-    found: tuple[Visibility, ...]
+    comparison: Comparison
+    limits: tuple[DetectionLimit, ...]
     needed: float
 
     @property
-    def hidden(self) -> list[int]:
+    def hidden_numbers(self) -> list[int]:
         """Numbers of the effects that would go unnoticed at their typical size, worst first."""
-        order = sorted(range(len(self.found)), key=lambda k: -self.found[k].factor)
-        return [k for k in order if self.found[k].is_hidden]
+        order = sorted(range(len(self.limits)), key=lambda k: -self.limits[k].factor)
+        return [k for k in order if self.limits[k].is_hidden]
 
     @property
-    def unpromised(self) -> list[str]:
-        """Names of those of which nothing is said; see `Visibility.is_promised`."""
-        return [one.rival.name for one in self.found if not one.is_promised]
+    def unpromised_names(self) -> tuple[str, ...]:
+        """Names of those of which nothing is said; see `DetectionLimit.is_promised`."""
+        return tuple(one.alternative.name for one in self.limits if not one.is_promised)
 
     @property
-    def of_brakes(self) -> list[str]:
+    def brake_effects(self) -> tuple[str, ...]:
         """Names of the effects that show where brakes are on."""
-        return [one.rival.name for one in self.found if one.item.system.braked]
+        return tuple(one.alternative.name for one in self.limits if one.item.system.braked)
 
-    def narrowed(self, chosen: Sequence[int]) -> Blindness:
+    def restrict(self, chosen: Sequence[int]) -> Detectability:
         """The same for some of the effects."""
-        contest = replace(self.contest, rivals=tuple(self.found[k].rival for k in chosen))
-        return Blindness(contest, tuple(self.found[k] for k in chosen), self.needed)
+        limits = tuple(self.limits[k] for k in chosen)
+        comparison = replace(self.comparison, alternatives=tuple(one.alternative for one in limits))
+        return Detectability(comparison, limits, self.needed)
+
+    def gain(self, motion: Motion) -> float:
+        """Sum of the logarithms by which a trial lowers what goes unnoticed of these effects."""
+        now = np.minimum([one.factor for one in self.limits], _FACTORS[-1])
+        then = np.clip(self.factors_with([motion]), 1.0, now)
+        return float(np.sum(np.log(now / then)))
+
+    def tabulate(self, motions: Sequence[Motion]) -> dict[str, Detectable]:
+        """The smallest strength of each effect that shows, without and with a trial.
+
+        Args:
+            motions: versions of the trial, of which the median counts.
+        """
+        after = np.median([self.factors_with([motion]) for motion in motions], axis=0)
+        axes = self.comparison.fit.evidence.system.coordinates
+        return {
+            one.alternative.name: Detectable(
+                parameter=one.parameter.name,
+                smallest=one.factor * one.typical if np.isfinite(one.factor) else None,
+                typical=one.typical,
+                unit=one.parameter.unit,
+                axis=axes[one.axis] if np.isfinite(one.factor) else "",
+                with_proposal=factor * one.typical if np.isfinite(factor) else None,
+            )
+            for one, factor in zip(self.limits, after, strict=True)
+            if one.is_promised
+        }
 
     def factors_with(self, motions: Sequence[Motion]) -> Array:
         """From which factor on each effect is found once ``motions`` have been recorded."""
-        now, before = np.array([one.factor for one in self.found]), self._factors_at_hand
-        after = self._factors(self.contest.at_hand + self.contest.sums(motions))
+        now, before = np.array([one.factor for one in self.limits]), self._factors_at_hand
+        after = self._factors(self.comparison.at_hand + self.comparison.sums(motions))
         # What is not linear in its strength is taken to change alike.
         ratio = np.ones(len(now))
         known = np.isfinite(before) & np.isfinite(now)
         ratio[known] = now[known] / before[known]
-        return np.asarray(after * ratio)
+        return np.array([_limit(factor) for factor in after * ratio])
 
     @cached_property
     def _factors_at_hand(self) -> Array:
-        return self._factors(self.contest.at_hand)
+        return self._factors(self.comparison.at_hand)
 
     def _factors(self, sums: Sums) -> Array:
-        return np.array([v.factor for v in weigh_visibility(self.contest, sums, self.needed)])
+        found = find_limits(self.comparison, sums, self.needed)
+        return np.array([one.factor for one in found])
 
 
-def find_blindness(session: Session, fit: Fit, by_chance: Sequence[float] = ()) -> Blindness:
+def find_detectability(
+    session: Session, fit: Fit, by_chance: Sequence[float] = ()
+) -> Detectability:
     """What the trials would have shown of every effect of the library that the model lacks.
 
     Args:
@@ -233,60 +269,66 @@ def find_blindness(session: Session, fit: Fit, by_chance: Sequence[float] = ()) 
         by_chance: what replays give to any candidate, nats.
     """
     scale, names = MachineScale.of_trials(fit.evidence), session.candidate_names(fit.recipe)
-    typical = (typical_rival(item, scale) for item in candidates_of(fit.recipe, names))
-    rivals = tuple(rival for rival in typical if rival is not None)
-    left = fit.problem.solve().left / fit.problem.count
-    contest = Contest(session, fit, left, rivals)
+    typical = (make_typical_alternative(item, scale) for item in candidates_of(fit.recipe, names))
+    alternatives = tuple(alternative for alternative in typical if alternative is not None)
+    comparison = Comparison(session, fit, fit, alternatives)
     needed = find_needed(session.criteria, len(names), by_chance)
-    found = _refine(contest, weigh_visibility(contest, contest.at_hand, needed), needed)
-    found = [replace(v, factor=_within(v, scale), growth=growth_of_jump(contest, v)) for v in found]
-    return Blindness(contest, tuple(found), needed)
+    limits = find_limits(comparison, comparison.at_hand, needed)
+    limits = [
+        replace(one, factor=_within(one, scale), growth=growth_of_jump(comparison, one))
+        for one in _refine(comparison, limits, needed)
+    ]
+    return Detectability(comparison, tuple(limits), needed)
 
 
-def _refine(contest: Contest, found: Sequence[Visibility], needed: float) -> list[Visibility]:
+def _refine(
+    comparison: Comparison, found: Sequence[DetectionLimit], needed: float
+) -> list[DetectionLimit]:
     """The same with each effect at the strength found: it may not be linear in its strength."""
     refined = list(found)
     for _ in range(3):
         chosen = [k for k, one in enumerate(refined) if _is_nonlinear(one)]
         if not chosen:
             break
-        probe = replace(contest, rivals=tuple(_at_strength_found(refined[k]) for k in chosen))
-        again = weigh_visibility(probe, probe.at_hand, needed)
+        probe = replace(
+            comparison, alternatives=tuple(_at_strength_found(refined[k]) for k in chosen)
+        )
+        again = find_limits(probe, probe.at_hand, needed)
         for k, one in zip(chosen, again, strict=True):
             refined[k] = replace(refined[k], factor=refined[k].factor * one.factor, axis=one.axis)
     return refined
 
 
-def _is_nonlinear(found: Visibility) -> bool:
+def _is_nonlinear(found: DetectionLimit) -> bool:
     """Whether an effect is not linear in its strength, and shows at a strength at all."""
-    return not _is_linear(found.item) and 1e-3 < found.factor < HOPELESS
+    return not _is_linear(found.item) and 1e-3 < found.factor < np.inf
 
 
-def _at_strength_found(found: Visibility) -> Rival:
-    values, strengths = found.rival.values[0].copy(), _strengths(found.item)
+def _at_strength_found(found: DetectionLimit) -> Alternative:
+    values, strengths = found.alternative.values[0].copy(), _strengths(found.item)
     own = [found.item.parameters[i] for i in strengths]
     values[strengths] = np.clip(
         values[strengths] * found.factor, [q.lower for q in own], [q.upper for q in own]
     )
-    return replace(found.rival, values=(values,))
+    return replace(found.alternative, values=(values,))
 
 
-def _within(found: Visibility, scale: MachineScale) -> float:
+def _within(found: DetectionLimit, scale: MachineScale) -> float:
     """The factor from which on an effect is found where its strength is looked for."""
     q, effect = found.parameter, found.item.system.model.effects[-1]
     least = 0.0 if _is_linear(found.item) else scale.range_of(effect, q).low / found.typical
     return max(found.factor, least) if found.factor * found.typical <= q.upper else float("inf")
 
 
-def growth_of_jump(contest: Contest, found: Visibility) -> float:
+def growth_of_jump(comparison: Comparison, found: DetectionLimit) -> float:
     """By which share an effect of typical strength makes friction jump more where motion turns.
 
     0 of an effect with a memory, whose force does not jump.
 
     Args:
-        contest: of the effect; found: the effect on the trials at hand.
+        comparison: of the effect; found: the effect on the trials at hand.
     """
-    item, values, e = found.item, found.rival.values[0], contest.fit.evidence
+    item, values, e = found.item, found.alternative.values[0], comparison.fit.evidence
     if item.system.memory_names != e.system.memory_names or item.replaces_motion:
         return 0.0
     axis, motion = found.axis, e.motions[0]

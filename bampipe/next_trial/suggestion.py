@@ -12,19 +12,19 @@ from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.select import open_search, start_of
 from bampipe.diagnosis.session import Fit, Session, system_of, without_members
-from bampipe.next_trial.choice import rank_designs
-from bampipe.next_trial.discrimination import Contest, Rival
+from bampipe.next_trial.choice import DesignSpace, rank_designs
+from bampipe.next_trial.discrimination import Alternative, Comparison
 from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.primitives import Envelope
-from bampipe.next_trial.reasons import LOWERED, say_chance
 from bampipe.next_trial.words import describe
+from bampipe.phrases.proposal import say_chance
 from bampipe.physics.recipe import Recipe
 from bampipe.results.diagnose import DiagnoseResult, SuggestedTrial
-from bampipe.trials.motion import Motion
+from bampipe.results.next import AS_FORECAST
 
-_MOST_RIVALS = 4
+_MOST_ALTERNATIVES = 4
 _ROUNDS = 4
-"""Steps in which the shapes of a rival are refined."""
+"""Steps in which the shapes of an alternative are refined."""
 _SUGGESTED_S = 20.0
 
 
@@ -46,7 +46,7 @@ def find_ambiguity(found: DiagnoseResult, criteria: Criteria) -> Ambiguity | Non
     if all(axis.verdict != "undecided" for axis in found.axes.values()):
         return None
     sets, total = [], 0.0
-    for one in found.sets[:_MOST_RIVALS]:
+    for one in found.sets[:_MOST_ALTERNATIVES]:
         if total < criteria.probability:
             sets.append(one)
             total += one.probability
@@ -58,8 +58,8 @@ def find_ambiguity(found: DiagnoseResult, criteria: Criteria) -> Ambiguity | Non
     return Ambiguity(odds, tuple(sorted(common))) if len(odds) > 1 else None
 
 
-def make_contest(session: Session, final: Fit, asked: Ambiguity) -> Contest | None:
-    """The rivals of ``asked`` as they explain the trials; None where fewer than two can.
+def compare_alternatives(session: Session, final: Fit, asked: Ambiguity) -> Comparison | None:
+    """The alternatives of ``asked`` as they explain the trials; None where fewer than two can.
 
     Args:
         session: the trials; final: the model with its most probable set, fitted.
@@ -72,15 +72,14 @@ def make_contest(session: Session, final: Fit, asked: Ambiguity) -> Contest | No
     bare = Fit(recipe, evidence, final.likelihood, final.likelihood.pose(evidence))
     others = {*session.candidate_names(recipe)} - members
     with open_search(session, bare, others) as search:
-        found = [_fit_rival(search, recipe, *pair) for pair in asked.odds.items()]
-    rivals = tuple(rival for rival in found if rival is not None)
-    scale = final.problem.solve().left / final.problem.count
-    return Contest(session, bare, scale, rivals) if len(rivals) > 1 else None
+        found = [_fit_alternative(search, recipe, *pair) for pair in asked.odds.items()]
+    alternatives = tuple(alternative for alternative in found if alternative is not None)
+    return Comparison(session, bare, final, alternatives) if len(alternatives) > 1 else None
 
 
-def _fit_rival(
+def _fit_alternative(
     search: Search, recipe: Recipe, members: tuple[str, ...], odds: float
-) -> Rival | None:
+) -> Alternative | None:
     """A set of effects with its most probable parameters; None where it explains nothing."""
     keys: tuple[Key, ...] = ()
     for name in members:
@@ -102,7 +101,7 @@ def _fit_rival(
         for place, q in enumerate(item.parameters)
         if not q.fixed
     )
-    return Rival(items, values, odds, slopes)
+    return Alternative(items, values, odds, slopes)
 
 
 def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> SuggestedTrial | None:
@@ -115,43 +114,35 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
         result: the diagnosis.
     """
     asked = find_ambiguity(result, session.criteria)
-    contest = make_contest(session, final, asked) if asked is not None else None
-    if contest is None:
+    comparison = compare_alternatives(session, final, asked) if asked is not None else None
+    if comparison is None:
         return None
-    trials, e = session.trials, contest.fit.evidence
+    trials, e = session.trials, comparison.fit.evidence
     seen = Envelope.of_trials(trials.motions, e.system, e.p)
     rehearsal = Rehearsal(e.system, e.p, trials.sensors, trials.kinematics, seen, session.seed)
 
-    def worth(motion: Motion) -> float:
-        return -contest.confusion(contest.contrasts(contest.at_hand + contest.sums([motion])))
-
-    # About the axes on which rivals act: elsewhere they all leave the same.
-    acts = {
-        axis for rival in contest.rivals for item in rival.items for axis in item.system.touched
-    }
+    # About the axes on which alternatives act: elsewhere they all leave the same.
+    acts = {axis for one in comparison.alternatives for i in one.items for axis in i.system.touched}
     axes = [axis for axis in seen.movable if axis in acts] or seen.movable
-    tried = rank_designs(rehearsal, worth, _SUGGESTED_S, axes, with_rests=True, with_brakes=True)[0]
-    sums = [contest.sums([motion]) for motion in tried.usual]
-    then = [contest.contrasts(contest.at_hand + new, new) for new in sums]
-    weights, before = contest.weights(), contest.confusions(contest.now)
-    pair = max(weights, key=lambda pair: weights[pair] * before[pair])
-    confusion = float(np.median([contest.confusions(one)[pair] for one in then]))
-    if confusion > min(1.0 - session.criteria.probability, LOWERED * before[pair]):
+    space = DesignSpace(rehearsal, _SUGGESTED_S, axes, with_rests=True, with_brakes=True)
+    best = rank_designs(space, lambda motion: -comparison.confusion_with(motion))[0]
+    pairs = zip(comparison.expect(best.expected_motions), comparison.now.values(), strict=True)
+    expected, now = max(pairs, key=lambda pair: pair[0].weight * pair[0].before)
+    if expected.after > min(1.0 - session.criteria.probability, expected.before / AS_FORECAST):
         return None
-    left = np.median([one[pair].left for one in then], axis=0)
-    axis = int(np.argmax(left))
-    first, second = (contest.rivals[k].name for k in pair)
-    design = describe(tried.design, seen, e.system.model.device)
+    axis = max(expected.left, key=lambda name: expected.left[name])
+    first, second = expected.between
+    design = describe(best.design, seen, e.system.model.device)
     return SuggestedTrial(
-        between=(first, second),
-        axis=e.system.coordinates[axis],
+        between=expected.between,
+        axis=axis,
         design=design,
-        separation=float(left[axis]),
-        separation_now=float(contest.now[pair].left[axis]),
-        confusion=confusion,
-        confusion_now=before[pair],
+        separation=expected.left[axis],
+        separation_now=float(now.left[e.system.coordinates.index(axis)]),
+        confusion=expected.after,
+        confusion_now=expected.before,
         sentence=(
             f"To tell {first} from {second}, record this: {design} The chance of confusing"
-            f" them would fall from {say_chance(before[pair])} to {say_chance(confusion)}."
+            f" them would fall from {say_chance(expected.before)} to {say_chance(expected.after)}."
         ),
     )

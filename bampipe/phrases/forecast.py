@@ -8,9 +8,10 @@ from pathlib import Path
 
 from bampipe.errors import InputError
 from bampipe.lists import join_names
+from bampipe.phrases.proposal import say_chance, say_sizes
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
-from bampipe.results.next import AS_FORECAST, NOTHING, ExpectedSd, NextResult, split_rival
+from bampipe.results.next import AS_FORECAST, NOTHING, ExpectedSd, NextResult, split_effects
 
 _SHOWN = 3
 """Parameters that are compared: those with the largest predicted improvement."""
@@ -98,18 +99,18 @@ def compare_forecast(
             )
     for pair in best.confusion[:_SHOWN]:
         first, second = pair.between
-        chance = f"of {100.0 * pair.after:.0f} %" if pair.after >= 0.01 else "below 1 %"
+        chance = "of " * (pair.after >= 0.01) + say_chance(pair.after)
         text = f"{first} or {second}: a probability {chance} was forecast of confusing them"
         if diagnosed is None:
             said.append(f"{text}; `bampipe diagnose RUN` tells the outcome.")
         else:
-            said.append(f"{text}; {_name_rival(first, second, diagnosed)}.")
+            said.append(f"{text}; {_name_alternative(first, second, diagnosed)}.")
     return (*said, *_compare_revealed(proposed, diagnosed))
 
 
-def _name_rival(first: str, second: str, diagnosed: DiagnoseResult) -> str:
-    """Say which of two rivals a diagnosis found, as a clause."""
-    one, other = split_rival(first), split_rival(second)
+def _name_alternative(first: str, second: str, diagnosed: DiagnoseResult) -> str:
+    """Say which of two alternatives a diagnosis found, as a clause."""
+    one, other = split_effects(first), split_effects(second)
     open_effects = {
         name
         for axis in diagnosed.axes.values()
@@ -118,9 +119,9 @@ def _name_rival(first: str, second: str, diagnosed: DiagnoseResult) -> str:
     }
     if open_effects & (one ^ other):
         return "the trials still do not distinguish them"
-    there = [name for name in (first, second) if split_rival(name) <= {*diagnosed.selected}]
-    named = max(there, key=lambda name: len(split_rival(name)), default=NOTHING)
-    if split_rival(named):
+    there = [name for name in (first, second) if split_effects(name) <= {*diagnosed.selected}]
+    named = max(there, key=lambda name: len(split_effects(name)), default=NOTHING)
+    if split_effects(named):
         return f"it is {named}"
     return "neither is found" if one and other else f"{first if one else second} is not found"
 
@@ -131,9 +132,7 @@ def _compare_revealed(proposed: NextResult, diagnosed: DiagnoseResult | None) ->
         return
 
     def compare(names: Sequence[str], outcome: str) -> str:
-        table = proposed.sensitivity
-        sizes = [f"{n} from {table[n].with_proposal:.2g} {table[n].unit}".rstrip() for n in names]
-        return f"it was to reveal {join_names(sizes, _SHOWN)} on; {outcome}."
+        return f"it was to reveal {say_sizes(proposed.sensitivity, names)}; {outcome}."
 
     if diagnosed is None:
         they = "they are" if proposed.shows[1:] else "it is"

@@ -150,6 +150,10 @@ class Effect(Declaration):
     devices: Distinct[Text] = Field(
         default=(), description="Devices that it makes sense for; all where left out"
     )
+    on_request: bool = Field(
+        default=False,
+        description="Whether a diagnosis weighs it only where its setting `also` names it",
+    )
     looks_like: Text = Field(description="How it shows in a residual")
     on_the_machine: str = Field(
         default="", description="What to do on the machine about it, in one sentence"

@@ -15,18 +15,18 @@ Purpose = Literal["precision", "decision", "sensitivity"]
 revealed that the present trials would not have revealed."""
 
 NOTHING = "nothing missing"
-"""Name of the rival without any missing effect."""
+"""Name of the alternative without any missing effect."""
 AS_FORECAST = 1.3
 """Factor within which an uncertainty counts as forecast."""
 
 
-def join_rival(effects: Iterable[str]) -> str:
-    """Return the name of effects that together are one rival."""
+def join_effects(effects: Iterable[str]) -> str:
+    """Return the name of effects that together are one alternative."""
     return " + ".join(effects) or NOTHING
 
 
-def split_rival(name: str) -> set[str]:
-    """Return the effects of a rival from its name by `join_rival`."""
+def split_effects(name: str) -> set[str]:
+    """Return the effects of an alternative from its name by `join_effects`."""
     return {*name.split(" + ")} - {NOTHING}
 
 
@@ -62,7 +62,7 @@ class ExpectedSd(Record):
 
 
 class ExpectedConfusion(Record):
-    """Chance of taking one rival for another."""
+    """Chance of taking one alternative for another."""
 
     between: Names = Field(description="Each by its effects, joined by +")
     weight: Share = Field(description="Box-Hill weight of the pair: product of the odds")

@@ -63,6 +63,7 @@ class Config(Criteria):
         seed: seed of the noise in the replicates.
         trust_setup: whether to diagnose in spite of a mistake that was found in the set-up.
         without: effects that are not weighed, such as one that was added in vain.
+        also: effects that are weighed on request only, such as loose_load:joint.
     """
 
     model: str = "base"
@@ -70,6 +71,7 @@ class Config(Criteria):
     seed: Count = 0
     trust_setup: bool = False
     without: Distinct[str] = ()
+    also: Distinct[str] = ()
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -101,10 +103,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         )
     trials = replace(trials, motions=tuple(trials.motions))
     recipe = read_recipe(run, config.model, model)
-    _require_known(config.without, recipe)
+    for setting in ("without", "also"):
+        _require_known(getattr(config, setting), recipe, setting)
     start = identified(run, config.model, system)
     jobs = config.jobs or min(8, os.cpu_count() or 1)
-    session = Session(trials, config, jobs, config.seed)
+    session = Session(trials, config, jobs, config.seed, config.also)
     try:
         selection = select_effects(session, recipe, start, config.without, progress)
     except Runaway as error:
@@ -126,15 +129,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     return {"headline": headline, **_summary(result.write(out), phrases.limits(result))}
 
 
-def _require_known(without: Sequence[str], recipe: Recipe) -> None:
-    """Refuse a name of no effect, which would leave out nothing."""
+def _require_known(names: Sequence[str], recipe: Recipe, setting: str) -> None:
+    """Refuse a name of no effect, which would change nothing."""
     extra = [effect_from(effect) for effect in recipe.extra]
-    known = list_candidates(recipe.model().device, (), extra)
-    for name in without:
+    known = list_candidates(recipe.model().device, (), extra, on_request=True)
+    for name in names:
         if name not in known:
             raise InputError(
                 f"{name!r} is no effect of this device{did_you_mean(name, known)}",
-                where="diagnose.without",
+                where=f"diagnose.{setting}",
                 remedy="`bampipe effects` lists them",
             )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -23,24 +23,29 @@ from bampipe.estimate.simulation import Runaway
 from bampipe.files import digest_content, write_json
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import sensor_noise
-from bampipe.next_trial.choice import Tried, Worth, find_best_of_each, rank_designs
-from bampipe.next_trial.discrimination import Contest
+from bampipe.next_trial.choice import (
+    DesignSpace,
+    RankedDesign,
+    find_best_of_each,
+    rank_designs,
+)
+from bampipe.next_trial.discrimination import Comparison
 from bampipe.next_trial.forecast import Forecast
 from bampipe.next_trial.motion import TRAJECTORY_HZ, Rehearsal
 from bampipe.next_trial.plan import Goal, plan_trials, record_plan
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import Envelope, imitate_trials
-from bampipe.next_trial.reasons import explain_proposal, find_shown
-from bampipe.next_trial.sensitivity import HOPELESS, Blindness, find_blindness
-from bampipe.next_trial.suggestion import find_ambiguity, make_contest
+from bampipe.next_trial.sensitivity import Detectability, find_detectability
+from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity
 from bampipe.phrases.forecast import find_open, read_forecasts
+from bampipe.phrases.proposal import explain_proposal, find_shown
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.next import Detectable, NextResult, Plan, Purpose
+from bampipe.results.next import Detectable, NextResult, Plan, Proposal, Purpose
 from bampipe.results.validate import JudgedError, ValidateResult
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials, trial_of_block
@@ -66,7 +71,7 @@ Array = NDArray[np.float64]
 _SHOWN = 3
 """Proposals in the summary."""
 _WATCHED = 12
-"""Hidden effects that designs are tried for."""
+"""Hidden effects that designs are ranked for."""
 _LITTLE = 0.05
 """Sum of log strengths by which a trial for hidden effects must lower what goes unnoticed."""
 
@@ -98,8 +103,59 @@ class Config(Criteria):
     jobs: Count = 0
 
 
+@dataclass(frozen=True)
+class _Case:
+    """An identified model with its parameters, its trials and diagnosis, and what is asked."""
+
+    run: RunFolder
+    config: Config
+    recipe: Recipe
+    system: System
+    p: Array
+    identified: IdentifyResult
+    diagnosed: DiagnoseResult | None
+    session: Session
+    seen: Envelope
+
+    @property
+    def fitted(self) -> list[Motion]:
+        """The trials to which the parameters were fitted."""
+        trials = self.session.trials
+        return [trials.motions[k] for k in trials.folds.fitted_trials]
+
+
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Propose a trial for one identified model."""
+    case, purpose, parameter = _read_case(run, config, progress)
+    forecast = _make_forecast(case, purpose, progress)
+    space = _lay_out_designs(case, forecast)
+    ranked = _rank(forecast, space, parameter, progress)
+    progress(0.9, "what they are expected to give")
+    result = _record(case, forecast, parameter, ranked)
+    if config.plan:
+        progress(0.92, "planning a set of trials")
+        plan = _plan(case, forecast, space, ranked, result.proposals[0])
+        result = result.model_copy(update={"plan": plan})
+    result.write(out)
+    _write_earlier(run, out, result)
+    device, followed = case.system.model.device, ""
+    if device.robot is not None:
+        followed = _write_trajectory(out, config.model, forecast.rehearsal, ranked[0])
+    if result.plan is not None:
+        # typst is slow to import: only here
+        from bampipe.report.protocol import protocol_sheet
+
+        by_hand = not (device.drive or device.prescribed)
+        name = run.read(IngestResult).session_id
+        sheet = protocol_sheet(result.plan, name, config.model, by_hand)
+        (out / f"models/{config.model}/protocol.pdf").write_bytes(sheet)
+    return _summary(result, followed)
+
+
+def _read_case(
+    run: RunFolder, config: Config, progress: Progress
+) -> tuple[_Case, Purpose | Literal["auto"], str]:
+    """What is known of the model; the purpose and the parameter that are asked for."""
     model = load_model(run, config.model)
     system = compile_model(model)
     if system.undriven:
@@ -108,8 +164,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             " can be designed",
             where=f"device {model.device.name!r}",
         )
-    p = identified(run, config.model, system)
-    found = run.read(IdentifyResult, config.model)
+    p, found = identified(run, config.model, system), run.read(IdentifyResult, config.model)
     purpose, parameter = _split(config.purpose, list(found.parameters))
     diagnosed = None
     if run.exists(DiagnoseResult.file(config.model)):
@@ -123,125 +178,155 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.0, "what the trials at hand say")
     trials = read_measured_trials(run, system, every_input=True, timing=found.input_timing)
     trials = replace(trials, motions=tuple(trials.motions))
-    recipe = read_recipe(run, config.model, model)
     session = Session(trials, config, config.jobs or os.cpu_count() or 1, config.seed)
-    fitted = [trials.motions[k] for k in trials.folds.fitted_trials]
-    noise = sensor_noise(trials.sensors, system, fitted, p, FilterChoice())
     seen = Envelope.of_trials(trials.motions, system, p)
-    precision = Precision.of_trials(system, fitted, trials.band, p, found, noise)
-    contest, blindness = None, None
-    if diagnosed is not None and purpose in ("auto", "decision"):
-        contest = _find_contest(session, recipe, system, p, diagnosed)
-    if purpose == "decision" and contest is None:
+    if not seen.movable:
+        raise InputError("no axis moves in the trials at hand", where=str(run.root))
+    recipe = read_recipe(run, config.model, model)
+    case = _Case(run, config, recipe, system, p, found, diagnosed, session, seen)
+    return case, purpose, parameter
+
+
+def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Progress) -> Forecast:
+    """What is needed to forecast: what was asked for, else what the diagnosis left open or hid."""
+    trials, comparison, detectability = case.session.trials, None, None
+    if asked in ("auto", "decision") and case.diagnosed is not None:
+        comparison = _compare_alternatives(case, case.diagnosed)
+    if asked == "decision" and comparison is None:
         raise InputError(
             "the diagnosis left nothing to decide",
-            where=str(run.path(DiagnoseResult.file(config.model))),
+            where=str(case.run.path(DiagnoseResult.file(case.config.model))),
             remedy="ask for precision, sensitivity, or a parameter by name",
         )
-    chosen = _settle(diagnosed, contest is not None) if purpose == "auto" else purpose
-    if chosen == "sensitivity":
+    if asked == "auto" and comparison is None and case.diagnosed is not None:
+        verdicts = {axis.verdict for axis in case.diagnosed.axes.values()}
+        asked = "sensitivity" if verdicts == {"nothing_missing"} else "precision"
+    if asked == "sensitivity":
         progress(0.1, "what these trials would have shown of each effect")
-        blindness = _find_blindness(session, recipe, p, diagnosed)
-    judged = contest or (blindness.contest if blindness is not None else None)
-    evidence = judged.fit.evidence if judged is not None else None
-    # A design is followed with the model beside which effects are weighed on it.
-    rehearsal = Rehearsal(
-        evidence.system if evidence is not None else system,
-        evidence.p if evidence is not None else p,
-        trials.sensors,
-        trials.kinematics,
-        seen,
-        config.seed,
+        detectability = _find_detectability(case)
+    noise = sensor_noise(trials.sensors, case.system, case.fitted, case.p, FilterChoice())
+    precision = Precision.of_trials(
+        case.system, case.fitted, trials.band, case.p, case.identified, noise
     )
-    forecast = Forecast(rehearsal, precision, contest)
-    worth = _worth(chosen, parameter, forecast, blindness)
-    axes = seen.movable
-    if not axes:
-        raise InputError("no axis moves in the trials at hand", where=str(run.root))
+    system, p, judged = case.system, case.p, comparison
+    if detectability is not None:
+        judged = detectability.comparison
+    if judged is not None:
+        # A design is followed with the model beside which effects are weighed on it.
+        system, p = judged.fit.evidence.system, judged.fit.evidence.p
+    seed = case.config.seed
+    rehearsal = Rehearsal(system, p, trials.sensors, trials.kinematics, case.seen, seed)
+    return Forecast(rehearsal, precision, comparison, detectability)
 
-    free = [motion for motion in fitted if not _is_braked(motion, model.device.brakes)]
-    alike = imitate_trials(free, seen, config.seconds)
 
-    def rank(worth: Worth, of_effects: bool, first: float, least: float = -np.inf) -> list[Tried]:
-        # No parameters are fitted to what has the brakes on, but for those of brakes.
-        with_brakes = of_effects or system.braked
+def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
+    """The designs to try, trials at hand among them."""
+    seconds, brakes = case.config.seconds, case.system.model.device.brakes
+    free = [motion for motion in case.fitted if not _is_braked(motion, brakes)]
+    examples, of_effects = imitate_trials(free, case.seen, seconds), forecast.purpose != "precision"
+    # No parameters are fitted to what has the brakes on, but for those of brakes.
+    brakes_on = of_effects or case.system.braked
+    return DesignSpace(
+        forecast.rehearsal, seconds, case.seen.movable, examples, of_effects, brakes_on
+    )
 
-        def report(fraction: float, message: str) -> None:
-            progress(first + 0.3 * fraction, message)
 
+def _rank(
+    forecast: Forecast, space: DesignSpace, parameter: str, progress: Progress
+) -> list[RankedDesign]:
+    """The designs that serve the purpose best."""
+
+    def report(first: float, fraction: float, message: str) -> None:
+        progress(first + 0.3 * fraction, message)
+
+    comparison, detectability = forecast.comparison, forecast.detectability
+    if comparison is not None:
         return rank_designs(
-            rehearsal, worth, config.seconds, axes, of_effects, with_brakes, report, alike, least
+            space, lambda motion: -comparison.confusion_with(motion), partial(report, 0.2)
         )
-
-    hidden = chosen == "sensitivity"
-    tried = rank(worth, chosen != "precision", 0.2, _LITTLE if hidden else -np.inf)
-    if hidden and (not tried or tried[0].worth < _LITTLE):
+    if detectability is not None:
+        watched = detectability.restrict(detectability.hidden_numbers[:_WATCHED])
+        ranked = (
+            rank_designs(space, watched.gain, partial(report, 0.2), _LITTLE)
+            if watched.limits
+            else []
+        )
+        if ranked and ranked[0].utility >= _LITTLE:
+            return ranked
         # Nothing that a person could do here shows more: then for the parameters.
-        tried = rank(_worth("precision", "", forecast, None), False, 0.5)
-    progress(0.9, "what they are expected to give")
-    proposals = tuple(forecast.proposal(one) for one in tried)
-    best = proposals[0]
-    table = _sensitivity(blindness, tried[0]) if blindness else {}
-    plan: Plan | None = None
-    if config.plan:
-        progress(0.92, "planning a set of trials")
-        estimates = [found.parameters[name].estimate for name in precision.names]
-        goal = _goal(config, np.array(estimates), contest is None)
-        # What the best design for all leaves too uncertain gets a design of its own.
-        places = {name: k for k, name in enumerate(precision.names)}
-        poor = [name for name, sd in best.sd.items() if sd.after > goal.sd[places[name]]]
-        if poor:
-            worths = [
-                partial(precision.worth, seconds=config.seconds, parameter=name) for name in poor
-            ]
-            tried += find_best_of_each(
-                rehearsal, precision.of_motion, worths, config.seconds, axes, alike
-            )
-        plan = record_plan(forecast, goal, plan_trials(forecast, tried, goal))
-    unlimited = [axis for axis in system.coordinates if axis not in model.device.limits]
-    lacking = _lacking(run, config.model, diagnosed)
-    missing = diagnosed.selected if diagnosed is not None else None
-    unbraked = blindness.of_brakes if blindness and not seen.field.any() else ()
-    unpromised = tuple(blindness.unpromised) if blindness else ()
-    reasons = explain_proposal(
-        chosen, parameter, best, table, unlimited, lacking, missing, unbraked, unpromised
-    )
+        space = replace(space, with_rests=False, with_brakes=forecast.rehearsal.system.braked)
+    utility = partial(forecast.precision.worth_of, parameter=parameter)
+    return rank_designs(space, utility, partial(report, 0.5))
+
+
+def _record(
+    case: _Case, forecast: Forecast, parameter: str, ranked: Sequence[RankedDesign]
+) -> NextResult:
+    """What is proposed, why, and what it is expected to give."""
+    proposals = tuple(forecast.proposal(one) for one in ranked)
+    table: dict[str, Detectable] = {}
+    unbraked: tuple[str, ...] = ()
+    unpromised: tuple[str, ...] = ()
+    if (found := forecast.detectability) is not None:
+        table = found.tabulate(ranked[0].expected_motions)
+        unpromised = found.unpromised_names
+        unbraked = found.brake_effects if not case.seen.field.any() else ()
+    motions, limits = case.session.trials.motions, case.system.model.device.limits
     result = NextResult(
-        model=config.model,
-        purpose=chosen,
+        model=case.config.model,
+        purpose=forecast.purpose,
         parameter=parameter,
-        trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in trials.motions)),
-        sentence=best.sentence,
-        why=reasons.why,
-        expected=reasons.expected,
+        trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in motions)),
+        sentence=proposals[0].sentence,
+        why="",
+        expected="",
         proposals=proposals,
         sensitivity=table,
         unpromised=unpromised,
         shows=find_shown(table),
-        plan=plan,
     )
-    result.write(out)
-    _write_earlier(run, out, result)
-    followed = ""
-    if model.device.robot is not None:
-        # A controller follows positions, where a person follows a sentence.
-        t, q = rehearsal.trajectory(tried[0].design)
-        head, file = ",".join(["t", *system.coordinates]), f"models/{config.model}/trajectory.csv"
-        path = np.column_stack([t, q])
-        np.savetxt(out / file, path, "%.6f", ",", header=head, comments="")
-        followed = (
-            f"{file} of the run has the positions of the joints along it, {TRAJECTORY_HZ:g} a"
-            " second; check them for collisions, of which the model knows none."
-        )
-    if plan is not None:
-        # typst is slow to import: only here
-        from bampipe.report.protocol import protocol_sheet
+    unlimited = [axis for axis in case.system.coordinates if axis not in limits]
+    missing = case.diagnosed.selected if case.diagnosed is not None else None
+    why, expected = explain_proposal(result, unlimited, _find_lacking(case), missing, unbraked)
+    return result.model_copy(update={"why": why, "expected": expected})
 
-        by_hand = not (model.device.drive or model.device.prescribed)
-        name = run.read(IngestResult).session_id
-        sheet = protocol_sheet(plan, name, config.model, by_hand)
-        (out / f"models/{config.model}/protocol.pdf").write_bytes(sheet)
-    return _summary(result, followed)
+
+def _plan(
+    case: _Case,
+    forecast: Forecast,
+    space: DesignSpace,
+    ranked: Sequence[RankedDesign],
+    best: Proposal,
+) -> Plan:
+    """A set of trials that reaches what is asked."""
+    precision, config = forecast.precision, case.config
+    estimates = np.array([case.identified.parameters[name].estimate for name in precision.names])
+    # Of a model that lacks something, no uncertainty of parameters is asked for.
+    is_asked = (forecast.comparison is None) & (estimates != 0.0)
+    goal = Goal(np.where(is_asked, config.sd * np.abs(estimates), np.inf), config.confusion)
+    # What the best design for all leaves too uncertain gets a design of its own.
+    asked = dict(zip(precision.names, goal.sd, strict=True))
+    utilities = [
+        partial(precision.worth, seconds=config.seconds, parameter=name)
+        for name, sd in best.sd.items()
+        if sd.after > asked[name]
+    ]
+    options = list(ranked)
+    if utilities:
+        fitted = replace(space, with_rests=False)
+        options += find_best_of_each(fitted, precision.of_motion, utilities)
+    return record_plan(forecast, goal, plan_trials(forecast, options, goal))
+
+
+def _write_trajectory(out: Path, model: str, rehearsal: Rehearsal, best: RankedDesign) -> str:
+    """Write what a robot's controller follows, where a person follows a sentence; say where."""
+    t, q = rehearsal.trajectory(best.design)
+    head, file = ",".join(["t", *rehearsal.system.coordinates]), f"models/{model}/trajectory.csv"
+    np.savetxt(out / file, np.column_stack([t, q]), "%.6f", ",", header=head, comments="")
+    return (
+        f"{file} of the run has the positions of the joints along it, {TRAJECTORY_HZ:g} a"
+        " second; check them for collisions, of which the model knows none."
+    )
 
 
 def _write_earlier(run: RunFolder, out: Path, result: NextResult) -> None:
@@ -265,35 +350,23 @@ def _split(asked: str, names: Sequence[str]) -> tuple[Purpose | Literal["auto"],
     )
 
 
-def _settle(diagnosed: DiagnoseResult | None, is_open: bool) -> Purpose:
-    """What a trial is for where nobody says: what the diagnosis left open, or would not show."""
-    if is_open:
-        return "decision"
-    verdicts = [axis.verdict for axis in diagnosed.axes.values()] if diagnosed else [""]
-    return "sensitivity" if set(verdicts) == {"nothing_missing"} else "precision"
-
-
-def _find_contest(
-    session: Session, recipe: Recipe, system: System, p: Array, diagnosed: DiagnoseResult
-) -> Contest | None:
-    """The rivals that a diagnosis left; None where it decided, or they cannot be replayed."""
-    asked = find_ambiguity(diagnosed, session.criteria)
+def _compare_alternatives(case: _Case, diagnosed: DiagnoseResult) -> Comparison | None:
+    """What a diagnosis left open; None where it decided, or no model of it can be replayed."""
+    asked = find_ambiguity(diagnosed, case.config)
     if asked is None:
         return None
-    final = without_members(recipe, (), diagnosed.selected)
+    final = without_members(case.recipe, (), diagnosed.selected)
     known = {name: v for row in diagnosed.ranking for name, v in row.parameters.items()}
-    known |= {q.name: value for q, value in zip(system.parameters, p, strict=True)}
+    known |= {q.name: value for q, value in zip(case.system.parameters, case.p, strict=True)}
     start = np.array([known.get(q.name, q.prior) for q in system_of(final).parameters])
-    fit = session.try_fit(final, start)
-    return make_contest(session, fit, asked) if fit is not None else None
+    fit = case.session.try_fit(final, start)
+    return compare_alternatives(case.session, fit, asked) if fit is not None else None
 
 
-def _find_blindness(
-    session: Session, recipe: Recipe, p: Array, diagnosed: DiagnoseResult | None
-) -> Blindness:
+def _find_detectability(case: _Case) -> Detectability:
     """What the trials would have shown of each effect, were it beside the model as it is."""
     try:
-        fit = session.fit(recipe, p)
+        fit = case.session.fit(case.recipe, case.p)
     except Runaway as error:
         raise NothingToDoError(
             f"what these trials would have shown is not known, for the model cannot be replayed:"
@@ -301,66 +374,22 @@ def _find_blindness(
             where="next",
             remedy="ask for precision or for a parameter by name",
         ) from error
-    chance = diagnosed.chance if diagnosed is not None else None
-    return find_blindness(session, fit, chance.largest if chance is not None else ())
+    chance = case.diagnosed.chance if case.diagnosed is not None else None
+    return find_detectability(case.session, fit, chance.largest if chance is not None else ())
 
 
-def _lacking(run: RunFolder, model: str, diagnosed: DiagnoseResult | None) -> list[str]:
+def _find_lacking(case: _Case) -> list[str]:
     """Axes whose held-out error is above the noise floor."""
     entries: Mapping[str, AxisVerdict | JudgedError] = {}
-    if diagnosed is not None:
-        entries = diagnosed.axes
-    elif run.exists(ValidateResult.file(model)):
-        entries = run.read(ValidateResult, model).axes
+    if case.diagnosed is not None:
+        entries = case.diagnosed.axes
+    elif case.run.exists(ValidateResult.file(case.config.model)):
+        entries = case.run.read(ValidateResult, case.config.model).axes
     return [axis for axis, entry in entries.items() if entry.standing == "above_floor"]
-
-
-def _goal(config: Config, estimates: Array, is_complete: bool) -> Goal:
-    """What a plan is to reach; no uncertainty of parameters where the model lacks something."""
-    asked = np.where(is_complete & (estimates != 0.0), config.sd * np.abs(estimates), np.inf)
-    return Goal(asked, config.confusion)
-
-
-def _worth(
-    purpose: Purpose, parameter: str, forecast: Forecast, blindness: Blindness | None
-) -> Worth:
-    precision = forecast.precision
-    if purpose == "decision":
-        return lambda motion: -forecast.confusion_with(motion)
-    if blindness is not None and blindness.hidden:
-        watched = blindness.narrowed(blindness.hidden[:_WATCHED])
-        now = np.minimum([v.factor for v in watched.found], HOPELESS)
-
-        def shown(motion: Motion) -> float:
-            then = np.clip(watched.factors_with([motion]), 1.0, now)
-            return float(np.sum(np.log(now / then)))
-
-        return shown
-    return lambda motion: precision.worth(
-        precision.of_motion(motion), float(motion.t[-1]), parameter
-    )
 
 
 def _is_braked(motion: Motion, brakes: Mapping[str, str]) -> bool:
     return any(motion.channels[name].any() for name in brakes.values() if name in motion.channels)
-
-
-def _sensitivity(blindness: Blindness, best: Tried) -> dict[str, Detectable]:
-    """The smallest strength of each effect that shows, without and with the best trial."""
-    after = np.median([blindness.factors_with([motion]) for motion in best.usual], axis=0)
-    axes = blindness.contest.fit.evidence.system.coordinates
-    return {
-        found.rival.name: Detectable(
-            parameter=found.parameter.name,
-            smallest=found.factor * found.typical if found.factor < HOPELESS else None,
-            typical=found.typical,
-            unit=found.parameter.unit,
-            axis=axes[found.axis] if found.factor < HOPELESS else "",
-            with_proposal=factor * found.typical if factor < HOPELESS else None,
-        )
-        for found, factor in zip(blindness.found, after, strict=True)
-        if found.is_promised
-    }
 
 
 def _summary(result: NextResult, followed: str) -> dict[str, object]:

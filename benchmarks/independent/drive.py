@@ -78,7 +78,7 @@ def record(
                "hold": STEP}  # fmt: skip
     friction = {"viscous": rng.uniform(0.02, 0.04), "coulomb": rng.uniform(0.08, 0.16),
                 "creep": c.creep * SIGN_WIDTH}  # fmt: skip
-    specimen = Specimen("rotor", mechanism | control, friction)
+    specimen = Specimen("rotor", mechanism | control, friction, play=0.024)
     specimen.truth |= mechanism
     specimen.hide(effects, LAWS, {}, rng)
     steps, trials = round((c.seconds or TRIAL_S) / STEP), []

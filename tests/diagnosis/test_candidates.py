@@ -132,3 +132,11 @@ def test_the_right_effect_explains_most_and_has_the_true_size(
         if parameter.name in truth:
             value = found[parameter.name]
             assert value == pytest.approx(truth[parameter.name], rel=0.12), parameter.name
+
+
+def test_an_effect_on_request_is_a_candidate_only_where_it_is_asked_for():
+    device = registry.device("slider")
+    named = "loose_load:carriage"
+    assert named not in list_candidates(device, ())
+    assert named in list_candidates(device, (), on_request=True)
+    assert named not in list_candidates(device, (named,), on_request=True)

@@ -11,8 +11,8 @@ import pytest
 from diagnosis.sessions import BAND, KINEMATICS, SENSORS, bam
 
 from bampipe.diagnosis.session import system_of
-from bampipe.next_trial.choice import Tried, find_best_of_each, rank_designs
-from bampipe.next_trial.discrimination import Contest, Rival, chance_of_confusion
+from bampipe.next_trial.choice import DesignSpace, RankedDesign, find_best_of_each, rank_designs
+from bampipe.next_trial.discrimination import Alternative, Comparison, chance_of_confusion
 from bampipe.next_trial.forecast import Forecast
 from bampipe.next_trial.motion import (
     HASTY,
@@ -32,9 +32,10 @@ from bampipe.next_trial.primitives import (
     list_primitives,
     vary_surroundings,
 )
-from bampipe.next_trial.reasons import explain_proposal, find_shown
+from bampipe.next_trial.sensitivity import Detectability
 from bampipe.next_trial.words import describe
 from bampipe.phrases.forecast import compare_forecast, read_forecasts
+from bampipe.phrases.proposal import explain_proposal, find_shown
 from bampipe.physics import Model, compile_model, registry
 from bampipe.results.next import (
     Detectable,
@@ -43,7 +44,6 @@ from bampipe.results.next import (
     NextResult,
     Proposal,
 )
-from bampipe.stages.next import _sensitivity
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
 
@@ -124,12 +124,13 @@ def test_going_beyond_what_has_been_seen_has_to_pay(pays, first_is_beyond):
     def worth(design: Primitive) -> float:
         return pays if any(find_beyond(design, seen)) else 1.0
 
-    tried = rank_designs(rehearsal, worth, 20.0, [0, 1, 2], with_rests=True, with_brakes=True)
-    are_beyond = [any(find_beyond(one.design, seen)) for one in tried]
+    space = DesignSpace(rehearsal, 20.0, [0, 1, 2], with_rests=True, with_brakes=True)
+    ranked = rank_designs(space, worth)
+    are_beyond = [any(find_beyond(one.design, seen)) for one in ranked]
     assert are_beyond[0] is first_is_beyond
     # Who does not want to go there finds another one.
     assert not all(are_beyond)
-    assert next(one.worth for one in tried if any(find_beyond(one.design, seen))) == pays
+    assert next(one.utility for one in ranked if any(find_beyond(one.design, seen))) == pays
 
 
 def made_rehearsal(seen: Envelope) -> SimpleNamespace:
@@ -148,9 +149,9 @@ def test_what_is_worth_little_to_somebody_hasty_does_not_win():
         exact = 1.0 + 0.01 * design.seconds
         return (3.0 * exact if version != HASTY else 0.0) if wide else exact
 
-    tried = rank_designs(made_rehearsal(SEEN), worth, 20.0, [0], with_rests=False, with_brakes=True)
-    assert tried[0].design.strokes[design_axis(tried[0].design)].high <= 0.6
-    assert tried[0].worth == pytest.approx(1.2)
+    ranked = rank_designs(DesignSpace(made_rehearsal(SEEN), 20.0, [0], with_brakes=True), worth)
+    assert ranked[0].design.strokes[design_axis(ranked[0].design)].high <= 0.6
+    assert ranked[0].utility == pytest.approx(1.2)
 
 
 def design_axis(design: Primitive) -> int:
@@ -158,13 +159,12 @@ def design_axis(design: Primitive) -> int:
 
 
 def test_designs_of_which_none_is_worth_enough_are_not_followed():
-    ranked = rank_designs(made_rehearsal(SEEN), lambda _: 0.04, 20.0, [0], False, True, least=0.05)
+    space = DesignSpace(made_rehearsal(SEEN), 20.0, [0], with_brakes=True)
+    ranked = rank_designs(space, lambda _: 0.04, least=0.05)
     assert ranked == []
     # With the brakes on it may be.
     ranked, without = (
-        rank_designs(
-            made_rehearsal(SEEN), lambda one: one[0].field, 20.0, [0], False, brakes, least=0.05
-        )
+        rank_designs(replace(space, with_brakes=brakes), lambda one: one[0].field, least=0.05)
         for brakes in (True, False)
     )
     assert ranked[0].design.field == 1.0
@@ -179,7 +179,9 @@ def test_each_parameter_gets_the_design_that_is_best_for_it():
         return np.array([[float(one[0].strokes[0].fast)], [-float(one[0].strokes[0].fast)]])
 
     fast, slow = find_best_of_each(
-        made_rehearsal(SEEN), inform, [lambda v: v[0, 0], lambda v: v[1, 0]], 20.0, [0]
+        DesignSpace(made_rehearsal(SEEN), 20.0, [0]),
+        inform,
+        [lambda v: v[0, 0], lambda v: v[1, 0]],
     )
     assert fast.design.strokes[0].fast == pytest.approx(0.6 * SEEN.speed[0])
     assert slow.design.strokes[0].fast < 0.1 * SEEN.speed[0]
@@ -398,11 +400,23 @@ def made_proposal(after: float, farther: tuple[str, ...] = ()) -> Proposal:
     )  # fmt: skip
 
 
+def explain(
+    purpose, best, table=(), unlimited=(), lacking=(), missing=(), unbraked=(), unpromised=()
+):
+    """Why the best proposal is made, and what it is expected to give."""
+    found = NextResult(
+        model="base", purpose=purpose, trials=("t1",), sentence=best.sentence, why="", expected="",
+        proposals=(best,), sensitivity=dict(table), unpromised=unpromised,
+    )  # fmt: skip
+    why, expected = explain_proposal(found, unlimited, lacking, missing, unbraked)
+    return SimpleNamespace(why=why, expected=expected)
+
+
 def test_a_forecast_beyond_the_trials_at_hand_is_said_to_be_the_models():
-    said = explain_proposal("decision", "", made_proposal(0.01, ("yaw",)), {}, (), ()).expected
+    said = explain("decision", made_proposal(0.01, ("yaw",)), {}, (), ()).expected
     assert said.startswith("The chance of confusing them is expected to fall from 40 % to")
     assert said.endswith("takes the model to hold beyond what the trials at hand have shown.")
-    said = explain_proposal("decision", "", made_proposal(0.01), {}, (), ()).expected
+    said = explain("decision", made_proposal(0.01), {}, (), ()).expected
     assert "beyond" not in said
 
 
@@ -423,31 +437,31 @@ def test_what_a_model_lacks_is_said_to_count_as_noise():
     wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
     sharp = ExpectedSd(before=0.05, after=0.005, low=0.0045, high=0.006, unit="kg")
     best = made_proposal(0.1).model_copy(update={"sd": {"mass": wide, "moment": sharp}})
-    said = explain_proposal("precision", "", best, {}, (), ()).expected
+    said = explain("precision", best, {}, (), ()).expected
     assert said == (
         "Expected: `mass` ± 0.002 to 0.01 kg, now ± 0.05; `moment` ± 0.005 kg, now ± 0.05"
         " (eight cases in ten)."
     )
-    said = explain_proposal("precision", "", best, {}, (), ("yaw", "pitch")).expected
+    said = explain("precision", best, {}, (), ("yaw", "pitch")).expected
     assert "The error of yaw and pitch is above the noise floor" in said
     # What the diagnosis found comes before any trial; where effects compete, nothing need be said.
-    reasons = explain_proposal("precision", "", best, {}, (), ("yaw",), ["lag:x"])
+    reasons = explain("precision", best, {}, (), ("yaw",), ["lag:x"])
     assert reasons.why.startswith("By the diagnosis the model lacks lag:x: add that first")
     assert reasons.expected.endswith("of a model that lacks something.")
     assert "noise floor" not in reasons.expected
-    why = explain_proposal("precision", "", best, {}, (), ("yaw",), None).why
+    why = explain("precision", best, {}, (), ("yaw",), None).why
     assert why.startswith("The error of yaw is above the noise floor: ask first what")
-    said = explain_proposal("decision", "", made_proposal(0.01), {}, (), ("yaw",)).expected
+    said = explain("decision", made_proposal(0.01), {}, (), ("yaw",)).expected
     assert "noise floor" not in said
 
 
 def test_it_is_said_what_a_trial_is_for_that_shows_no_effect_and_why_there_are_two():
     entry = ExpectedSd(before=0.05, after=0.005, low=0.0045, high=0.006, unit="kg")
     best = made_proposal(0.1).model_copy(update={"sd": {"mass": entry}})
-    reasons = explain_proposal("sensitivity", "", best, {}, (), ())
+    reasons = explain("sensitivity", best, {}, (), ())
     assert reasons.why.endswith("This one adds most to what is known of all parameters together.")
     assert reasons.expected.startswith("Expected: `mass`")
-    why = explain_proposal("precision", "", best.model_copy(update={"parts": 2}), {}, (), ()).why
+    why = explain("precision", best.model_copy(update={"parts": 2}), {}, (), ()).why
     assert "more than one trial, because each is judged by what the others say" in why
 
 
@@ -456,37 +470,37 @@ def test_effects_of_brakes_are_said_to_need_viscous_trials():
         parameter="brake_lag.time_constant", smallest=None, typical=0.06, unit="s", axis=""
     )
     best, table = made_proposal(0.1), {"brake_lag": entry}
-    reasons = explain_proposal("sensitivity", "", best, table, (), (), unbraked=["brake_lag"])
+    reasons = explain("sensitivity", best, table, (), (), unbraked=["brake_lag"])
     assert "every other effect of the library at its typical size. What brakes do" in reasons.why
     assert "(brake_lag) shows in viscous trials, of which there are none" in reasons.why
     assert "out of sight" not in reasons.why
     assert "promised" not in reasons.why
-    unpromised = explain_proposal("sensitivity", "", best, {}, (), (), unpromised=["stribeck:yaw"])
+    unpromised = explain("sensitivity", best, {}, (), (), unpromised=["stribeck:yaw"])
     assert "every other effect of the library at its typical size. Of stri" in unpromised.why
     braked = best.model_copy(update={"brakes": 1.0})
-    why = explain_proposal("sensitivity", "", braked, table, (), ()).why
+    why = explain("sensitivity", braked, table, (), ()).why
     assert why.endswith("Add it to session.toml as a viscous trial.")
 
 
 def test_what_shows_at_no_size_that_a_machine_has_is_out_of_sight():
-    def seen(factor: float) -> SimpleNamespace:
+    def limit(factor: float) -> SimpleNamespace:
         parameter = SimpleNamespace(name="p", unit="A")
-        rival = SimpleNamespace(name=f"effect:{factor:g}")
+        alternative = SimpleNamespace(name=f"effect:{factor:g}")
         return SimpleNamespace(
-            rival=rival, parameter=parameter, typical=2.0, factor=factor, axis=0,
+            alternative=alternative, parameter=parameter, typical=2.0, factor=factor, axis=0,
             is_promised=factor != 7.0,
         )  # fmt: skip
 
-    blindness = SimpleNamespace(
-        found=[seen(3.0), seen(7.0), seen(1e5)],
-        contest=SimpleNamespace(
+    detectability = SimpleNamespace(
+        limits=[limit(3.0), limit(7.0), limit(np.inf)],
+        comparison=SimpleNamespace(
             fit=SimpleNamespace(
                 evidence=SimpleNamespace(system=SimpleNamespace(coordinates=("yaw",)))
             )
         ),
         factors_with=lambda motions: np.array([1.0, 1.0, 99.0]),
     )
-    near, far = _sensitivity(blindness, SimpleNamespace(usual=(None,))).values()
+    near, far = Detectability.tabulate(detectability, [None]).values()
     assert (near.smallest, near.with_proposal, near.axis) == (6.0, 2.0, "yaw")
     assert (far.smallest, far.with_proposal, far.axis) == (None, 198.0, "")
 
@@ -498,17 +512,17 @@ def test_what_the_trial_would_show_is_named_first():
         )
 
     table = {f"far:{k}": entry(50.0 + k, 50.0 + k) for k in range(3)} | {"drag:x": entry(3.0, 1.0)}
-    reasons = explain_proposal("sensitivity", "", made_proposal(0.1), table, (), ())
+    reasons = explain("sensitivity", made_proposal(0.1), table, (), ())
     assert reasons.why.startswith("These trials would not have shown drag:x below 3 N, far:2")
     assert reasons.expected.startswith("It would show drag:x from 1 N on")
 
 
 def test_where_nothing_decides_it_is_said_what_was_not_tried():
-    said = explain_proposal("decision", "", made_proposal(0.39), {}, ["yaw", "pitch"], ()).expected
+    said = explain("decision", made_proposal(0.39), {}, ["yaw", "pitch"], ()).expected
     assert said.endswith(
         "the device file states no [limits] of yaw and pitch, so that none was tried."
     )
-    said = explain_proposal("decision", "", made_proposal(0.39), {}, [], ()).expected
+    said = explain("decision", made_proposal(0.39), {}, [], ()).expected
     assert said.endswith("39 % after this one. Another load may.")
 
 
@@ -597,15 +611,15 @@ def test_a_plan_is_not_stalled_by_an_uncertainty_that_was_small_by_luck():
     )  # fmt: skip
     design = Primitive({0: Stroke(-0.5, 0.5, 1.0, 1.0)}, np.zeros(1), 20.0)
     forecast = SimpleNamespace(
-        precision=known, contest=None, added_by=lambda tried: list(tried.usual)
+        precision=known, comparison=None, added_by=lambda ranked: list(ranked.expected_motions)
     )
-    tried = Tried(design, 1.0, (information, information))
+    ranked = RankedDesign(design, 1.0, (information, information))
     goal = Goal(np.array([0.2, 0.004, 0.004, 0.004, 0.004]), 0.05)
-    found = plan_trials(forecast, [tried], goal)
+    found = plan_trials(forecast, [ranked], goal)
     assert found.designs
     assert not found.is_enough or (found.sd.median <= goal.sd).all()
     # What is reached as published needs no trial.
-    assert plan_trials(forecast, [tried], Goal(2.0 * sd, 0.05)).designs == ()
+    assert plan_trials(forecast, [ranked], Goal(2.0 * sd, 0.05)).designs == ()
 
 
 def test_a_trial_that_is_not_fitted_adds_nothing_on_the_parameters():
@@ -614,7 +628,7 @@ def test_a_trial_that_is_not_fitted_adds_nothing_on_the_parameters():
         rehearsal = SimpleNamespace(system=SimpleNamespace(braked=is_braked))
         forecast = Forecast(rehearsal, known)
         design = Primitive({}, np.zeros(1), 20.0, field=0.5)
-        found = forecast.added_by(Tried(design, 1.0, (known.information, known.information)))
+        found = forecast.added_by(RankedDesign(design, 1.0, (known.information, known.information)))
         assert found[0][0, 0] == pytest.approx(added)
 
 
@@ -698,8 +712,8 @@ def test_what_a_trial_was_to_show_is_held_against_the_diagnosis_that_knows_it(
 
 
 def test_pairs_weigh_by_the_product_of_their_odds():
-    rivals = tuple(Rival((), (), share) for share in (0.6, 0.3, 0.1))
-    weights = Contest(None, None, np.ones(1), rivals).weights()
+    alternatives = tuple(Alternative((), (), share) for share in (0.6, 0.3, 0.1))
+    weights = Comparison(None, None, None, alternatives).weights()
     assert weights[0, 1] == pytest.approx(0.18 / 0.27)
     assert sum(weights.values()) == pytest.approx(1.0)
 

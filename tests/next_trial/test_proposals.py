@@ -31,10 +31,10 @@ def propose(run: bampipe.Run, **settings) -> tuple[NextResult, Path]:
     return NextResult.read(path), path
 
 
-def filter_sd_of(run: bampipe.Run, name: str) -> float:
-    found = IdentifyResult.read(run.root / IdentifyResult.file("base")).parameters[name].filter_sd
+def information_on(run: bampipe.Run, name: str) -> float:
+    found = IdentifyResult.read(run.root / IdentifyResult.file("base")).parameters[name].bound_sd
     assert found is not None
-    return found
+    return found**-2
 
 
 def test_the_uncertainty_forecast_is_the_one_that_comes(tmp_path):
@@ -56,9 +56,9 @@ def test_the_uncertainty_forecast_is_the_one_that_comes(tmp_path):
     assert np.median(np.abs(off)) < np.log(1.15)
     sloppy = Task.read(path, reach=0.5, haste=2.0)
     rough, _ = record_run(tmp_path / "rough", "joint", 922, **LONG, tasks=sloppy)
-    # By the filter's own uncertainty: the scatter of blocks of time is itself known to a tenth.
+    # By the Cramer-Rao bound: the scatter of blocks of time is itself known to a tenth.
     gained, by_chance, roughly = (
-        filter_sd_of(one, "coulomb.joint") ** -2 - filter_sd_of(run, "coulomb.joint") ** -2
+        information_on(one, "coulomb.joint") - information_on(run, "coulomb.joint")
         for one in (after, more, rough)
     )
     assert gained > 1.5 * by_chance

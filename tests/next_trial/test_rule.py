@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from diagnosis.sessions import TRUTH, bam, made
 
-from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.criteria import Criteria, most_probable
 from bampipe.diagnosis.dictionary import Dictionary, Key
+from bampipe.diagnosis.probability import chance_of, least_gain
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import Search
-from bampipe.diagnosis.session import Fit, Session, candidates_of
-from bampipe.next_trial.sensitivity import find_blindness, find_needed
-from bampipe.next_trial.suggestion import find_ambiguity, make_contest, suggest_trial
+from bampipe.diagnosis.session import Fit, Session, candidates_of, system_of
+from bampipe.next_trial.sensitivity import find_detectability, find_needed
+from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity, suggest_trial
 from bampipe.trials.folds import Folds
 from bampipe.trials.measured import MeasuredTrials
 
@@ -53,16 +54,16 @@ def key_of(dictionary: Dictionary, name: str, values) -> Key:
 
 
 def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_it(session, fit):
-    blindness = find_blindness(session, fit)
-    found = {one.rival.name: one for one in blindness.found}
-    assert blindness.needed == find_needed(CRITERIA, len(session.candidate_names(fit.recipe)))
-    noise, scale = fit.likelihood.noise, blindness.contest.scale
+    detectability = find_detectability(session, fit)
+    found = {one.alternative.name: one for one in detectability.limits}
+    assert detectability.needed == find_needed(CRITERIA, len(session.candidate_names(fit.recipe)))
+    noise, scale = fit.likelihood.noise, detectability.comparison.scale
     plain = search_beside(fit, noise.bias)
     # Of the whole library each is less probable beforehand than of these few.
-    enough = blindness.needed + plain.log_prior
+    enough = detectability.needed + plain.log_prior
     for name in NAMES:
         one = found[name]
-        values = one.rival.values[0]
+        values = one.alternative.values[0]
         key = key_of(plain.dictionary, name, values)
         plain.ensure([key])
         atom = plain.atoms[key]
@@ -82,6 +83,18 @@ def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_
             shares.append(np.mean(is_found))
         assert shares[0] <= 0.1, name
         assert shares[1] >= 0.9, name
+
+
+@pytest.mark.parametrize("count", [12, 400])
+def test_what_is_needed_is_what_the_rule_of_the_diagnosis_takes(count):
+    by_chance = np.random.default_rng(0).gumbel(-3.0, 2.0, count)
+    least = least_gain(CRITERIA, by_chance)
+    for gain, is_missing in ((least - 0.01, False), (least + 0.01, True)):
+        surely = most_probable(chance_of(gain, by_chance)) >= CRITERIA.probability
+        assert (surely and gain > np.log(9.0)) == is_missing
+    assert least_gain(CRITERIA) == pytest.approx(np.log(9.0))
+    # No dozen of replays makes anything that sure.
+    assert least_gain(Criteria(probability=0.9999), by_chance) == np.inf
 
 
 def made_diagnosis(sets, verdict="undecided") -> SimpleNamespace:
@@ -111,12 +124,15 @@ def test_a_trial_is_suggested_that_tells_apart_what_small_motion_does_not():
     session = Session(trials, CRITERIA)
     final = session.fit(recipe, np.array([*TRUTH.values(), 0.6]))
     asked = made_diagnosis([(("quadratic_drag:yaw",), 0.6), (("stribeck:yaw",), 0.4)])
-    contest = make_contest(session, final, find_ambiguity(asked, CRITERIA))
-    assert [rival.name for rival in contest.rivals] == ["quadratic_drag:yaw", "stribeck:yaw"]
-    assert contest.confusions(contest.now) == {(0, 1): pytest.approx(0.4)}
+    comparison = compare_alternatives(session, final, find_ambiguity(asked, CRITERIA))
+    assert [alternative.name for alternative in comparison.alternatives] == [
+        "quadratic_drag:yaw",
+        "stribeck:yaw",
+    ]
+    assert comparison.confusions(comparison.now) == {(0, 1): pytest.approx(0.4)}
     # Twice the trials at hand leave twice the distance: nothing else is in a likelihood.
-    twice = contest.contrasts(contest.at_hand.scaled(2.0))[0, 1].distance
-    assert twice == pytest.approx(2.0 * contest.now[0, 1].distance, rel=0.05)
+    twice = comparison.contrasts(comparison.at_hand.scaled(2.0))[0, 1].distance
+    assert twice == pytest.approx(2.0 * comparison.now[0, 1].distance, rel=0.05)
     found = suggest_trial(session, final, asked)
     assert found is not None
     assert found.axis == "yaw"
@@ -124,6 +140,29 @@ def test_a_trial_is_suggested_that_tells_apart_what_small_motion_does_not():
     assert found.confusion < 0.1 < found.confusion_now == pytest.approx(0.4)
     assert "fall from 40 % to" in found.sentence
     assert suggest_trial(session, final, made_diagnosis([(("quadratic_drag:yaw",), 1.0)])) is None
+
+
+def test_where_both_alternatives_fit_badly_a_trial_tells_no_more_than_the_diagnosis_counts():
+    """What both lack comes back with the motion: sample after sample says the same thing."""
+    values = {"quadratic_drag.yaw.coefficient": 0.6, "return_spring.yaw.stiffness": 3.0}
+    trials = made(bam(["quadratic_drag:yaw", "return_spring:yaw"]), values, trials=2, seconds=6.0)
+    session, distances = Session(trials, CRITERIA), []
+    asked = made_diagnosis([(("quadratic_drag:yaw",), 0.6), (("stribeck:yaw",), 0.4)])
+    for more in ((), ("return_spring:yaw",)):
+        recipe = bam(["quadratic_drag:yaw", *more])
+        start = [(TRUTH | values).get(q.name, q.prior) for q in system_of(recipe).parameters]
+        final = session.fit(recipe, np.array(start))
+        comparison = compare_alternatives(session, final, find_ambiguity(asked, CRITERIA))
+        counted = [here.independent for here in final.count_independent(CRITERIA)]
+        assert comparison.at_hand.independent == pytest.approx(counted)
+        # A new trial is counted as those at hand are.
+        again = comparison.sums(final.evidence.motions)
+        assert again.independent == pytest.approx(counted)
+        distances.append((comparison.now[0, 1].distance, comparison.scale[0], counted[0]))
+    (distance, scale, count), (complete, scale_then, count_then) = distances
+    assert scale > 4.0 * scale_then
+    assert count < 0.7 * count_then
+    assert distance < 0.01 * complete
 
 
 def test_effects_are_weighed_by_trials_with_brakes_on_too_but_by_none_held_out():

@@ -64,7 +64,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
                 remedy="save it as a numeric array: cells, tables and objects are not",
             )
         check_size(array.size, wanted, name)
-        values[column] = np.asarray(pick(array, index, where), dtype=np.float64)
+        # A copy: what stands in the file cannot be written to.
+        values[column] = np.array(pick(array, index, where), dtype=np.float64)
     return RawTrial(aligned(values, name, "variable"), first_row=1)
 
 

@@ -1,0 +1,186 @@
+"""Why a trial is proposed, and what it is expected to give, from the record of a proposal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from bampipe.lists import join_names
+from bampipe.results.next import AS_FORECAST, Detectable, NextResult
+
+_SHOWN = 3
+"""Parameters or effects that a sentence names."""
+
+
+def say_chance(value: float) -> str:
+    """Return a chance in per cent."""
+    return "below 1 %" if value < 0.01 else f"{100.0 * value:.0f} %"
+
+
+def say_sizes(table: Mapping[str, Detectable], names: Iterable[str]) -> str:
+    """Return effects with the sizes from which on a proposed trial shows them."""
+    sizes = (f"{name} from {table[name].with_proposal:.2g} {table[name].unit}" for name in names)
+    return f"{join_names((size.rstrip() for size in sizes), _SHOWN)} on"
+
+
+def find_shown(table: Mapping[str, Detectable]) -> tuple[str, ...]:
+    """Return what the trials at hand do not show and the proposed one would, the smallest first."""
+    hidden = _find_hidden(table)
+    sizes = {
+        name: entry.with_proposal / entry.typical
+        for name, entry in table.items()
+        if name in hidden
+        and entry.with_proposal is not None
+        and (entry.smallest is None or entry.with_proposal < entry.smallest / AS_FORECAST)
+    }
+    return tuple(sorted(sizes, key=lambda name: sizes[name]))
+
+
+def explain_proposal(
+    found: NextResult,
+    unlimited: Sequence[str],
+    lacking: Sequence[str],
+    missing: Sequence[str] | None = (),
+    unbraked: Sequence[str] = (),
+) -> tuple[str, str]:
+    """Say why a trial is proposed and what it is expected to give, a sentence or two each.
+
+    Args:
+        found: the proposal, without these sentences.
+        unlimited: axes of which the device states no range, so that nothing wider was tried.
+        lacking: axes whose held-out error is above the noise floor.
+        missing: effects that the diagnosis found and the model does not have; None without one.
+        unbraked: effects of brakes that no trial at hand has on.
+    """
+    best = found.proposals[0]
+    why, expected = _explain_purpose(found, unlimited, unbraked)
+    if best.brakes:
+        why += " Add it to session.toml as a viscous trial."
+    if best.farther or best.faster:
+        expected += (
+            " This forecast takes the model to hold beyond what the trials at hand have shown."
+        )
+    if best.parts > 1:
+        why += (
+            " It takes more than one trial, because each is judged by what the others say and none"
+            " at hand is like it."
+        )
+    if best.sd and missing:
+        why = (
+            f"By the diagnosis the model lacks {join_names(missing, _SHOWN)}: add that first"
+            f" (`bampipe extend`), and ask again. {why}"
+        )
+        expected += " These are the uncertainties of a model that lacks something."
+    elif best.sd and lacking:
+        error = f"The error of {join_names(lacking, _SHOWN)} is above the noise floor:"
+        if missing is None:
+            why = f"{error} ask first what the model lacks (`bampipe diagnose`). {why}"
+        expected += f" {error} what the model lacks there counts as noise in these uncertainties."
+    return why, expected
+
+
+def _explain_purpose(
+    found: NextResult, unlimited: Sequence[str], unbraked: Sequence[str]
+) -> tuple[str, str]:
+    """Why, and what is expected as far as the model goes."""
+    if found.purpose == "decision":
+        return _explain_decision(found, unlimited)
+    most = (
+        f"says most of `{found.parameter}`"
+        if found.parameter
+        else "adds most to what is known of all parameters together"
+    )
+    if found.purpose == "precision":
+        return f"Of the motions tried, this one {most}.", _say_uncertainties(found)
+    why = _say_unseen(found, unbraked)
+    if shown := find_shown(found.sensitivity):
+        sizes = say_sizes(found.sensitivity, shown)
+        return why, f"It would show {sizes} with 90 % probability."
+    # Nothing tried shows more: then it is for the parameters.
+    return f"{why} This one {most}.", _say_uncertainties(found)
+
+
+def _say_unseen(found: NextResult, unbraked: Sequence[str]) -> str:
+    """Which effects the trials at hand would not have shown."""
+    table, unpromised = found.sensitivity, found.unpromised
+    hidden = list(dict.fromkeys([*find_shown(table), *_find_hidden(table)]))
+    # Neither the trials at hand nor the one proposed show these, whatever their size.
+    never = [
+        name
+        for name, entry in table.items()
+        if entry.smallest is None and entry.with_proposal is None and name not in unbraked
+    ]
+    if hidden:
+        sizes = join_names([_say_size(name, table[name]) for name in hidden], _SHOWN)
+        why = f"These trials would not have shown {sizes}."
+    else:
+        every = "every other effect" if never or unbraked or unpromised else "every effect"
+        why = f"These trials would have shown {every} of the library at its typical size."
+    if never:
+        one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
+        names = join_names(never, _SHOWN)
+        why += f" In trials like these {one} out of sight at any size ({names})."
+    if unbraked:
+        names = join_names(unbraked, _SHOWN)
+        why += f" What brakes do ({names}) shows in viscous trials, of which there are none."
+    if unpromised:
+        names = join_names(unpromised, _SHOWN)
+        why += (
+            f" Of {names} no size is promised: large enough to show, it changes how the motion"
+            " turns round."
+        )
+    return why
+
+
+def _explain_decision(found: NextResult, unlimited: Sequence[str]) -> tuple[str, str]:
+    pair = max(found.proposals[0].confusion, key=lambda pair: pair.weight * pair.before)
+    before, after = say_chance(pair.before), say_chance(pair.after)
+    why = (
+        f"These trials may confuse {pair.between[0]} with {pair.between[1]}: the chance of that is"
+        f" {before}."
+    )
+    if pair.after < pair.before / AS_FORECAST:
+        return (
+            why,
+            f"The chance of confusing them is expected to fall from {before} to {after}.",
+        )
+    remedy = (
+        f", or a wider motion: the device file states no [limits] of"
+        f" {join_names(unlimited, _SHOWN)}, so that none was tried."
+    )
+    return why, (
+        f"No trial tried tells them apart: the chance would be {after} after this one. Another load"
+        f" may{remedy if unlimited else '.'}"
+    )
+
+
+def _say_size(name: str, entry: Detectable) -> str:
+    """An effect, and the size at which trials do not show it."""
+    if entry.smallest is None:
+        return f"{name} at any size"
+    return f"{name} below {entry.smallest:.2g} {entry.unit}".rstrip()
+
+
+def _say_uncertainties(found: NextResult) -> str:
+    """By how much the uncertainty of parameters falls."""
+    sds = found.proposals[0].sd
+    falls = {name: sd.after / sd.before for name, sd in sds.items() if sd.before > 0.0}
+    names = [found.parameter] if found.parameter else sorted(falls, key=lambda name: falls[name])
+    shown = {name: sds[name] for name in names[:_SHOWN] if name in sds}
+    if not shown:
+        return "No uncertainties are forecast: the model is not fitted to such a trial."
+    parts = [
+        f"`{name}` ± {sd.number} {sd.unit}".rstrip() + f", now ± {sd.before:.2g}"
+        for name, sd in shown.items()
+    ]
+    wide = any(not sd.is_sharp for sd in shown.values())
+    return f"Expected: {'; '.join(parts)}" + (" (eight cases in ten)." if wide else ".")
+
+
+def _find_hidden(table: Mapping[str, Detectable]) -> list[str]:
+    """Effects that go unnoticed at their typical size though trials can show them, worst first."""
+    factors = {
+        name: float("inf") if entry.smallest is None else entry.smallest / entry.typical
+        for name, entry in table.items()
+        if entry.smallest is not None or entry.with_proposal is not None
+    }
+    return sorted((n for n in factors if factors[n] > 1.0), key=lambda n: -factors[n])
