@@ -27,11 +27,12 @@ Frame: TypeAlias = pd.DataFrame | Mapping[str, np.ndarray | pa.Array]
 
 
 class ParquetAppender:
-    """Parquet file written frame by frame, one row group each; appears whole when closed.
+    """Parquet file written frame by frame; appears whole when closed.
 
-    Use as a context manager; :meth:`append` one frame a trial, all with the same columns. An
-    error inside the block leaves no file. Constant text columns may be dictionary arrays: they
-    are stored, and read back, as text.
+    Use as a context manager; :meth:`append` frames with the same columns. A ``trial_id`` column
+    gives one row group a stretch of equal ids, so that :func:`read_parquet` can fetch one trial
+    without reading the others. An error inside the block leaves no file. Constant text columns may
+    be dictionary arrays: they are stored, and read back, as text.
     """
 
     def __init__(self, path: Path) -> None:
@@ -45,7 +46,7 @@ class ParquetAppender:
         return self
 
     def append(self, frame: Frame) -> None:
-        """Write one row group.
+        """Write the rows of a frame.
 
         Args:
             frame: a DataFrame (its index is dropped) or named columns of equal length.
@@ -60,7 +61,9 @@ class ParquetAppender:
             self._writer = _writer(self._stream, table.schema)
         elif table.schema != self._writer.schema:
             table = table.cast(self._writer.schema)
-        self._writer.write_table(table, row_group_size=max(table.num_rows, 1))
+        for start, stop in pairwise(_trial_bounds(table)):
+            part = table.slice(start, stop - start)
+            self._writer.write_table(part, row_group_size=max(part.num_rows, 1))
 
     def __exit__(
         self,
@@ -83,19 +86,9 @@ class ParquetAppender:
 
 
 def write_parquet(path: Path, frame: Frame) -> None:
-    """Write one DataFrame, or named columns of equal length, as a Parquet file.
-
-    A ``trial_id`` column gives one row group a stretch of equal ids, so that
-    :func:`read_parquet` can fetch one trial without reading the others.
-    """
-    table = _table(frame)
-    with atomic_writer(path) as stream:
-        writer = _writer(stream, table.schema)
-        with writer:
-            bounds = _trial_bounds(table)
-            for start, stop in pairwise(bounds):
-                part = table.slice(start, stop - start)
-                writer.write_table(part, row_group_size=max(part.num_rows, 1))
+    """Write one DataFrame, or named columns of equal length, as by `ParquetAppender`."""
+    with ParquetAppender(path) as file:
+        file.append(frame)
 
 
 def read_parquet(
@@ -253,7 +246,9 @@ def _read_footer(path: Path, inode: int, size: int, changed_ns: int) -> _Footer:
         column = metadata.schema.names.index("trial_id")
         for group in range(metadata.num_row_groups):
             limits = metadata.row_group(group).column(column).statistics
-            if limits is not None and limits.has_min_max:  # the same: a group has one trial
+            if limits is not None and limits.has_min_max:
+                if limits.min != limits.max:
+                    raise pa.ArrowInvalid(f"row group {group} has rows of several trials")
                 groups.setdefault(str(limits.min), []).append(group)
     return _Footer(metadata, groups)
 

@@ -20,6 +20,7 @@ NUMERICAL = {
         "2": "effects in which two sets differ by an exchange",
     },
     "probability": {
+        "LEAST_CHANCE": "no chance is known to be smaller, so that nothing can be asked beyond it",
         "_NEAR": "what is less probable by a factor of a million changes no probability",
     },
     "select": {

@@ -13,7 +13,7 @@ from measured import REAL, bampipe, estimates, need, result
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
-from bampipe.estimate.least_squares import fit
+from bampipe.estimate.least_squares import minimise
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import Model, compile_model, registry
@@ -154,7 +154,7 @@ def held_out_error(runs: tuple[Path, Path], *effects: str) -> float:
         run = RunFolder(folder)
         motions = [read_motion(run, trial, system) for trial in free_trials(run)]
         problems.append(problem_of(system, motions, BAND))
-    found = fit(problems[0], np.append(system.prior, 0.0))
+    found = minimise(problems[0], np.append(system.prior, 0.0))
     errors = []
     for k, resting in enumerate(problems[1].standstill):
         errors.append(
