@@ -44,9 +44,9 @@ class Candidate:
 def list_candidates(
     device: Device, present: Sequence[str], extra: Sequence[Effect] = (), on_request: bool = False
 ) -> tuple[str, ...]:
-    """Return the names of effects that could be added to ``device``, without those ``present``.
+    """Return the names of effects that could be added to ``device`` and are not ``present``.
 
-    And without those that are weighed ``on_request`` only, unless that is set.
+    Effects that are weighed on request only are left out unless ``on_request`` is set.
     """
     known = {name: built_in(name) for name in effect_names()} | {e.name: e for e in extra}
     names = [

@@ -64,7 +64,7 @@ class SearchRange:
 
     @property
     def extent(self) -> float:
-        """Natural logarithm of the ratio of its ends; as of a ratio of 20 where not by ratios."""
+        """Natural log of the ratio of its ends; a linear range counts as a ratio of 20."""
         return float(np.log(self.high / self.low if self.by_ratio else 20.0))
 
     def value_at(self, searched: float) -> float:

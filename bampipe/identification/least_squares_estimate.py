@@ -248,7 +248,7 @@ def fit_squares(
     Args:
         trials: to be fitted, whose `timing` says how late inputs may be.
         recipe, system: the model; start: (n_p,) parameters to start from.
-        block_s: as of `SquaresFit`; remove_bias: whether replicates give weights and bias.
+        block_s: see `SquaresFit`; remove_bias: whether replicates give weights and bias.
 
     Raises:
         ValueError: fewer samples are clear of standstill than there are parameters.

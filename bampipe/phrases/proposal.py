@@ -1,4 +1,4 @@
-"""Why a trial is proposed, and what it is expected to give, from the record of a proposal."""
+"""Sentences about a proposed trial: the reason for it and the expected gain."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def explain_proposal(
     missing: Sequence[str] | None = (),
     unbraked: Sequence[str] = (),
 ) -> tuple[str, str]:
-    """Say why a trial is proposed and what it is expected to give, a sentence or two each.
+    """State the reason for a proposed trial and the expected gain, a sentence or two each.
 
     Args:
         found: the proposal, without these sentences.

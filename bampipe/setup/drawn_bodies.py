@@ -257,7 +257,7 @@ class Losses:
         power: the mean power of friction is its product with what is not required, (K,).
         drive: what they leave of the drive, (K,); size: mean square of the drive without an offset.
         taken: mean power of friction where nothing is required.
-        known: whether they can be told from each other.
+        known: whether they are distinguishable.
     """
 
     basis: Array

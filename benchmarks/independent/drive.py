@@ -21,7 +21,7 @@ from independent.sensors import (
     write_session,
     write_trial,
 )
-from independent.single_axis import STEP, Specimen, draw_waves, move
+from independent.single_axis import STEP, Specimen, describe_log, draw_waves, move
 
 RATE_HZ, TRIAL_S, COUNT, NOISE = 234.0, 22.5, 1e-5, 1e-3
 SIGN_WIDTH = 2e-3
@@ -95,19 +95,8 @@ def record(
         }
         trials.append({"file": f"trials/t{number + 1:02d}.csv", "kind": "free"})
         write_trial(folder / trials[-1]["file"], columns)
-    head = f"""device = "drive.toml"
-sample_rate_hz = {c.rate_hz or RATE_HZ!r}
-
-[time]
-column = "t"
-unit = "s"
-
-[encoders]
-rotor = {{ column = "q", unit = "rad", resolution = {COUNT * c.coarse!r} }}
-
-[channels]
-torque = {{ column = "tau", unit = "N.m" }}
-"""
+    head = describe_log("drive.toml", c.rate_hz or RATE_HZ, "rotor", COUNT * c.coarse,
+                        'torque = { column = "tau", unit = "N.m" }')  # fmt: skip
     truth = tell_truth("drive", seed, effects, OUTSIDE, specimen.truth, c)
     truth["hidden_laws"] = specimen.hidden_laws
     write_session(folder, head, trials, truth)

@@ -21,7 +21,7 @@ from independent.sensors import (
     write_session,
     write_trial,
 )
-from independent.single_axis import STEP, Specimen, draw_moves, draw_waves, move
+from independent.single_axis import STEP, Specimen, describe_log, draw_moves, draw_waves, move
 
 RATE_HZ, TORQUE_PER_AMPERE = 93.7, 10.0
 COUNT, CURRENT_STEP, NOISE = 5e-5, 2e-3, 0.015
@@ -151,19 +151,8 @@ def record(
         }
         trials.append({"file": f"trials/t{number + 1:02d}.csv", "kind": "free"})
         write_trial(folder / trials[-1]["file"], columns)
-    head = f"""device = "joint.toml"
-sample_rate_hz = {rate_hz!r}
-
-[time]
-column = "t"
-unit = "s"
-
-[encoders]
-joint = {{ column = "q", unit = "rad", resolution = {COUNT * c.coarse!r} }}
-
-[channels]
-current = {{ column = "i", unit = "A" }}
-"""
+    head = describe_log("joint.toml", rate_hz, "joint", COUNT * c.coarse,
+                        'current = { column = "i", unit = "A" }')  # fmt: skip
     truth = tell_truth("joint", seed, effects, OUTSIDE, specimen.truth, c)
     truth["hidden_laws"] = specimen.hidden_laws
     write_session(folder, head, trials, truth)

@@ -180,6 +180,23 @@ class Specimen:
                 raise ValueError(f"the machine has no effect {full!r}")
 
 
+def describe_log(device: str, rate_hz: float, axis: str, resolution: float, channel: str) -> str:
+    """The head of the session file of a drive: its encoder ``q`` in rad and one channel."""
+    return f"""device = "{device}"
+sample_rate_hz = {rate_hz!r}
+
+[time]
+column = "t"
+unit = "s"
+
+[encoders]
+{axis} = {{ column = "q", unit = "rad", resolution = {resolution!r} }}
+
+[channels]
+{channel}
+"""
+
+
 def draw_moves(
     rng: np.random.Generator, steps: int, reach: float, speed: float, pause: float
 ) -> tuple[Any, Any]:

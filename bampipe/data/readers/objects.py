@@ -80,7 +80,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
 
 
 def stated_units(path: Path, name: str) -> dict[str, str]:
-    """Units that stand beside the samples, as of ``"force units": "kip"``, by their quantity."""
+    """Units stated beside the samples, such as ``"force units": "kip"``, by quantity."""
     content = _parsed(path.read_text(encoding="utf-8-sig"), name)
     items = content.items() if isinstance(content, dict) else ()
     parts = [(re.split(r"[ _]units?$", str(key), flags=re.I), value) for key, value in items]
