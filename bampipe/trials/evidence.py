@@ -212,7 +212,7 @@ def gather_evidence(
         timing: least and largest change of the inputs' timing, s, that may be weighed beside it.
 
     Raises:
-        ValueError: fewer samples than parameters.
+        ValueError: fewer samples than parameters, where steps are to be taken.
     """
     problem = problem_of(system, motions, band)
     fitted = folds.fitted_trials
