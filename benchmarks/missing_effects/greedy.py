@@ -1,8 +1,9 @@
 """A baseline: effects one at a time, by held-out error.
 
     cd benchmarks
-    python -m missing_effects.greedy --part development --first 60 --out STEPS.jsonl
-    python -m missing_effects.greedy --part test --first 60 --learn STEPS.jsonl --out ENTRY.jsonl
+    python -m missing_effects.greedy --part development --first 60 --out LEARN.jsonl
+    python -m missing_effects.greedy --part test --first 60 --out STEPS.jsonl
+    python -m missing_effects.greedy --learn LEARN.jsonl --steps STEPS.jsonl --out ENTRY.jsonl
 
 The usual stepwise regression: at each step, the effect whose columns lower the held-out error most
 is added, each trial left out in turn; at most five. Motion, bare model and columns of the effects
@@ -20,6 +21,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from recovery import PIPELINE
@@ -71,6 +73,13 @@ class Regression:
             squares += float(np.sum((b - a @ rest) ** 2))
         return squares / len(self.y)
 
+    def reaches(self, force: Array, more: Array) -> bool:
+        """Whether ``force`` (n,) is, but for rounding, a sum of the columns with ``more``."""
+        x = np.column_stack([self.x, more])
+        x = x / np.maximum(np.linalg.norm(x, axis=0), 1e-300)
+        left = force - x @ np.linalg.lstsq(x, force)[0]
+        return float(np.linalg.norm(left)) < 1e-3 * float(np.linalg.norm(force))
+
 
 def search(session: Path, folder: Path) -> list[tuple[str, float]]:
     """Effects in the order in which they are added, with the fall of the error's logarithm."""
@@ -103,11 +112,16 @@ def search(session: Path, folder: Path) -> list[tuple[str, float]]:
     slopes = [take_samples(e.jacobian, s, a) for a, s in enumerate(samples)]
     groups = np.concatenate([np.array(e.folds.groups)[s.trial] for s in samples])
     regression = Regression(residual[:, 0], stack(slopes, slopes[0].shape[1]), groups)
+    thin = [e.band.thin(fitted.applied) for fitted in e.fitted]
+    applied = stack([take_samples(thin, s, a)[:, None] for a, s in enumerate(samples)], 1)[:, 0]
     pool: dict[str, list[Array]] = {}
     for name in names:
         grid = dictionary.grid(name)
         atoms = (dictionary.make(key) for key in grid[:: -(-len(grid) // SHAPES)])
-        pool[name] = [stack([a.columns.get(k) for k in axes], a.width) for a in atoms if a]
+        columns = [stack([a.columns.get(k) for k in axes], a.width) for a in atoms if a]
+        # With a factor on the measured force free, zero solves the equations of motion.
+        if not any(regression.reaches(applied, x) for x in columns[:1]):
+            pool[name] = columns
     found: list[tuple[str, float]] = []
     before = regression.error(np.zeros((len(groups), 0)))
     while len(found) < MOST:
@@ -122,11 +136,11 @@ def search(session: Path, folder: Path) -> list[tuple[str, float]]:
     return found
 
 
-def learn(lines: Sequence[dict[str, object]], recipes: Sequence[Recipe]) -> Array:
+def learn(lines: Sequence[dict[str, Any]], recipes: Sequence[Recipe]) -> Array:
     """Offset and slope of the logistic curve over the logarithm of what an effect brings, (2,)."""
     known = {r.id: r for r in recipes}
-    pairs = [(np.log(max(fall, 1e-9)), e in known[str(line["id"])].effects)
-             for line in lines for e, fall in line["steps"]]  # type: ignore[attr-defined] # fmt: skip
+    pairs = [(np.log(max(fall, 1e-9)), e in known[line["id"]].effects)
+             for line in lines for e, fall in line["steps"]]  # fmt: skip
     x, there = (np.array(column, float) for column in zip(*pairs, strict=True))
 
     def loss(c: Array) -> float:
@@ -135,8 +149,8 @@ def learn(lines: Sequence[dict[str, object]], recipes: Sequence[Recipe]) -> Arra
     return np.asarray(minimize(loss, np.array([0.0, 1.0])).x)
 
 
-def answer(recipe: Recipe, curve: Array | None) -> dict[str, object]:
-    """The answer to one session; without a curve, what the curve is fitted to."""
+def search_recipe(recipe: Recipe) -> dict[str, object]:
+    """The steps of one session, and how long they took."""
     with tempfile.TemporaryDirectory() as name:
         session = make_session(recipe, Path(name))
         begun = time.perf_counter()
@@ -146,31 +160,42 @@ def answer(recipe: Recipe, curve: Array | None) -> dict[str, object]:
             print(f"{recipe.id} {problem}", file=sys.stderr)
             steps = []
         seconds = round(time.perf_counter() - begun, 1)
-    if curve is None:
-        return {"id": recipe.id, "steps": steps, "seconds": seconds}
+    return {"id": recipe.id, "steps": steps, "seconds": seconds}
+
+
+def answer(line: dict[str, Any], curve: Array) -> dict[str, object]:
+    """The answer that the steps of a session give."""
     chances = {e: 1.0 / (1.0 + np.exp(-curve[0] - curve[1] * np.log(max(fall, 1e-9))))
-               for e, fall in steps}  # fmt: skip
+               for e, fall in line["steps"]}  # fmt: skip
     effects = {e: round(float(p), 4) for e, p in chances.items()}
-    return {"id": recipe.id, "effects": effects, "unknown": UNKNOWN, "seconds": seconds}
+    return {"id": line["id"], "effects": effects, "unknown": UNKNOWN, "seconds": line["seconds"]}
+
+
+def _read(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
 def main(arguments: Sequence[str]) -> None:
     """Answer sessions, a line each."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--part", choices=list(PARTS), required=True)
-    parser.add_argument("--first", type=int, default=60, help="so many sessions of the part")
-    parser.add_argument("--learn", type=Path, help="answers to the development part")
+    parser.add_argument("--part", choices=list(PARTS), help="to search")
+    parser.add_argument("--first", type=int, default=60, help="so many sessions of it")
+    parser.add_argument("--learn", type=Path, help="steps of the development part")
+    parser.add_argument("--steps", type=Path, help="steps to make an entry of")
     parser.add_argument("--out", type=Path, required=True, help="lines are added to it")
     given = parser.parse_args(arguments)
-    recipes, curve = read_recipes(), None
+    recipes = read_recipes()
     if given.learn:
-        text = given.learn.read_text(encoding="utf-8")
-        curve = learn([json.loads(line) for line in text.splitlines()], recipes)
+        curve = learn(_read(given.learn), recipes)
+        print(f"logit of the probability: {curve[0]:.2f} + {curve[1]:.2f} ln(fall)")
+        lines = [json.dumps(answer(line, curve)) + "\n" for line in _read(given.steps)]
+        given.out.write_text("".join(lines), encoding="utf-8")
+        return
     done = given.out.read_text(encoding="utf-8") if given.out.exists() else ""
     for recipe in [r for r in recipes if r.part == given.part][: given.first]:
         if f'"{recipe.id}"' in done:
             continue
-        line = json.dumps(answer(recipe, curve))
+        line = json.dumps(search_recipe(recipe))
         with given.out.open("a", encoding="utf-8") as log:
             log.write(line + "\n")
 

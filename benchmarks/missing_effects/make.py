@@ -22,7 +22,7 @@ from pathlib import Path
 
 from independent.draws import record_drawn
 
-from missing_effects.recipes import PARTS, TABLE, Recipe, draw_recipes, read_recipes, write_recipes
+from missing_effects.recipes import PARTS, TABLE, Recipe, read_recipes, write_recipes
 
 DEVICES = Path(__file__).parents[2] / "bampipe/physics/devices"
 BUILT_IN = ("bam", "magnetic_damper", "slider")
@@ -53,7 +53,7 @@ def make_sessions(recipes: Iterable[Recipe], out: Path) -> list[str]:
     (out / "devices").mkdir(parents=True, exist_ok=True)
     for name in BUILT_IN:
         shutil.copy(DEVICES / f"{name}.toml", out / "devices")
-    return [r.id for r in recipes if digest(make_session(r, out)) != r.sha256]
+    return [r.id for r in recipes if digest(make_session(r, out)) != r.sha256 != ""]
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -62,12 +62,13 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--part", choices=list(PARTS), help="all sessions of a part")
     parser.add_argument("--id", nargs="+", default=(), help="single sessions")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--freeze", action="store_true", help="write the table of recipes anew")
+    parser.add_argument("--freeze", type=int, help="add so many digests to the table of recipes")
     given = parser.parse_args(arguments)
     if given.freeze:
-        recipes = draw_recipes()
-        frozen = [replace(r, sha256=digest(make_session(r, given.out))) for r in recipes]
-        write_recipes(frozen, TABLE)
+        recipes = read_recipes()
+        turns = sorted((r for r in recipes if not r.sha256), key=lambda r: r.id.partition("_")[2])
+        added = {r.id: digest(make_session(r, given.out)) for r in turns[: given.freeze]}
+        write_recipes(replace(r, sha256=r.sha256 or added.get(r.id, "")) for r in recipes)
         return
     recipes = [r for r in read_recipes() if r.part == given.part or r.id in given.id]
     if missing := set(given.id) - {r.id for r in recipes}:

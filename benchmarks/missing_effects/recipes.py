@@ -29,7 +29,7 @@ class Recipe:
         machine, day, seed: what is recorded, and how.
         strengths: by hidden effect, in the order in which it is hidden.
         outside: of those, the ones that the library of effects has not.
-        sha256: first 16 digits of the session's, see `make.digest`.
+        sha256: first 16 digits of the session's, see `make.digest`; empty where it was not made.
     """
 
     id: str
