@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -107,23 +107,22 @@ class Tree:
         return (self.home / "log.txt").read_text(encoding="utf-8")
 
 
-def measure_first_run(tree: Tree, logs: Path, short: bool) -> list[Row]:
+def measure_first_run(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
     """README's run with nothing compiled and again, then the first session of another device."""
     sample = str(tree.root / "sample_runs/first")
-    rows: list[Row] = []
     for title, runs in (("first run, empty caches", "cold"), ("the same, compiled", "warm")):
         watch = {name: tree.home / runs / "first" / path for name, path in FIRST.items()}
         cost = tree.bampipe("run", sample, "--runs", runs, watch=watch)
-        rows += [(f"{title}: {name}", "s", cost.seen.get(name, np.nan)) for name in FIRST]
-        rows += [(f"{title}: in all", "s", cost.wall), (f"{title}: CPU", "s", cost.cpu)]
+        yield from ((f"{title}: {name}", "s", at) for name, at in cost.seen.items())
+        yield f"{title}: in all", "s", cost.wall
+        yield f"{title}: CPU", "s", cost.cpu
     session = _made(logs / "second", lambda at: record("joint", at, 1, {}, USUAL["joint"]))
     cost = tree.bampipe("run", str(session), "--runs", "cold")
-    return [*rows, ("second device, only its own functions to compile", "s", cost.wall)]
+    yield "second device, only its own functions to compile", "s", cost.wall
 
 
-def measure_robots(tree: Tree, logs: Path, short: bool) -> list[Row]:
+def measure_robots(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
     """`identify` of arms, everything compiled."""
-    rows = []
     for count, kinds in JOINTS.items():
         rate = 250.0 if short or count < 7 else 1000.0
         seconds = 6.0 if short else 20.0
@@ -139,14 +138,12 @@ def measure_robots(tree: Tree, logs: Path, short: bool) -> list[Row]:
         tree.bampipe("run", str(session), "--until", "identify")
         cost = tree.bampipe("identify", session.name, "--force")
         plural = "s" if count > 1 else ""
-        rows.append((f"identify, {count} joint{plural}, 3 × {seconds:g} s at {rate:g} Hz",
-                     "s", cost.wall))  # fmt: skip
-    return rows
+        title = f"identify, {count} joint{plural}, 3 × {seconds:g} s at {rate:g} Hz"
+        yield title, "s", cost.wall
 
 
-def measure_diagnosis(tree: Tree, logs: Path, short: bool) -> list[Row]:
+def measure_diagnosis(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
     """`diagnose` of sessions of the BAM, everything compiled."""
-    rows = []
     for number, (title, effects) in enumerate(HIDDEN.items()):
         session = _made(
             logs / f"hidden{number}",
@@ -155,28 +152,25 @@ def measure_diagnosis(tree: Tree, logs: Path, short: bool) -> list[Row]:
         tree.bampipe("run", str(session), "--until", "validate")
         tree.bampipe("diagnose", session.name, "--set", "jobs=2")
         cost = tree.bampipe("diagnose", session.name, "--set", "jobs=2", "--force")
-        rows += [(f"diagnose, BAM, {title}", "s", cost.wall)]
-        rows += [(f"diagnose, BAM, {title}: CPU", "s", cost.cpu)]
-    return rows
+        yield f"diagnose, BAM, {title}", "s", cost.wall
+        yield f"diagnose, BAM, {title}: CPU", "s", cost.cpu
 
 
-def measure_long_session(tree: Tree, logs: Path, short: bool) -> list[Row]:
+def measure_long_session(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
     """Memory and time of each stage on a long session: one simulated trial, over and over."""
     count, trial = (10**5 if short else 10**7), 4000
     source = _simulated(tree, logs, "trials", 5, trial / 500.0)
     session = _made(logs / "long", lambda at: repeat_session(source, at, count // (5 * trial)))
     tree.bampipe("run", str(source), "--runs", "warmed", "--until", "validate")
-    rows: list[Row] = []
     for stage in STAGES:
         cost = tree.bampipe(stage, str(session) if stage == "ingest" else session.name)
         title = f"{stage}, {count:.0e} samples"
-        rows += [(f"{title}: memory", "MB", cost.memory)]
-        rows += [(f"{title}: CPU a sample", "µs", 1e6 * cost.cpu / count)]
+        yield f"{title}: memory", "MB", cost.memory
+        yield f"{title}: CPU a sample", "µs", 1e6 * cost.cpu / count
     shutil.rmtree(tree.home / "runs" / session.name)
-    return rows
 
 
-def measure_batch(tree: Tree, logs: Path, short: bool) -> list[Row]:
+def measure_batch(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
     """A batch of small sessions, two trials of four seconds each."""
     count = 10 if short else 200
     source = _simulated(tree, logs, "small", 2, 4.0)
@@ -189,14 +183,12 @@ def measure_batch(tree: Tree, logs: Path, short: bool) -> list[Row]:
     tree.bampipe("run", str(source), "--runs", "warmed", "--until", "compare")
     sessions = [str(path) for path in sorted(batch.iterdir())]
     cost = tree.bampipe("run", *sessions, "--jobs", "2", "--runs", "many", "--until", "compare")
-    return [
-        (f"batch of {count} sessions, 2 jobs: a session", "s", cost.wall / count),
-        (f"batch of {count} sessions: CPU a session", "s", cost.cpu / count),
-        (f"batch of {count} sessions: largest process", "MB", cost.memory),
-    ]
+    yield f"batch of {count} sessions, 2 jobs: a session", "s", cost.wall / count
+    yield f"batch of {count} sessions: CPU a session", "s", cost.cpu / count
+    yield f"batch of {count} sessions: largest process", "MB", cost.memory
 
 
-def measure_install(tree: Tree, logs: Path, short: bool) -> list[Row]:
+def measure_install(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
     """Installation into an empty environment from pip's cache, and start of the command line."""
     place = tree.home / "environment"
     source = tree.home / "source"
@@ -210,10 +202,8 @@ def measure_install(tree: Tree, logs: Path, short: bool) -> list[Row]:
     begun = time.perf_counter()
     subprocess.run(install, check=True)
     took = time.perf_counter() - begun
-    rows: list[Row] = [
-        ("install, pip, from its cache", "s", took),
-        ("install, size beside an empty environment", "MB", _megabytes(place) - empty),
-    ]
+    yield "install, pip, from its cache", "s", took
+    yield "install, size beside an empty environment", "MB", _megabytes(place) - empty
     subprocess.run([str(place / "bin/bampipe"), "--help"], check=True, stdout=subprocess.DEVNULL)
     times = []
     for _ in range(5):
@@ -221,31 +211,26 @@ def measure_install(tree: Tree, logs: Path, short: bool) -> list[Row]:
         subprocess.run([str(place / "bin/bampipe"), "--help"], check=True,
                        stdout=subprocess.DEVNULL)  # fmt: skip
         times.append(time.perf_counter() - begun)
-    return [*rows, ("bampipe --help, least of five", "s", min(times))]
+    yield "bampipe --help, least of five", "s", min(times)
 
 
-def measure_filter(tree: Tree, logs: Path, short: bool) -> list[Row]:
+def measure_filter(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
     """The filter beside C in one process, by `filter_speed.py`."""
     seconds, repeats = ("4", "3") if short else ("16", "15")
-    rows = []
     for device in ("slider", "bam"):
         tree.run(
             str(ROOT / "benchmarks/filter_speed.py"), "--device", device, "--only-c",
             "--seconds", seconds, "--repeats", repeats,
         )  # fmt: skip
         found = re.findall(r"^\| (.*?) \| ([\d.]+) \| .*? \| ([\d.]+) \|$", tree.read(), re.M)
-        rows += [
-            (f"filter, {device}: a step", "µs", float(step))
-            for title, step, _ in found if title == "bampipe"
-        ]  # fmt: skip
-        rows += [
-            (f"filter, {device}: {title} over bampipe (more is better)", "×", float(ratio))
-            for title, _, ratio in found if title != "bampipe"
-        ]  # fmt: skip
-    return rows
+        for title, step, ratio in found:
+            if title == "bampipe":
+                yield f"filter, {device}: a step", "µs", float(step)
+            else:
+                yield f"filter, {device}: {title} over bampipe, more is better", "×", float(ratio)
 
 
-PARTS: dict[str, Callable[[Tree, Path, bool], list[Row]]] = {
+PARTS: dict[str, Callable[[Tree, Path, bool], Iterator[Row]]] = {
     "first": measure_first_run,
     "robots": measure_robots,
     "diagnosis": measure_diagnosis,
@@ -305,14 +290,12 @@ def measure(trees: Mapping[str, Tree], parts: Sequence[str], logs: Path, short: 
     for part in parts:
         for name, tree in trees.items():
             try:
-                found = PARTS[part](tree, logs, short)
+                for title, unit, value in PARTS[part](tree, logs, short):
+                    row = rows.setdefault(title, {"part": part, "title": title, "unit": unit})
+                    row[name] = round(value, 4)
+                    print(f"{name}: {title}: {value:.3g} {unit}", file=sys.stderr, flush=True)
             except (RuntimeError, subprocess.CalledProcessError) as problem:
                 print(f"{part}, {name}: {problem}", file=sys.stderr)
-                continue
-            for title, unit, value in found:
-                row = rows.setdefault(title, {"part": part, "title": title, "unit": unit})
-                row[name] = round(value, 4)
-                print(f"{name}: {title}: {value:.3g} {unit}", file=sys.stderr, flush=True)
     return list(rows.values())
 
 
