@@ -368,7 +368,7 @@ class Fit:
 
     @cached_property
     def held_out_rmse(self) -> Array:
-        """Error on trials that the parameters have not seen, (n_q,), N.m or N, by a linear step.
+        """Error on trials that parameters have not seen, nor timing, (n_q,), N.m or N, linearised.
 
         With one group of trials only, that of the fit.
         """
@@ -376,7 +376,7 @@ class Fit:
         group_of = np.array(e.folds.groups)
         groups = [group_of[here.trial] for here in samples]
         plain = [take_samples(e.residual, here, axis) for axis, here in enumerate(samples)]
-        slopes = [take_samples(e.jacobian, here, axis) for axis, here in enumerate(samples)]
+        slopes = [take_samples(e.slopes, here, axis) for axis, here in enumerate(samples)]
         xx, xy, yy = p.sums()
         squares = np.zeros(len(samples))
         for group in np.unique(group_of):

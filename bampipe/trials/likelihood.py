@@ -413,16 +413,12 @@ def _pose(
     if evidence.factors:  # in units of what is measured: small factors explain nothing
         ratio = np.array(likelihood.factors) / np.array(evidence.factors)
         weights = tuple(root * by for root, by in zip(weights, ratio, strict=True))
-    jacobian: Sequence[Array] = evidence.jacobian
     timing = evidence.timing if evidence.by_timing else ()
-    if timing:
-        pairs = zip(evidence.jacobian, evidence.by_timing, strict=True)
-        jacobian = [np.append(x, by[:, :, None], axis=2) for x, by in pairs]
-    n = jacobian[0].shape[2]
+    n = evidence.slopes[0].shape[2]
     full = []
     for axis, here in enumerate(samples):
         columns = np.zeros((len(here.rows), n + 2 * n_q))
-        columns[:, :n] = take_samples(jacobian, here, axis)
+        columns[:, :n] = take_samples(evidence.slopes, here, axis)
         columns[:, n + axis] = -bias[axis]
         columns[:, n + n_q + axis] = -likelihood.noise.stopping[axis]
         full.append(columns * weights[axis][:, None])
