@@ -342,6 +342,8 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--store", action="store_true", help="write results/speed.json")
     given = parser.parse_args(arguments)
     load = f"{os.getloadavg()[0]:.1f}"
+    commit = _commit_of("HEAD")
+    beside = _commit_of(given.beside) if given.beside else None
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         trees = {"this": Tree(ROOT, folder / "this")}
@@ -359,8 +361,8 @@ def main(arguments: Sequence[str]) -> None:
                 subprocess.run([*worktree, "remove", "--force", str(folder / "tree")], check=True)
     python = f"Python {platform.python_version()}"
     content = {
-        "commit": _commit_of("HEAD"),
-        "beside": _commit_of(given.beside) if given.beside else None,
+        "commit": commit,
+        "beside": beside,
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {python}",
         "load": load,
         "versions": {library: version(library) for library in LIBRARIES},
@@ -373,7 +375,7 @@ def main(arguments: Sequence[str]) -> None:
         path = RESULTS / "measured.json"
         measured = json.loads(path.read_text(encoding="utf-8"))
         command = " ".join(["python benchmarks/speed.py", *arguments])
-        measured["speed"] = {"command": command, "commit": content["commit"]}
+        measured["speed"] = {"command": command, "commit": commit}
         text = json.dumps(dict(sorted(measured.items())), indent=2, ensure_ascii=False)
         path.write_text(text + "\n", encoding="utf-8")
 
