@@ -93,13 +93,17 @@ def staubli_tx40(source: Path, folder: Path) -> None:
     write_session(folder, joints, 5000.0, {"log": trial}, device)
 
 
-def kuka_kr300(source: Path, folder: Path) -> None:
-    """Six axes at 250 Hz: A to identify, B and C to judge; bodies by their drawing."""
-    drawn = tomllib.loads((source / "robot.toml").read_text())
-    lines = ['name = "kr300"', "[robot]", "gravity = [0.0, 0.0, 9.81]", "uncertainty = 0.02"]
-    joints = [f"axis_{k}" for k in range(1, 7)]
-    zero = np.array([0.0, -90.0, 90.0, 0.0, 0.0, 0.0])
-    for joint, link in zip(joints, drawn["links"], strict=True):
+KR300_AXES = [f"axis_{k}" for k in range(1, 7)]
+KR300_ZERO = np.deg2rad([0.0, -90.0, 90.0, 0.0, 0.0, 0.0])
+"""Of the drawing, which stands upright where the encoders count from; its base is upside down."""
+
+
+def kr300_device(drawing: Path, uncertainty: float = 0.02) -> str:
+    """Text of the device file: bodies, gears and motors by their drawing."""
+    drawn = tomllib.loads(drawing.read_text())
+    lines = ['name = "kr300"', "[robot]", "gravity = [0.0, 0.0, 9.81]"]
+    lines += [f"uncertainty = {uncertainty}"]
+    for joint, link in zip(KR300_AXES, drawn["links"], strict=True):
         xx, yy, zz, xy, yz, xz = (float(v) for v in link["inertia"])
         lines += [
             f"[robot.dh.{joint}]", f"d = {link['d']}", f"a = {link['a']}",
@@ -108,21 +112,25 @@ def kuka_kr300(source: Path, folder: Path) -> None:
             f"mass = {link['mass']}", f"center = {link['com']}",
             f"inertia = {[xx, xy, xz, yy, yz, zz]}",
         ]  # fmt: skip
-    for joint, link in zip(joints, drawn["links"], strict=True):
+    for joint, link in zip(KR300_AXES, drawn["links"], strict=True):
         lines += [
             f"[robot.motors.{joint}]", f"turns = {{ {joint} = {link['gear']} }}",
             f"rotor_inertia = {link['motor_inertia']}",
         ]  # fmt: skip
-    trials = {}
+    return "\n".join(lines) + "\n"
+
+
+def kuka_kr300(source: Path, folder: Path) -> None:
+    """Six axes at 250 Hz: A to identify, B and C to judge; bodies by their drawing."""
+    trials, joints = {}, KR300_AXES
     for name in "ABC":
         record = loadmat(source / f"{name}.mat", struct_as_record=False, squeeze_me=True)["rec"]
-        # The drawing stands upright where the encoders count from; its base is upside down.
-        q = np.deg2rad(record.act_pos_mot_deg.T + zero)
+        q = np.deg2rad(record.act_pos_mot_deg.T) + KR300_ZERO
         t = np.asarray(record.time_cont, dtype=float)
-        second = np.deg2rad(record.act_pos_se_deg.T[:, :3] + zero[:3])
+        second = np.deg2rad(record.act_pos_se_deg.T[:, :3]) + KR300_ZERO[:3]
         trials[name] = t - t[0], q, np.hstack([record.act_torque_abs_nm.T, second])
     inputs = [*(f"torque_{joint}" for joint in joints), *(f"second_{j}" for j in joints[:3])]
-    device = "\n".join(lines) + "\n"
+    device = kr300_device(source / "robot.toml")
     write_session(folder, joints, 250.0, trials, device, held_out="BC", inputs=inputs)
 
 
