@@ -128,12 +128,14 @@ def main() -> None:
     band = ("--set", f"filter.band_hz={BAND_HZ}", "--until", "validate")
     session = write_records(source, drawing, work / "choose", "validation")
     run, note = work / "runs" / "choose", ""
-    seconds = bampipe("run", session, *common, *band)
-    seconds += bampipe("extend", run, COUNTERBALANCE, "--model", "base")
+    begin = time.monotonic()
+    bampipe("run", session, *common, *band)
+    bampipe("extend", run, COUNTERBALANCE, "--model", "base")
     try:
-        seconds += bampipe("extend", run, "--auto", most_s=SEARCH_S)
+        bampipe("extend", run, "--auto", most_s=SEARCH_S)
     except Failed as reason:
         note = f"extend --auto: {reason}"
+    seconds = time.monotonic() - begin
     ladder = read_ladder(run)
     choice = [
         {"model": model, "added": added, "validation_percent": held_out(run, model)}

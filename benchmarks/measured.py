@@ -65,8 +65,8 @@ def need(path: Path) -> Path:
     return path
 
 
-def bampipe(*arguments: object, most_s: float = 3600.0) -> float:
-    """Run a command line; its seconds. A failed gate, exit code 1, is a result.
+def bampipe(*arguments: object, most_s: float = 3600.0) -> tuple[float, str]:
+    """Run a command line; its seconds and what it prints. A failed gate, code 1, is a result.
 
     Raises:
         Failed: it refuses, or takes longer than ``most_s``.
@@ -79,7 +79,7 @@ def bampipe(*arguments: object, most_s: float = 3600.0) -> float:
         raise Failed(f"not done in {most_s:.0f} s") from None
     if done.returncode > 1:
         raise Failed((done.stderr.strip() or done.stdout.strip()).splitlines()[-1])
-    return time.monotonic() - start
+    return time.monotonic() - start, done.stdout
 
 
 def read(run: Path, model: str, stage: str) -> Any:
