@@ -26,7 +26,7 @@ import numpy as np
 import pandas as pd
 from emps import write_session as write_emps
 from measured import RESULTS, ROOT, Array, Failed, bampipe, parse, read, read_ladder, rms, store
-from robots import BAND_HZ, dfki_double_pendulum, staubli_tx40, tiago
+from robots import BAND_HZ, dfki_double_pendulum, kuka_kr300, staubli_tx40, tiago
 from scipy.spatial.distance import cdist
 
 Recipe = Callable[[Path, Path], object]
@@ -76,6 +76,7 @@ SETS: dict[str, tuple[str, Recipe]] = {
     "uart_servo_backlash": ("", take_logs),
     "dfki_double_pendulum": ("dfki_double_pendulum", dfki_double_pendulum),
     "staubli_tx40": ("staubli_tx40", staubli_tx40),
+    "kuka_kr300": ("kuka_kr300", kuka_kr300),
     "rokae_ar5_arm": ("", take_logs),
     "kuka_med7_arm": ("", take_logs),
     "tiago": ("tiago", tiago),

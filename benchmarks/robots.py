@@ -1,27 +1,17 @@
-"""Measured arms: how far a drawing goes, what it lacks, and whether that is named unaided.
+"""Sessions of measured arms, for `measured_sets.py`, `kr300.py` and `beside_figaroh.py`.
 
-Four recordings that others published; FOLDER holds one folder of files for each:
+Four recordings that others published, each a folder of files:
 
 - staubli_tx40 (thanhndv212/figaroh-examples, Apache-2.0): pos_read_data.csv, curr_data.csv, a URDF;
 - kuka_kr300 (JonasWeigand/Robot_Identification, MIT): A.mat, B.mat, C.mat, robot.toml;
 - dfki_double_pendulum (dfki-ric-underactuated-lab/double_pendulum, BSD-3): *.csv;
 - tiago (thanhndv212/figaroh-examples, Apache-2.0): tiago_*.csv, a URDF.
-
-    python benchmarks/robots.py FOLDER [--arm NAME ...] [--diagnose] [--out DIR]
-
-Prints the held-out error of each joint, per cent of its torque, and what the diagnosis names.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import subprocess
-import sys
-import tempfile
-import time
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -170,55 +160,3 @@ def tiago(source: Path, folder: Path) -> None:
     )
     trial = t - t[0], q, current * turns * constant
     write_session(folder, joints, 100.0, {"log": trial}, device, {"torso_lift_joint": "m"})
-
-
-ARMS: dict[str, Callable[[Path, Path], None]] = {
-    arm.__name__: arm for arm in (staubli_tx40, kuka_kr300, dfki_double_pendulum, tiago)
-}
-
-
-def bampipe(*arguments: str) -> float:
-    """Run a command; its seconds."""
-    start = time.monotonic()
-    command = [sys.executable, "-m", "bampipe", *arguments, "--quiet"]
-    if subprocess.run(command, stdout=subprocess.DEVNULL).returncode > 1:  # 1: a gate failed
-        raise SystemExit(f"failed: {' '.join(command)}")
-    return time.monotonic() - start
-
-
-def errors(run: Path, model: str) -> str:
-    content = json.loads((run / f"models/{model}/validate.json").read_text())
-    return " ".join(
-        f"{axis} {entry['held_out_relative_error_percent']:.1f}"
-        for axis, entry in content["axes"].items()
-    )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("source", type=Path)
-    parser.add_argument("--arm", action="append", choices=ARMS)
-    parser.add_argument("--diagnose", action="store_true")
-    parser.add_argument("--out", type=Path, default=Path(tempfile.mkdtemp()))
-    given = parser.parse_args()
-    for name in given.arm or ARMS:
-        folder = given.out / name
-        folder.mkdir(parents=True, exist_ok=True)
-        ARMS[name](given.source / name, folder)
-        runs = given.out / "runs"
-        common = ["--runs", str(runs)]
-        band = ["--set", f"filter.band_hz={BAND_HZ[name]}"]
-        seconds = bampipe("run", str(folder), *common, *band, "--until", "validate")
-        print(f"{name}: {errors(runs / name, 'base')} % ({seconds:.0f} s)", flush=True)
-        gears = json.loads((runs / name / "stiffness/stiffness.json").read_text())["headline"]
-        if "gear of" in gears:
-            print(f"  {gears}", flush=True)
-        if given.diagnose:
-            seconds = bampipe("diagnose", str(runs / name), *common)
-            found = json.loads((runs / name / "models/base/diagnose.json").read_text())
-            verdicts = {axis: entry["verdict"] for axis, entry in found["axes"].items()}
-            print(f"  {found['selected']} {verdicts} ({seconds:.0f} s)", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -3,8 +3,8 @@
     python benchmarks/validation.py            # write them into the page
     python benchmarks/validation.py --check    # fail where the page has other ones
 
-`benchmarks/results/` has one file a benchmark, a line of JSON a session, and in `measured.json` the
-commit and the command of each.
+`benchmarks/results/` has one file a benchmark: a line of JSON a session, and in `measured.json` the
+commit and the command of each; or one object that holds its commit, command and versions.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import mistakes
+import tables
 from pydantic import TypeAdapter
 from scores import read_scores, write_tables
 
@@ -53,15 +55,32 @@ def write_mistakes(path: Path) -> str:
     )
 
 
+def _stored(write: Callable[[Any], str]) -> Callable[[Path], str]:
+    """What makes a table from the file of a result that holds its own command."""
+    return lambda path: write(json.loads(path.read_text(encoding="utf-8"))["result"])
+
+
 TABLES: dict[str, Callable[[Path], str]] = {
     "calibration": write_calibration,
     "mistakes": write_mistakes,
+    "emps": _stored(tables.write_emps),
+    "kr300": _stored(tables.write_kr300),
+    "measured_sets": _stored(tables.write_measured_sets),
+    "rivals": _stored(tables.write_rivals),
 }
 
 
 def read_measured() -> dict[str, dict[str, str]]:
-    """Command and commit of each stored result."""
-    return dict(json.loads((RESULTS / "measured.json").read_text(encoding="utf-8")))
+    """Command and commit of each stored result, and its file."""
+    known = json.loads((RESULTS / "measured.json").read_text(encoding="utf-8"))
+    found = {name: {**head, "file": f"{name}.jsonl"} for name, head in known.items()}
+    for path in sorted(RESULTS.glob("*.json")):
+        if path.stem in TABLES:
+            head = json.loads(path.read_text(encoding="utf-8"))
+            versions = ", ".join(f"{name} {number}" for name, number in head["versions"].items())
+            commit = f"{head['commit']}; {versions}"
+            found[path.stem] = {"command": head["command"], "commit": commit, "file": path.name}
+    return found
 
 
 def fill(page: str) -> str:
@@ -71,7 +90,7 @@ def fill(page: str) -> str:
     def filled(match: re.Match[str]) -> str:
         head, name, _, end = match.groups()
         about = f"`{measured[name]['command']}`, commit {measured[name]['commit']}."
-        return f"{head}\n{about}\n\n{TABLES[name](RESULTS / f'{name}.jsonl')}\n\n{end}"
+        return f"{head}\n{about}\n\n{TABLES[name](RESULTS / measured[name]['file'])}\n\n{end}"
 
     return BLOCK.sub(filled, page)
 
