@@ -149,7 +149,7 @@ def score(run: Path, model: str, records: dict[str, Array]) -> dict[str, Any]:
     fitted = refit(system, p, motions["train"], records["train"], free, sd)
     dry = [system.index("coulomb.carriage")]
     oracle = refit(system, p, motions["test"], records["test"], dry, np.ones(1))
-    inverse = read(run, model, "validate")["axes"]["carriage"]
+    inverse = read(run, model, "validate")["trials"]
 
     def errors(parameters: Array) -> dict[str, float | None]:
         return {n: measure_open(system, parameters, m, records[n]) for n, m in motions.items()}
@@ -160,8 +160,8 @@ def score(run: Path, model: str, records: dict[str, Array]) -> dict[str, Any]:
         "open_loop_friction_of_the_test_mm": errors(oracle)["test"],
         "friction_of_the_test_n": float(oracle[dry[0]] - p[dry[0]]),
         "inverse_percent": {
-            "train": inverse["relative_error_percent"],
-            "test": inverse["held_out_relative_error_percent"],
+            "train": inverse[TRIALS["train"]]["carriage"]["relative_error_percent"],
+            "test": inverse[TRIALS["test"]]["carriage"]["held_out_relative_error_percent"],
         },
         "parameters": {name: [e["estimate"], e["sd"]] for name, e in found.items()},
     }
@@ -176,7 +176,7 @@ def measure_open(system: System, p: Array, motion: Motion, position: Array) -> f
 
 
 def closed_loop(run: Path, model: str) -> dict[str, Any]:
-    """Errors of position and force on the test record, per cent, and the standing held out."""
+    """Errors of position on the test record and of force on both, and held out, per cent."""
     found = read(run, model, "validate")
     free, axis = found["free_run"], found["axes"]["carriage"]
     if free.get("mode") != "closed_loop":

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from emps import write_session as write_emps
-from measured import RESULTS, ROOT, Array, Failed, bampipe, parse, read, read_ladder, rms, store
+from measured import (
+    RESULTS,
+    ROOT,
+    Array,
+    Failed,
+    bampipe,
+    parse,
+    processor_seconds,
+    read,
+    read_ladder,
+    rms,
+    store,
+)
 from robots import BAND_HZ, dfki_double_pendulum, kuka_kr300, staubli_tx40, tiago
 from scipy.spatial.distance import cdist
 
@@ -125,21 +136,21 @@ def measure(source: Path, recipe: Recipe, folder: Path, most_s: float) -> dict[s
     folder.mkdir(parents=True)
     recipe(source, folder)
     runs, run = folder.parent / "runs", folder.parent / "runs" / folder.name
-    begin, row = time.monotonic(), {"note": ""}
+    begin, row = processor_seconds(), {"note": ""}
     try:
         if not (folder / "session.toml").exists():
             bampipe("init", folder, most_s=most_s)
         band = BAND_HZ.get(folder.name)
         setting = ("--set", f"filter.band_hz={band}") if band else ()
         bampipe("run", folder, "--runs", runs, "--until", "validate", *setting, most_s=most_s)
-        row["seconds_run"] = time.monotonic() - begin
+        row["seconds_run"] = processor_seconds() - begin
         row["axes"] = describe(run, run_is_extended=False)
         bampipe("extend", run, "--auto", most_s=most_s)
         row["axes"] = describe(run, run_is_extended=True)
         row["ladder"] = [[model, added] for model, added in read_ladder(run)]
     except Failed as reason:
         row["note"] = str(reason)
-    return row | {"seconds": time.monotonic() - begin}
+    return row | {"seconds": processor_seconds() - begin}
 
 
 def describe(run: Path, *, run_is_extended: bool) -> dict[str, dict[str, Any]]:

@@ -47,7 +47,7 @@ def write_emps(result: Mapping[str, Any]) -> str:
     rows.append(row("all, under the likelihood of `diagnose`", result["as_found"]))
     published = ", ".join(f"{name} {mm:g}" for name, mm in result["published_mm"].items())
     closed = write_rows(
-        ["model", "position, %", "force, %"],
+        ["model", "position, %", "force, both records, %"],
         [
             [" ".join(f"`{e}`" for e in c["added"]) or "bare", number(c.get("position_percent")),
              number(c.get("force_percent"))]
@@ -121,7 +121,16 @@ def write_measured_sets(result: Mapping[str, Any]) -> str:
                 f"{verdict}: {named}" if x["verdict"] else verdict, minutes,
             ])  # fmt: skip
             name = minutes = ""
-    head = ["set", "axis", "bare, %", "after, %", "flexible, %", "floor, %", "verdict", "min"]
+    head = [
+        "set",
+        "axis",
+        "bare, %",
+        "after, %",
+        "flexible, %",
+        "floor, %",
+        "verdict",
+        "processor, min",
+    ]
     return write_rows(head, rows)
 
 
@@ -138,4 +147,4 @@ def write_rivals(result: Mapping[str, Any]) -> str:
         known = x.get("parameters", {})
         values = ", ".join(f"{n} {number(v, 4)}" for n, v in known.items())
         rows.append([name, reached.strip(" ;"), values, f"{x['seconds']:.0f}", x["scope"]])
-    return write_rows(["program", "error", "parameters", "s", "in its makers' words"], rows)
+    return write_rows(["program", "error", "parameters", "CPU, s", "in its makers' words"], rows)
