@@ -176,7 +176,7 @@ def measure_open(system: System, p: Array, motion: Motion, position: Array) -> f
 
 
 def closed_loop(run: Path, model: str) -> dict[str, Any]:
-    """Errors of position on the test record and of force on both, and held out, per cent."""
+    """Errors of position and force on the test record, and held out, per cent."""
     found = read(run, model, "validate")
     free, axis = found["free_run"], found["axes"]["carriage"]
     if free.get("mode") != "closed_loop":

@@ -47,7 +47,7 @@ def write_emps(result: Mapping[str, Any]) -> str:
     rows.append(row("all, under the likelihood of `diagnose`", result["as_found"]))
     published = ", ".join(f"{name} {mm:g}" for name, mm in result["published_mm"].items())
     closed = write_rows(
-        ["model", "position, %", "force, both records, %"],
+        ["model", "position, %", "force, %"],
         [
             [" ".join(f"`{e}`" for e in c["added"]) or "bare", number(c.get("position_percent")),
              number(c.get("force_percent"))]
