@@ -149,7 +149,7 @@ def score(run: Path, model: str, records: dict[str, Array]) -> dict[str, Any]:
     fitted = refit(system, p, motions["train"], records["train"], free, sd)
     dry = [system.index("coulomb.carriage")]
     oracle = refit(system, p, motions["test"], records["test"], dry, np.ones(1))
-    inverse = read(run, model, "validate")["trials"]
+    inverse = read(run, model, "validate")["axes"]["carriage"]
 
     def errors(parameters: Array) -> dict[str, float | None]:
         return {n: measure_open(system, parameters, m, records[n]) for n, m in motions.items()}
@@ -159,10 +159,7 @@ def score(run: Path, model: str, records: dict[str, Array]) -> dict[str, Any]:
         "open_loop_fitted_mm": errors(fitted),
         "open_loop_friction_of_the_test_mm": errors(oracle)["test"],
         "friction_of_the_test_n": float(oracle[dry[0]] - p[dry[0]]),
-        "inverse_percent": {
-            "train": inverse[TRIALS["train"]]["carriage"]["relative_error_percent"],
-            "test": inverse[TRIALS["test"]]["carriage"]["held_out_relative_error_percent"],
-        },
+        "inverse_percent": inverse["held_out_relative_error_percent"],
         "parameters": {name: [e["estimate"], e["sd"]] for name, e in found.items()},
     }
 
@@ -224,55 +221,77 @@ def read_record(path: Path) -> dict[str, Array]:
     }  # fmt: skip
 
 
+def search(work: Path, session: Path, positions: dict[str, Array]) -> dict[str, Any]:
+    """What `extend --auto` finds on DATA_EMPS, and how far that carries."""
+    run = work / "runs" / session.name
+    bampipe("run", session, "--runs", work / "runs", "--until", "validate")
+    seconds, told = bampipe("extend", run, "--auto")
+    ladder = read_ladder(run)
+    return {
+        "seconds": seconds,
+        "told": told,
+        "effects": [effect for _, added in ladder for effect in added],
+        "as_found": score(run, ladder[-1][0], positions),
+        "diagnosis": read(run, "base", "diagnose")["axes"]["carriage"],
+    }
+
+
+def climb(
+    work: Path, session: Path, effects: Sequence[str], positions: dict[str, Array]
+) -> list[dict[str, Any]]:
+    """The three tasks effect by effect, with the authors' filters and least squares."""
+    runs, run = ("--runs", work / "authors"), work / "authors" / session.name
+    bampipe("run", session, *runs, "--pipeline", SAMPLE / "published.toml")
+    model, rungs = "base", []
+    for effect in ("", *effects):
+        if effect:
+            bampipe("extend", run, effect, "--model", model)
+            model = f"{model}+{effect.replace(':', '.')}"
+        rungs.append(
+            {"added": effect, **score(run, model, positions), "closed": closed_loop(run, model)}
+        )
+        print(rungs[-1], flush=True)
+    return rungs
+
+
+def diagnose_pulses(work: Path, source: Path) -> dict[str, Any]:
+    """The verdict on DATA_EMPS_PULSES alone, with the parameters of DATA_EMPS as priors."""
+    session = write_session(source, work / "pulses", ["test"])
+    put_priors(session / "device.toml", work / "authors" / "emps")
+    bampipe("run", session, "--runs", work / "runs", "--until", "validate")
+    run = work / "runs" / session.name
+    bampipe("diagnose", run, "--model", "base")
+    found = read(run, "base", "diagnose")
+    return {
+        "band_hz": read(run, "base", "validate")["cutoff_hz"],
+        "verdict": found["axes"]["carriage"],
+        "ranking": found["ranking"][:6],
+    }
+
+
 def main() -> None:
     """Run all, print and store."""
-    given, work = parse(__doc__)
+    given, work = parse(
+        __doc__,
+        effects={
+            "nargs": "*",
+            "help": "take these effects; neither search for them nor diagnose the pulses",
+        },
+    )
     source = need(given.data / "emps")
     records = {name: read_record(source / file) for name, file in FILES.items()}
     positions = {name: record["q"] for name, record in records.items()}
     session = write_session(source, work / "emps")
-    runs, run = ("--runs", work / "runs"), work / "runs" / "emps"
-    bampipe("run", session, *runs, "--until", "validate")
-    seconds, told = bampipe("extend", run, "--auto")
-    ladder = read_ladder(run)
-    effects = [effect for _, added in ladder for effect in added]
-    closed = [{"added": added, **closed_loop(run, model)} for model, added in ladder]
-    print(told, closed, flush=True)
-
-    # With the authors' filters and least squares, effect by effect, in the order of their gain.
-    bampipe("run", session, "--runs", work / "authors", "--pipeline", SAMPLE / "published.toml")
-    authors, model = work / "authors" / "emps", "base"
-    rungs: list[dict[str, Any]] = []
-    for effect in ("", *effects):
-        if effect:
-            bampipe("extend", authors, effect, "--model", model)
-            model = f"{model}+{effect.replace(':', '.')}"
-        rungs.append({"added": effect, **score(authors, model, positions)})
-        print(rungs[-1], flush=True)
-
-    pulses = write_session(source, work / "pulses", ["test"])
-    put_priors(pulses / "device.toml", run)
-    bampipe("run", pulses, *runs, "--until", "validate")
-    bampipe("diagnose", work / "runs" / "pulses", "--model", "base")
-    found = read(work / "runs" / "pulses", "base", "diagnose")
-    friction = read(run, "base", "identify")["parameters"]
+    found = search(work, session, positions) if given.effects is None else None
+    effects = found["effects"] if found else given.effects
+    rungs = climb(work, session, effects, positions)
+    friction = [rungs[0]["parameters"][f"{name}.carriage"][0] for name in ("viscous", "coulomb")]
     result = {
-        "seconds": seconds,
-        "told": told,
         "published_mm": PUBLISHED,
+        "search": found,
         "rungs": rungs,
-        "as_found": score(run, ladder[-1][0], positions),
-        "closed_loop": closed,
-        "diagnosis": read(run, "base", "diagnose")["axes"]["carriage"],
-        "pulses": {
-            "band_hz": read(work / "runs" / "pulses", "base", "validate")["cutoff_hz"],
-            "verdict": found["axes"]["carriage"],
-            "ranking": found["ranking"][:6],
-            "transfer": look_at_pulses(
-                records["test"],
-                *(friction[f"{name}.carriage"]["estimate"] for name in ("viscous", "coulomb")),
-            ),
-        },
+        "transfer": look_at_pulses(records["test"], *friction),
+        "pulses": diagnose_pulses(work, source) if found else None,
     }
     print(store("emps", result, given.out))
 

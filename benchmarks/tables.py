@@ -29,45 +29,40 @@ def per_cent(value: float | None) -> str:
 
 
 def write_emps(result: Mapping[str, Any]) -> str:
-    """The three tasks, the ladder, and what the pulses show."""
+    """The three tasks by effect, and what the pulses show."""
+    head = [
+        "model", "open loop, mm", "fitted to the free run, mm", "with the friction of the test, mm",
+        "force, %", "closed loop, position, %", "closed loop, force, %",
+    ]  # fmt: skip
 
     def row(name: str, rung: Mapping[str, Any]) -> list[str]:
-        loop, fitted = rung["open_loop_mm"], rung["open_loop_fitted_mm"]
+        closed = rung.get("closed", {})
         return [
-            name, *(number(x["test"]) for x in (loop, fitted)), number(loop["train"]),
-            number(rung["open_loop_friction_of_the_test_mm"]),
-            *(f"{rung['inverse_percent'][k]:.2f}" for k in ("train", "test")),
+            name, number(rung["open_loop_mm"]["test"]), number(rung["open_loop_fitted_mm"]["test"]),
+            number(rung["open_loop_friction_of_the_test_mm"]), f"{rung['inverse_percent']:.2f}",
+            number(closed.get("position_percent"), 2), number(closed.get("force_percent")),
         ]  # fmt: skip
 
-    head = [
-        "model", "open loop, test, mm", "fitted to the free run", "open loop, train, mm",
-        "test, with its own dry friction", "force, train, %", "force, test, %",
-    ]  # fmt: skip
     rows = [row(f"and `{r['added']}`" if r["added"] else "bare", r) for r in result["rungs"]]
-    rows.append(row("all, under the likelihood of `diagnose`", result["as_found"]))
+    if result["search"]:
+        rows.append(row("as `extend --auto` leaves it", result["search"]["as_found"]))
     published = ", ".join(f"{name} {mm:g}" for name, mm in result["published_mm"].items())
-    closed = write_rows(
-        ["model", "position, %", "force, %"],
-        [
-            [" ".join(f"`{e}`" for e in c["added"]) or "bare", number(c.get("position_percent")),
-             number(c.get("force_percent"))]
-            for c in result["closed_loop"]
-        ],
-    )  # fmt: skip
-    pulses = result["pulses"]
     seen = write_rows(
         ["Hz", "apparent mass, kg", "delay, ms"],
         [
             [f"{x['hz']:.0f}", f"{x['mass_kg']:.1f}", f"{x['delay_ms']:.2f}"]
-            for x in pulses["transfer"]
+            for x in result["transfer"]
         ],
     )
-    named = state_probabilities(pulses["verdict"]["probabilities"])
+    said = ""
+    if result["pulses"]:
+        verdict = result["pulses"]["verdict"]
+        named = state_probabilities(verdict["probabilities"])
+        said = f"DATA_EMPS_PULSES alone: {verdict['verdict'].replace('_', ' ')}; {named}. "
     return (
-        f"{write_rows(head, rows)}\n\nPublished for the open loop, mm: {published}.\n\n"
-        f"Closed loop on the test record (published: position 0.0080 %, force 8.94 %):\n\n{closed}"
-        f"\n\nDATA_EMPS_PULSES alone: {pulses['verdict']['verdict'].replace('_', ' ')}; {named}."
-        f" From force to acceleration, the mean over its pulses, without a model:\n\n{seen}"
+        f"{write_rows(head, rows)}\n\nPublished, open loop, mm: {published}; force 5.98 %; closed"
+        f" loop, position 0.0080 %, force 8.94 %.\n\n{said}From force to acceleration, the mean over the"
+        f" pulses, without a model:\n\n{seen}"
     )
 
 
