@@ -47,26 +47,27 @@ from bampipe.trials.motion import Motion
 
 RATE, BAND_HZ = 250.0, 10.0
 STARTS, HORIZONS = 100, (75, 150)
+RECORDS = ("training", "validation", "test")
 COUNTERBALANCE = "counterbalance:axis_2"
 SEARCH_S = 1800.0
 
 
-def write_records(source: Path, drawing: Path, folder: Path, held_out: str) -> Path:
-    """A session of the training record and of one that is held out."""
+def write_records(source: Path, drawing: Path, folder: Path) -> Path:
+    """A session of the three records; validation and test are held out."""
     folder.mkdir(parents=True, exist_ok=True)
     found, trials = loadmat(source), {}
-    for name in ("training", held_out):
+    for name in RECORDS:
         q = found[f"y_{name}"][:, :6].astype(float) + KR300_ZERO
         trials[name] = np.arange(len(q)) / RATE, q, found[f"u_{name}"].astype(float)
     device = kr300_device(drawing, uncertainty=0.1)
-    write_session(folder, KR300_AXES, RATE, trials, device, held_out=[held_out])
+    write_session(folder, KR300_AXES, RATE, trials, device, held_out=RECORDS[1:])
     return folder
 
 
-def held_out(run: Path, model: str) -> dict[str, float]:
-    """Error of each joint on the record held out, per cent of its torque."""
-    axes = read(run, model, "validate")["axes"]
-    return {axis: found["held_out_relative_error_percent"] for axis, found in axes.items()}
+def error_of(run: Path, model: str, record: str) -> dict[str, float]:
+    """Error of each joint on a record held out, per cent of its torque."""
+    trial = read(run, model, "validate")["trials"][record]
+    return {axis: trial[axis]["held_out_relative_error_percent"] for axis in KR300_AXES}
 
 
 def simulate_from_starts(system: System, p: Array, motion: Motion, steps: int) -> dict[str, Any]:
@@ -119,57 +120,55 @@ def simulate_whole(system: System, p: Array, motion: Motion) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def main() -> None:
-    """Run all, print and store."""
-    given, work = parse(__doc__)
-    source = need(given.data / "kuka_kr300_60s") / "elabee_robot_ftsd.mat"
-    drawing = need(given.data / "kuka_kr300" / "robot.toml")
-    common = ("--runs", work / "runs")
-    band = ("--set", f"filter.band_hz={BAND_HZ}", "--until", "validate")
-    session = write_records(source, drawing, work / "choose", "validation")
-    run, note = work / "runs" / "choose", ""
-    begin = processor_seconds()
-    bampipe("run", session, *common, *band)
-    bampipe("extend", run, COUNTERBALANCE, "--model", "base")
+def search(run: Path) -> str:
+    """Add what the diagnosis finds beside the counterbalance; why not, where it cannot."""
     try:
         bampipe("extend", run, "--auto", most_s=SEARCH_S)
     except Failed as reason:
-        note = f"extend --auto: {reason}"
-    seconds = processor_seconds() - begin
-    ladder = read_ladder(run)
-    choice = [
-        {"model": model, "added": added, "validation_percent": held_out(run, model)}
-        for model, added in ladder
-    ]
-    best = min(range(len(choice)), key=lambda k: sum(choice[k]["validation_percent"].values()))
-    print(note, choice, flush=True)
+        return f"extend --auto: {reason}"
+    return ""
 
-    session = write_records(source, drawing, work / "once", "test")
-    once, model = work / "runs" / "once", "base"
-    bampipe("run", session, *common, *band)
-    for name, added in ladder[1 : best + 1]:
-        bampipe("extend", once, *added, "--model", model)
-        model = name
-    system, p = load(once, model)
-    motion = read_trial(once, "test", system)
-    simulations = {str(k): simulate_from_starts(system, p, motion, k) for k in HORIZONS}
+
+def main() -> None:
+    """Run all, print and store."""
+    given, work = parse(
+        __doc__, simple={"action": "store_true", "help": "neither counterbalance nor search"}
+    )
+    source = need(given.data / "kuka_kr300_60s") / "elabee_robot_ftsd.mat"
+    drawing = need(given.data / "kuka_kr300" / "robot.toml")
+    begin, session = processor_seconds(), write_records(source, drawing, work / "kr300")
+    run, note = work / "runs" / session.name, "neither counterbalance nor search asked for"
+    judged = ("--set", "validate.free_run=false", "--set", "validate.noise_floor=false")
+    band = ("--set", f"filter.band_hz={BAND_HZ}", *judged, "--until", "validate")
+    bampipe("run", session, "--runs", work / "runs", *band)
+    if not given.simple:
+        bampipe("extend", run, COUNTERBALANCE, "--model", "base")
+        note = search(run)
+    choice = [
+        {"model": model, "added": added, "validation_percent": error_of(run, model, "validation")}
+        for model, added in read_ladder(run)
+    ]
+    best = min(choice, key=lambda rung: sum(rung["validation_percent"].values()))
+    model = best["model"]
+    print(note, choice, flush=True)
+    system, p = load(run, model)
+    motion = read_trial(run, "test", system)
     result = {
-        "seconds": seconds,
         "note": note,
         "axes": KR300_AXES,
         "band_hz": BAND_HZ,
         "choice": choice,
         "model": model,
-        "inverse_percent": held_out(once, model),
-        "inverse_percent_bare": held_out(once, "base"),
-        "simulation": simulations,
+        "inverse_percent": error_of(run, model, "test"),
+        "inverse_percent_bare": error_of(run, "base", "test"),
+        "friction": {
+            name: [entry["estimate"], entry["sd"]]
+            for name, entry in read(run, model, "identify")["parameters"].items()
+            if name.startswith(("viscous", "coulomb"))
+        },
+        "simulation": {str(k): simulate_from_starts(system, p, motion, k) for k in HORIZONS},
         "free_run": simulate_whole(system, p, motion),
-        "diagnosis": {
-            axis: [found["verdict"], found["probabilities"]]
-            for axis, found in read(run, choice[1]["model"], "diagnose")["axes"].items()
-        }
-        if not note
-        else {},
+        "seconds": processor_seconds() - begin,
     }
     print(store("kr300", result, given.out))
 

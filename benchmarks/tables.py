@@ -61,8 +61,8 @@ def write_emps(result: Mapping[str, Any]) -> str:
         said = f"DATA_EMPS_PULSES alone: {verdict['verdict'].replace('_', ' ')}; {named}. "
     return (
         f"{write_rows(head, rows)}\n\nPublished, open loop, mm: {published}; force 5.98 %; closed"
-        f" loop, position 0.0080 %, force 8.94 %.\n\n{said}From force to acceleration, the mean over the"
-        f" pulses, without a model:\n\n{seen}"
+        f" loop, position 0.0080 %, force 8.94 %.\n\n{said}From force to acceleration, the mean"
+        f" over the pulses, without a model:\n\n{seen}"
     )
 
 
