@@ -4,9 +4,9 @@
 
 FOLDER/kuka_kr300_60s has the recordings (Weigand et al. 2022, CC BY-SA 4.0), FOLDER/kuka_kr300 the
 drawing of the same kind of arm (MIT). The load at the flange may differ, so that the drawn numbers
-count within 10 %. Parameters come from the training record. Of the models (bodies and friction by
-the drawing; with the counterbalance of axis 2, entered as a user would; with what `extend --auto`
-adds to that), the error on the validation record chooses one. The test record is used once.
+count within their own size. Parameters come from the training record. Of the models (bodies and
+friction; with the counterbalance of axis 2, entered as a user would; with what `extend --auto` adds
+to that), the error on the validation record chooses one. The test record is used once.
 
 - Inverse dynamics: error of each joint's torque, per cent of it, within the band compared.
 - Simulation over 75 and 150 steps (0.3 and 0.6 s) by the recorded torques, from the filtered state
@@ -59,7 +59,7 @@ def write_records(source: Path, drawing: Path, folder: Path) -> Path:
     for name in RECORDS:
         q = found[f"y_{name}"][:, :6].astype(float) + KR300_ZERO
         trials[name] = np.arange(len(q)) / RATE, q, found[f"u_{name}"].astype(float)
-    device = kr300_device(drawing, uncertainty=0.1)
+    device = kr300_device(drawing, uncertainty=1.0)
     write_session(folder, KR300_AXES, RATE, trials, device, held_out=RECORDS[1:])
     return folder
 
