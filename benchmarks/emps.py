@@ -75,7 +75,8 @@ def write_session(source: Path, folder: Path, records: Sequence[str] = tuple(FIL
     text += f'pulse = {{ column = "pulses_N", unit = "N", scale = {VOLT_N} }}\n'
     for name in records:
         content = {k: v for k, v in loadmat(source / FILES[name]).items() if k[0] != "_"}
-        savemat(folder / FILES[name], {"pulses_N": np.zeros_like(content["qm"]), **content})
+        if not (folder / FILES[name]).exists():  # the format holds the date: results stay current
+            savemat(folder / FILES[name], {"pulses_N": np.zeros_like(content["qm"]), **content})
         text += f'[[trials]]\nfile = "{FILES[name]}"\nkind = "free"\n'
         text += "hold_out = true\n" if name != records[0] else ""
     (folder / "session.toml").write_text(text, encoding="utf-8")

@@ -10,6 +10,7 @@ import argparse
 import json
 import os
 import platform
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -155,7 +156,7 @@ def rms(x: Array) -> float:
 def store(name: str, result: dict[str, Any], out: Path | None = None) -> Path:
     """Write a result with the command, the commit and the versions that made it."""
     head = {
-        "command": f"python benchmarks/{Path(sys.argv[0]).name}",
+        "command": shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *_asked()]),
         "commit": _ask_git("rev-parse", "--short", "HEAD"),
         "changed": bool(_ask_git("status", "--porcelain", "--", "bampipe")),
         "versions": {"python": platform.python_version(), **_versions(PACKAGES)},
@@ -163,6 +164,18 @@ def store(name: str, result: dict[str, Any], out: Path | None = None) -> Path:
     path = out or RESULTS / f"{name}.json"
     path.write_text(json.dumps({**head, "result": result}, indent=1) + "\n", encoding="utf-8")
     return path
+
+
+def _asked() -> list[str]:
+    """The arguments given, but for the places of files."""
+    kept: list[str] = []
+    given = iter(sys.argv[1:])
+    for one in given:
+        if one in ("--data", "--work", "--out", "--cases"):
+            next(given, None)
+        else:
+            kept.append(one)
+    return kept
 
 
 def _ask_git(*arguments: str) -> str:

@@ -140,6 +140,6 @@ def write_rivals(result: Mapping[str, Any]) -> str:
         for what, errors in x.get("held_out_percent", {}).items():
             reached += f" TX40, {what}: {' '.join(f'{e:.1f}' for e in errors)} %;"
         known = x.get("parameters", {})
-        values = ", ".join(f"{n} {number(v, 4)}" for n, v in known.items())
+        values = ", ".join(f"{n} {number(v, 4)}" for n, v in known.items()).replace("|", "\\|")
         rows.append([name, reached.strip(" ;"), values, f"{x['seconds']:.0f}", x["scope"]])
     return write_rows(["program", "error", "parameters", "CPU, s", "in its makers' words"], rows)
