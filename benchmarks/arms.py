@@ -17,7 +17,7 @@ import tomllib
 from pathlib import Path
 
 from independent import arm
-from robots import bampipe
+from measured import bampipe
 
 CASES: dict[str, tuple[int, str, str, dict[str, float]]] = {
     "nothing": (211, "ZYYX", "joint_states", {}),
@@ -86,9 +86,9 @@ def main() -> None:
             bampipe("init", str(folder))
             names = list(arm.NAMES[: len(kinds)])
             paired = "right" if is_paired(folder, names, turned) else "wrong"
-            to_run = bampipe("run", str(folder), *runs)
+            to_run, _ = bampipe("run", str(folder), *runs)
             run = given.out / "runs" / folder.name
-            to_diagnose = bampipe("diagnose", str(run), *runs)
+            to_diagnose, _ = bampipe("diagnose", str(run), *runs)
             found = json.loads((run / "models/base/diagnose.json").read_text())
             worst = {
                 axis: (entry["rmse_before"] / entry["noise_floor"],

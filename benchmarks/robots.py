@@ -1,27 +1,17 @@
-"""Measured arms: how far a drawing goes, what it lacks, and whether that is named unaided.
+"""Sessions of measured arms, for `measured_sets.py`, `kr300.py` and `beside_figaroh.py`.
 
-Four recordings that others published; FOLDER holds one folder of files for each:
+Four recordings that others published, each a folder of files:
 
 - staubli_tx40 (thanhndv212/figaroh-examples, Apache-2.0): pos_read_data.csv, curr_data.csv, a URDF;
 - kuka_kr300 (JonasWeigand/Robot_Identification, MIT): A.mat, B.mat, C.mat, robot.toml;
 - dfki_double_pendulum (dfki-ric-underactuated-lab/double_pendulum, BSD-3): *.csv;
 - tiago (thanhndv212/figaroh-examples, Apache-2.0): tiago_*.csv, a URDF.
-
-    python benchmarks/robots.py FOLDER [--arm NAME ...] [--diagnose] [--out DIR]
-
-Prints the held-out error of each joint, per cent of its torque, and what the diagnosis names.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import subprocess
-import sys
-import tempfile
-import time
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -93,13 +83,17 @@ def staubli_tx40(source: Path, folder: Path) -> None:
     write_session(folder, joints, 5000.0, {"log": trial}, device)
 
 
-def kuka_kr300(source: Path, folder: Path) -> None:
-    """Six axes at 250 Hz: A to identify, B and C to judge; bodies by their drawing."""
-    drawn = tomllib.loads((source / "robot.toml").read_text())
-    lines = ['name = "kr300"', "[robot]", "gravity = [0.0, 0.0, 9.81]", "uncertainty = 0.02"]
-    joints = [f"axis_{k}" for k in range(1, 7)]
-    zero = np.array([0.0, -90.0, 90.0, 0.0, 0.0, 0.0])
-    for joint, link in zip(joints, drawn["links"], strict=True):
+KR300_AXES = [f"axis_{k}" for k in range(1, 7)]
+KR300_ZERO = np.deg2rad([0.0, -90.0, 90.0, 0.0, 0.0, 0.0])
+"""Of the drawing, which stands upright where the encoders count from; its base is upside down."""
+
+
+def kr300_device(drawing: Path, uncertainty: float = 0.02) -> str:
+    """Text of the device file: bodies, gears and motors by their drawing."""
+    drawn = tomllib.loads(drawing.read_text())
+    lines = ['name = "kr300"', "[robot]", "gravity = [0.0, 0.0, 9.81]"]
+    lines += [f"uncertainty = {uncertainty}"]
+    for joint, link in zip(KR300_AXES, drawn["links"], strict=True):
         xx, yy, zz, xy, yz, xz = (float(v) for v in link["inertia"])
         lines += [
             f"[robot.dh.{joint}]", f"d = {link['d']}", f"a = {link['a']}",
@@ -108,21 +102,25 @@ def kuka_kr300(source: Path, folder: Path) -> None:
             f"mass = {link['mass']}", f"center = {link['com']}",
             f"inertia = {[xx, xy, xz, yy, yz, zz]}",
         ]  # fmt: skip
-    for joint, link in zip(joints, drawn["links"], strict=True):
+    for joint, link in zip(KR300_AXES, drawn["links"], strict=True):
         lines += [
             f"[robot.motors.{joint}]", f"turns = {{ {joint} = {link['gear']} }}",
             f"rotor_inertia = {link['motor_inertia']}",
         ]  # fmt: skip
-    trials = {}
+    return "\n".join(lines) + "\n"
+
+
+def kuka_kr300(source: Path, folder: Path) -> None:
+    """Six axes at 250 Hz: A to identify, B and C to judge; bodies by their drawing."""
+    trials, joints = {}, KR300_AXES
     for name in "ABC":
         record = loadmat(source / f"{name}.mat", struct_as_record=False, squeeze_me=True)["rec"]
-        # The drawing stands upright where the encoders count from; its base is upside down.
-        q = np.deg2rad(record.act_pos_mot_deg.T + zero)
+        q = np.deg2rad(record.act_pos_mot_deg.T) + KR300_ZERO
         t = np.asarray(record.time_cont, dtype=float)
-        second = np.deg2rad(record.act_pos_se_deg.T[:, :3] + zero[:3])
+        second = np.deg2rad(record.act_pos_se_deg.T[:, :3]) + KR300_ZERO[:3]
         trials[name] = t - t[0], q, np.hstack([record.act_torque_abs_nm.T, second])
     inputs = [*(f"torque_{joint}" for joint in joints), *(f"second_{j}" for j in joints[:3])]
-    device = "\n".join(lines) + "\n"
+    device = kr300_device(source / "robot.toml")
     write_session(folder, joints, 250.0, trials, device, held_out="BC", inputs=inputs)
 
 
@@ -162,55 +160,3 @@ def tiago(source: Path, folder: Path) -> None:
     )
     trial = t - t[0], q, current * turns * constant
     write_session(folder, joints, 100.0, {"log": trial}, device, {"torso_lift_joint": "m"})
-
-
-ARMS: dict[str, Callable[[Path, Path], None]] = {
-    arm.__name__: arm for arm in (staubli_tx40, kuka_kr300, dfki_double_pendulum, tiago)
-}
-
-
-def bampipe(*arguments: str) -> float:
-    """Run a command; its seconds."""
-    start = time.monotonic()
-    command = [sys.executable, "-m", "bampipe", *arguments, "--quiet"]
-    if subprocess.run(command, stdout=subprocess.DEVNULL).returncode > 1:  # 1: a gate failed
-        raise SystemExit(f"failed: {' '.join(command)}")
-    return time.monotonic() - start
-
-
-def errors(run: Path, model: str) -> str:
-    content = json.loads((run / f"models/{model}/validate.json").read_text())
-    return " ".join(
-        f"{axis} {entry['held_out_relative_error_percent']:.1f}"
-        for axis, entry in content["axes"].items()
-    )
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("source", type=Path)
-    parser.add_argument("--arm", action="append", choices=ARMS)
-    parser.add_argument("--diagnose", action="store_true")
-    parser.add_argument("--out", type=Path, default=Path(tempfile.mkdtemp()))
-    given = parser.parse_args()
-    for name in given.arm or ARMS:
-        folder = given.out / name
-        folder.mkdir(parents=True, exist_ok=True)
-        ARMS[name](given.source / name, folder)
-        runs = given.out / "runs"
-        common = ["--runs", str(runs)]
-        band = ["--set", f"filter.band_hz={BAND_HZ[name]}"]
-        seconds = bampipe("run", str(folder), *common, *band, "--until", "validate")
-        print(f"{name}: {errors(runs / name, 'base')} % ({seconds:.0f} s)", flush=True)
-        gears = json.loads((runs / name / "stiffness/stiffness.json").read_text())["headline"]
-        if "gear of" in gears:
-            print(f"  {gears}", flush=True)
-        if given.diagnose:
-            seconds = bampipe("diagnose", str(runs / name), *common)
-            found = json.loads((runs / name / "models/base/diagnose.json").read_text())
-            verdicts = {axis: entry["verdict"] for axis, entry in found["axes"].items()}
-            print(f"  {found['selected']} {verdicts} ({seconds:.0f} s)", flush=True)
-
-
-if __name__ == "__main__":
-    main()

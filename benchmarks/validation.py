@@ -3,8 +3,9 @@
     python benchmarks/validation.py            # write them into the pages
     python benchmarks/validation.py --check    # fail where a page has other ones
 
-`benchmarks/results/` has one file a benchmark, and in `measured.json` the commit and the command
-of each. The page of the benchmark of missing effects is filled as well.
+`benchmarks/results/` has one file a benchmark: a line of JSON a session, and in `measured.json` the
+commit and the command of each; or one object that holds its commit, command and versions. The page
+of the benchmark of missing effects is filled as well.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import mistakes
 import speed
+import tables
 from missing_effects.score import write_results, write_summary
 from pydantic import TypeAdapter
 from scores import read_scores, write_tables
@@ -60,19 +63,37 @@ def write_speed(path: Path) -> str:
     return speed.write_table(json.loads(path.read_text(encoding="utf-8")))
 
 
+def _stored(write: Callable[[Any], str]) -> Callable[[Path], str]:
+    """What makes a table from the file of a result that holds its own command."""
+    return lambda path: write(json.loads(path.read_text(encoding="utf-8"))["result"])
+
+
 TABLES: dict[str, tuple[str, str, Callable[[Path], str]]] = {
     "calibration": ("calibration", "calibration.jsonl", write_calibration),
     "mistakes": ("mistakes", "mistakes.jsonl", write_mistakes),
     "missing_effects": ("missing_effects", "missing_effects", write_summary),
     "entries": ("missing_effects", "missing_effects", write_results),
     "speed": ("speed", "speed.json", write_speed),
+    "emps": ("emps", "emps.json", _stored(tables.write_emps)),
+    "kr300": ("kr300", "kr300.json", _stored(tables.write_kr300)),
+    "measured_sets": ("measured_sets", "measured_sets.json", _stored(tables.write_measured_sets)),
+    "rivals": ("rivals", "rivals.json", _stored(tables.write_rivals)),
 }
 """By the name of a block: result in `measured.json`, what is stored, and what writes it."""
 
 
 def read_measured() -> dict[str, dict[str, str]]:
     """Command and commit of each stored result."""
-    return dict(json.loads((RESULTS / "measured.json").read_text(encoding="utf-8")))
+    found = dict(json.loads((RESULTS / "measured.json").read_text(encoding="utf-8")))
+    for path in sorted(RESULTS.glob("*.json")):
+        held = json.loads(path.read_text(encoding="utf-8"))
+        if path.stem in TABLES and "versions" in held and path.stem not in found:
+            versions = ", ".join(f"{name} {number}" for name, number in held["versions"].items())
+            found[path.stem] = {
+                "command": held["command"],
+                "commit": f"{held['commit']}; {versions}",
+            }
+    return found
 
 
 def fill(page: str) -> str:

@@ -90,17 +90,17 @@ def free_runs(
                 )
     except InputError as error:
         return FreeRun(reason=f"{mode.replace('_', ' ')}: {error}")
-    forces = {}
+    forces, counted = {}, [r for r, j in zip(runs, judged, strict=True) if j] or runs
     if mode == CLOSED:
         for j, name in enumerate(system.model.device.forces):
-            commanded = np.concatenate([r.command[:, j] for r in runs])
-            given = np.concatenate([r.force[:, j] for r in runs])
+            commanded = np.concatenate([r.command[:, j] for r in counted])
+            given = np.concatenate([r.force[:, j] for r in counted])
             percent = _percent(commanded - given, given)
             forces[name] = CommandError(relative_error_percent=percent)
     return FreeRun(
         reason="" if mode == CLOSED else reason,
         mode=mode,
-        axes=_axes(system, [r for r, j in zip(runs, judged, strict=True) if j] or runs),
+        axes=_axes(system, counted),
         trials={r.trial_id: _axes(system, [r]) for r in runs},
         forces=forces,
     )
