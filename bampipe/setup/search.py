@@ -64,7 +64,7 @@ for a position has derivatives up to no more than some 25 Hz."""
 _SAMPLES, _SCREENED_SAMPLES = 12_000, 3_000
 _SCREENING_STEPS = 3
 _SHORTLIST = 6
-_DECADES = np.arange(-10, 11) / 2.0
+DECADES = np.arange(-10, 11) / 2.0
 _STEPS = 16
 _MOST_TRIALS = 6
 _SAME_FACTOR = 0.05
@@ -158,7 +158,7 @@ class Search:
             return best
         family = partial(scaled_by_power, self.signals, first.signals)
         start = math.log10(first.factor)
-        refined = self._refine(chosen, family, start, math.inf, float(_DECADES[1] - _DECADES[0]))
+        refined = self._refine(chosen, family, start, math.inf, float(DECADES[1] - DECADES[0]))
         found = (refined, *rest)
         far = abs(math.log(refined.factor / first.factor)) > _SAME_FACTOR
         gain = score_of(self.judge, (*chosen, *best)) - score_of(self.judge, (*chosen, *found))
@@ -288,7 +288,7 @@ class Search:
         if not self.has_few_axes:
             return
         for names in groups_of_like(self.signals):
-            yield partial(scaled_by_power, self.signals, names), _DECADES
+            yield partial(scaled_by_power, self.signals, names), DECADES
         change = combine(self.signals, chosen)
         changed = [change.of_motion(motion, self.signals) for motion in self.screened[0]]
         for place, axis in enumerate(self.signals.axes):
