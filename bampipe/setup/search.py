@@ -55,6 +55,8 @@ two deviations."""
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
 """A factor, an angle (rad) and a share of an axis' travel below which what is off is no mistake of
 set-up but an effect to be diagnosed."""
+_VARIED = 0.2
+"""Standard deviation of a drive over its root mean square, the least."""
 MOST_AXES = 3
 """With more, only signs, the clock and units of all axes or inputs at once are tried: what may be
 exchanged, shifted or scaled grows faster than what a fit of a robot's bodies leaves time for."""
@@ -332,7 +334,15 @@ def _shifted_by(signals: Signals, axis: str, offset: float) -> Correction:
 
 
 def _is_gross(correction: Correction, motions: Sequence[Motion], signals: Signals) -> bool:
-    """Whether a scale or zero is off by more than what an effect would explain."""
+    """Whether a scale or zero is off by more than what an effect would explain.
+
+    And whether an exchange leaves a drive that varies: an offset explains any that does not.
+    """
+    others = [name for name in correction.signals if name not in signals.axes]
+    if correction.kind == "exchange" and 0 < len(others) < len(correction.signals):
+        changed = [correction.change.of_motion(motion, signals) for motion in motions]
+        drives = (np.concatenate([m.channels[name] for m in changed]) for name in others)
+        return all(np.std(drive) > _VARIED * np.sqrt(np.mean(drive**2)) for drive in drives)
     if correction.kind == "scale":
         return abs(math.log(correction.factor)) > math.log(LEAST_FACTOR)
     if correction.kind != "zero":

@@ -55,6 +55,30 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [f"{name}[{k}]" for k in range(min(sides))] if min(sides) <= LARGEST_WIDTH else []
 
 
+def join_runs(
+    arrays: Mapping[str, np.ndarray],
+) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, ...]]]:
+    """Vectors of one name in all structs of a list, end to end: ``runs[:].q`` of ``runs[0].q``.
+
+    Returns:
+        All arrays, and by the name of each that was joined the samples before which one begins.
+    """
+    runs: dict[str, dict[int, str]] = {}
+    for label in arrays:
+        match = re.fullmatch(r"(.+?)\[(\d+)\]\.([^\[\]]+)", label)
+        if match and len(labels("", arrays[label].shape)) == 1 < arrays[label].size:
+            runs.setdefault(f"{match[1]}[:].{match[3]}", {})[int(match[2])] = label
+    whole = {name: own for name, own in runs.items() if list(own) == list(range(len(own))) != [0]}
+    members = {label for own in whole.values() for label in own.values()}
+    found = {label: array for label, array in arrays.items() if label not in members}
+    begun = {}
+    for name, own in whole.items():
+        found[name] = np.concatenate([arrays[label].ravel() for label in own.values()])
+        ends = np.cumsum([arrays[label].size for label in own.values()])
+        begun[name] = tuple(int(end) for end in ends[:-1])
+    return found, begun
+
+
 def recorded(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
     """Labels of the variables that were recorded together, and of numbers that stand alone.
 

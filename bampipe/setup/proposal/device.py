@@ -236,12 +236,13 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     driver, role = match.driver(position)
     supply = match.supply(driver) if role == "duty" else None
     coil = role == "force" and _has_coil(driver, match, notes)
-    position = position if linear else _at_joint(position, driver, match)
+    read, position = position, position if linear else _at_joint(position, driver, match)
     fit = _rough_fit(position, driver, role, linear, match.t)
     drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
     weight, on_gravity = weight_of(position, fit, linear, found)
     starter = starter_device(position.name, linear, drive, fit, weight, width)
+    match.given = {starter.axis: read}
     kind = "linear" if linear else "rotary"
     doubt = "" if position.conversion is not None else _MAY_SLIDE
     if doubt and linear:
