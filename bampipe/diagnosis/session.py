@@ -312,12 +312,14 @@ class Fit:
             kept, u = e.band.thinned_rows(len(motion.t)), motion.inputs(system.inputs)
             moved = motion.of_mechanism(system, u, e.p)
             z = system.memory(*moved.kinematics, u, e.p, motion.t)
-            at, u = (*(x[kept] for x in moved.kinematics), z[kept]), u[kept]
-            here, square = system.residual(*at, u, e.p), 0.0
+            z, u = z[kept], u[kept]
+            at = (moved.q[kept], moved.qd[kept], moved.qdd[kept])
+            here = system.residual(*at, z, u, e.p)
+            square = np.zeros_like(here)
             for column in map(system.inputs.index, system.model.device.forces):
                 more, step = u.copy(), 1e-6 * max(float(np.abs(u[:, column]).max()), 1e-6)
                 more[:, column] += step
-                square = square + ((system.residual(*at, more, e.p) - here) / step) ** 2
+                square += ((system.residual(*at, z, more, e.p) - here) / step) ** 2
             rows.append(0.5 * np.log(np.maximum(square, 1e-300)))
         taken = [take_samples(rows, here, a) for a, here in enumerate(self.likelihood.samples)]
         return np.array([float(each.mean()) if each.size else 0.0 for each in taken])

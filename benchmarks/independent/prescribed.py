@@ -48,7 +48,7 @@ def _waves(
     rng: np.random.Generator, t: np.ndarray, pace: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Position, velocity and acceleration of a sum of sines, rad."""
-    rate = 2.0 * np.pi * rng.uniform(0.08, 1.0, 5)
+    rate = pace * 2.0 * np.pi * rng.uniform(0.08, 1.0, 5)
     size = pace * rng.uniform(0.3, 1.0, 5) / rate
     angle = rate * t[:, None] + rng.uniform(0.0, 2.0 * np.pi, 5)
     parts = (size * np.sin(angle), size * rate * np.cos(angle), -size * rate**2 * np.sin(angle))
