@@ -10,6 +10,7 @@ import numpy as np
 from bampipe.errors import InputError
 
 LARGEST_WIDTH = 64
+_TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
 
 
 def split_index(column: str, names: Container[str]) -> tuple[str, int | None]:
@@ -60,6 +61,8 @@ def join_runs(
 ) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, ...]]]:
     """Vectors of one name in all structs of a list, end to end: ``runs[:].q`` of ``runs[0].q``.
 
+    Of structs that each have a time, or are as long as no other; others are rather joints.
+
     Returns:
         All arrays, and by the name of each that was joined the samples before which one begins.
     """
@@ -69,6 +72,9 @@ def join_runs(
         if match and len(labels("", arrays[label].shape)) == 1 < arrays[label].size:
             runs.setdefault(f"{match[1]}[:].{match[3]}", {})[int(match[2])] = label
     whole = {name: own for name, own in runs.items() if list(own) == list(range(len(own))) != [0]}
+    timed = {name.partition("[")[0] for name in whole if _TIMES.search(name)}
+    sizes = {name: {arrays[label].size for label in own.values()} for name, own in whole.items()}
+    whole = {n: x for n, x in whole.items() if n.partition("[")[0] in timed or len(sizes[n]) > 1}
     members = {label for own in whole.values() for label in own.values()}
     found = {label: array for label, array in arrays.items() if label not in members}
     begun = {}
