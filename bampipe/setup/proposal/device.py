@@ -243,6 +243,11 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     weight, on_gravity = weight_of(position, fit, linear, found)
     starter = starter_device(position.name, linear, drive, fit, weight, width)
     match.given = {starter.axis: read}
+    if match.turning and role == "force" and driver is not None and "motor" in words(driver.name):
+        notes.check.append(
+            f"{driver.name} is the torque of a motor, by its name: for that of the joint put the"
+            ' gear before the unit, as in unit = "70mN.m"'
+        )
     kind = "linear" if linear else "rotary"
     doubt = "" if position.conversion is not None else _MAY_SLIDE
     if doubt and linear:
