@@ -37,7 +37,9 @@ def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
     except ElementTree.ParseError as error:
         line = error.position[0]
         raise InputError(
-            f"not XML: {str(error).partition(':')[0]}", where=f"{where}, line {line}"
+            f"not XML: {str(error).partition(':')[0]}",
+            where=f"{where}, line {line}",
+            remedy="mend it, or take it out of the folder",
         ) from error
     if to_write:
         _keep_prefixes(text)

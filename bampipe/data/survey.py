@@ -126,11 +126,6 @@ class Survey:
     remarks: tuple[str, ...]
     passed: tuple[tuple[str, str], ...]
 
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Paths relative to the folder, the first of each recording."""
-        return tuple(dict.fromkeys(trial.file for trial in self.trials))
-
     def of(self, *roles: str) -> list[SurveyedColumn]:
         """The columns with one of these roles."""
         return [column for column in self.columns if column.role in roles]

@@ -99,15 +99,13 @@ def _describe_travel(system: System, session: IngestResult, motions: Sequence[Mo
 def _axis(
     place: int, axis: str, held: Plausibility | None, mistakes: Sequence[SetupMistake]
 ) -> AxisSetup:
-    if held is None:
-        return AxisSetup(state="mistaken" if mistakes else "sound", error_percent=None,
-                         moving_share=1.0)  # fmt: skip
-    still = held.moving[place] < LEAST_MOVING
-    spoilt = any(axis in mistake.axes for mistake in mistakes)
+    moving = held.moving[place] if held is not None else 1.0
+    still = moving < LEAST_MOVING
+    spoilt = any(axis in mistake.axes or held is None for mistake in mistakes)
     return AxisSetup(
         state="mistaken" if spoilt else "hardly_moves" if still else "sound",
-        error_percent=None if still else 100.0 * held.error[place],
-        moving_share=held.moving[place],
+        error_percent=None if held is None or still else 100.0 * held.error[place],
+        moving_share=moving,
     )
 
 

@@ -305,18 +305,15 @@ class Search:
 
 def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:
     """The middle of each trial, so that all have ``most`` samples together at most."""
-    return [_middle(motion, most // max(len(motions), 1)) for motion in motions]
+    each = most // max(len(motions), 1)
+    starts = [max((motion.t.size - each) // 2, 0) for motion in motions]
+    return [m.rows(slice(at, at + each)) for m, at in zip(motions, starts, strict=True)]
 
 
 def spread(count: int) -> list[int]:
     """Numbers of some trials of ``count``, spread over the session."""
     chosen = np.linspace(0, max(count - 1, 0), min(count, _MOST_TRIALS))
     return [int(number) for number in np.unique(chosen.round())]
-
-
-def _middle(motion: Motion, most: int) -> Motion:
-    first = max((motion.t.size - most) // 2, 0)
-    return motion.rows(slice(first, first + most))
 
 
 def scaled_by_power(signals: Signals, names: tuple[str, ...], power: float) -> Correction:

@@ -71,17 +71,16 @@ def join_runs(
         match = re.fullmatch(r"(.+?)\[(\d+)\]\.([^\[\]]+)", label)
         if match and len(labels("", arrays[label].shape)) == 1 < arrays[label].size:
             runs.setdefault(f"{match[1]}[:].{match[3]}", {})[int(match[2])] = label
-    whole = {name: own for name, own in runs.items() if list(own) == list(range(len(own))) != [0]}
-    timed = {name.partition("[")[0] for name in whole if _TIMES.search(name)}
-    sizes = {name: {arrays[label].size for label in own.values()} for name, own in whole.items()}
-    whole = {n: x for n, x in whole.items() if n.partition("[")[0] in timed or len(sizes[n]) > 1}
-    members = {label for own in whole.values() for label in own.values()}
-    found = {label: array for label, array in arrays.items() if label not in members}
-    begun = {}
-    for name, own in whole.items():
-        found[name] = np.concatenate([arrays[label].ravel() for label in own.values()])
-        ends = np.cumsum([arrays[label].size for label in own.values()])
-        begun[name] = tuple(int(end) for end in ends[:-1])
+    timed = {name.partition("[")[0] for name in runs if _TIMES.search(name)}
+    found, begun = dict(arrays), {}
+    for name, own in runs.items():
+        parts = [arrays[label].ravel() for label in own.values()]
+        alike = len({part.size for part in parts}) == 1 and name.partition("[")[0] not in timed
+        if alike or len(own) < 2 or list(own) != list(range(len(own))):
+            continue
+        found = {label: array for label, array in found.items() if label not in own.values()}
+        found[name] = np.concatenate(parts)
+        begun[name] = tuple(map(int, np.cumsum([part.size for part in parts[:-1]])))
     return found, begun
 
 

@@ -25,11 +25,6 @@ _DEEPEST = 8
 _MOST_FIELDS = 4096
 
 
-def is_hdf5(head: bytes) -> bool:
-    """Whether a file that begins with ``head`` is HDF5, with or without MATLAB's user block."""
-    return hdf5.SIGNATURE in (head[:8], head[512:520])
-
-
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     """The wanted variables; ``X[0]`` is the first column of ``X``, ``S.q`` a field of ``S``.
 
@@ -87,7 +82,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
 def _is_level_5(path: Path, name: str) -> bool:
     with path.open("rb") as stream:
         head = stream.read(1024)
-    if is_hdf5(head):
+    if hdf5.SIGNATURE in (head[:8], head[512:520]):  # the latter behind MATLAB's user block
         return False
     if len(head) >= _HEADER and head[126:128] in (b"IM", b"MI"):
         return True
