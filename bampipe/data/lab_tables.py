@@ -21,93 +21,47 @@ from bampipe.errors import InputError
 
 Row = Mapping[str, object]
 
-_SESSION = {"session_id": pa.string(), "recorded_at": pa.timestamp("us", tz="UTC")}
-_TEXT, _NUMBER, _COUNT, _FLAG = pa.string(), pa.float64(), pa.int64(), pa.bool_()
-_LIST = pa.list_(pa.string())
+_KINDS = {
+    "text": pa.string(), "number": pa.float64(), "count": pa.int64(), "flag": pa.bool_(),
+    "texts": pa.list_(pa.string()), "numbers": pa.list_(pa.float64()),
+    "moment": pa.timestamp("us", tz="UTC"),
+}  # fmt: skip
+
+
+def _table(*columns: str) -> dict[str, pa.DataType]:
+    """Columns given as ``name:kind``, behind those that every table has; numbers where no kind."""
+    pairs = [c.partition(":") for c in ("session_id:text", "recorded_at:moment", *columns)]
+    return {name: _KINDS[kind or "number"] for name, _, kind in pairs}
+
 
 TABLES: dict[str, dict[str, pa.DataType]] = {
-    "sessions": {
-        **_SESSION,
-        "sample_rate_hz": _NUMBER,
-        "trials": _COUNT,
-        "trials_repaired": _COUNT,
-        "trials_set_aside": _COUNT,
-        "models": _LIST,
-        "counting_model": _TEXT,
-        "effects": _LIST,
-        "gates_failed": _COUNT,
-        "gates_warned": _COUNT,
-        "failures": _LIST,
-        "bampipe": _TEXT,
-    },
-    "parameters": {
-        **_SESSION,
-        "model": _TEXT,
-        "parameter": _TEXT,
-        "axis": _TEXT,
-        "estimate": _NUMBER,
-        "sd": _NUMBER,
-        "lower": _NUMBER,
-        "upper": _NUMBER,
-        "unit": _TEXT,
-        "at_bound": _FLAG,
-        "method": _TEXT,
-    },
-    "stiffness": {
-        **_SESSION,
-        "axis": _TEXT,
-        "stiffness": _NUMBER,
-        "sd": _NUMBER,
-        "lower": _NUMBER,
-        "upper": _NUMBER,
-        "unit": _TEXT,
-        "bandwidth_hz": _NUMBER,
-        "n_cycles": _COUNT,
-    },
-    "errors": {
-        **_SESSION,
-        "model": _TEXT,
-        "axis": _TEXT,
-        "rmse": _NUMBER,
-        "rmse_without_friction": _NUMBER,
-        "held_out_rmse": _NUMBER,
-        "noise_floor": _NUMBER,
-        "error_over_floor": _NUMBER,
-        "standing": _TEXT,
-        "fit_percent": _NUMBER,
-        "unit": _TEXT,
-    },
-    "verdicts": {
-        **_SESSION,
-        "model": _TEXT,
-        "axis": _TEXT,
-        "verdict": _TEXT,
-        "effects": _LIST,
-        "named": _TEXT,
-        "likely": _LIST,
-        "probabilities": pa.list_(_NUMBER),
-        "unknown": _NUMBER,
-        "explained": _NUMBER,
-        "explainable_share": _NUMBER,
-        "rmse_before": _NUMBER,
-        "rmse_after": _NUMBER,
-        "noise_floor": _NUMBER,
-        "unit": _TEXT,
-        "sentence": _TEXT,
-    },
-    "quality": {
-        **_SESSION,
-        "trial_id": _TEXT,
-        "kind": _TEXT,
-        "status": _TEXT,
-        "reason": _TEXT,
-        "repairs": _TEXT,
-        "n_samples": _COUNT,
-        "duration_s": _NUMBER,
-        "sample_rate_hz": _NUMBER,
-        "nis": _NUMBER,
-    },
-}
+    "sessions": _table(
+        "sample_rate_hz", "trials:count", "trials_repaired:count", "trials_set_aside:count",
+        "models:texts", "counting_model:text", "effects:texts", "gates_failed:count",
+        "gates_warned:count", "failures:texts", "bampipe:text",
+    ),
+    "parameters": _table(
+        "model:text", "parameter:text", "axis:text", "estimate", "sd", "lower", "upper",
+        "unit:text", "at_bound:flag", "method:text",
+    ),
+    "stiffness": _table(
+        "axis:text", "stiffness", "sd", "lower", "upper", "unit:text", "bandwidth_hz",
+        "n_cycles:count",
+    ),
+    "errors": _table(
+        "model:text", "axis:text", "rmse", "rmse_without_friction", "held_out_rmse", "noise_floor",
+        "error_over_floor", "standing:text", "fit_percent", "unit:text",
+    ),
+    "verdicts": _table(
+        "model:text", "axis:text", "verdict:text", "effects:texts", "named:text", "likely:texts",
+        "probabilities:numbers", "unknown", "explained", "explainable_share", "rmse_before",
+        "rmse_after", "noise_floor", "unit:text", "sentence:text",
+    ),
+    "quality": _table(
+        "trial_id:text", "kind:text", "status:text", "reason:text", "repairs:text",
+        "n_samples:count", "duration_s", "sample_rate_hz", "nis",
+    ),
+}  # fmt: skip
 """Columns of each table; ``device`` stands in the path."""
 
 

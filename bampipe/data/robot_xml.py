@@ -13,6 +13,7 @@ from bampipe.errors import InputError
 from bampipe.files import read_bytes
 
 LARGEST_BYTES = 20_000_000
+_MEND = "mend it, or take it out of the folder"
 DEEPEST = 200
 """Most elements inside one another, and most links one behind another."""
 
@@ -37,7 +38,9 @@ def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
     except ElementTree.ParseError as error:
         line = error.position[0]
         raise InputError(
-            f"not XML: {str(error).partition(':')[0]}", where=f"{where}, line {line}"
+            f"not XML: {str(error).partition(':')[0]}",
+            where=f"{where}, line {line}",
+            remedy=_MEND,
         ) from error
     if to_write:
         _keep_prefixes(text)
@@ -45,7 +48,8 @@ def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
     while level := [inner for element in level for inner in element]:
         depth += 1
         if depth > DEEPEST:
-            raise InputError(f"elements are nested more than {DEEPEST} deep", where=where)
+            what = f"elements are nested more than {DEEPEST} deep"
+            raise InputError(what, where=where, remedy=_MEND)
     return root
 
 

@@ -54,11 +54,9 @@ _BY_UNIT = {
     "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
     "m/s": "velocity", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
 }  # fmt: skip
-_BY_SUFFIX = {
-    "rad": "position", "deg": "position", "mm": "position", "rpm": "velocity", "Nm": "force",
-    "kN": "force", "mA": "current", "mV": "voltage",
-}  # fmt: skip
-"""By a unit at the end of a name that says nothing else."""
+_SHORT_UNITS = frozenset(["mm", "Nm", "kN", "mA", "mV"])
+_PLAIN_WORDS = frozenset(["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano"])
+"""Units of two letters at the end of a name that are no words, and longer ones that are."""
 _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
 _PRESENT = frozenset(["current", "curr", "cur"])
 _LONGEST_WORD = 2
@@ -127,11 +125,6 @@ class Survey:
     columns: tuple[SurveyedColumn, ...]
     remarks: tuple[str, ...]
     passed: tuple[tuple[str, str], ...]
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Paths relative to the folder, the first of each recording."""
-        return tuple(dict.fromkeys(trial.file for trial in self.trials))
 
     def of(self, *roles: str) -> list[SurveyedColumn]:
         """The columns with one of these roles."""
@@ -335,7 +328,7 @@ class _Logs:
         raw = read_recording(self.folder, trial, ordered, clock, self.dialect)
         sound = _complete_rows(raw.columns, clock.column)
         self.first = trial.file
-        if not trial.parts and not trial.file.lower().endswith(TEXTS):
+        if not (trial.parts or trial.recording or trial.file.lower().endswith(TEXTS)):
             self.remarks += raw.remarks
         found = []
         for column in ordered:
@@ -357,16 +350,17 @@ class _Logs:
                 )
 
     def recordings(self, trial: TrialEntry) -> list[TrialEntry]:
-        """The recordings that one text file holds; others are taken as they are.
+        """The recordings that one text file or list of structs holds; others as they are.
 
         Raises:
             InputError: it cannot be read.
         """
         path = self.folder / trial.file
         self.scanned += path.stat().st_size
-        if trial.parts or path.suffix.lower() not in TEXTS or self.scanned > _MOST_SCANNED:
-            return [trial]
         columns = self.found[trial.file]
+        several = path.suffix.lower() in TEXTS or any("[:]." in column for column in columns)
+        if trial.parts or not several or self.scanned > _MOST_SCANNED:
+            return [trial]
         times = [c for c, u in columns.items() if _role(c, u) == "time" and u != "datetime"]
         column = (times or [_first(columns)])[0]
         raw = self._read_one(trial.file, columns, column)
@@ -520,7 +514,15 @@ def _role(name: str, stated: str) -> str:
     if len(roles) > 1 and max(map(len, said)) == 1:
         return ""  # x_F: letters that stand for several quantities
     named = next(iter(roles), "")
-    return named or _BY_SUFFIX.get(re.split(r"[_\W]+", name)[-1], "")
+    return named or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
+
+
+def _role_by_suffix(suffix: str) -> str:
+    """The role by a unit at the end of a name that says nothing else."""
+    long = len(suffix) > _LONGEST_WORD and suffix.lower() not in _PLAIN_WORDS
+    known = unit(suffix) if long or suffix in _SHORT_UNITS else None
+    role = _BY_UNIT.get(known.si, "") if known is not None else ""
+    return role if role != "time" else ""
 
 
 def _unit(name: str, stated: str, role: str) -> str:

@@ -71,8 +71,12 @@ def spelled(text: str, among: Sequence[str]) -> str:
     known = unit(text)
     if text in among or known is None:
         return text if text in among else ""
-    bare = text.strip().strip("[]()").strip()
-    return next((other for other in among if unit(other) == known), bare)
+    return next((other for other in among if unit(other) == known), bare(text))
+
+
+def bare(text: str) -> str:
+    """A unit without the brackets in which some files have it."""
+    return text.strip().strip("[]()").strip()
 
 
 def unit(text: str) -> RecordedUnit | None:
@@ -83,7 +87,7 @@ def unit(text: str) -> RecordedUnit | None:
     prefix, ``13.5mA`` is a reading in steps of 13.5 mA. ``nm`` is a nanometre, not a torque; a
     mass times a length is a torque.
     """
-    plain = text.strip().strip("[]()").strip().replace("µ", "u").replace("μ", "u")
+    plain = bare(text).replace("µ", "u").replace("μ", "u")
     plain = plain.replace("²", "2").replace("³", "3").replace("⁻", "-").replace("¹", "1")
     plain = _WHOLE.get(plain.lower().replace("-", "").replace(".", "") or plain, plain)
     plain = re.sub(

@@ -165,7 +165,8 @@ def _by_direction(evidence: Evidence, axis: int, variable: Variable, alike: floa
             means.append((up.mean(), down.mean()))
     if len(means) < 4:
         return "seen in one direction of motion only"
-    likeness = float(np.corrcoef(np.array(means).T)[0, 1])
+    varied = np.ptp(np.array(means), axis=0).all()
+    likeness = float(np.corrcoef(np.array(means).T)[0, 1]) if varied else 0.0
     if likeness > alike:
         return "the same in both directions of motion, as of a spring"
     if likeness < -alike:

@@ -424,6 +424,12 @@ class Search:
             if not out.any():
                 break
             active &= ~out
+        # Of one strength that its bounds hold, at the bound: a delay's columns of shorter ones.
+        only = np.flatnonzero(self.widths == 1)
+        square, moment = block[only, 0, 0], mom[only, 0]
+        x = np.clip(moment / np.maximum(square, 1e-300), low[only, 0], high[only, 0])
+        held = np.where(square > 1e-6 * own[only, 0], (moment - 0.5 * square * x) * x, 0.0)
+        gain[only] = np.maximum(held, 0.0)
         return gain
 
     def best_beside(
@@ -435,7 +441,7 @@ class Search:
         # Close to those of this set: most weights are found in two passes from there.
         self._weight = self.solve(keys).weight
         gains, have = self.gains(keys), {name.removeprefix("-") for name, _ in keys}
-        tried: dict[str, int] = {}
+        tried: dict[str, float] = {}
         best: dict[str, tuple[float, Key]] = {}
         for k in np.argsort(-gains):
             key = self.places[k]
@@ -448,8 +454,9 @@ class Search:
                 or (name not in tried and len(tried) >= most)
             ):
                 continue
-            tried[name] = tried.get(name, 0) + 1
             cost = self.cost((*keys, key))
+            # A shape that its bounds rule out says nothing yet of the others.
+            tried[name] = tried.get(name, 0.0) + (1.0 if np.isfinite(cost) else 0.5)
             if np.isfinite(cost) and cost < best.get(name, (np.inf,))[0]:
                 best[name] = cost, key
         return sorted(best.values())

@@ -227,7 +227,10 @@ def is_better(before: Fit, after: Fit, promised: Solution) -> bool:
             ]
             ratio = max(squares[1], 1e-300) / max(squares[0], 1e-300)
             gained -= 0.5 * before.problem.independent[axis] * float(np.log(ratio))
-    return gained + float(promised.volume.sum()) - promised.penalty > _WORTH
+    # What a fit ends at may take more off the measured quantity than its linear problem promised.
+    taken = before.problem.independent * (after.log_slope - before.log_slope)
+    volume = float(np.minimum(promised.volume, taken).sum())
+    return gained + volume - promised.penalty > _WORTH
 
 
 def _explore(search: Search, room: int, deep: int) -> Pool:

@@ -316,6 +316,29 @@ class Fit:
         return self.problem.solve()
 
     @cached_property
+    def log_slope(self) -> Array:
+        """Mean log of the slope of the residual by the measured forces, by axis, (n_q,).
+
+        Where it falls, both sides of the equation are made small.
+        """
+        e, system, rows = self.evidence, self.evidence.system, []
+        for motion in e.motions:
+            kept, u = e.band.thinned_rows(len(motion.t)), motion.inputs(system.inputs)
+            moved = motion.of_mechanism(system, u, e.p)
+            z = system.memory(*moved.kinematics, u, e.p, motion.t)
+            z, u = z[kept], u[kept]
+            at = (moved.q[kept], moved.qd[kept], moved.qdd[kept])
+            here = system.residual(*at, z, u, e.p)
+            square = np.zeros_like(here)
+            for column in map(system.inputs.index, system.model.device.forces):
+                more, step = u.copy(), 1e-6 * max(float(np.abs(u[:, column]).max()), 1e-6)
+                more[:, column] += step
+                square += ((system.residual(*at, z, more, e.p) - here) / step) ** 2
+            rows.append(0.5 * np.log(np.maximum(square, 1e-300)))
+        taken = [take_samples(rows, here, a) for a, here in enumerate(self.likelihood.samples)]
+        return np.array([float(each.mean()) if each.size else 0.0 for each in taken])
+
+    @cached_property
     def bias(self) -> tuple[Array, ...]:
         """The bias of filters and of friction that stops, as fitted, by axis, each (n,)."""
         noise, n_q = self.likelihood.noise, len(self.likelihood.samples)

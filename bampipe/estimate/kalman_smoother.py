@@ -481,6 +481,10 @@ class Fit:
     at_limit: bool
 
 
+_FINEST = 1e-8
+"""Of the travel: noise below it leaves the variances of a filter to rounding."""
+
+
 def maximum_likelihood(
     records: Sequence[tuple[Array, Flags]],
     rate_hz: float,
@@ -504,7 +508,9 @@ def maximum_likelihood(
         bandwidth_limits_hz: range of the smoother's bandwidth that is searched.
     """
     step, noise = transition(order)
-    quantum = resolution / np.sqrt(12.0)
+    # A log of a machine at rest may seem free of noise: finer than this no number here is.
+    travel = max((float(np.ptp(position)) for position, _ in records), default=0.0)
+    quantum = max(resolution / np.sqrt(12.0), _FINEST * travel) if resolution > 0.0 else 0.0
     unit = quantum if quantum > 0.0 else float(np.std(np.diff(records[0][0]))) or 1.0
     scaled = [
         ((position - position[0]) / unit, np.ascontiguousarray(present))

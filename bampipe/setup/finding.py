@@ -93,14 +93,15 @@ def conclude(
     for place, finding in enumerate(found):
         rest = without(chosen, finding.correction)
         known = {(one.kind, one.signals) for one in chosen}
-        rivals = [
-            other
-            for other in others
-            if (other.kind, other.signals) not in known and score_of(judge, (*rest, other)) < most
-        ]
-        found[place] = replace(finding, rivals=distinct(rivals))
+        rivals: dict[tuple[str, tuple[str, ...]], Correction] = {}
+        for other in others:
+            key = (other.kind, other.signals)
+            if key not in known and score_of(judge, (*rest, other)) < most:
+                rivals.setdefault(key, other)
+        found[place] = replace(finding, rivals=tuple(rivals.values()))
     found.sort(key=lambda finding: -finding.gain)
-    return tuple(found) if all(is_explained(f, f.after) for f in found) else ()
+    explained = all((f.after.error[spoilt_axes(f)] < EXPLAINED).all() for f in found)
+    return tuple(found) if explained else ()
 
 
 def without(corrections: tuple[Correction, ...], one: Correction) -> tuple[Correction, ...]:
@@ -128,11 +129,6 @@ def spoilt_axes(finding: Finding) -> list[int]:
     return fallen or list(range(len(before)))
 
 
-def is_explained(finding: Finding, last: Plausibility) -> bool:
-    """Whether the axes that a mistake spoils are explained in the end."""
-    return bool((last.error[spoilt_axes(finding)] < EXPLAINED).all())
-
-
 def gain_of(before: Plausibility, after: Plausibility, cost: float) -> float:
     """Of the score, by a correction of that cost."""
     return before.score(JUDGED_ERROR) - after.score(JUDGED_ERROR) - cost
@@ -142,11 +138,3 @@ def spoils_sound_axes(before: Plausibility, after: Plausibility) -> bool:
     """Whether a correction makes an axis much worse that was right without it."""
     sound = before.error < SUSPICIOUS_ERROR
     return bool(np.any(after.error[sound] > SPOILS * np.maximum(before.error[sound], JUDGED_ERROR)))
-
-
-def distinct(corrections: Sequence[Correction]) -> tuple[Correction, ...]:
-    """The first of each kind and signals."""
-    found: dict[tuple[str, tuple[str, ...]], Correction] = {}
-    for correction in corrections:
-        found.setdefault((correction.kind, correction.signals), correction)
-    return tuple(found.values())

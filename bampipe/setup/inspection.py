@@ -61,7 +61,7 @@ def inspect_setup(
         for axis, entry in axes.items()
         if entry.state == "hardly_moves"
     ]
-    warnings += _describe_travel(system, motions)
+    warnings += _describe_travel(system, session, motions)
     if search.heavier is not None:
         robot = drawn_robot(system)
         warnings.append(robot.describe_mass(search.heavier.place, search.heavier.factor))
@@ -82,14 +82,13 @@ def inspect_setup(
     )
 
 
-def _describe_travel(system: System, motions: Sequence[Motion]) -> list[str]:
+def _describe_travel(system: System, session: IngestResult, motions: Sequence[Motion]) -> list[str]:
     """Say which axes move farther than machines do, as in degrees that pass for radians."""
-    ends = np.array([[motion.q.min(axis=0), motion.q.max(axis=0)] for motion in motions])
-    travel = ends[:, 1].max(axis=0) - ends[:, 0].min(axis=0)
+    travel = np.max([np.ptp(motion.q, axis=0) for motion in motions], axis=0)
     found = []
     for coordinate, size in zip(system.model.device.coordinates, travel, strict=True):
         most, meant = _FARTHEST[coordinate.kind]
-        if size > most:
+        if size > most and session.axes[coordinate.name].raw_unit == coordinate.unit:
             found.append(
                 f"{coordinate.name} moves through {size:.3g} {coordinate.unit}: is its position in"
                 f" {meant}?"
@@ -100,15 +99,13 @@ def _describe_travel(system: System, motions: Sequence[Motion]) -> list[str]:
 def _axis(
     place: int, axis: str, held: Plausibility | None, mistakes: Sequence[SetupMistake]
 ) -> AxisSetup:
-    if held is None:
-        return AxisSetup(state="mistaken" if mistakes else "sound", error_percent=None,
-                         moving_share=1.0)  # fmt: skip
-    still = held.moving[place] < LEAST_MOVING
-    spoilt = any(axis in mistake.axes for mistake in mistakes)
+    moving = held.moving[place] if held is not None else 1.0
+    still = moving < LEAST_MOVING
+    spoilt = any(axis in mistake.axes or held is None for mistake in mistakes)
     return AxisSetup(
         state="mistaken" if spoilt else "hardly_moves" if still else "sound",
-        error_percent=None if still else 100.0 * held.error[place],
-        moving_share=held.moving[place],
+        error_percent=None if held is None or still else 100.0 * held.error[place],
+        moving_share=moving,
     )
 
 

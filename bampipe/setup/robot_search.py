@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
@@ -31,7 +31,15 @@ from bampipe.setup.hypotheses import (
 )
 from bampipe.setup.mounting import Mounting, find_mounting
 from bampipe.setup.plausibility import FARTHEST, WEIGHT, Plausibility
-from bampipe.setup.search import MOST_AXES, Corrections, Family, Search, gears
+from bampipe.setup.search import (
+    DECADES,
+    MOST_AXES,
+    Corrections,
+    Family,
+    Search,
+    gears,
+    scaled_by_power,
+)
 from bampipe.trials.residuals import standstill_of
 from bampipe.trials.signals import Change
 
@@ -132,6 +140,16 @@ class DrawnSearch(Search):
         )
 
     @cached_property
+    def _alone(self) -> dict[str, int]:
+        """Joints by the force that alone acts on them, and on nothing else."""
+        return {
+            self.signals.forces[f]: k
+            for k, row in enumerate(self._by_force)
+            for f in np.flatnonzero(row)
+            if np.count_nonzero(row) == np.count_nonzero(self._by_force[:, f]) == 1
+        }
+
+    @cached_property
     def _by_force(self) -> Array:
         """Joint forces by one of each force of the device, (n, forces)."""
         n, inputs = len(self.system.coordinates), len(self.system.inputs)
@@ -143,7 +161,7 @@ class DrawnSearch(Search):
         return np.asarray((found[1:] - found[0])[places].T)
 
     def screen(self, chosen: Corrections, correction: Correction) -> float:
-        # Signs and sizes of drives are free here: the shares tell them.
+        # Signs and sizes of drives of one joint are free here: the shares tell them.
         held = self._hold((*chosen, correction), self.roughly)
         return np.inf if held is None else held[0].misfit(held[1]) + 2.0 * correction.cost / WEIGHT
 
@@ -161,14 +179,16 @@ class DrawnSearch(Search):
         ]
 
     def discrete(self) -> Iterator[Correction]:
+        coupled = {force for force in self.signals.forces if force not in self._alone}
+        yield from (one for one in sign_corrections(self.signals) if coupled & set(one.signals))
         axes = set(self.signals.axes)
         for correction in (
             *exchange_corrections(self.signals),
             *unit_corrections(self.signals),
             *clock_corrections(self.signals),
         ):
-            # Of a drive in another unit, the share tells.
-            of_drive = correction.kind == "scale" and not axes.issuperset(correction.signals)
+            # Of a drive in another unit, the share tells, unless it turns several joints.
+            of_drive = correction.kind == "scale" and not (axes | coupled) & set(correction.signals)
             cycle = correction.kind == "exchange" and len(correction.signals) > 2
             if not (of_drive or (cycle and len(axes) > MOST_AXES)):
                 yield correction
@@ -178,6 +198,9 @@ class DrawnSearch(Search):
         for axis, turns, q in zip(self.signals.axes, self.stated.turning, position.T, strict=True):
             if turns:
                 yield from gears(self.signals, axis, float(np.ptp(q)))
+        for force in self.signals.forces:
+            if force not in self._alone:
+                yield partial(scaled_by_power, self.signals, (force,)), DECADES
 
     def together(self, chosen: Corrections) -> Corrections:
         # What the best mounting and the drives' shares say is mistaken besides.
@@ -206,21 +229,14 @@ class DrawnSearch(Search):
 
     def _by_share(self, drives: Sequence[Drive]) -> Iterator[Correction]:
         """Drives whose sign or size is not that of the bodies, each by itself or all alike."""
-        single = {
-            f: k
-            for k, row in enumerate(self._by_force)
-            for f in np.flatnonzero(row)
-            if np.count_nonzero(row) == np.count_nonzero(self._by_force[:, f]) == 1
-        }
-        names = {f: self.signals.forces[f] for f in single}
-        signs = [names[f] for f, k in single.items() if drives[k].is_turned]
-        if len(signs) == len(names) > 1:
+        signs = [name for name, k in self._alone.items() if drives[k].is_turned]
+        if len(signs) == len(self.signals.forces) > 1:
             yield turned(self.signals, signs, 1.0)
         else:
             yield from (turned(self.signals, [name]) for name in signs)
         sizes = {
-            names[f]: float(np.log(abs(drives[k].share)))
-            for f, k in single.items()
+            name: float(np.log(abs(drives[k].share)))
+            for name, k in self._alone.items()
             if drives[k].is_sure
         }
         logs = np.array(list(sizes.values()))

@@ -55,6 +55,8 @@ two deviations."""
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
 """A factor, an angle (rad) and a share of an axis' travel below which what is off is no mistake of
 set-up but an effect to be diagnosed."""
+_VARIED = 0.2
+"""Standard deviation of a drive over its root mean square, the least."""
 MOST_AXES = 3
 """With more, only signs, the clock and units of all axes or inputs at once are tried: what may be
 exchanged, shifted or scaled grows faster than what a fit of a robot's bodies leaves time for."""
@@ -64,7 +66,7 @@ for a position has derivatives up to no more than some 25 Hz."""
 _SAMPLES, _SCREENED_SAMPLES = 12_000, 3_000
 _SCREENING_STEPS = 3
 _SHORTLIST = 6
-_DECADES = np.arange(-10, 11) / 2.0
+DECADES = np.arange(-10, 11) / 2.0
 _STEPS = 16
 _MOST_TRIALS = 6
 _SAME_FACTOR = 0.05
@@ -158,7 +160,7 @@ class Search:
             return best
         family = partial(scaled_by_power, self.signals, first.signals)
         start = math.log10(first.factor)
-        refined = self._refine(chosen, family, start, math.inf, float(_DECADES[1] - _DECADES[0]))
+        refined = self._refine(chosen, family, start, math.inf, float(DECADES[1] - DECADES[0]))
         found = (refined, *rest)
         far = abs(math.log(refined.factor / first.factor)) > _SAME_FACTOR
         gain = score_of(self.judge, (*chosen, *best)) - score_of(self.judge, (*chosen, *found))
@@ -288,7 +290,7 @@ class Search:
         if not self.has_few_axes:
             return
         for names in groups_of_like(self.signals):
-            yield partial(scaled_by_power, self.signals, names), _DECADES
+            yield partial(scaled_by_power, self.signals, names), DECADES
         change = combine(self.signals, chosen)
         changed = [change.of_motion(motion, self.signals) for motion in self.screened[0]]
         for place, axis in enumerate(self.signals.axes):
@@ -303,18 +305,15 @@ class Search:
 
 def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:
     """The middle of each trial, so that all have ``most`` samples together at most."""
-    return [_middle(motion, most // max(len(motions), 1)) for motion in motions]
+    each = most // max(len(motions), 1)
+    starts = [max((motion.t.size - each) // 2, 0) for motion in motions]
+    return [m.rows(slice(at, at + each)) for m, at in zip(motions, starts, strict=True)]
 
 
 def spread(count: int) -> list[int]:
     """Numbers of some trials of ``count``, spread over the session."""
     chosen = np.linspace(0, max(count - 1, 0), min(count, _MOST_TRIALS))
     return [int(number) for number in np.unique(chosen.round())]
-
-
-def _middle(motion: Motion, most: int) -> Motion:
-    first = max((motion.t.size - most) // 2, 0)
-    return motion.rows(slice(first, first + most))
 
 
 def scaled_by_power(signals: Signals, names: tuple[str, ...], power: float) -> Correction:
@@ -332,7 +331,15 @@ def _shifted_by(signals: Signals, axis: str, offset: float) -> Correction:
 
 
 def _is_gross(correction: Correction, motions: Sequence[Motion], signals: Signals) -> bool:
-    """Whether a scale or zero is off by more than what an effect would explain."""
+    """Whether a scale or zero is off by more than what an effect would explain.
+
+    And whether an exchange leaves a drive that varies: an offset explains any that does not.
+    """
+    others = [name for name in correction.signals if name not in signals.axes]
+    if correction.kind == "exchange" and 0 < len(others) < len(correction.signals):
+        changed = [correction.change.of_motion(motion, signals) for motion in motions]
+        drives = (np.concatenate([m.channels[name] for m in changed]) for name in others)
+        return all(np.std(drive) > _VARIED * np.sqrt(np.mean(drive**2)) for drive in drives)
     if correction.kind == "scale":
         return abs(math.log(correction.factor)) > math.log(LEAST_FACTOR)
     if correction.kind != "zero":

@@ -96,12 +96,10 @@ def _sign(correction: Correction, session: IngestResult) -> str:
         counts = session.axes[name].counts_per_unit
         fix = "negate counts_per_unit" if counts else "negate gear_ratio, 1 where left out"
         return f"the encoder of {name} counts the other way: {fix}"
+    entry = f"scale of channels.{name}" if name in session.channels else "its column"
     if name in session.force.columns:
-        row = " in its row" if len(session.force.columns) > 1 else ""
-        return f"{name} has the wrong sign: negate {_force_entry(session)}{row}"
-    if name in session.channels:
-        return f"{name} has the wrong sign: negate scale of channels.{name}"
-    return f"{name} has the wrong sign: negate its column"
+        entry = _force_entry(session) + " in its row" * (len(session.force.columns) > 1)
+    return f"{name} has the wrong sign: negate {entry}"
 
 
 def describe_size(correction: Correction) -> str:

@@ -171,7 +171,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     fitted = [k for k, name in enumerate(free) if name not in held_out]
     band = Band(rate, tuple(bands[axis].cutoff_hz for axis in system.coordinates))
     dead = _dead(session)
-    offsets = find_force_offsets(system, _motions(path, free, system, dead), band, fitted)
+    offsets: dict[str, dict[str, float]] = {}
+    # Nobody zeroes a sensor between two stretches of one record.
+    if trials.loc[trials["trial_id"].isin(free), "file"].nunique() > 1:
+        offsets = find_force_offsets(system, _motions(path, free, system, dead), band, fitted)
     if offsets:
         written = _write_motions(path, samples, ids, kinematics, progress, offsets)
     disturbances = _disturbances(_motions(path, free, system, dead), system, band, fitted, dead)

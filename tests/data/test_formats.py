@@ -115,6 +115,14 @@ def test_fields_of_matlab_structs(tmp_path, compressed):
     for name, values in zip(wanted, expected, strict=True):
         np.testing.assert_array_equal(trial.columns[name], values)
     assert {"log.time", "log.axis.X[0]", "log.more.f", "runs[0].q"} <= set(columns_of(path))
+    runs = np.zeros(2, dtype=[("t", object), ("q", object)])
+    runs[0], runs[1] = (T, Q), (T[:9], Q[:9])
+    scipy.io.savemat(tmp_path / "runs.mat", {"runs": runs})
+    assert list(columns_of(tmp_path / "runs.mat")) == ["runs[:].t", "runs[:].q"]
+    joined = read_trial(tmp_path / "runs.mat", ("runs[:].t", "runs[:].q"))
+    assert joined.begun == (len(T),) and len(joined) == len(T) + 9
+    np.testing.assert_array_equal(joined.columns["runs[:].q"], np.concatenate([Q, Q[:9]]))
+    scipy.io.savemat(path, content, do_compression=compressed)
     assert "not numbers" in refused(path, ("log.time", "log.name"))
     assert "did you mean 'log.axis.q'" in refused(path, ("log.time", "log.axis.qq"))
     with h5py.File(tmp_path / "b.mat", "w", userblock_size=512) as file:

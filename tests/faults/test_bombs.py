@@ -5,7 +5,6 @@ from __future__ import annotations
 import bz2
 import json
 import os
-import sqlite3
 import struct
 import subprocess
 import sys
@@ -163,29 +162,6 @@ def messages(kind: str, *fields: str) -> Callable[[Path], None]:
     return write
 
 
-def view(path: Path) -> None:
-    """A bag whose messages are made without end by a query."""
-    with sqlite3.connect(path) as database:
-        database.executescript(
-            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
-            " serialization_format TEXT);"
-            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1"
-            " FROM n) SELECT id, 1 AS topic_id, id AS timestamp, zeroblob(1000) AS data FROM n;"
-        )
-
-
-def generated(path: Path) -> None:
-    """A bag whose messages hold 1 GB each that is not in the file."""
-    with sqlite3.connect(path) as database:
-        database.executescript(
-            "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
-            " serialization_format TEXT);"
-            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
-            " data BLOB GENERATED ALWAYS AS (zeroblob(1000000000)) VIRTUAL);"
-            "INSERT INTO messages(topic_id, timestamp) VALUES (1, 1);"
-        )
-
-
 def brackets(path: Path) -> None:
     """Empty objects: 150 MB of text are 4 GB of objects."""
     with path.open("wb") as stream:
@@ -226,8 +202,6 @@ BOMBS: dict[str, tuple[Callable[[Path], None], str, tuple[str, ...]]] = {
     "list.bag": (messages(""), "state", LACK),
     "array.bag": (messages("300000000"), "state", LACK),
     "array.mcap": (messages("300000000", "float64 y"), "state", LACK),
-    "view.db3": (view, "state", ("not a sound bag",)),
-    "generated.db3": (generated, "state", ("not a sound bag",)),
     "brackets.json": (brackets, "", LACK),
     "struct.mat": (deep_struct, "", LACK),
     "sound.h5": (sound_hdf5, "", ("5000000 samples",)),

@@ -27,8 +27,19 @@ OFF = np.array([1.15, 0.9, 1.2, 0.85])
 """Of the drawn numbers, what the bodies truly have."""
 
 
+Drawn = tuple[float, float, float]
+DOWN: Drawn = (0.0, 0.0, -9.81)
+SHARED = {
+    "m1": {"turns": {"one": 1.0}},
+    "m2": {"turns": {"two": 1.0}},
+    "m3": {"turns": {"three": 45.0}},
+    "m4": {"turns": {"three": 32.0, "four": 32.0}},
+}
+"""Motors of which the last one turns two joints, as those of a wrist do."""
+
+
 @cache
-def arm(gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)) -> System:
+def arm(gravity: Drawn = DOWN, is_shared: bool = False) -> System:
     joints = {
         name: {
             "kind": "revolute", "position": [0.0, 0.0, 0.3], "rotation": [1.3, 0.0, 0.4],
@@ -38,20 +49,22 @@ def arm(gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)) -> System:
         for k, name in enumerate(JOINTS)
     }  # fmt: skip
     table = {"name": "arm", "robot": {"joints": joints, "gravity": gravity}}
+    table["robot"] |= {"motors": SHARED} if is_shared else {}  # type: ignore[operator]
     return compile_model(Model(device_from(complete_device(table, None, ""))))  # type: ignore[arg-type]
 
 
 def motions(
     factor: float,
     viscous: float,
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81),
+    gravity: Drawn = DOWN,
     tool: float = 1.0,
+    is_shared: bool = False,
 ) -> list[Motion]:
     """Two trials whose torques read ``factor`` times too much.
 
     Under a gravity in the base's frame, m/s2, and with a last body ``tool`` times as heavy.
     """
-    system = arm(gravity)
+    system = arm(gravity, is_shared)
     p = system.prior
     for i, item in enumerate(system.parameters):
         short, _, name = item.name.rpartition(".")
@@ -70,9 +83,13 @@ def motions(
         qd = (size * rate[:, None] * np.cos(angle)).sum(axis=0)
         qdd = -(size * rate[:, None] ** 2 * np.sin(angle)).sum(axis=0)
         none = np.zeros((len(t), 0)), np.zeros((len(t), len(system.inputs)))
-        torque = factor * system.required(q, qd, qdd, *none, p)
-        torque += factor * rng.normal(0.0, 0.1, torque.shape)
-        channels = {f"torque_{name}": torque[:, k] for k, name in enumerate(JOINTS)}
+        torque = system.required(q, qd, qdd, *none, p)
+        torque += rng.normal(0.0, 0.1, torque.shape)
+        one_each = np.vstack([np.zeros(4), np.eye(4)])
+        still = np.zeros((5, 4))
+        by_force = system.applied(still, still, still, np.zeros((5, 0)), one_each, p)[1:].T
+        torque = factor * torque @ np.linalg.inv(by_force).T
+        channels = dict(zip(system.inputs, torque.T, strict=True))
         found.append(Motion(f"t{seed}", t, q, qd, qdd, np.full_like(qd, 1e-4), channels))
     return found
 
@@ -80,13 +97,14 @@ def motions(
 FORCES = tuple(f"torque_{name}" for name in JOINTS)
 
 
-def search_in(given: list[Motion]) -> DrawnSearch:
+def search_in(given: list[Motion], is_shared: bool = False) -> DrawnSearch:
     units = ("rad",) * 4 + ("N.m",) * 4
     eye, none = np.eye(8), np.zeros(8)
-    signals = Signals(JOINTS, FORCES, (), (), units, units, eye, none, 0.0 * eye, none)
+    system = arm(is_shared=is_shared)
+    signals = Signals(JOINTS, system.inputs, (), (), units, units, eye, none, 0.0 * eye, none)
     folds = Folds.of_trials(["t0", "t1"], [], ["t0", "t1"])
     given = shorten(given, DRAWN_SAMPLES)
-    return DrawnSearch(arm(), given, Band(RATE, (10.0,) * 4), folds, signals)
+    return DrawnSearch(system, given, Band(RATE, (10.0,) * 4), folds, signals)
 
 
 def find_mistakes(given: list[Motion]) -> tuple[Finding, ...]:
@@ -212,3 +230,19 @@ def test_a_reduction_follows_from_the_drives_and_is_none_of_a_list(
     assert (found.correction.kind, found.correction.signals) == ("scale", named)
     expected = 70.0 if position == 1.0 else 1.0 / 70.0
     assert found.correction.factor == pytest.approx(expected, rel=0.25 if position == 1.0 else 0.03)
+
+
+@pytest.mark.parametrize(
+    ("motor", "factor", "kind"),
+    [(2, -1.0, "sign"), (3, -1.0, "sign"), (3, 1000.0, "scale"), (2, 1.0 / 3.0, "scale")],
+)
+def test_one_mistaken_drive_of_motors_that_turn_several_joints_is_found(
+    motor: int, factor: float, kind: str
+) -> None:
+    given = motions(1.0, 2.0, is_shared=True)
+    name = f"torque_m{motor + 1}"
+    wrong = [replace(m, channels={**m.channels, name: factor * m.channels[name]}) for m in given]
+    assert search_in(given, is_shared=True).find_mistakes(()) == ()
+    (found,) = search_in(wrong, is_shared=True).find_mistakes(())
+    assert (found.correction.kind, found.correction.signals) == (kind, (name,))
+    assert found.correction.factor == pytest.approx(1.0 / factor, rel=0.25)

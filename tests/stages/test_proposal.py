@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import tomllib
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from other_labs import (
     COULOMB,
@@ -702,10 +704,11 @@ def test_sign_bits_of_a_servo_are_taken_off_and_its_counts_shown_by_its_weight(t
 
 
 @pytest.mark.parametrize(
-    ("column", "unit"), [("handle_force_N", "N"), ("loadcell_kN", "kN"), ("kraft", "N")]
+    ("column", "unit"),
+    [("handle_force_N", "N"), ("loadcell_kN", "kN"), ("kraft", "N"), ("pull_kgf", "kgf")],
 )
 def test_a_force_on_a_joint_needs_a_lever(tmp_path, command: Command, column: str, unit: str):
-    scale = 1e-3 if unit == "kN" else 1.0
+    scale = {"kN": 1e-3, "kgf": 1.0 / 9.80665}.get(unit, 1.0)
     write_table(tmp_path / "a.csv", labelled(f"t,angle_rad,w,{column}", u=scale / 0.31))
     session, proposal = proposed(tmp_path)
     assert (session["force"]["unit"], session["force"]["lever_m"]) == (unit, 0.0)
@@ -736,6 +739,37 @@ def test_the_gear_of_a_motor_is_what_the_weight_says(tmp_path):
     assert session["encoders"]["joint"]["gear_ratio"] == pytest.approx(70.0, rel=0.02)
     assert any("times for one turn of it, by its weight" in line for line in proposal.check)
     assert "moment" in proposal.device
+
+
+def test_the_torque_of_a_motor_is_said_to_lack_the_gear(tmp_path):
+    write_table(tmp_path / "a.csv", pendulum("t,motor_deg,motor_torque_mNm", 4000.0, 14.0))
+    session, proposal = proposed(tmp_path)
+    assert any("motor_torque_mNm is the torque of a motor" in line for line in proposal.check)
+    assert session["force"]["unit"] == "mN.m"
+
+
+def test_of_joints_in_a_message_the_one_that_moves_is_the_axis(tmp_path):
+    t = np.arange(3000) / 100.0
+    table = pendulum("field.header.stamp,field.position1,field.effort1", 1.0, 1.0)
+    frame = pd.DataFrame({"%time": np.rint(1e9 * t + 4e6), **table})
+    frame["field.header.stamp"] = np.rint(1e9 * t)
+    frame = frame.assign(**{"field.name0": "gripper", "field.name1": "elbow"})
+    frame = frame.assign(**{"field.position0": 0.0, "field.effort0": 0.0})
+    frame[sorted(frame.columns)].to_csv(tmp_path / "a.csv", index=False)
+    session, _ = proposed(tmp_path)
+    assert session["time"]["column"] == "field.header.stamp"
+    assert session["encoders"]["elbow"]["column"] == "field.position[elbow]"
+    assert session["force"]["columns"] == ["field.effort[elbow]"]
+
+
+def test_recordings_in_a_list_are_trials(tmp_path):
+    runs = [{n: [*map(float, v)] for n, v in pendulum("t,q,tau", 1.0, 1.0).items()}] * 2
+    (tmp_path / "all.json").write_text(json.dumps({"rig": "a", "runs": runs}))
+    session, proposal = proposed(tmp_path)
+    assert [trial["recording"] for trial in session["trials"]] == [1, 2]
+    assert session["encoders"]["joint"]["column"] == "runs[:].q"
+    assert any("all.json holds 2 recordings" in line for line in proposal.check)
+    assert len(samples(tmp_path, tmp_path / "out", "all_2")) == 3000
 
 
 def test_held_rows_are_proposed_at_their_true_rate(tmp_path):

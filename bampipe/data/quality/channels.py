@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bampipe.data.quality.table import TrialTable, counted, in_rows, longest_run
+from bampipe.data.quality.table import TrialTable, counted, longest_run
 from bampipe.data.session import SECONDS, Channel, Encoder, Session
 from bampipe.data.session.channels import LARGEST_CONDITION
 from bampipe.data.units import unit
@@ -51,7 +51,7 @@ def fill_missing(table: TrialTable) -> None:
     if start > 0 or stop < len(table):
         dropped = len(table) - (stop - start)
         table.keep(slice(start, stop))
-        table.repairs.append(f"{in_rows(dropped)} with missing samples at the ends dropped")
+        table.repairs.append(f"{counted(dropped, 'row')} with missing samples at the ends dropped")
     for name in channels:
         values = table.columns[name]
         missing = ~np.isfinite(values)

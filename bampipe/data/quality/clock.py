@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bampipe.data.quality.stamps import COARSEST_STAMP, find_fresh_rows, spread_stamps, unroll
-from bampipe.data.quality.table import TrialTable, counted, find_runs, in_rows, in_times
+from bampipe.data.quality.table import TrialTable, counted, find_runs, in_times
 from bampipe.data.session import SECONDS
 
 LONGEST_TRIAL_S = 3.2e7
@@ -36,13 +36,18 @@ def keep_fresh_rows(table: TrialTable) -> None:
 def time_to_seconds(table: TrialTable) -> None:
     """Time stamps in s, whatever unit they are really in; rows without one are dropped."""
     missing = ~np.isfinite(table.t)
+    blank = np.logical_and.reduce([~np.isfinite(values) for values in table.columns.values()])
+    if blank.any() and not blank.all():
+        table.keep(~blank)
+        table.repairs.append(f"{counted(int(blank.sum()), 'row')} that hold no number dropped")
+        missing = missing[~blank]
     count = int(missing.sum())
     if count:
         if count > _few(table, len(table)):
             at = int(np.argmax(missing))
             raise table.fault(f"{count} time stamps are missing", column=table.clock, at=at)
         table.keep(~missing)
-        table.repairs.append(f"{in_rows(count)} without a time stamp dropped")
+        table.repairs.append(f"{counted(count, 'row')} without a time stamp dropped")
     _unwrap_clock(table)
     steps = np.diff(table.t)
     steps = steps[steps > 0]
@@ -108,7 +113,9 @@ def put_in_order(table: TrialTable) -> None:
     lone[1:-1] = (t[1:-1] > t[2:]) & (t[:-2] < t[2:])
     if 0 < lone.sum() <= _few(table, len(table)):
         table.keep(~lone)
-        table.repairs.append(f"{in_rows(int(lone.sum()))} with a time stamp out of order dropped")
+        table.repairs.append(
+            f"{counted(int(lone.sum()), 'row')} with a time stamp out of order dropped"
+        )
         t = table.t
     mixed = np.maximum.accumulate(t)[:-1] > np.minimum.accumulate(t[::-1])[::-1][1:]
     sources = [encoder.column for encoder in table.session.encoders]
@@ -137,7 +144,9 @@ def put_in_order(table: TrialTable) -> None:
                 )
     if late:
         table.keep(order)
-        table.repairs.append(f"{in_rows(late)} written out of order sorted by their time stamps")
+        table.repairs.append(
+            f"{counted(late, 'row')} written out of order sorted by their time stamps"
+        )
 
 
 def _goes_on(positions: np.ndarray, at: int) -> bool:
@@ -159,20 +168,12 @@ def drop_backward_stamps(table: TrialTable) -> None:
     counts = int(repeated.sum()), int(behind.sum())
     if sum(counts) > _few(table, total):
         at = int(np.argmax(repeated | behind))
-        starts = 1 + np.flatnonzero(np.diff(t) < 0.0)
-        if len(starts) <= _few(table, total) and counts[1] > counts[0]:
-            raise table.fault(
-                f"time starts again {in_times(len(starts))}",
-                column=table.clock,
-                at=int(starts[0]),
-                remedy="several recordings in one file? put each into a file of its own",
-            )
         if counts[1] > counts[0]:
             raise table.fault(
                 f"time runs backwards: {counts[1]} of {total} stamps are not after those before",
                 column=table.clock,
                 at=at,
-                remedy="is this the time column?",
+                remedy="is this the time column? recordings of one file go into files of their own",
             )
         raise table.fault(
             f"{counts[0]} of {total} time stamps are repeated",
@@ -182,9 +183,9 @@ def drop_backward_stamps(table: TrialTable) -> None:
         )
     table.keep(~(repeated | behind))
     if counts[0]:
-        table.repairs.append(f"{in_rows(counts[0])} with a repeated time stamp dropped")
+        table.repairs.append(f"{counted(counts[0], 'row')} with a repeated time stamp dropped")
     if counts[1]:
-        table.repairs.append(f"{in_rows(counts[1])} with a time stamp out of order dropped")
+        table.repairs.append(f"{counted(counts[1], 'row')} with a time stamp out of order dropped")
 
 
 def cut_stretch(table: TrialTable) -> None:
@@ -229,7 +230,7 @@ def keep_longest_stretch(table: TrialTable) -> None:
     first, last = table.rows[start], table.rows[stop - 1]
     dropped = len(table) - (stop - start)
     table.keep(slice(start, stop))
-    table.repairs.append(f"{words}: rows {first} to {last} kept, {in_rows(dropped)} dropped")
+    table.repairs.append(f"{words}: rows {first} to {last} kept, {counted(dropped, 'row')} dropped")
 
 
 def refuse_length(table: TrialTable) -> None:

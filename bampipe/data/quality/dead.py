@@ -20,11 +20,8 @@ _MOVES = 0.02
 
 def note_dead_stretches(table: TrialTable) -> None:
     """Note where an input reads one value for longer than chance would have it."""
-    session = table.session
-    columns = [*(session.force.columns if session.force is not None else ())]
-    columns += [channel.column for channel in session.channels]
-    positions = [table.columns[encoder.column] for encoder in session.encoders]
-    for column in dict.fromkeys(columns):
+    positions = [table.columns[encoder.column] for encoder in table.session.encoders]
+    for column in table.inputs:
         for start, stop in find_equal_runs(table.columns[column], table.t):
             travel = [np.ptp(q[start:stop]) / max(float(np.ptp(q)), 1e-300) for q in positions]
             if max(travel, default=0.0) > _MOVES:

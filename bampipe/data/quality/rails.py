@@ -52,13 +52,11 @@ def leave_out_rails(table: TrialTable) -> None:
     Raises:
         InputError: a sensor of a locked trial, which is used as a whole, is at a rail for long.
     """
-    session, limits = table.session, table.limits
-    force = session.force
-    columns = [*(force.columns if force is not None else ())]
-    volts = columns if force is not None and force.volts and limits.saturated_share < 1.0 else []
-    columns += [channel.column for channel in session.channels]
+    force, limits = table.session.force, table.limits
+    sensed = force is not None and force.volts and limits.saturated_share < 1.0
+    volts = force.columns if force is not None and sensed else ()
     motions = None
-    for column in dict.fromkeys(columns):
+    for column in table.inputs:
         values = table.columns[column]
         rails = {rail: at for rail, at in find_rails(values).items() if rail != 0.0}
         share = float(sum(at.mean() for at in rails.values()))

@@ -58,10 +58,8 @@ def find_spikes(values: np.ndarray, rule: tuple[float, float]) -> np.ndarray:
 
 def interpolate_spikes(table: TrialTable) -> None:
     """Take wild readings of positions and inputs out and interpolate them, where they are few."""
-    session = table.session
-    rules = {encoder.column: POSITION for encoder in session.encoders}
-    rules |= dict.fromkeys(session.force.columns if session.force is not None else (), INPUT)
-    rules |= {channel.column: INPUT for channel in session.channels}
+    rules = {encoder.column: POSITION for encoder in table.session.encoders}
+    rules |= dict.fromkeys(table.inputs, INPUT)
     some = False
     for column, rule in rules.items():
         values = table.columns[column]

@@ -100,6 +100,12 @@ class TrialTable:
     def t(self, seconds: np.ndarray) -> None:
         self.columns[self.clock] = seconds
 
+    @property
+    def inputs(self) -> list[str]:
+        """Columns of the force and of other channels, each once."""
+        force = self.session.force.columns if self.session.force is not None else ()
+        return list(dict.fromkeys([*force, *(c.column for c in self.session.channels)]))
+
     def keep(self, which: np.ndarray | slice) -> None:
         """Keep only some rows; one column at a time, to hold little twice."""
         self.rows = self.rows[which].copy()
@@ -141,11 +147,6 @@ def longest_run(which: np.ndarray) -> tuple[int, int]:
 def counted(count: int, noun: str) -> str:
     """``3 rows``, ``1 row``."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
-def in_rows(count: int) -> str:
-    """``3 rows``, ``1 row``."""
-    return counted(count, "row")
 
 
 def in_times(count: int) -> str:

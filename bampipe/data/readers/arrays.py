@@ -10,6 +10,7 @@ import numpy as np
 from bampipe.errors import InputError
 
 LARGEST_WIDTH = 64
+_TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
 
 
 def split_index(column: str, names: Container[str]) -> tuple[str, int | None]:
@@ -53,6 +54,34 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     if len(sides) < 2:
         return [name]
     return [f"{name}[{k}]" for k in range(min(sides))] if min(sides) <= LARGEST_WIDTH else []
+
+
+def join_runs(
+    arrays: Mapping[str, np.ndarray],
+) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, ...]]]:
+    """Vectors of one name in all structs of a list, end to end: ``runs[:].q`` of ``runs[0].q``.
+
+    Of structs that each have a time, or are as long as no other; others are rather joints.
+
+    Returns:
+        All arrays, and by the name of each that was joined the samples before which one begins.
+    """
+    runs: dict[str, dict[int, str]] = {}
+    for label in arrays:
+        match = re.fullmatch(r"(.+?)\[(\d+)\]\.([^\[\]]+)", label)
+        if match and len(labels("", arrays[label].shape)) == 1 < arrays[label].size:
+            runs.setdefault(f"{match[1]}[:].{match[3]}", {})[int(match[2])] = label
+    timed = {name.partition("[")[0] for name in runs if _TIMES.search(name)}
+    found, begun = dict(arrays), {}
+    for name, own in runs.items():
+        parts = [arrays[label].ravel() for label in own.values()]
+        alike = len({part.size for part in parts}) == 1 and name.partition("[")[0] not in timed
+        if alike or len(own) < 2 or list(own) != list(range(len(own))):
+            continue
+        found = {label: array for label, array in found.items() if label not in own.values()}
+        found[name] = np.concatenate(parts)
+        begun[name] = tuple(map(int, np.cumsum([part.size for part in parts[:-1]])))
+    return found, begun
 
 
 def recorded(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:

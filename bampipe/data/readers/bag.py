@@ -16,9 +16,7 @@ empty, are a stream of their own, and a column is taken from that with most of w
 from __future__ import annotations
 
 import json
-import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -169,8 +167,8 @@ def _read_streams(
         if stream is None:
             stream = streams[topic, kind] = _Stream(topic, kind)
             asked = [c for c, f in fields.items() if f.topic == topic and not f.is_time]
-            present = [c for c in asked if _holds(message, fields[c].path)]
-            stream.cells = {column: [] for column in present}
+            there = {c: items(message, fields[c].path) for c in asked}
+            stream.cells = {c: [] for c, v in there.items() if v and v[0] is not MISSING}
             near = near or ", ".join(path for path in _numbers_in(message) if path != STAMP)
         stream.add(moment, message, name)
         samples += stream.counts[-1]
@@ -183,11 +181,6 @@ def _read_streams(
                 remedy=f"it has {near:.200}",
             )
     return list(streams.values())
-
-
-def _holds(message: Any, path: str) -> bool:
-    found = items(message, path)
-    return bool(found) and found[0] is not MISSING
 
 
 def _kind(message: Any) -> tuple[Any, ...]:
@@ -292,11 +285,9 @@ def _messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[st
     """Topic, time of recording (ns) and message, in the order of recording; all if no topics.
 
     Raises:
-        InputError: not installed, damaged, would unpack to too much, or a topic is missing.
+        InputError: not installed, damaged, or a topic is missing.
     """
     need("rosbags.highlevel", "ros", name)
-    if path.suffix.lower() == ".db3":
-        _check_tables(path)
     in_json = path.suffix.lower() == ".mcap" and _holds_json(path, name)
     yield from (_json_messages if in_json else _ros_messages)(path, topics, name)
 
@@ -310,20 +301,6 @@ def _ros_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tupl
             raise InputError("holds no messages", where=name)
         for connection, moment, raw in reader.messages(connections=chosen):
             yield connection.topic, moment, reader.deserialize(raw, connection.msgtype)
-
-
-def _check_tables(path: Path) -> None:
-    """Raise ValueError unless a database holds plain tables: views, generated columns and virtual
-    tables can make rows without end of nothing.
-    """
-    uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
-    with closing(sqlite3.connect(uri, uri=True)) as database:
-        for kind, label, sql in database.execute("SELECT type, name, sql FROM sqlite_master"):
-            if kind not in ("table", "index") or "VIRTUAL" in str(sql).upper().split():
-                raise ValueError(f"{label} is no plain table")
-            columns = database.execute("SELECT hidden FROM pragma_table_xinfo(?)", (label,))
-            if any(hidden for (hidden,) in columns):
-                raise ValueError(f"{label} has generated columns")
 
 
 def _holds_json(path: Path, name: str) -> bool:

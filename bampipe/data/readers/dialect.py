@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import Dialect, check_columns
-from bampipe.data.units import unit
+from bampipe.data.units import bare, unit
 from bampipe.errors import InputError
 
 HEAD = 1 << 16
@@ -131,7 +131,7 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
             and not dialect.names
             and not (remark and not _are_units(row))
         ):
-            units |= {h: _bare(u) for h, u in zip(header, row, strict=False) if _bare(u)}
+            units |= {h: bare(u) for h, u in zip(header, row, strict=False) if bare(u)}
             remarks.append(f"row {line.number} gives units")
             passed += 1
             break
@@ -430,7 +430,7 @@ def _looks_like_units(row: list[str]) -> bool:
         and bool(said)
         and all(_UNIT.match(cell) and cell not in NULLS for cell in said)
         and not any(_POINT.match(cell) and cell != "1" for cell in said)
-        and any(re.search(r"[A-Za-z%°Ωµμ]", cell) and len(_bare(cell)) <= 10 for cell in said)
+        and any(re.search(r"[A-Za-z%°Ωµμ]", cell) and len(bare(cell)) <= 10 for cell in said)
     )
 
 
@@ -467,7 +467,3 @@ def _units_of_motion(above: list[str], header: list[str]) -> dict[str, str]:
     units |= {name: f"{angle}/s" for name in units if re.search(r"(?i)speed|velocit|_u\Z", name)}
     units |= {name: f"{angle}/s2" for name in units if re.search(r"(?i)acc", name)}
     return units | {name: "s" for name in header if name.lower() == "time"}
-
-
-def _bare(unit: str) -> str:
-    return unit.strip().strip("[]()").strip()

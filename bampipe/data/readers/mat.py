@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import hdf5
-from bampipe.data.readers.arrays import pick, recorded, split_index
+from bampipe.data.readers.arrays import join_runs, pick, recorded, split_index
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
 from bampipe.errors import InputError
 
@@ -23,11 +23,6 @@ _STRUCT_CLASS, _NUMERIC_CLASSES, _OPAQUE_CLASS = 2, range(6, 16), 17
 _COMPLEX = 0x0800
 _DEEPEST = 8
 _MOST_FIELDS = 4096
-
-
-def is_hdf5(head: bytes) -> bool:
-    """Whether a file that begins with ``head`` is HDF5, with or without MATLAB's user block."""
-    return hdf5.SIGNATURE in (head[:8], head[512:520])
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
@@ -45,6 +40,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     if not _is_level_5(path, name):
         return hdf5.read(path, wanted, name, "variable")
     known = _arrays(path, name)
+    joined, begun = join_runs({label: a for label, a in known.items() if a is not None})
+    known |= {label: joined[label] for label in begun}
     values = {}
     for column in wanted.columns:
         variable, index = split_index(column, known)
@@ -66,7 +63,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         check_size(array.size, wanted, name)
         # A copy: what stands in the file cannot be written to.
         values[column] = np.array(pick(array, index, where), dtype=np.float64)
-    return RawTrial(aligned(values, name, "variable"), first_row=1)
+    starts = next((begun[column] for column in wanted.columns if column in begun), ())
+    return RawTrial(aligned(values, name, "variable"), first_row=1, begun=starts)
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
@@ -77,14 +75,14 @@ def columns(path: Path, name: str) -> dict[str, str]:
     """
     if not _is_level_5(path, name):
         return hdf5.columns(path, name)
-    shapes = {label: a.shape for label, a in _arrays(path, name).items() if a is not None}
-    return dict.fromkeys(recorded(shapes), "")
+    arrays = {label: a for label, a in _arrays(path, name).items() if a is not None}
+    return dict.fromkeys(recorded({x: a.shape for x, a in join_runs(arrays)[0].items()}), "")
 
 
 def _is_level_5(path: Path, name: str) -> bool:
     with path.open("rb") as stream:
         head = stream.read(1024)
-    if is_hdf5(head):
+    if hdf5.SIGNATURE in (head[:8], head[512:520]):  # the latter behind MATLAB's user block
         return False
     if len(head) >= _HEADER and head[126:128] in (b"IM", b"MI"):
         return True

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import pick, recorded, split_index
+from bampipe.data.readers.arrays import join_runs, pick, recorded, split_index
 from bampipe.data.readers.nested import MISSING, as_number, find, leaves
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns
 from bampipe.errors import InputError
@@ -66,8 +66,9 @@ def columns(path: Path, name: str) -> dict[str, str]:
     """
     samples, constants, _ = _samples(path, name)
     if isinstance(samples, dict):
-        shapes = {column: values.shape for column, values in samples.items()}
-        moment = {column for column, values in samples.items() if values.dtype == object}
+        joined = join_runs(samples)[0]
+        shapes = {column: values.shape for column, values in joined.items()}
+        moment = {column for column, values in joined.items() if values.dtype == object}
         kept = {column: "datetime" if column in moment else "" for column in recorded(shapes)}
         return kept | dict.fromkeys(constants, "")
     found = {}
@@ -102,6 +103,7 @@ def _from_arrays(
 ) -> RawTrial:
     """The wanted columns of arrays."""
     values = {}
+    arrays, begun = join_runs(arrays)
     for column in wanted.columns:
         where = f"{name}, '{column}'"
         if column in constants:
@@ -116,7 +118,8 @@ def _from_arrays(
             raise InputError("found text, expected numbers", where=where)
         else:
             values[column] = pick(arrays[label], index, where)
-    return RawTrial(aligned(values, name, "array"), first_row=1, notes=notes)
+    starts = next((begun[column] for column in wanted.columns if column in begun), ())
+    return RawTrial(aligned(values, name, "array"), first_row=1, notes=notes, begun=starts)
 
 
 def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
@@ -135,6 +138,10 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
                 else:
                     yield label, array
     elif isinstance(value, list) and len(value) > 1:
+        if isinstance(value[0], dict):
+            for k, item in enumerate(value):
+                yield from _arrays(item, f"{path}[{k}]")
+            return
         if isinstance(value[0], str):
             if moments.is_moment(value[0]) and all(isinstance(x, str | None) for x in value):
                 yield path, np.array(value, dtype=object)
@@ -177,7 +184,8 @@ def _samples(
     else:
         content = _parsed(text, name)
     lists = _lists_of_samples(content)
-    if not lists and (arrays := dict(_arrays(content))):
+    single = all(_is_sample(items[0]) for items in lists.values())
+    if not (lists and single) and (arrays := dict(_arrays(content))):
         return arrays, _numbers(content), notes
     if path.suffix.lower() not in (".jsonl", ".ndjson"):
         samples, constants = _list_of_samples(content, lists, name), _numbers(content)
@@ -204,6 +212,11 @@ def _lists_of_samples(content: object) -> dict[str, list[object]]:
         for key, value in items
         if isinstance(value, list) and value and isinstance(value[0], dict)
     }
+
+
+def _is_sample(value: object) -> bool:
+    """Whether an object is a sample rather than a recording, whose values are long lists."""
+    return any(isinstance(cell, int | float) for _, cell in leaves(value))
 
 
 def _numbers(content: object) -> dict[str, object]:

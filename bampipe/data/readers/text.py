@@ -32,7 +32,7 @@ _WESTERN = "cp1252"
 _TAKEN_AS = "not UTF-8: names and units are taken as Windows-1252"
 
 
-class _Stretch:
+class _Stretch(io.RawIOBase):
     """A binary file of which only the bytes from ``start`` to ``end`` are seen."""
 
     def __init__(self, stream: BinaryIO, start: int, end: int, ended: bool = False) -> None:
@@ -40,25 +40,15 @@ class _Stretch:
         self._stream = stream
         self._left = max(end - start, 0)
         self._ended = ended
-        self.closed = False
-
-    def read(self, size: int = -1) -> bytes:
-        size = self._left if size < 0 else min(size, self._left)
-        data = self._stream.read(size)
-        self._left -= len(data)
-        return data.replace(b";", b" ") if self._ended else data
 
     def readable(self) -> bool:
         return True
 
-    def seekable(self) -> bool:
-        return False
-
-    def writable(self) -> bool:
-        return False
-
-    def close(self) -> None:
-        self.closed = True
+    def read(self, size: int = -1, /) -> bytes:
+        size = self._left if size < 0 else min(size, self._left)
+        data = self._stream.read(size)
+        self._left -= len(data)
+        return data.replace(b";", b" ") if self._ended else data
 
 
 class _SingleBlanks(_Stretch):
@@ -66,7 +56,7 @@ class _SingleBlanks(_Stretch):
 
     _held = b"\n"
 
-    def read(self, size: int = -1) -> bytes:
+    def read(self, size: int = -1, /) -> bytes:
         while True:
             data = super().read(size)
             text = self._held + data

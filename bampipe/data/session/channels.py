@@ -32,7 +32,6 @@ LARGEST_CONDITION = 1e8
 TimeUnit = Literal["ns", "us", "ms", "s", "datetime"]
 CLOCK_UNITS: tuple[TimeUnit, ...] = get_args(TimeUnit)
 SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
-_FORCE_SUFFIXES = ("_nm", "_v", "_n")
 
 
 def _name(text: str) -> str:
@@ -417,12 +416,7 @@ class Force(Declaration):
 
 def _component(column: str) -> str:
     """``x`` for the columns ``force_x_v``, ``force_x`` and ``x``."""
-    name = column
-    for suffix in _FORCE_SUFFIXES:
-        if name.lower().endswith(suffix) and len(name) > len(suffix):
-            name = name[: -len(suffix)]
-            break
-    return name.removeprefix("force_")
+    return re.sub(r"(?i)(?<=.)_(nm|v|n)\Z", "", column).removeprefix("force_")
 
 
 class Brake(NamedTuple):

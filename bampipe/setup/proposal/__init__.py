@@ -164,13 +164,12 @@ def _hung(folder: Path, chosen: ChosenDevice, mounting: Mounting, notes: Notes) 
     """The robot under the gravity that the drawn bodies ask for, where that is not as stated."""
     if not mounting.hangs:
         return chosen
-    gravity = ", ".join(
-        f"{v:.4g}" for v in np.where(np.abs(mounting.gravity) < 1e-9, 0.0, mounting.gravity)
-    )
-    said = f"gravity = [{gravity}]"
+    gravity = np.where(np.abs(mounting.gravity) < 1e-9, 0.0, mounting.gravity)
+    said = f"gravity = [{', '.join(f'{v:.4g}' for v in gravity)}]"
+    put = "" if chosen.text else f" put that into [robot] of {chosen.name}"
     notes.check.append(
         f"{said} in the frame of the base, by weight and inertia as drawn: is the robot mounted so?"
-        + ("" if chosen.text else f" put that into [robot] of {chosen.name}")
+        + put
     )
     return with_gravity(folder, chosen, said) if chosen.text else chosen
 

@@ -52,7 +52,14 @@ def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     if seconds and rest:
         return _in_two_columns(seconds[-1], rest[-1], notes)
     # When a message was recorded is the second best to when it was stamped.
-    stamped = sorted(times, key=lambda column: column.name.endswith(_RECORDED))
+    topics = {c.name.partition(":")[0] for c in found.of("position") if c.name[:1] == "/"}
+
+    def rank(c: SurveyedColumn) -> tuple[bool, bool, bool]:
+        # Motion that is interpolated is worse off than what drives it.
+        beside = c.name.partition(":")[0] in topics or not topics
+        return c.name.endswith(_RECORDED), "stamp" not in words(c.name), not beside
+
+    stamped = sorted(times, key=rank)
     column = next((c for c in stamped if _increases(c.values)), None)
     return _counted(found, notes) if column is None else _in_one_column(column, notes)
 
@@ -112,7 +119,7 @@ def _counted(found: Survey, notes: Notes) -> ProposedClock:
     ]
     step_s, name = max(steps, default=(0.0, ""))
     if step_s > 0.0:
-        note = notes.guess(f"counted; {name} sets the rate")
+        note = notes.guess(f"samples are counted, and {name} sets the rate")
         rate = f"sample_rate_hz = {1.0 / step_s:g}"
         return ProposedClock(step_s * samples, (name,), _table(f'unit = "samples"{note}'), rate)
     stamps = next((column for column in found.of("time") if not column.is_constant), None)

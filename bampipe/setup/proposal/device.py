@@ -12,7 +12,6 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.chain import Branches
 from bampipe.data.device_file import complete_device, read_device_file
-from bampipe.data.robot_xml import read_xml
 from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.urdf import unexpanded
 from bampipe.errors import InputError
@@ -34,8 +33,8 @@ DEVICE = "device.toml"
 _SCHEMA = "bampipe.device/1"
 _MAY_SLIDE = " (no unit says that it slides: if it does, bampipe init FOLDER --device slider)"
 _MAY_TURN = " (by a force in N alone: if it turns, call its column {0}_rad or {0}_deg)"
-_HEAD_BYTES = 4096
-"""Of a file that cannot be read whole, in which its first element is looked for."""
+_HEAD_BYTES = 1 << 16
+"""Of an XML file, in which its first element is looked for."""
 _SAME_DRIVE = 0.8
 """Correlation beyond which a current and a force are of one drive: that of a coil has its own."""
 
@@ -78,22 +77,7 @@ def find_device(folder: Path, found: Survey, wanted: str) -> ChosenDevice | None
 
 
 def _is_mjcf(path: Path) -> bool:
-    """Whether an XML file is one of MuJoCo.
-
-    Raises:
-        InputError: it names itself one, and cannot be read.
-    """
-    try:
-        return read_xml(path).tag == "mujoco"
-    except InputError as error:
-        if not _starts_as_mjcf(path):
-            return False
-        raise InputError(
-            error.what, where=error.where, remedy="mend it, or take it out of the folder"
-        ) from error
-
-
-def _starts_as_mjcf(path: Path) -> bool:
+    """Whether an XML file is one of MuJoCo, sound or not."""
     try:
         with path.open("rb") as file:
             return b"<mujoco" in file.read(_HEAD_BYTES)
@@ -228,7 +212,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     if position is None:
         raise InputError(
             "no column looks like a position",
-            where=f"{folder}: {found.files[0]}",
+            where=f"{folder}: {found.trials[0].file}",
             remedy="name the device: bampipe init FOLDER --device NAME; columns are "
             + ", ".join(c.name for c in found.columns[:12]),
         )
@@ -236,12 +220,18 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     driver, role = match.driver(position)
     supply = match.supply(driver) if role == "duty" else None
     coil = role == "force" and _has_coil(driver, match, notes)
-    position = position if linear else _at_joint(position, driver, match)
+    read, position = position, position if linear else _at_joint(position, driver, match)
     fit = _rough_fit(position, driver, role, linear, match.t)
     drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
     weight, on_gravity = weight_of(position, fit, linear, found)
     starter = starter_device(position.name, linear, drive, fit, weight, width)
+    match.given = {starter.axis: read}
+    if match.turning and role == "force" and driver is not None and "motor" in words(driver.name):
+        notes.check.append(
+            f"{driver.name} is the torque of a motor, by its name: for that of the joint put the"
+            ' gear before the unit, as in unit = "70mN.m"'
+        )
     kind = "linear" if linear else "rotary"
     doubt = "" if position.conversion is not None else _MAY_SLIDE
     if doubt and linear:

@@ -6,11 +6,11 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.survey import SurveyedColumn, words
-from bampipe.data.units import spelled, unit
+from bampipe.data.units import bare, spelled, unit
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.setup.proposal.matching import Matcher
-from bampipe.setup.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
 from bampipe.setup.proposal.positions import in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")

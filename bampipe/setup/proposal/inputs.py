@@ -8,12 +8,12 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.survey import SurveyedColumn, words
-from bampipe.data.units import spelled, unit
+from bampipe.data.units import bare, spelled, unit
 from bampipe.lists import join_names
 from bampipe.physics.device import Device
 from bampipe.setup.proposal.device import ChosenDevice
 from bampipe.setup.proposal.matching import Match, Matcher
-from bampipe.setup.proposal.notes import UNKNOWN, Notes, bare, entry, quoted
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
 
 _FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "kip", "V")
 _SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])

@@ -108,8 +108,17 @@ def _groups(names: Sequence[str], columns: Sequence[SurveyedColumn]) -> list[Gro
     found: list[Group] = []
     for said in (wanted, bare):
         if all(said.values()) and len(set(said.values())) == len(names):
-            found += _by_name(said, columns, split)
-    found += _by_number(len(names), columns, split)
+            found += [
+                Group(tuple(group[name] for name in said), named=True)
+                for group in _named_alike(said, columns, split).values()
+                if len(group) == len(said)
+            ]
+    # Names that differ by one number only, in its order.
+    found += [
+        Group(tuple(group[number] for number in sorted(group)), named=len(names) == 1)
+        for group in _numbered_alike(columns, split).values()
+        if len(group) == len(names)
+    ]
     taken: set[str] = set()
     chosen = []
     for group in found:
@@ -119,14 +128,6 @@ def _groups(names: Sequence[str], columns: Sequence[SurveyedColumn]) -> list[Gro
             taken |= {column.name for column in group.columns}
             chosen.append(group)
     return chosen
-
-
-def _by_name(
-    said: dict[str, Tokens], columns: Sequence[SurveyedColumn], split: dict[str, Tokens]
-) -> Iterator[Group]:
-    for group in _named_alike(said, columns, split).values():
-        if len(group) == len(said):
-            yield Group(tuple(group[name] for name in said), named=True)
 
 
 def _named_alike(
@@ -142,15 +143,6 @@ def _named_alike(
                 groups.setdefault(rest, {}).setdefault(name, column)
                 break
     return groups
-
-
-def _by_number(
-    count: int, columns: Sequence[SurveyedColumn], split: dict[str, Tokens]
-) -> Iterator[Group]:
-    """Groups whose names differ by one number only, in its order."""
-    for group in _numbered_alike(columns, split).values():
-        if len(group) == count:
-            yield Group(tuple(group[number] for number in sorted(group)), named=count == 1)
 
 
 def _numbered_alike(

@@ -32,6 +32,7 @@ class Matcher:
         registers: columns that hold signed numbers in a register, and how.
         robot: columns of a robot of which the drawing tells, and how they are counted.
         turning: what the readings of a position are worth, by the weight on it, by name of column.
+        given: columns that are known, by name of axis or input.
     """
 
     found: Survey
@@ -40,11 +41,13 @@ class Matcher:
     registers: Mapping[str, guesses.Register]
     robot: RobotColumns = field(default_factory=RobotColumns)
     turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
+    given: Mapping[str, SurveyedColumn] = field(default_factory=dict)
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""
-        if name in self.robot.columns:
-            return self.robot.columns[name]
+        known = {**self.robot.columns, **self.given}
+        if name in known:
+            return known[name]
         wanted, numbers = set(words(name)), set(_numbers(name))
         for column in self.found.of(*roles):
             counted = set(_numbers(column.name))

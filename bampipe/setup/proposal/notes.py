@@ -65,8 +65,3 @@ def quoted(text: str) -> str:
 def entry(column: str, unit: str, more: str = "") -> str:
     """An inline table that names a column and its unit; ``more`` follows, with a comma before."""
     return f'{{ column = {quoted(column)}, unit = "{unit}"{more} }}'
-
-
-def bare(unit: str) -> str:
-    """A unit without the brackets in which some files have it."""
-    return unit.strip("[]()")

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from bampipe.data.guesses import Driven
 from bampipe.data.survey import REFERENCE_WORDS, words
+from bampipe.data.units import unit as unit_named
 from bampipe.physics.device import KINDS
 from bampipe.setup.proposal.gravity import Weight
 
 _NAMELESS = (
     "enc encoder pos position angle counts ticks displacement disp stroke present actual act"
     " measured meas current state value deg degree degrees rad radian radians vel velocity speed"
-    " header feedback column ang motion dist percent rec log data mot motor"
+    " header feedback column ang motion dist percent rec log data mot motor field run runs"
 )
 """Words in the name of a position that name no axis."""
 _FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "eff", "torque", "tau"}
@@ -83,7 +85,9 @@ def starter_device(
         sign_width: of the sign of the velocity, rad/s or m/s; 0 for the usual one.
     """
     taken = _NAMELESS.split()
-    names = [word for word in words(position) if word not in taken and len(word) > 2]
+    item = re.search(r"\[([A-Za-z]\w*)\]", position)  # of a list, such as position[elbow]
+    parts = [item[1]] if item and unit_named(item[1]) is None else []
+    names = [w for p in (*parts, position) for w in words(p) if w not in taken and len(w) > 2]
     axis = names[0] if names else ("carriage" if linear else "joint")
     kind, qd = ("linear" if linear else "rotary"), f"qd_{axis}"
     torque, mass = KINDS[kind][1], "kg" if linear else "kg.m2"

@@ -1,0 +1,62 @@
+"""Joints whose motion a position controller gives: what the right effect explains is found."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from independent import prescribed
+from independent.sensors import Conditions
+from independent_runs import PIPELINE, record_trials
+
+import bampipe
+from bampipe.data.run_folder import RunFolder
+from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.search import Solution
+from bampipe.diagnosis.select import change_set, is_better, open_search
+from bampipe.diagnosis.session import Session, system_of
+from bampipe.physics.recipe import Recipe
+from bampipe.physics.registry import device_from
+from bampipe.trials.measured import read_measured_trials
+
+
+def test_delays_shorter_than_the_true_one_promise_what_they_can_at_their_bounds(
+    tmp_path: Path,
+) -> None:
+    """Without that, the only shape within its bounds was never weighed beside two that were not."""
+    conditions = Conditions(trials=2, seconds=8.0, rate_hz=500.0)
+    prescribed.record(tmp_path / "logs", 7, {"actuator_delay": 2.0}, conditions)
+    (tmp_path / "short.toml").write_text(PIPELINE)
+    pipeline = str(tmp_path / "short.toml")
+    run = bampipe.run_session(tmp_path / "logs", runs=tmp_path, pipeline=pipeline, last="filter")
+    recipe = Recipe(device_from(tomllib.loads(prescribed.DEVICE)).declaration, (), ())
+    trials = read_measured_trials(RunFolder(run.root), system_of(recipe), every_input=True)
+    session = Session(trials, Criteria())
+    fit = session.fit_plainly(recipe, system_of(recipe).prior)
+    with open_search(session, fit, only=("actuator_delay",)) as search:
+        gains = search.gains(())
+        shorter = [search.dictionary.values(key)[0] < 8e-3 for key in search.places]
+        assert sum(shorter) >= 3
+        assert (np.diff(gains[shorter]) > 0.0).all() and (gains[shorter] > 0.0).all()
+
+
+def test_a_drive_that_hardly_acts_any_more_explains_nothing(tmp_path: Path) -> None:
+    """Friction that falls with the speed left nearly one force, which a drive at its limit has."""
+    trials, recipe, _ = record_trials(tmp_path, "joint", 3)
+    session, weak = Session(trials, Criteria()), change_set(recipe, [("drive_sag:joint", ())])
+    before = session.fit_plainly(recipe, system_of(recipe).prior)
+    p = np.append(before.evidence.p, 0.0)
+    fits = []
+    for sag in (0.0, 1e3):
+        p[-1] = sag
+        evidence = session.linearise(weak, p)
+        fits.append(replace(before, recipe=weak, evidence=evidence))
+    same, weaker = fits
+    assert same.log_slope == pytest.approx(before.log_slope)
+    assert weaker.log_slope[0] < same.log_slope[0] - 5.0
+    promised = Solution(0.0, volume=np.zeros(1))
+    small = replace(weaker, problem=before.likelihood.pose(weaker.evidence))
+    assert not is_better(before, small, promised)
