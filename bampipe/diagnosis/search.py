@@ -22,7 +22,6 @@ from bampipe.trials.likelihood import (
     NOTHING,
     Problem,
     Samples,
-    hold_parameters,
     solve_bounded,
     solve_scaled,
 )
@@ -235,7 +234,7 @@ class Search:
             used = np.flatnonzero(~solved.held)
             # What a set takes away does not move along: its place can be taken by a twin of it.
             if absent:
-                free = hold_parameters(p.to_parameters, absent, n)[1]
+                free = p.hold(absent, n)[1]
                 normal = free.T @ normal @ free
             inside = _schur(normal, nb - (n - len(normal)))[np.ix_(used, used)]
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
@@ -339,7 +338,7 @@ class Search:
             # Of a candidate, too, the information on its strengths is that at its shape.
             p, shapes = self.p, self.p.shapes[name]
             away = {k: change for k, change in p.absence[name].items() if k not in shapes}
-            free = hold_parameters(p.to_parameters, dict.fromkeys(shapes, 0.0), self.bb.shape[1])[1]
+            free = p.hold(dict.fromkeys(shapes, 0.0))[1]
             to = p.to_parameters[list(away)] @ free
             normal = np.tensordot(self.solve(()).weight, self.bb, 1) + p.precision
             spread = to @ solve_scaled(free.T @ normal @ free, to.T)
@@ -557,7 +556,7 @@ class Search:
     def _free_of(self, keys: Sequence[Key], n: int) -> Array:
         """Directions in which n unknowns may move while effects that a set takes away stay away."""
         away = [place for name in gone(keys) for place in self.p.absence[name]]
-        return hold_parameters(self.p.to_parameters, dict.fromkeys(away, 0.0), n)[1]
+        return self.p.hold(dict.fromkeys(away, 0.0), n)[1]
 
     def shape_slopes(
         self, keys: Sequence[Key], strengths: Sequence[Array]

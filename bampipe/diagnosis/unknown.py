@@ -17,7 +17,7 @@ from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Search, gone
 from bampipe.diagnosis.shape import since_reversal
 from bampipe.trials.evidence import Evidence
-from bampipe.trials.likelihood import hold_parameters, solve_scaled, take_samples
+from bampipe.trials.likelihood import solve_scaled, take_samples
 
 Array = NDArray[np.float64]
 
@@ -105,7 +105,7 @@ def weigh_unknown(
     root = p.likelihood.root[axis]
     x = take_samples(wide, p.likelihood.samples[axis], 0) * root[:, None]
     absent = {k: v for name in gone(keys) for k, v in p.absence[name].items()}
-    fixed, free = hold_parameters(p.to_parameters, absent, nb)
+    fixed, free = p.hold(absent)
     force = float(np.sqrt(np.mean(p.likelihood.applied[axis] ** 2)))
     base = [b @ free for b in p.base]
     y = [v + b @ fixed for v, b in zip(p.y, p.base, strict=True)]

@@ -31,7 +31,6 @@ from bampipe.physics import System
 from bampipe.physics.recipe import Recipe
 from bampipe.results.identify import Convergence, StateBound
 from bampipe.trials.likelihood import (
-    hold_parameters,
     lay_out_samples,
     solve_bounded,
     take_samples,
@@ -137,7 +136,7 @@ class SquaresFit:
             x.T @ (w * c) for (x, _), w, c in zip(self.rows, self.weights, changes, strict=True)
         )
         to, count = self.fit.problem.to_parameters, self.free.size
-        _, chosen = hold_parameters(to, dict.fromkeys(held, 0.0), to.shape[1])
+        _, chosen = self.fit.problem.hold(dict.fromkeys(held, 0.0))
         step = chosen @ invert_scaled(chosen.T @ self.normal @ chosen) @ (chosen.T @ score)
         return np.asarray(-(to @ step)[:count])
 

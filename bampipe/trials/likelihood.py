@@ -37,6 +37,8 @@ NOTHING = 1e-4
 _DETERMINED = 1e-9
 """Of the largest eigenvalue of the scaled normal equations, below which a direction of the model's
 own parameters is not determined by the trials, and stays."""
+_LOOSE = 1e-6
+"""Of a parameter in units of its uncertainty, from which on a direction without effect moves it."""
 _SLOW = 3.0
 """Sign widths: slow motion, in which dry friction is as large as it gets."""
 _MOST_STOPPING = 1.5
@@ -311,6 +313,7 @@ class Problem:
         spread: of each, the standard deviations of these strengths before any data; shapes: the
             places of the parameters that it has beside them.
         prior_cost: negative log density of what is known beforehand, where nothing changes.
+        loose: (n_all, m) directions of the parameters in which nothing measured changes.
     """
 
     likelihood: Likelihood
@@ -325,6 +328,7 @@ class Problem:
     spread: Mapping[str, Array] = field(default_factory=dict)
     shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     prior_cost: float = 0.0
+    loose: Array | None = None
 
     @property
     def independent(self) -> Array:
@@ -343,6 +347,37 @@ class Problem:
             np.array([b.T @ y for b, y in zip(self.base, self.y, strict=True)]),
             np.array([float(y @ y) for y in self.y]),
         )
+
+    def hold(self, values: Mapping[int, float], n: int | None = None) -> tuple[Array, Array]:
+        """Unknowns (n,) at which parameters have given values, and (n, m) directions still free.
+
+        A value that a direction reaches in which nothing measured changes holds nothing else.
+
+        Args:
+            values: by number of the parameter.
+            n: of unknowns, the model's own first; these alone by default.
+        """
+        nb, places = self.to_parameters.shape[1], list(values)
+        n = nb if n is None else n
+        fixed, free = np.zeros(n), np.eye(n)
+        rows, wanted = self.to_parameters[places], np.array(list(values.values()))
+        # Each row in its own unit; what does not move is held already.
+        norm = np.linalg.norm(rows, axis=1)
+        moves = norm > 0.0
+        rows, wanted = rows[moves] / norm[moves, None], wanted[moves] / norm[moves]
+        if self.loose is not None and rows.size:
+            u, size, _ = np.linalg.svd(self.loose[places][moves] / norm[moves, None])
+            bound = u[:, int(np.sum(size > _LOOSE)) :].T
+            rows, wanted = bound @ rows, bound @ wanted
+        if not rows.size:
+            return fixed, free
+        u, size, vt = np.linalg.svd(rows)
+        rank = int(np.sum(size > 1e-9 * max(float(size[0]), 1e-300)))
+        fixed[:nb] = vt[:rank].T @ ((u.T @ wanted)[:rank] / size[:rank])
+        free = np.zeros((n, n - rank))
+        free[:nb, : nb - rank] = vt[rank:].T
+        free[nb:, nb - rank :] = np.eye(n - nb)
+        return fixed, free
 
     def solve(self) -> Solved:
         """The change of the model's own parameters that is most likely."""
@@ -442,6 +477,7 @@ def _pose(
     values, vectors = np.linalg.eigh(normal * per_unit * per_unit[:, None])
     kept = values > _DETERMINED * values[-1]
     to = vectors[:, kept] / np.sqrt(values[kept]) * per_unit[:, None]
+    loose = vectors[:, ~kept] * per_unit[:, None]
     effects = evidence.system.model.effects
     return Problem(
         likelihood, tuple(y), tuple(x @ to for x in full),
@@ -449,7 +485,7 @@ def _pose(
         {item.name: _absence(evidence, item) for item in effects},
         {item.name: _spread(item) for item in effects},
         {item.name: _shapes(evidence, item) for item in effects},
-        0.5 * float(precision @ known**2),
+        0.5 * float(precision @ known**2), loose,
     )  # fmt: skip
 
 
@@ -526,7 +562,7 @@ def solve_bounded(
     held = np.zeros(n - nb, dtype=bool)
     weight = independent / np.maximum(yy, 1e-300) if weight is None else weight
     for _ in range(_PASSES):
-        fixed, free = hold_parameters(p.to_parameters, fixed_at, n)
+        fixed, free = p.hold(fixed_at, n)
         chosen = free[:, np.append(np.ones(free.shape[1] - n + nb, dtype=bool), ~held)]
         for _ in range(_REWEIGHTS):
             normal = np.tensordot(weight, xx, 1) + precision
@@ -550,33 +586,6 @@ def solve_bounded(
     off = b[:nb]
     cost += p.prior_cost + 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
     return Solved(b, held, left, weight, cost)
-
-
-def hold_parameters(
-    to_parameters: Array, values: Mapping[int, float], n: int
-) -> tuple[Array, Array]:
-    """Unknowns (n,) at which parameters have given values, and the directions (n, m) still free.
-
-    Args:
-        to_parameters: (n_all, P) to parameters from the first P unknowns.
-        values: by number of the parameter.
-    """
-    fixed, free = np.zeros(n), np.eye(n)
-    rows, wanted = to_parameters[list(values)], np.array(list(values.values()))
-    # Each row in its own unit; what does not move is held already.
-    norm = np.linalg.norm(rows, axis=1)
-    moves = norm > 0.0
-    rows, wanted = rows[moves] / norm[moves, None], wanted[moves] / norm[moves]
-    if not rows.size:
-        return fixed, free
-    nb = rows.shape[1]
-    u, size, vt = np.linalg.svd(rows)
-    rank = int(np.sum(size > 1e-9 * float(size[0])))
-    fixed[:nb] = vt[:rank].T @ ((u.T @ wanted)[:rank] / size[:rank])
-    free = np.zeros((n, n - rank))
-    free[:nb, : nb - rank] = vt[rank:].T
-    free[nb:, nb - rank :] = np.eye(n - nb)
-    return fixed, free
 
 
 def solve_scaled(normal: Array, right: Array) -> Array:
