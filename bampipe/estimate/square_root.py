@@ -172,7 +172,8 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     by differences and sums of opposite points: parameters stay where they are, so that in the
     sums, and in the points that move the noise, only the state is not zero. The update rotates
     the joint root of measurement and state, so that it needs no downdate and cannot lose positive
-    definiteness.
+    definiteness. It is longer than other functions because prediction and update share all of
+    their memory.
 
     Args:
         derivative: f(count, x, u, p, w, dx); measure: h(count, x, u, p, y).
