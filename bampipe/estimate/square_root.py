@@ -132,20 +132,12 @@ def allocate(n: int, nx: int, nu: int, ny: int, nw: int, p: Array) -> Workspace:
     """
     pairs, wide, longest = n + nw, padded(n), n + ny + 1
     return Workspace(
-        images=np.empty((nx, 1 + 2 * pairs)),
-        readings=np.empty((ny, 1 + 2 * n)),
-        root=np.zeros((n, wide)),
-        columns=np.zeros((n, padded(pairs + nw))),
-        reading_columns=np.zeros((ny, wide)),
-        noise=np.empty((ny, ny)),
-        cross=np.empty((ny, n)),
-        gain=np.empty((ny, wide)),
-        cosine=np.empty(longest),
-        sine=np.empty(longest),
-        single=np.empty(longest),
-        whitened=np.empty(longest),
-        points=allocate_points(nx, nu, p, nw),
-    )
+        images=np.empty((nx, 1 + 2 * pairs)), readings=np.empty((ny, 1 + 2 * n)),
+        root=np.zeros((n, wide)), columns=np.zeros((n, padded(pairs + nw))),
+        reading_columns=np.zeros((ny, wide)), noise=np.empty((ny, ny)), cross=np.empty((ny, n)),
+        gain=np.empty((ny, wide)), cosine=np.empty(longest), sine=np.empty(longest),
+        single=np.empty(longest), whitened=np.empty(longest), points=allocate_points(nx, nu, p, nw),
+    )  # fmt: skip
 
 
 @njit(

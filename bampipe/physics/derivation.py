@@ -307,15 +307,11 @@ def _combine_motion(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
     motion = tuple(d.q), tuple(d.qd), tuple(d.qdd)
     bodies = _apply_newton_euler(robot.links, gravity_vector(robot), numbers, motion)
     return _Motion(
-        bodies.steps,
-        [_add(*rows) for rows in zip(energy_motion.mass, bodies.mass, strict=True)],
-        _add(energy_motion.bias, bodies.bias),
-        _add(energy_motion.dynamics, bodies.dynamics),
-        energy_motion.kinetic + bodies.kinetic,
-        energy_motion.potential + bodies.potential,
-        bodies.names,
-        bodies.numbers,
-    )
+        bodies.steps, [_add(*rows) for rows in zip(energy_motion.mass, bodies.mass, strict=True)],
+        _add(energy_motion.bias, bodies.bias), _add(energy_motion.dynamics, bodies.dynamics),
+        energy_motion.kinetic + bodies.kinetic, energy_motion.potential + bodies.potential,
+        bodies.names, bodies.numbers,
+    )  # fmt: skip
 
 
 def _add(one: Sequence[Any], other: Sequence[Any]) -> list[Any]:
