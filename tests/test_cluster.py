@@ -198,12 +198,12 @@ def scheduler(tmp_path: Path, *workers: str) -> Iterator[tuple[str, list[Any]]]:
     file = tmp_path / "scheduler.json"
     plain = ("--scheduler-file", str(file), "--no-dashboard")
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    alone = f"--no-nanny --nthreads 1 --preload {TOYS / 'toy_worker.py'} --name"
+    alone = ["--no-nanny", "--nthreads", "1", "--preload", str(TOYS / "toy_worker.py"), "--name"]
     commands = [
-        [sys.executable, "-m", f"distributed.cli.dask_{program}", *plain, *options.split()]
+        [sys.executable, "-m", f"distributed.cli.dask_{program}", *plain, *options]
         for program, options in (
-            ("scheduler", "--host 127.0.0.1 --port 0"),
-            *(("worker", f"{alone} {name}") for name in workers),
+            ("scheduler", ["--host", "127.0.0.1", "--port", "0"]),
+            *(("worker", [*alone, name]) for name in workers),
         )
     ]
     started = [subprocess.Popen(commands[0], cwd=tmp_path, **quiet)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,19 +23,6 @@ FASTEST = 2.4  # of the joint, rad/s
 LONG = {"trials": 4, "seconds": 12.0}
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session of the joint and its run."""
-    root = tmp_path_factory.mktemp("recorded") / "now"
-    record_run(root, "joint", 922, **LONG)
-    return root
-
-
-def run_again(root: Path) -> bampipe.Run:
-    pipeline = str(root / "short.toml")
-    return bampipe.run_session(root / "joint", runs=root / "runs", pipeline=pipeline)
-
-
 def propose(run: bampipe.Run, **settings) -> tuple[NextResult, Path]:
     bampipe.run_stage(run, "next", **settings)
     path = run.root / NextResult.file("base")
@@ -49,8 +35,8 @@ def information_on(run: bampipe.Run, name: str) -> float:
     return found**-2
 
 
-def test_the_uncertainty_forecast_is_the_one_that_comes(recorded, tmp_path):
-    run = run_again(Path(shutil.copytree(recorded, tmp_path / "now")))
+def test_the_uncertainty_forecast_is_the_one_that_comes(tmp_path):
+    run, _ = record_run(tmp_path / "now", "joint", 922, **LONG)
     found, path = propose(run, purpose="coulomb.joint", seconds=12.0)
     assert found.purpose == "precision"
     forecast = found.proposals[0].sd
@@ -116,8 +102,8 @@ def record_at(folder: Path, strength: float) -> dict[str, float]:
     return independent.record("joint", folder, 931, hidden, SHORT["joint"])["parameters"]
 
 
-def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(recorded, tmp_path):
-    run = run_again(Path(shutil.copytree(recorded, tmp_path / "now")))
+def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(tmp_path):
+    run, _ = record_run(tmp_path / "now", "joint", 922, **LONG)
     names = ("coulomb.joint", "viscous.joint", "inertia", "moment")
     found, path = propose(run, purpose="coulomb.joint", seconds=12.0, plan=True, sd=0.002)
     assert found.plan is not None
@@ -137,7 +123,11 @@ def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(recorded,
         "joint", tmp_path / "now" / "joint", 922, {},
         replace(SHORT["joint"], **LONG, tasks=Task.read(path)),
     )  # fmt: skip
-    again = run_again(tmp_path / "now")
+    again = bampipe.run_session(
+        tmp_path / "now" / "joint",
+        runs=tmp_path / "now" / "runs",
+        pipeline=str(tmp_path / "now" / "short.toml"),
+    )
     identified = IdentifyResult.read(again.root / IdentifyResult.file("base"))
     (said,) = compare_forecast(easy, identified, None)
     came = identified.parameters["coulomb.joint"].sd
