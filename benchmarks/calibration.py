@@ -23,29 +23,16 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from independent import record
-from independent.sensors import Conditions
-from recovery import DAYS, PIPELINE, draw_effects
+from independent.draws import draw_session, record_drawn
+from recovery import PIPELINE
 from scores import Scores, read_scores, write_tables
 
 import bampipe
 from bampipe.diagnosis.criteria import Criteria
-
-USUAL = {
-    "bam": Conditions(creep=True, trials=4, seconds=8.0, rate_hz=250.0),
-    "joint": Conditions(creep=True, trials=4, seconds=10.0),
-    "axis": Conditions(creep=True, trials=4, seconds=5.0),
-    "damper": Conditions(creep=True, trials=4, seconds=10.0),
-    "wrist": Conditions(creep=True, trials=4, seconds=10.0),
-}
-"""Sessions that are recorded and diagnosed within seconds."""
-MOST = {"bam": 5, "joint": 3, "axis": 3, "damper": 2, "wrist": 1}
-"""Effects hidden at once."""
 
 
 def diagnose(name: str, run: bampipe.Run | Path, truth: Mapping[str, Any]) -> Scores:
@@ -80,29 +67,12 @@ def diagnose(name: str, run: bampipe.Run | Path, truth: Mapping[str, Any]) -> Sc
     )  # fmt: skip
 
 
-def draw_session(seed: int, clean: bool) -> tuple[str, str, dict[str, float]]:
-    """Machine, day and hidden effects with their strengths, 0.1 to 1, each as likely by ratio."""
-    rng = np.random.default_rng([seed, clean])
-    machine = list(USUAL)[seed % len(USUAL)]
-    day = "good" if rng.uniform() < 0.5 else str(rng.choice([d for d in DAYS if d != "good"]))
-    count = 0 if clean else int(rng.integers(1, MOST[machine] + 1))
-    outside = int(count > 1 and rng.uniform() < 0.2)
-    names = () if clean else draw_effects(machine, count - outside, outside, seed)
-    return machine, day, {n: round(float(10 ** rng.uniform(-1.0, 0.0)), 3) for n in names}
-
-
 def record_and_diagnose(seed: int, clean: bool) -> Scores:
     """Record the session of a seed, identify the bare model and diagnose it."""
     machine, day, effects = draw_session(seed, clean)
-    usual, drawn = USUAL[machine], DAYS[day]
-    conditions = replace(
-        drawn, creep=True, trials=drawn.trials or usual.trials,
-        seconds=drawn.seconds or usual.seconds, rate_hz=drawn.rate_hz or usual.rate_hz,
-        viscous_trials=3 * any(e.startswith("brake") for e in effects),
-    )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
-        truth = record(machine, root / "session", seed, effects, conditions)
+        truth = record_drawn(root / "session", seed, machine, day, effects)
         named = {"effects": {e: effects[e] for e in truth["effects"]}, "outside": truth["outside"]}
         (root / "calibration.toml").write_text(PIPELINE)
         try:

@@ -26,7 +26,8 @@ from typing import Any
 
 import numpy as np
 from independent import MACHINES, record
-from independent.sensors import GOOD, HARD, Conditions
+from independent.draws import DAYS, draw_effects
+from independent.sensors import Conditions
 from pydantic import TypeAdapter
 
 import bampipe
@@ -46,15 +47,10 @@ PIPELINE = """schema = "bampipe.pipeline/1"
 name = "recovery"
 stages = ["ingest", "filter", "identify", "validate"]
 """
-DAYS = {"good": GOOD} | HARD
 RIGHT = "right"
 OTHERWISE = {"shear_thinning": ("viscous", "coulomb")}
 """Effects that simulators write in other mathematics, with the parameters of the same axis that
 take part in the difference: of them, such a session has no truth."""
-
-SHARE_OF_COULOMB = ("presliding", "maxwell_slip", "position_dependent_friction")
-"""What takes its force from the Coulomb friction of an axis: two of them leave none, and then the
-simulator does not have what its truth says."""
 
 
 @dataclass(frozen=True)
@@ -328,24 +324,6 @@ def _hold_against(
         for name, value in truth.items()
         if name in result.parameters and name not in shared
     )
-
-
-def draw_effects(machine: str, count: int, outside: int, seed: int) -> tuple[str, ...]:
-    """Draw ``count`` effects of the library and ``outside`` others, none of one kind twice."""
-    rng = np.random.default_rng([seed, count, outside])
-    chosen: list[str] = []
-    for pool, size in (
-        (MACHINES[machine].EFFECTS, count),
-        (MACHINES[machine].UNKNOWN, count + outside),
-    ):
-        for name in rng.permutation(pool):
-            kind, _, axis = name.partition(":")
-            kinds = {c.partition(":")[0] for c in chosen}
-            rivals = SHARE_OF_COULOMB if kind in SHARE_OF_COULOMB else ()
-            beside_rival = any(f"{rival}:{axis}" in chosen for rival in rivals)
-            if len(chosen) < size and kind not in kinds and not beside_rival:
-                chosen.append(str(name))
-    return tuple(chosen)
 
 
 def write_table(outcomes: Sequence[Outcome]) -> str:

@@ -1,10 +1,10 @@
 """The tables of docs/validation.md, made from the results that benchmarks have stored.
 
-    python benchmarks/validation.py            # write them into the page
-    python benchmarks/validation.py --check    # fail where the page has other ones
+    python benchmarks/validation.py            # write them into the pages
+    python benchmarks/validation.py --check    # fail where a page has other ones
 
-`benchmarks/results/` has one file a benchmark, a line of JSON a session, and in `measured.json` the
-commit and the command of each.
+`benchmarks/results/` has one file a benchmark, and in `measured.json` the commit and the command
+of each. The page of the benchmark of missing effects is filled as well.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import mistakes
+import speed
+from missing_effects.score import write_results, write_summary
 from pydantic import TypeAdapter
 from scores import read_scores, write_tables
 
@@ -24,7 +26,7 @@ from bampipe.diagnosis.criteria import Criteria
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-PAGE = ROOT / "docs" / "validation.md"
+PAGES = (ROOT / "docs/validation.md", ROOT / "benchmarks/missing_effects/README.md")
 BLOCK = re.compile(r"(<!-- results of (\w+) -->\n)(.*?)(<!-- end -->)", re.S)
 
 
@@ -53,10 +55,19 @@ def write_mistakes(path: Path) -> str:
     )
 
 
-TABLES: dict[str, Callable[[Path], str]] = {
-    "calibration": write_calibration,
-    "mistakes": write_mistakes,
+def write_speed(path: Path) -> str:
+    """Times, memory and size, beside those of another commit."""
+    return speed.write_table(json.loads(path.read_text(encoding="utf-8")))
+
+
+TABLES: dict[str, tuple[str, str, Callable[[Path], str]]] = {
+    "calibration": ("calibration", "calibration.jsonl", write_calibration),
+    "mistakes": ("mistakes", "mistakes.jsonl", write_mistakes),
+    "missing_effects": ("missing_effects", "missing_effects", write_summary),
+    "entries": ("missing_effects", "missing_effects", write_results),
+    "speed": ("speed", "speed.json", write_speed),
 }
+"""By the name of a block: result in `measured.json`, what is stored, and what writes it."""
 
 
 def read_measured() -> dict[str, dict[str, str]]:
@@ -70,8 +81,9 @@ def fill(page: str) -> str:
 
     def filled(match: re.Match[str]) -> str:
         head, name, _, end = match.groups()
-        about = f"`{measured[name]['command']}`, commit {measured[name]['commit']}."
-        return f"{head}\n{about}\n\n{TABLES[name](RESULTS / f'{name}.jsonl')}\n\n{end}"
+        result, stored, write = TABLES[name]
+        about = f"`{measured[result]['command']}`, commit {measured[result]['commit']}."
+        return f"{head}\n{about}\n\n{write(RESULTS / stored)}\n\n{end}"
 
     return BLOCK.sub(filled, page)
 
@@ -81,12 +93,13 @@ def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--check", action="store_true", help="write nothing")
     given = parser.parse_args(arguments)
-    page = PAGE.read_text(encoding="utf-8")
-    made = fill(page)
-    if given.check and made != page:
-        raise SystemExit(f"{PAGE} is not what the results give: python benchmarks/validation.py")
-    if not given.check:
-        PAGE.write_text(made, encoding="utf-8")
+    for path in PAGES:
+        page = path.read_text(encoding="utf-8")
+        made = fill(page)
+        if given.check and made != page:
+            raise SystemExit(f"{path} is not what the results give: {__file__}")
+        if not given.check:
+            path.write_text(made, encoding="utf-8")
 
 
 if __name__ == "__main__":

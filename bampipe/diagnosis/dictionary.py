@@ -24,9 +24,9 @@ _ALONE, _SEVERAL = 7, 5
 _WIDE = 300.0
 """Ratio of the ends of a range from which on its grid has `_MORE` values more."""
 _MORE = 4
-_MOST, _MOST_OF_STATES = 60, 300
+_MOST, _MOST_OF_THREE, _MOST_OF_STATES = 60, 120, 300
 """Shapes on a grid: of an effect without and with internal states, whose shape decides when things
-happen, not only how large they are."""
+happen, not only how large they are; three of them at most, or more."""
 _DIVERGED = 1e30
 """An internal state that is too stiff to be integrated at the sampling rate ends above this."""
 _SEGMENT = 128
@@ -90,7 +90,8 @@ class Dictionary:
         each = _ALONE if len(ranges) == 1 else _SEVERAL
         counts = [each + _MORE * (r.by_ratio and r.high / r.low > _WIDE) for r in ranges]
         states = self.candidates[name].system.model.effects[-1].effect.states
-        while np.prod(counts) > (_MOST_OF_STATES if states else _MOST):
+        most = _MOST_OF_STATES if len(ranges) > 3 else _MOST_OF_THREE
+        while np.prod(counts) > (most if states else _MOST):
             dense = [(n - 1) / r.extent for n, r in zip(counts, ranges, strict=True)]
             counts[int(np.argmax(dense))] -= 1
         # Few values are better off amid the parts of a range than at its ends.

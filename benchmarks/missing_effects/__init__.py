@@ -1,0 +1,1 @@
+"""A benchmark of naming missing effects: recipes of sessions, their generator, and a scorer."""
