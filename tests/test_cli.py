@@ -34,28 +34,10 @@ from bampipe.run.status import StepStatus
 Command = Callable[..., tuple[int, str, str]]
 
 COMMANDS = [
-    "run",
-    "ingest",
-    "filter",
-    "stiffness",
-    "identify",
-    "viscous",
-    "performance",
-    "validate",
-    "diagnose",
-    "draft",
-    "next",
-    "extend",
-    "compare",
-    "report",
-    "effects",
-    "simulate",
-    "demo",
-    "status",
-    "verify",
-    "version",
-    "init",
-]
+    "run", "ingest", "filter", "stiffness", "identify", "viscous", "performance", "validate",
+    "diagnose", "draft", "next", "extend", "compare", "report", "effects", "simulate", "demo",
+    "status", "verify", "version", "init",
+]  # fmt: skip
 
 
 def arguments(toy: Toy) -> list[str]:
@@ -221,24 +203,6 @@ def test_a_typo_in_a_setting_changes_nothing(toy: Toy, command: Command, setting
     assert command("status", toy.root)[1].count("current") == 4
 
 
-def test_a_setting_that_a_stage_refuses_leaves_its_results_current(
-    toy: Toy, command: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from bampipe.stages import toy_double  # type: ignore[attr-defined]
-
-    assert command("run", *arguments(toy))[0] == 0
-    before = toy.files()
-
-    def refuse(*_: object) -> None:
-        raise InputError("no such channel", where="toy_double.factor")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(toy_double, "execute", refuse)
-        assert command("run", *arguments(toy), "--set", "toy_double.factor=3")[0] == 2
-    assert toy.files() == before
-    assert command("status", toy.root)[1].count("current") == 4
-
-
 def test_all_faults_of_a_file_are_said(toy: Toy, command: Command) -> None:
     path = toy.folder / "own.toml"
     path.write_text('schema = "bampipe.pipeline/1"\nname = 3\nstage = ["toy_read"]\nsummary = 1\n')
@@ -298,14 +262,6 @@ def test_status_and_verify(toy: Toy, command: Command) -> None:
     steps = {step["step"]: step for step in json.loads(out)["steps"]}
     assert steps["toy_sum"]["state"] == "stale"
     assert "was changed" in steps["toy_sum"]["reason"]
-
-
-def test_read_only_commands_write_nothing(toy: Toy, command: Command) -> None:
-    command("run", *arguments(toy))
-    before = {p: p.stat().st_mtime_ns for p in toy.root.rglob("*")}
-    command("status", toy.root)
-    command("verify", toy.root)
-    assert {p: p.stat().st_mtime_ns for p in toy.root.rglob("*")} == before
 
 
 # Which run is meant
@@ -405,16 +361,6 @@ def test_one_effect_in_full(command: Command) -> None:
 )
 def test_wrong_effect(command: Command, name: str, message: str) -> None:
     assert message in one_line_error(*command("effects", name))
-
-
-def test_plot_keeps_its_frame() -> None:
-    from bampipe.cli.effects import COLUMNS, ROWS, plot
-
-    lines = plot([-1.0, 0.0, 2.0], [3.0, 0.0, -1.0])
-    assert len(lines) == ROWS + 1
-    assert all(len(line) <= COLUMNS + 11 for line in lines)
-    assert lines[0].strip().startswith("3")
-    assert plot([1.0, 1.0], [0.0, 0.0])
 
 
 # Printing
@@ -617,19 +563,3 @@ def test_a_diagnosis_that_is_older_than_its_inputs_is_said(
         said = capsys.readouterr().out
         assert ("bampipe diagnose runs/s01" in said) == ("identify.json" in said)
         assert bool(said) == ("identify.json" in reason)
-
-
-@pytest.mark.parametrize(
-    ("verdict", "after"),
-    [
-        ("missing", "bampipe extend RUN stribeck:yaw --model base"),
-        ("undecided", "record more trials like these that move yaw"),
-        ("unknown_effect", "look at the residual maps of yaw with `bampipe report RUN`"),
-    ],
-)
-def test_what_to_do_next_is_what_the_diagnosis_stored(
-    ingested: Path, command: Command, verdict: str, after: str
-) -> None:
-    assert after_run(ingested, "base", "s01") == "bampipe status s01"
-    write_result(ingested, DiagnoseResult, axes={"yaw": {"verdict": verdict}}, next=after)
-    assert after_run(ingested, "base", "s01") == after.replace("RUN", "s01")

@@ -153,6 +153,7 @@ class Listener:
 ANSWERS = {"silence": b"", "HTTP": b"HTTP/1.1 400 Bad Request\r\n\r\n" * 20, "bytes": b"\xff" * 999}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("answer", ANSWERS.values(), ids=ANSWERS)
 def test_what_is_no_scheduler_is_one_line(
     toy: Toy, answer: bytes, monkeypatch: pytest.MonkeyPatch
@@ -196,34 +197,15 @@ def scheduler(tmp_path: Path, *workers: str) -> Iterator[tuple[str, list[Any]]]:
     """A scheduler, and workers, in processes of their own; gives its address and them."""
     file = tmp_path / "scheduler.json"
     plain = ("--scheduler-file", str(file), "--no-dashboard")
-    program = [sys.executable, "-m", "distributed.cli"]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    alone = ["--no-nanny", "--nthreads", "1", "--preload", str(TOYS / "toy_worker.py"), "--name"]
     commands = [
-        [
-            *program[:2],
-            "distributed.cli.dask_scheduler",
-            *plain,
-            "--host",
-            "127.0.0.1",
-            "--port",
-            "0",
-        ]
-    ]
-    for name in workers:
-        commands.append(
-            [
-                *program[:2],
-                "distributed.cli.dask_worker",
-                *plain,
-                "--nthreads",
-                "1",
-                "--name",
-                name,
-                "--no-nanny",
-                "--preload",
-                str(TOYS / "toy_worker.py"),
-            ]
+        [sys.executable, "-m", f"distributed.cli.dask_{program}", *plain, *options]
+        for program, options in (
+            ("scheduler", ["--host", "127.0.0.1", "--port", "0"]),
+            *(("worker", [*alone, name]) for name in workers),
         )
+    ]
     started = [subprocess.Popen(commands[0], cwd=tmp_path, **quiet)]
     try:
         deadline = time.monotonic() + 30.0
@@ -242,6 +224,7 @@ def scheduler(tmp_path: Path, *workers: str) -> Iterator[tuple[str, list[Any]]]:
             process.wait()
 
 
+@pytest.mark.long
 def test_a_scheduler_without_workers_is_one_line(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine, "PATIENCE_S", 4.0)
     with scheduler(toy.folder) as (address, _):
@@ -251,14 +234,14 @@ def test_a_scheduler_without_workers_is_one_line(toy: Toy, monkeypatch: pytest.M
         assert time.monotonic() - began < 9.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_worker_in_place_of_a_scheduler_is_one_line(toy: Toy, cluster: Any) -> None:
     worker = next(iter(cluster.workers.values()))
     with pytest.raises(InputError, match="no Dask scheduler answers: this is a worker"):
         run_on_cluster([toy.request()], worker.worker_address, unheard)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
 def test_a_scheduler_lost_in_mid_run_keeps_what_was_done(
     toy: Toy, number: signal.Signals, monkeypatch: pytest.MonkeyPatch

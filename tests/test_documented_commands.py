@@ -179,7 +179,7 @@ def test_what_is_printed_is_held_against_what_is_shown() -> None:
 RUN = [page for page in PAGES if any(k == "console" for k, *_ in blocks(page.read_text("utf-8")))]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("page", RUN, ids=lambda p: str(p.relative_to(ROOT)))
 def test_a_page_prints_what_it_shows(
     page: Path,

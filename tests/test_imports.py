@@ -17,16 +17,8 @@ from bampipe.stages import base
 
 PACKAGE = Path(bampipe.__file__).parent
 HEAVY = (
-    "h5py",
-    "matplotlib",
-    "numba",
-    "numpy",
-    "pandas",
-    "pyarrow",
-    "pydantic",
-    "scipy",
-    "sympy",
-)
+    "h5py", "matplotlib", "numba", "numpy", "pandas", "pyarrow", "pydantic", "scipy", "sympy",
+)  # fmt: skip
 
 
 def law(libraries: str, rooms: str) -> set[str]:

@@ -154,13 +154,9 @@ def simulate_controlled(
     controller = _Controller(
         columns=columns,
         ticks=max(1, round(dt * rate_hz) if rate_hz > 0.0 else int(np.ceil(dt / 1e-3 - 1e-9))),
-        states=states,
-        limits=bounds,
-        start=np.empty(total.shape[1]),
-        end=np.empty(total.shape[1]),
-        given=np.empty(references.shape[1]),
-        out=np.empty(columns.size + states.size),
-    )
+        states=states, limits=bounds, start=np.empty(total.shape[1]), end=np.empty(total.shape[1]),
+        given=np.empty(references.shape[1]), out=np.empty(columns.size + states.size),
+    )  # fmt: skip
     work = np.zeros((9, max(len(x0), total.shape[1])))
     _close(
         derivative, measure, command, x, total, references, readings, plant, controller, dt, work

@@ -8,6 +8,7 @@ filterpy draws the sigma points afresh after adding Q, as the compiled engine do
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,50 +65,13 @@ def _filter(
     advance: Callable[..., None],
 ) -> tuple[FilteredTrial, Array, Array]:
     """Filter one trial; return it and the parameters with their covariance after it."""
-    try:
-        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
-    except ImportError as error:
-        raise InputError(
-            "engine filterpy needs filterpy 2", remedy="pip install 'filterpy>=2'"
-        ) from error
-
-    nx, nw = model.n_states, settings.noise_sd.size
-    n, ny = nx + model.free.size, settings.observed.size
-    lower, upper = model.range
-    p = np.array(model.parameters, dtype=float)
-    t = np.asarray(trial.t, dtype=float)
-    u = np.ascontiguousarray(trial.u, dtype=float)
-    curvature = trial.input_curvature
-    work = np.empty((6, max(n, 2 * nx) + u.shape[1]))
-    reading = np.empty(2 * nx)
-
-    def move(point: Array, dt: float, k: int) -> Array:
-        model.place_parameters(point[nx:n], p)
-        x, w = point[:nx].copy(), point[n:].copy()
-        c0, c1 = curvature[k - 1], curvature[k]
-        late = p[-1] * ((u[k] - u[k - 1]) / dt - 0.25 * p[-1] * (c0 + c1))
-        start, end = u[k - 1] - late, u[k] - late
-        substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
-        advance(model.derivative, x, start, end, c0, c1, p, w, dt, substeps, work)
-        return np.concatenate([x, point[nx:n], np.zeros(nw)])
-
-    def read(point: Array, k: int) -> Array:
-        model.place_parameters(point[nx:n], p)
-        model.measure(point[:nx].copy(), u[k], p, reading)
-        return reading[settings.observed].copy()
-
-    chosen = settings.points
-    points = MerweScaledSigmaPoints(n + nw, chosen.alpha, chosen.beta, chosen.kappa)
-    ukf = UnscentedKalmanFilter(n + nw, ny, 1.0, hx=read, fx=move, points=points)
-    ukf.x = np.concatenate([trial.x, np.clip(theta, lower, upper), np.zeros(nw)])
-    ukf.P = np.zeros((n + nw, n + nw))
-    ukf.P[:nx, :nx] = np.diag(np.square(trial.x_sd))
-    ukf.P[nx:n, nx:n] = covariance
-    ukf.P[n:, n:] = np.diag(np.square(settings.noise_sd))
-    ukf.R = np.diag(np.square(settings.reading_sd))
+    nx, n, ny = model.n_states, model.n_states + model.free.size, settings.observed.size
+    t, (lower, upper) = np.asarray(trial.t, dtype=float), model.range
+    ukf = _make_filter(model, trial, settings, advance)
+    ukf.x[nx:n], ukf.P[nx:n, nx:n] = np.clip(theta, lower, upper), covariance
     means, covariances = [ukf.x[:n].copy()], [ukf.P[:n, :n].copy()]
-    innovation, innovation_sd = np.full((t.size, ny), np.nan), np.full((t.size, ny), np.nan)
-    nis, log_likelihood = np.full(t.size, np.nan), np.full(t.size, np.nan)
+    innovation, innovation_sd = np.full((2, t.size, ny), np.nan)
+    nis, log_likelihood = np.full((2, t.size), np.nan)
     for k in range(1, t.size):
         dt = t[k] - t[k - 1]
         walk = np.square(settings.walk_sd) * dt
@@ -127,12 +91,50 @@ def _filter(
             means.append(ukf.x[:n].copy())
             covariances.append(ukf.P[:n, :n].copy())
     filtered = FilteredTrial(
-        t=t[:: settings.stride],
-        mean=np.array(means),
-        covariance=np.array(covariances),
-        innovation=innovation,
-        innovation_sd=innovation_sd,
-        nis=nis,
-        log_likelihood=log_likelihood,
-    )
+        t[:: settings.stride], np.array(means), np.array(covariances),
+        innovation, innovation_sd, nis, log_likelihood,
+    )  # fmt: skip
     return filtered, ukf.x[nx:n].copy(), ukf.P[nx:n, nx:n].copy()
+
+
+def _make_filter(
+    model: FilterModel, trial: Trial, settings: FilterSettings, advance: Callable[..., None]
+) -> Any:
+    """Return filterpy's filter of state, parameters and noise at the first sample of a trial."""
+    try:
+        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+    except ImportError as error:
+        raise InputError(
+            "engine filterpy needs filterpy 2", remedy="pip install 'filterpy>=2'"
+        ) from error
+
+    nx, nw = model.n_states, settings.noise_sd.size
+    n, ny = nx + model.free.size, settings.observed.size
+    p, curvature = np.array(model.parameters, dtype=float), trial.input_curvature
+    u = np.ascontiguousarray(trial.u, dtype=float)
+    work, reading = np.empty((6, max(n, 2 * nx) + u.shape[1])), np.empty(2 * nx)
+
+    def move(point: Array, dt: float, k: int) -> Array:
+        model.place_parameters(point[nx:n], p)
+        x, w = point[:nx].copy(), point[n:].copy()
+        c0, c1 = curvature[k - 1], curvature[k]
+        late = p[-1] * ((u[k] - u[k - 1]) / dt - 0.25 * p[-1] * (c0 + c1))
+        start, end = u[k - 1] - late, u[k] - late
+        substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
+        advance(model.derivative, x, start, end, c0, c1, p, w, dt, substeps, work)
+        return np.concatenate([x, point[nx:n], np.zeros(nw)])
+
+    def read(point: Array, k: int) -> Array:
+        model.place_parameters(point[nx:n], p)
+        model.measure(point[:nx].copy(), u[k], p, reading)
+        return reading[settings.observed].copy()
+
+    chosen = settings.points
+    points = MerweScaledSigmaPoints(n + nw, chosen.alpha, chosen.beta, chosen.kappa)
+    ukf = UnscentedKalmanFilter(n + nw, ny, 1.0, hx=read, fx=move, points=points)
+    ukf.x = np.concatenate([trial.x, np.zeros(n - nx + nw)])
+    ukf.P = np.zeros((n + nw, n + nw))
+    ukf.P[:nx, :nx] = np.diag(np.square(trial.x_sd))
+    ukf.P[n:, n:] = np.diag(np.square(settings.noise_sd))
+    ukf.R = np.diag(np.square(settings.reading_sd))
+    return ukf

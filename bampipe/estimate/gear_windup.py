@@ -102,11 +102,7 @@ def find_windup(
     play = len(values) - 1
     rest = wanted - table[:, :own] @ np.linalg.lstsq(table[:, :own], wanted, rcond=None)[0]
     return Windup(
-        float(values[own]),
-        float(errors[own]),
-        float(values[play]) if crossed else None,
-        float(errors[play]) if crossed else None,
-        -float(values[0]),
-        float(errors[0]),
+        float(values[own]), float(errors[own]), float(values[play]) if crossed else None,
+        float(errors[play]) if crossed else None, -float(values[0]), float(errors[0]),
         float(1.0 - np.var(left) / max(float(np.var(rest)), 1e-300)),
-    )
+    )  # fmt: skip

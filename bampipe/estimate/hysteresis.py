@@ -308,13 +308,10 @@ def hysteresis(
         stiffness=stiffness,
         standard_error=max(standard_error, scatter / float(np.sqrt(len(values)))),
         systematic=_SYSTEMATIC * stiffness * max(abs(slope_change), slope_change_error),
-        scatter=scatter,
-        cycles=cycles,
-        branches=branches,
-        transition=start,
+        scatter=scatter, cycles=cycles, branches=branches, transition=start,
         slope_change=slope_change,
         yielded=abs(slope_change) < max(_LARGEST_SLOPE_CHANGE, 3.0 * slope_change_error),
-    )
+    )  # fmt: skip
 
 
 def _cycle(
@@ -331,12 +328,7 @@ def _cycle(
     start, stop = pair[0].start, pair[1].stop
     load, moved = torque[start : stop + 1], deflection[start : stop + 1]
     return Cycle(
-        start=start,
-        stop=stop,
-        stiffness=1.0 / compliance,
-        width_torque=across / compliance,
-        width_deflection=across,
-        energy=energy_lost(load, moved, 1.0 / compliance),
-        amplitude=0.5 * float(np.ptp(load)),
-        centre=0.5 * (intercepts[-1] + intercepts[1]),
-    )
+        start=start, stop=stop, stiffness=1.0 / compliance, width_torque=across / compliance,
+        width_deflection=across, energy=energy_lost(load, moved, 1.0 / compliance),
+        amplitude=0.5 * float(np.ptp(load)), centre=0.5 * (intercepts[-1] + intercepts[1]),
+    )  # fmt: skip

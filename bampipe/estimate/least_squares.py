@@ -226,12 +226,9 @@ def minimise(
     start_at = _Linearised(problem, chosen, p, stacked)
     found = descend(start_at, problem.lower, problem.upper, most_iterations, tolerance)
     return Minimum(
-        p=found.last.p,
-        stacked=tuple(found.last.stacked),
-        iterations=found.iterations,
-        converged=found.converged,
-        at_bound=found.at_bound,
-    )
+        p=found.last.p, stacked=tuple(found.last.stacked), iterations=found.iterations,
+        converged=found.converged, at_bound=found.at_bound,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -132,20 +132,12 @@ def allocate(n: int, nx: int, nu: int, ny: int, nw: int, p: Array) -> Workspace:
     """
     pairs, wide, longest = n + nw, padded(n), n + ny + 1
     return Workspace(
-        images=np.empty((nx, 1 + 2 * pairs)),
-        readings=np.empty((ny, 1 + 2 * n)),
-        root=np.zeros((n, wide)),
-        columns=np.zeros((n, padded(pairs + nw))),
-        reading_columns=np.zeros((ny, wide)),
-        noise=np.empty((ny, ny)),
-        cross=np.empty((ny, n)),
-        gain=np.empty((ny, wide)),
-        cosine=np.empty(longest),
-        sine=np.empty(longest),
-        single=np.empty(longest),
-        whitened=np.empty(longest),
-        points=allocate_points(nx, nu, p, nw),
-    )
+        images=np.empty((nx, 1 + 2 * pairs)), readings=np.empty((ny, 1 + 2 * n)),
+        root=np.zeros((n, wide)), columns=np.zeros((n, padded(pairs + nw))),
+        reading_columns=np.zeros((ny, wide)), noise=np.empty((ny, ny)), cross=np.empty((ny, n)),
+        gain=np.empty((ny, wide)), cosine=np.empty(longest), sine=np.empty(longest),
+        single=np.empty(longest), whitened=np.empty(longest), points=allocate_points(nx, nu, p, nw),
+    )  # fmt: skip
 
 
 @njit(
@@ -172,7 +164,8 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     by differences and sums of opposite points: parameters stay where they are, so that in the
     sums, and in the points that move the noise, only the state is not zero. The update rotates
     the joint root of measurement and state, so that it needs no downdate and cannot lose positive
-    definiteness.
+    definiteness. It is longer than other functions because prediction and update share all of
+    their memory.
 
     Args:
         derivative: f(count, x, u, p, w, dx); measure: h(count, x, u, p, y).

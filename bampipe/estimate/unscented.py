@@ -194,12 +194,9 @@ class Trial:
     def first(self, samples: int) -> Trial:
         """The same with no more than so many samples."""
         return replace(
-            self,
-            t=self.t[:samples],
-            u=self.u[:samples],
-            y=self.y[:samples],
+            self, t=self.t[:samples], u=self.u[:samples], y=self.y[:samples],
             curvature=None if self.curvature is None else self.curvature[:samples],
-        )
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -334,22 +331,15 @@ def run_kernel(
     n, size, ny, nw = mean.size, trial.t.size, settings.observed.size, settings.noise_sd.size
     rows, p = -(-size // stride), _array(model.parameters)
     out = Output(
-        means=np.empty((rows, n)),
-        covariances=np.empty((rows, n, n)),
-        innovation=np.full((size, ny), np.nan),
-        innovation_sd=np.full((size, ny), np.nan),
-        nis=np.full(size, np.nan),
-        log_likelihood=np.full(size, np.nan),
-    )
+        means=np.empty((rows, n)), covariances=np.empty((rows, n, n)),
+        innovation=np.full((size, ny), np.nan), innovation_sd=np.full((size, ny), np.nan),
+        nis=np.full(size, np.nan), log_likelihood=np.full(size, np.nan),
+    )  # fmt: skip
     estimated = Estimated(
-        model.n_states,
-        p.size - 1,
-        _array(model.free, np.int64),
-        _array(model.logarithmic, np.bool_),
-        *model.range,
-        _array(settings.observed, np.int64),
+        model.n_states, p.size - 1, _array(model.free, np.int64),
+        _array(model.logarithmic, np.bool_), *model.range, _array(settings.observed, np.int64),
         model.reads_parameters,
-    )
+    )  # fmt: skip
     spread, _, centre, other = settings.points.weights(n + nw)
     levels = Levels(
         _array(settings.noise_sd), _array(settings.walk_sd), _array(settings.reading_sd),

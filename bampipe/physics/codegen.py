@@ -274,7 +274,7 @@ def slopes_source(e: Equations) -> tuple[str, list[tuple[int, int]]]:
     """
     by_place = {
         (i, axis): slope
-        for i, by_axis in enumerate(e.lasting)
+        for i, by_axis in enumerate(e.dependence.lasting)
         for axis, slope in (by_axis or {}).items()
     }
     groups = _select_groups(e, "q qd qdd u")

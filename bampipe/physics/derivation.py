@@ -17,7 +17,7 @@ import sympy as sp
 
 from bampipe.errors import InputError
 from bampipe.physics.device import LAST_ORDER, derivative
-from bampipe.physics.equations import Equations
+from bampipe.physics.equations import Dependence, Equations
 from bampipe.physics.lagrange import allow, check_inertia, lagrange
 from bampipe.physics.model import Model
 from bampipe.physics.newton_euler import (
@@ -85,7 +85,7 @@ def _assemble_equations(d: Vocabulary) -> Equations:
         input_map=forces.input_map, rates=rates, initial=initial,
         offset=terms.offset, offset_rate=offset_rate,
         kinetic=motion.kinetic, potential=motion.potential,
-        **vars(_classify_parameters(d, residual, [*rates, *terms.offset], motion, forces.w)),
+        dependence=_find_dependence(d, residual, [*rates, *terms.offset], motion, forces.w),
         compensation=find_compensation(d, motion.potential, forces.logged, forces.side),
         delays=find_delays(d, forces.applied),
     )  # fmt: skip
@@ -306,15 +306,11 @@ def _combine_motion(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
     motion = tuple(d.q), tuple(d.qd), tuple(d.qdd)
     bodies = _apply_newton_euler(robot.links, gravity_vector(robot), numbers, motion)
     return _Motion(
-        bodies.steps,
-        [_add(*rows) for rows in zip(energy_motion.mass, bodies.mass, strict=True)],
-        _add(energy_motion.bias, bodies.bias),
-        _add(energy_motion.dynamics, bodies.dynamics),
-        energy_motion.kinetic + bodies.kinetic,
-        energy_motion.potential + bodies.potential,
-        bodies.names,
-        bodies.numbers,
-    )
+        bodies.steps, [_add(*rows) for rows in zip(energy_motion.mass, bodies.mass, strict=True)],
+        _add(energy_motion.bias, bodies.bias), _add(energy_motion.dynamics, bodies.dynamics),
+        energy_motion.kinetic + bodies.kinetic, energy_motion.potential + bodies.potential,
+        bodies.names, bodies.numbers,
+    )  # fmt: skip
 
 
 def _add(one: Sequence[Any], other: Sequence[Any]) -> list[Any]:
@@ -372,21 +368,9 @@ def _apply_newton_euler(
     return _Motion(text.steps, mass, bias, dynamics, kinetic, potential, names, numbers_read)
 
 
-@dataclass(frozen=True)
-class _Parameters:
-    """How the residual depends on each parameter; see `Equations`."""
-
-    linear: list[bool]
-    products: list[tuple[int, int]]
-    constant: list[bool]
-    unforced: list[bool]
-    lasting: list[dict[int, Any] | None]
-    of_bodies: list[int]
-
-
-def _classify_parameters(
+def _find_dependence(
     d: Vocabulary, residual: Sequence[Any], beside: Sequence[Any], motion: _Motion, w: Sequence[Any]
-) -> _Parameters:
+) -> Dependence:
     """Find how the residual depends on each parameter.
 
     Args:
@@ -394,7 +378,7 @@ def _classify_parameters(
             parameter makes it nonlinear; motion: whose steps stand in the residual by name; w: the
             noise, which slopes leave out.
     """
-    classes = _Parameters([], [], [], [], [], [])
+    found = Dependence([], [], [], [], [], [])
     p, varying = [*d.p.values()], {*d.p.values(), *d.z.values()}
     inputs, no_noise = {*d.channel.values()}, dict.fromkeys(w, 0)
     elsewhere = _collect_symbols(beside)
@@ -409,13 +393,13 @@ def _classify_parameters(
         linear = symbol not in curving and symbol not in elsewhere
         constant = linear and not slope_symbols & varying
         lasts = constant and not bodily and slope_symbols.isdisjoint(motion.names)
-        classes.linear.append(linear)
-        classes.constant.append(constant)
-        classes.unforced.append(constant and slope_symbols.isdisjoint(inputs))
+        found.linear.append(linear)
+        found.constant.append(constant)
+        found.unforced.append(constant and slope_symbols.isdisjoint(inputs))
         if lasts and not slope_symbols.isdisjoint(w):
             by_axis = {k: slope.subs(no_noise) for k, slope in by_axis.items()}
-        classes.lasting.append(by_axis if lasts else None)
-        classes.products.extend((j, i) for j in range(i) if p[j] in curving)
+        found.lasting.append(by_axis if lasts else None)
+        found.products.extend((j, i) for j in range(i) if p[j] in curving)
         if bodily and not by_axis:
-            classes.of_bodies.append(i)
-    return classes
+            found.of_bodies.append(i)
+    return found

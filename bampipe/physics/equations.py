@@ -9,6 +9,28 @@ import sympy as sp
 
 
 @dataclass(frozen=True)
+class Dependence:
+    """How the residual of a model depends on each of its parameters, by number.
+
+    Attributes:
+        linear: whether it is linear in the parameter.
+        products: pairs of parameters of which it has a product.
+        constant: whether its slope depends on no parameter and no internal state; unforced: and on
+            no input either.
+        lasting: that slope by axis, None where there is none such or bodies in
+            `Equations.steps` take part in it.
+        of_bodies: parameters that stand in those steps alone.
+    """
+
+    linear: list[bool]
+    products: list[tuple[int, int]]
+    constant: list[bool]
+    unforced: list[bool]
+    lasting: list[dict[int, Any] | None]
+    of_bodies: list[int]
+
+
+@dataclass(frozen=True)
 class Equations:
     """Symbolic equations of a model; lists are in the order of the names they belong to.
 
@@ -28,13 +50,7 @@ class Equations:
         rates, initial: of the internal states.
         offset, offset_rate: q_true - q_measured and its time derivative.
         kinetic, potential: energies, as declared, definitions put in.
-        linear: for each parameter, whether the residual is linear in it.
-        products: pairs of parameters, by number, of which the residual has a product.
-        constant: for each parameter, whether the slope of the residual by it depends on no
-            parameter and no internal state; unforced: and on no input either.
-        lasting: for each parameter, that slope by axis, None where there is none such or bodies in
-            ``steps`` take part in it.
-        of_bodies: parameters, by number, that stand in ``steps`` alone.
+        dependence: of the residual on each parameter.
         compensation: per coordinate, the part of Q_other that balances gravity there: see
             `roles.find_compensation`; zero where nothing does.
         delays: parameters that shift measured forces in time: see `roles.find_delays`.
@@ -64,12 +80,7 @@ class Equations:
     offset_rate: list[Any]
     kinetic: Any
     potential: Any
-    linear: list[bool]
-    products: list[tuple[int, int]]
-    constant: list[bool]
-    unforced: list[bool]
-    lasting: list[dict[int, Any] | None]
-    of_bodies: list[int]
+    dependence: Dependence
     compensation: list[Any]
     delays: list[str]
 

@@ -40,10 +40,10 @@ def effects_code(model: Model) -> Generation:
         "memory": equations.z_names,
         "inputs": equations.inputs,
         "noise": equations.noise,
-        "linear": equations.linear,
-        "products": equations.products,
-        "constant": equations.constant,
-        "unforced": equations.unforced,
+        "linear": equations.dependence.linear,
+        "products": equations.dependence.products,
+        "constant": equations.dependence.constant,
+        "unforced": equations.dependence.unforced,
         "touched": [i for i, e in enumerate(added) if e != 0],
         "moves_sensors": any(e != 0 for e in equations.offset),
         "moved_by": [
@@ -77,8 +77,10 @@ def whole_code(model: Model) -> Generation:
     along, here = bodies_along_motion(equations), bodies_at_state(equations)
     facts = {
         "slopes": places,
-        "lasting": [i for i, by_axis in enumerate(equations.lasting) if by_axis is not None],
-        "of_bodies": equations.of_bodies,
+        "lasting": [
+            i for i, by_axis in enumerate(equations.dependence.lasting) if by_axis is not None
+        ],
+        "of_bodies": equations.dependence.of_bodies,
         "bodies": len(along.names),
     }
     sources = {

@@ -236,13 +236,10 @@ def _unit_wrenches(a: Algebra, at: _LinkMotion) -> list[tuple[Vector, Vector]]:
     results: list[tuple[Vector, Vector]] = [(at.acceleration, ZERO)]
     results += [(_multiply(at.change, e), _cross(e, at.acceleration)) for e in units]
     moments: list[Vector] = [
-        (dx, x * z, -x * y),
-        (dy - x * z, dx + y * z, x * x - y * y),
-        (dz + x * y, z * z - x * x, dx - y * z),
-        (-y * z, dy, x * y),
-        (y * y - z * z, dz - x * y, dy + x * z),
-        (y * z, -x * z, dz),
-    ]
+        (dx, x * z, -x * y), (dy - x * z, dx + y * z, x * x - y * y),
+        (dz + x * y, z * z - x * x, dx - y * z), (-y * z, dy, x * y),
+        (y * y - z * z, dz - x * y, dy + x * z), (y * z, -x * z, dz),
+    ]  # fmt: skip
     return results + [(ZERO, _name_components(a, moment)) for moment in moments]
 
 

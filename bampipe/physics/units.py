@@ -58,26 +58,13 @@ def _dimension(kg: int = 0, m: int = 0, s: int = 0, ampere: int = 0, kelvin: int
 
 
 _UNITS = {
-    "1": PURE,
-    "rad": PURE,
-    "m": _dimension(m=1),
-    "kg": _dimension(kg=1),
-    "s": _dimension(s=1),
-    "A": _dimension(ampere=1),
-    "K": _dimension(kelvin=1),
-    "Hz": _dimension(s=-1),
-    "N": _dimension(1, 1, -2),
-    "Pa": _dimension(1, -1, -2),
-    "J": _dimension(1, 2, -2),
-    "W": _dimension(1, 2, -3),
-    "V": _dimension(1, 2, -3, -1),
-    "Ohm": _dimension(1, 2, -3, -2),
-    "H": _dimension(1, 2, -2, -2),
-    "F": _dimension(-1, -2, 4, 2),
-    "C": _dimension(s=1, ampere=1),
-    "T": _dimension(1, 0, -2, -1),
-    "Wb": _dimension(1, 2, -2, -1),
-}
+    "1": PURE, "rad": PURE, "m": _dimension(m=1), "kg": _dimension(kg=1), "s": _dimension(s=1),
+    "A": _dimension(ampere=1), "K": _dimension(kelvin=1), "Hz": _dimension(s=-1),
+    "N": _dimension(1, 1, -2), "Pa": _dimension(1, -1, -2), "J": _dimension(1, 2, -2),
+    "W": _dimension(1, 2, -3), "V": _dimension(1, 2, -3, -1), "Ohm": _dimension(1, 2, -3, -2),
+    "H": _dimension(1, 2, -2, -2), "F": _dimension(-1, -2, 4, 2), "C": _dimension(s=1, ampere=1),
+    "T": _dimension(1, 0, -2, -1), "Wb": _dimension(1, 2, -2, -1),
+}  # fmt: skip
 _FACTOR = re.compile(r"([A-Za-z]+|1)(-?\d{1,2})?\Z")
 
 

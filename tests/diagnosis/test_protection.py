@@ -52,7 +52,7 @@ def test_nothing_is_missing_where_nothing_was_hidden(record, machine, seed, cond
         assert 0.8 < axis.rmse_after / axis.noise_floor < 1.35
 
 
-@pytest.mark.parametrize("seconds", [0.3, 1.0])
+@pytest.mark.parametrize("seconds", [pytest.param(0.3, marks=pytest.mark.long), 1.0])
 def test_one_event_decides_nothing(record, seconds):
     """Somebody pushes the drive once, for less than a block of time."""
     trials, recipe = record("joint", 7)
@@ -67,7 +67,7 @@ def test_one_event_decides_nothing(record, seconds):
     assert verdicts(found) != ["missing"]
 
 
-@pytest.mark.parametrize("seed", [8, 9, 10])
+@pytest.mark.parametrize("seed", [8, *(pytest.param(k, marks=pytest.mark.long) for k in (9, 10))])
 def test_a_lag_gains_nothing_by_averaging_noise(record, seed):
     trials, recipe = record("joint", 4)
     rng = np.random.default_rng(seed)

@@ -145,22 +145,13 @@ def test_a_link_in_the_folder_of_the_lab_is_refused(toy: Toy, outside: Path) -> 
     assert (outside / "mine.svg").read_text() == "mine"
 
 
-@pytest.mark.parametrize("kind", ["fifo", "device"])
 @pytest.mark.parametrize("name", ["run.json", ".bampipe/hashes.json", "toy/double.json", "note"])
 def test_what_is_no_file_is_refused_by_name(
-    toy: Toy, outside: Path, command: Command, name: str, kind: str
+    toy: Toy, outside: Path, command: Command, name: str
 ) -> None:
     path = toy.root / name
     path.unlink(missing_ok=True)
-    if kind == "fifo":
-        os.mkfifo(path)
-    elif os.geteuid() == 0:
-        try:
-            os.mknod(path, 0o020666, os.makedev(1, 5))
-        except PermissionError:
-            pytest.skip("no device can be made here")
-    else:
-        pytest.skip("only root makes devices")
+    os.mkfifo(path)
     code, _, said = command("run", toy.session, "--pipeline", toy.pipeline_file, "--runs", toy.runs)
     assert code == 2 and name in said and "neither a file nor a folder" in said
 
@@ -189,25 +180,9 @@ def test_a_folder_for_a_file_or_a_file_for_a_folder_is_one_line_or_mended(
 
 
 NOT_NORMAL = [
-    "",
-    ".",
-    "..",
-    "/etc/passwd",
-    "./a",
-    "a/./b",
-    "a//b",
-    "a/",
-    "a/../b",
-    "../a",
-    "./.bampipe/staging/x/.commit.json",
-    "a\\b",
-    "a\0b",
-    "a\nb",
-    ".bam\u200cpipe/x",
-    "\ud800",
-    None,
-    5,
-]
+    "", ".", "..", "/etc/passwd", "./a", "a/./b", "a//b", "a/", "a/../b", "../a", "a\\b", "a\0b",
+    "a\nb", ".bam\u200cpipe/x", "\ud800", None,
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", NOT_NORMAL)
@@ -241,11 +216,9 @@ def test_inside_means_links_followed(tmp_path: Path) -> None:
     ("outputs", "remove", "step"),
     [
         ({"../../../../outside/double.json": digest("planted")}, (), "toy_double"),
-        ({"./toy/more.json": digest("planted")}, (), "toy_double"),
         ({"run.json": digest("planted")}, (), "toy_double"),
         ({".bampipe/hashes.json": digest("planted")}, (), "toy_double"),
         ({"toy/more.json": digest("planted")}, ("../../outside/double.json",), "toy_double"),
-        ({"toy/more.json": digest("planted")}, ("run.json",), "toy_double"),
         ({"toy/more.json": digest("planted")}, ("toy",), "toy_double"),
         ({"toy/more.json": digest("planted")}, (), "toy_read"),
         ({"toy/more.json": digest("planted")}, (), "../toy_double"),
@@ -276,19 +249,13 @@ def test_a_commit_through_a_link_in_staging_is_refused(toy: Toy, outside: Path) 
     ("path", "value"),
     [
         (("stages", "toy_double", "declared_inputs"), ["../../outside/*"]),
-        (("stages", "toy_double", "declared_inputs"), [5]),
         (("stages", "toy_double", "outputs"), {"../../outside/double.json": digest("mine")}),
-        (("stages", "toy_double", "outputs"), {"./toy/double.json": digest("mine")}),
         (("stages", "toy_double", "inputs"), {"../../outside/double.json": digest("mine")}),
         (("timings",), {"toy_double": 5}),
-        (("timings",), [5]),
         (("failures",), {"toy_double": 5}),
-        (("place",), {"session": 5}),
         (("place",), {"session": "\0"}),
-        (("gates",), [5]),
         (("gates",), "x"),
         (("pipeline",), 5),
-        (("pipeline",), {}),
         (("pipeline",), {"name": "x", "stages": 5, "settings": [], "device": 5, "effects": 5}),
         (("stages",), []),
     ],
@@ -329,24 +296,23 @@ UNREADABLE = {
 }
 
 
-@pytest.mark.parametrize("content", UNREADABLE.values(), ids=UNREADABLE)
 @pytest.mark.parametrize(
-    "name",
+    ("name", "kind"),
     [
-        "run.json",
-        ".bampipe/hashes.json",
-        ".bampipe/staging/toy_double/.commit.json",
-        "toy/double.json",
-        "models/base/model.toml",
+        *(("run.json", kind) for kind in UNREADABLE),
+        (".bampipe/hashes.json", "brackets"),
+        (".bampipe/staging/toy_double/.commit.json", "tables"),
+        ("toy/double.json", "bytes"),
+        ("models/base/model.toml", "nul"),
     ],
 )
 def test_what_json_and_toml_can_do_is_one_line_or_rebuilt(
-    toy: Toy, outside: Path, command: Command, name: str, content: bytes
+    toy: Toy, outside: Path, command: Command, name: str, kind: str
 ) -> None:
     good = toy.files()
     path = toy.root / name
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(content)
+    path.write_bytes(UNREADABLE[kind])
     for given in (("status", "first"), ("verify", "first")):
         code, _, said = command(*given, "--runs", toy.runs)
         assert code in (0, 1, 2) and all(map(is_said, said.splitlines())), said
@@ -373,7 +339,7 @@ def test_only_regular_files_are_opened(
         read(path)
 
 
-@pytest.mark.parametrize("trials", ["5", '"x"', "[5]", "[[1]]", '{ file = "a" }', "1979-05-27"])
+@pytest.mark.parametrize("trials", ["5", "[5]", '{ file = "a" }'])
 def test_trials_that_are_no_tables_are_one_line(toy: Toy, command: Command, trials: str) -> None:
     file = toy.session / "session.toml"
     head = file.read_text().partition("[[trials]]")[0]

@@ -21,8 +21,8 @@ from bampipe.next_trial.motion import (
     follow_roughly,
     stroke_path,
 )
-from bampipe.next_trial.plan import Goal, TrialPlan, _sentence, _shortest, plan_trials
-from bampipe.next_trial.precision import Expected, Precision
+from bampipe.next_trial.plan import Goal, _shortest, plan_trials
+from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import (
     Envelope,
     Primitive,
@@ -32,7 +32,6 @@ from bampipe.next_trial.primitives import (
     list_primitives,
     vary_surroundings,
 )
-from bampipe.next_trial.sensitivity import Detectability
 from bampipe.next_trial.words import describe
 from bampipe.phrases.forecast import compare_forecast, read_forecasts
 from bampipe.phrases.proposal import explain_proposal, find_shown
@@ -240,14 +239,6 @@ def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
     )
 
 
-def test_of_one_axis_a_sentence_names_it_once():
-    motion = made_motion("t01", 2.0)
-    still = replace(motion, qd=motion.qd * [1.0, 0.0, 0.0])
-    (like,) = imitate_trials([still], SEEN, 12.0)
-    said = describe(like, SEEN, registry.device("bam"))
-    assert said.startswith("Move yaw as in trial t01, between −11° and 11°")
-
-
 def test_who_follows_roughly_stays_within_the_device_too():
     system = SimpleNamespace(coordinates=("a", "b", "c"))
     seen = TIMID.within(LIMITS, np.full(3, np.nan))
@@ -355,22 +346,6 @@ def test_a_sentence_says_where_how_fast_and_how_long():
     assert " mm" in said
 
 
-def test_no_stroke_is_called_fast_that_takes_long():
-    timid = replace(SEEN, speed=np.array([0.3, 1.6, 0.9]), usual=np.zeros(3))
-    for half, said in ((0.1, "Move yaw fast back"), (0.5, "Move yaw at an easy pace back")):
-        design = Primitive({0: Stroke(-half, half, 0.2, 0.3)}, np.zeros(3), 20.0)
-        assert describe(design, timid, registry.device("bam")).startswith(said)
-
-
-def test_a_zero_has_no_sign():
-    said = describe(
-        Primitive({0: Stroke(-0.002, 0.4, 0.5, 1.0)}, SEEN.usual, 20.0),
-        SEEN,
-        registry.device("bam"),
-    )
-    assert "between 0° and 23° (0.00 to 0.40 rad)" in said
-
-
 def test_a_sentence_says_what_goes_beyond_the_trials_at_hand():
     device, seen = registry.device("bam"), TIMID.within(LIMITS, np.full(3, 20.0))
     far, fast = Stroke(-1.0, 1.0, 0.5, 1.0), Stroke(0.1, 0.4, 3.0, 4.0)
@@ -412,14 +387,6 @@ def explain(
     return SimpleNamespace(why=why, expected=expected)
 
 
-def test_a_forecast_beyond_the_trials_at_hand_is_said_to_be_the_models():
-    said = explain("decision", made_proposal(0.01, ("yaw",)), {}, (), ()).expected
-    assert said.startswith("The chance of confusing them is expected to fall from 40 % to")
-    assert said.endswith("takes the model to hold beyond what the trials at hand have shown.")
-    said = explain("decision", made_proposal(0.01), {}, (), ()).expected
-    assert "beyond" not in said
-
-
 def test_a_forecast_in_the_terms_of_another_version_does_not_stop_a_new_proposal(tmp_path):
     wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
     found = NextResult(
@@ -455,16 +422,6 @@ def test_what_a_model_lacks_is_said_to_count_as_noise():
     assert "noise floor" not in said
 
 
-def test_it_is_said_what_a_trial_is_for_that_shows_no_effect_and_why_there_are_two():
-    entry = ExpectedSd(before=0.05, after=0.005, low=0.0045, high=0.006, unit="kg")
-    best = made_proposal(0.1).model_copy(update={"sd": {"mass": entry}})
-    reasons = explain("sensitivity", best, {}, (), ())
-    assert reasons.why.endswith("This one adds most to what is known of all parameters together.")
-    assert reasons.expected.startswith("Expected: `mass`")
-    why = explain("precision", best.model_copy(update={"parts": 2}), {}, (), ()).why
-    assert "more than one trial, because each is judged by what the others say" in why
-
-
 def test_effects_of_brakes_are_said_to_need_viscous_trials():
     entry = Detectable(
         parameter="brake_lag.time_constant", smallest=None, typical=0.06, unit="s", axis=""
@@ -482,29 +439,6 @@ def test_effects_of_brakes_are_said_to_need_viscous_trials():
     assert why.endswith("Add it to session.toml as a viscous trial.")
 
 
-def test_what_shows_at_no_size_that_a_machine_has_is_out_of_sight():
-    def limit(factor: float) -> SimpleNamespace:
-        parameter = SimpleNamespace(name="p", unit="A")
-        alternative = SimpleNamespace(name=f"effect:{factor:g}")
-        return SimpleNamespace(
-            alternative=alternative, parameter=parameter, typical=2.0, factor=factor, axis=0,
-            is_promised=factor != 7.0,
-        )  # fmt: skip
-
-    detectability = SimpleNamespace(
-        limits=[limit(3.0), limit(7.0), limit(np.inf)],
-        comparison=SimpleNamespace(
-            fit=SimpleNamespace(
-                evidence=SimpleNamespace(system=SimpleNamespace(coordinates=("yaw",)))
-            )
-        ),
-        factors_with=lambda motions: np.array([1.0, 1.0, 99.0]),
-    )
-    near, far = Detectability.tabulate(detectability, [None]).values()
-    assert (near.smallest, near.with_proposal, near.axis) == (6.0, 2.0, "yaw")
-    assert (far.smallest, far.with_proposal, far.axis) == (None, 198.0, "")
-
-
 def test_what_the_trial_would_show_is_named_first():
     def entry(smallest: float, then: float) -> Detectable:
         return Detectable(
@@ -515,15 +449,6 @@ def test_what_the_trial_would_show_is_named_first():
     reasons = explain("sensitivity", made_proposal(0.1), table, (), ())
     assert reasons.why.startswith("These trials would not have shown drag:x below 3 N, far:2")
     assert reasons.expected.startswith("It would show drag:x from 1 N on")
-
-
-def test_where_nothing_decides_it_is_said_what_was_not_tried():
-    said = explain("decision", made_proposal(0.39), {}, ["yaw", "pitch"], ()).expected
-    assert said.endswith(
-        "the device file states no [limits] of yaw and pitch, so that none was tried."
-    )
-    said = explain("decision", made_proposal(0.39), {}, [], ()).expected
-    assert said.endswith("39 % after this one. Another load may.")
 
 
 def made_precision(
@@ -555,12 +480,6 @@ def test_what_few_blocks_widen_goes_with_more_of_them():
     nothing = np.zeros((2, 2))
     assert few.sd_with(nothing, 0.0)[0] < few.sd[0]
     assert few.sd_with(nothing, 1000.0)[0] == pytest.approx(0.01, rel=0.02)
-
-
-def test_more_blocks_never_widen_an_uncertainty():
-    factors = [made_precision(0.01, 0.01, 1)._few(blocks) for blocks in range(1, 40)]
-    assert factors == sorted(factors, reverse=True)
-    assert factors[0] == pytest.approx(np.sqrt(2.0))
 
 
 def test_what_methods_disagree_by_is_diluted_and_what_a_calibration_leaves_open_stays():
@@ -643,22 +562,6 @@ def test_a_planned_trial_is_shortened_no_further_than_its_strokes_allow():
     (like,) = imitate_trials([made_motion("t01", 2.0)], SEEN, 20.0)
     assert _shortest(like) == pytest.approx(12.0, abs=0.01)
     assert _shortest(replace(like, seconds=8.0)) == 8.0
-
-
-@pytest.mark.parametrize(
-    ("is_enough", "is_full", "said"),
-    [
-        (True, False, "every uncertainty is expected to fall below what is asked."),
-        (False, True, "below what is asked; ask again once they are recorded."),
-        (False, False, "below what is asked; more trials like these add little."),
-    ],
-)
-def test_a_plan_says_whether_more_trials_would_help(is_enough, is_full, said):
-    design = Primitive({0: Stroke(-0.5, 0.5, 1.0, 1.0)}, np.zeros(1), 20.0, parts=2)
-    sd = Expected(np.ones(1), np.ones(1), np.ones(1))
-    sentence = _sentence(TrialPlan((design,), sd, {}, is_enough, is_full), 20.0, "uncertainties")
-    assert sentence.startswith("With 2 trials, 20 s in all, ")
-    assert sentence.endswith(said)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ pytestmark = pytest.mark.slow
 
 FASTEST = 2.4  # of the joint, rad/s
 LONG = {"trials": 4, "seconds": 12.0}
-UNDECIDED = {"trials": 2, "pace": 0.4, "noise_factor": 8.0}
 
 
 def propose(run: bampipe.Run, **settings) -> tuple[NextResult, Path]:
@@ -63,51 +62,6 @@ def test_the_uncertainty_forecast_is_the_one_that_comes(tmp_path):
     assert roughly > 0.7 * gained
     # Coulomb friction shows in slow motion.
     assert found.proposals[0].moves["joint"].fast < 0.1 * FASTEST
-
-
-@pytest.mark.long
-@pytest.mark.xfail(
-    reason="drag scores 374 and Stribeck friction 362 after that trial: odds of 58 to 42, as scores"
-    " count as a tenth off",
-    strict=True,
-)
-def test_what_is_undecided_is_decided_after_the_proposed_trial(tmp_path):
-    run, _ = record_run(tmp_path / "now", "joint", 905, "quadratic_drag:joint", **UNDECIDED)
-    before = diagnose(run)
-    assert before["axes"]["joint"]["verdict"] == "undecided"
-    named = {name for one in before["sets"] for name in one["effects"]}
-    assert {"quadratic_drag:joint", "stribeck:joint"} <= named
-    found, path = propose(run)
-    assert found.purpose == "decision"
-    assert found.proposals[0].confusion[0].after < 0.25
-    after, _ = record_run(
-        tmp_path / "after", "joint", 905, "quadratic_drag:joint", **UNDECIDED,
-        tasks=Task.read(path),
-    )  # fmt: skip
-    again = diagnose(after)
-    assert again["selected"] == ["quadratic_drag:joint"]
-    assert again["axes"]["joint"]["verdict"] == "missing"
-    # Who asks for a parameter gets its forecast, whatever is open.
-    narrow, _ = propose(run, purpose="viscous.joint", seconds=8.0)
-    assert narrow.proposals[0].confusion == ()
-    assert narrow.expected.startswith("Expected: `viscous.joint` ± ")
-
-
-@pytest.mark.long
-@pytest.mark.xfail(
-    reason="of two noisy trials of 6 s, a spring is called a stop without a doubt, which scores"
-    " more there",
-    strict=True,
-)
-def test_an_undecided_diagnosis_asks_for_a_trial_that_would_decide(tmp_path):
-    noisy = {"trials": 2, "pace": 0.5, "seconds": 6.0, "noise_factor": 3.0}
-    run, _ = record_run(tmp_path, "joint", 905, "return_spring:joint", **noisy)
-    found = bampipe.diagnose(run, replicates=10, jobs=1)
-    assert found["axes"]["joint"]["verdict"] == "undecided"
-    asked = found["suggested_trial"]
-    assert "return_spring:joint" in asked["between"]
-    assert asked["confusion"] < 0.5 * asked["confusion_now"]
-    assert asked["separation"] > asked["separation_now"]
 
 
 def test_bad_requests_are_refused_in_one_line(tmp_path):

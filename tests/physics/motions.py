@@ -1,6 +1,7 @@
 """Random motions inside a device's workspace, and variants of the BAM."""
 
 import copy
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -12,6 +13,22 @@ def of_mechanism(system, q, qd, qdd, u, p, t):
     """The motion of the mechanism where encoders without filters read this; each (T, n_q)."""
     read = Motion("read", t, q, qd, qdd, np.zeros_like(q), {})
     return read.of_mechanism(system, u, p).kinematics
+
+
+def run_as_python(system, *modules):
+    """The functions that ``modules`` of a model print for numba, run as the Python that they are.
+
+    Numba takes seconds to compile what is compared in milliseconds.
+    """
+    scope = {}
+    for name in modules:
+        sources = system._whole.sources
+        for text in (sources.get(f"{name}_bodies", ""), sources[name]):
+            lines = [line for line in text.splitlines() if not line.startswith("from bampipe_")]
+            plain = "njit = lambda *_, **__: lambda function: function"
+            text = "\n".join(lines).replace("from bampipe.compiled import njit", plain)
+            exec(text, scope)
+    return SimpleNamespace(**scope)
 
 
 def random_motion(device, count, seed, speed=1.0):

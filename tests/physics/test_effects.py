@@ -1,12 +1,12 @@
 """One battery over every effect of the registry, at every target on the BAM.
 
-Each is declared in consistent units, finite, dissipative if it says so, absent at zero strength,
-and recovered by least squares from a motion that it took part in, starting from a wrong guess.
+Each is finite, dissipative if it says so, absent at zero strength, and recovered by least squares
+from what it does along a motion, starting from a wrong guess. `test_units` holds its units, and
+`test_generated_code` that the functions which simulate do the same.
 """
 
 from __future__ import annotations
 
-import ast
 import re
 from functools import cache
 
@@ -16,50 +16,23 @@ from motions import of_mechanism
 from scipy.optimize import least_squares
 
 from bampipe.errors import InputError
-from bampipe.estimate.simulation import simulate_tracking
 from bampipe.physics import Model, compile_model, registry
 
 BAM = registry.device("bam")
 AXES = tuple(c.name for c in BAM.coordinates)
-WIDTH = np.array([c.sign_width for c in BAM.coordinates])
 CASES = [
     f"{name}:{target}" if target else name
     for name in registry.effect_names()
     for target in registry.effect(name).targets(BAM)
 ]
-CANONICAL = [
-    "stribeck",
-    "presliding",
-    "asymmetric_coulomb",
-    "quadratic_drag",
-    "position_dependent_friction",
-    "load_dependent_friction",
-    "thermal_damping",
-    "return_spring",
-    "inertia_mismatch",
-    "handle_payload",
-    "base_tilt",
-    "gravity_compensator_lag",
-    "gravity_compensator_rate_limit",
-    "gravity_compensator_mistuned",
-    "brake_lag",
-    "brake_residual_torque",
-    "transmission_compliance",
-    "backlash",
-    "force_bias",
-    "force_gain",
-    "force_crosstalk",
-    "force_delay",
-    "force_drift",
-    "force_application_point",
-    "encoder_scale",
-    "shear_thinning",
-    "upper_stop",
-    "lower_stop",
-    "maxwell_slip",
-    "unbalance",
-    "friction_by_pose",
-]
+CANONICAL = """
+stribeck presliding asymmetric_coulomb quadratic_drag position_dependent_friction
+load_dependent_friction thermal_damping return_spring inertia_mismatch handle_payload base_tilt
+gravity_compensator_lag gravity_compensator_rate_limit gravity_compensator_mistuned brake_lag
+brake_residual_torque transmission_compliance backlash force_bias force_gain force_crosstalk
+force_delay force_drift force_application_point encoder_scale shear_thinning upper_stop lower_stop
+maxwell_slip unbalance friction_by_pose
+"""
 
 
 def typical(system, strength=1.0):
@@ -130,7 +103,7 @@ def contribution(case, p_of):
 
 
 def test_every_canonical_name_is_there():
-    assert set(CANONICAL) <= set(registry.effect_names())
+    assert set(CANONICAL.split()) <= set(registry.effect_names())
 
 
 @pytest.mark.parametrize("name", registry.effect_names())
@@ -146,129 +119,6 @@ def test_says_what_a_user_needs(name):
                 assert p.prior == 0 and p.typical and p.sd > 0
             elif not p.fixed:
                 assert p.lower < p.typical < p.upper and np.isfinite([p.lower, p.upper]).all()
-
-
-# Units ------------------------------------------------------------------------------------------
-
-BASE = {"": (0, 0, 0), "rad": (0, 0, 0), "m": (1, 0, 0), "kg": (0, 1, 0), "s": (0, 0, 1)}
-BASE |= {"N": (1, 1, -2), "J": (2, 1, -2), "W": (2, 1, -3)}
-ANY = None
-
-
-def dimension(unit):
-    """Powers of metre, kilogram and second in ``unit``, such as N.m.s2/rad2."""
-    total = np.zeros(3)
-    for k, part in enumerate(unit.split("/")):
-        for factor in part.split("."):
-            name, power = re.fullmatch(r"([A-Za-z]*)(\d?)", factor.replace("1", "")).groups()
-            total += (-1 if k else 1) * np.array(BASE[name]) * int(power or 1)
-    return tuple(total)
-
-
-class Dimensions:
-    """Dimensional analysis of an expression; a decimal literal may carry any dimension."""
-
-    def __init__(self, known):
-        self.known = known
-
-    def same(self, nodes):
-        found = {d for d in map(self.of, nodes) if d is not ANY}
-        assert len(found) <= 1, f"terms of different dimension in {ast.unparse(nodes[0])}"
-        return found.pop() if found else ANY
-
-    def pure(self, node):
-        assert self.of(node) in (ANY, (0, 0, 0)), f"{ast.unparse(node)} is not a pure number"
-        return (0, 0, 0)
-
-    def of(self, node):
-        match node:
-            case ast.Constant(value=value):
-                return (0, 0, 0) if isinstance(value, int) and value != 0 else ANY
-            case ast.Name(id=name):
-                return self.known[name]
-            case ast.UnaryOp(operand=operand):
-                return self.of(operand)
-            case ast.BinOp(left=left, op=ast.Add() | ast.Sub(), right=right):
-                return self.same([left, right])
-            case ast.BinOp(left=left, op=ast.Pow(), right=ast.Constant(value=power)):
-                inner = self.of(left)
-                return ANY if inner is ANY else tuple(np.multiply(inner, power))
-            case ast.BinOp(left=left, op=op, right=right):
-                a, b = self.of(left), self.of(right)
-                if a is ANY or b is ANY:
-                    return ANY
-                return tuple(np.add(a, b) if isinstance(op, ast.Mult) else np.subtract(a, b))
-            case ast.Call(func=ast.Name(id=name), args=args):
-                if name in ("sgn", "heaviside"):
-                    self.of(args[0])
-                    return (0, 0, 0)
-                if name == "ddt":
-                    return tuple(np.subtract(self.of(args[0]), (0, 0, 1)))
-                if name == "sqrt":
-                    return tuple(np.multiply(self.of(args[0]), 0.5))
-                if name in ("abs", "min", "max", "clip"):
-                    return self.same(args)
-                return self.pure(args[0])
-        raise AssertionError(ast.dump(node))
-
-
-def symbols_of(case):
-    bound = Model(BAM, [case]).effects[0]
-    newton = dimension("N")
-    known = {c.name: dimension(c.unit) for c in BAM.coordinates}
-    known |= {name: dimension(c.unit) for name, c in BAM.constants.items()}
-    known |= {"rho": dimension("m"), "mass": dimension("kg"), "t": dimension("s")}
-    for k, order in enumerate(("", "rate_", "curvature_", "third_", "fourth_", "fifth_", "sixth_")):
-        slope = tuple(np.subtract(newton, (0, 0, k)))
-        known |= {f"force_{order}{c}": slope for c in "xyz"}
-        if bound.effect.scope in ("force_component", "force_pair"):
-            known |= {f"{f}_{order}".rstrip("_"): slope for f in "fg"}
-        elif bound.effect.scope == "device":
-            known[f"f_{order}".rstrip("_")] = slope
-    for c in BAM.coordinates:
-        torque = dimension(c.torque_unit)
-        known[f"brake_{c.name}"] = known[f"weight_{c.name}"] = torque
-        known[f"pull_{c.name}"] = torque
-        for letter in "ab" if bound.effect.scope == "axis_pair" else "":
-            if c.name == bound.axes["ab".index(letter)]:
-                known |= dict.fromkeys((f"q_{letter}", f"middle_{letter}"), dimension(c.unit))
-                known[f"qd_{letter}"] = dimension(f"{c.unit}/s")
-        if c.name == bound.target:
-            known |= dict.fromkeys(("load", "applied", "brake", "side_load", "coulomb"), torque)
-            known |= {"q": dimension(c.unit), "qd": dimension(f"{c.unit}/s")}
-            known["viscous"] = tuple(np.subtract(torque, dimension(f"{c.unit}/s")))
-    known |= {p.name.rpartition(".")[2]: dimension(p.unit) for p in bound.parameters}
-    kind = BAM.coordinate(bound.axes[0]).kind if bound.axes else ""
-    for state in bound.effect.states:
-        known[state.name] = dimension(state.unit_on(kind))
-    expected = {"kinetic": dimension("J"), "potential": dimension("J"), "input": newton}
-    return bound, known, expected
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_units_are_consistent(case):
-    bound, known, expected = symbols_of(case)
-    check = Dimensions(known)
-    for key, tree in bound.effect.expressions.items():
-        what = key.partition(".")[0]
-        wanted = expected.get(what)
-        if what == "torque":
-            wanted = dimension(BAM.coordinate(bound.target_of(key)).torque_unit)
-        elif what == "offset":
-            wanted = known["q"]
-        assert check.of(tree) in (wanted, ANY), key
-    for state in bound.effect.states:
-        rate = tuple(np.subtract(known[state.name], (0, 0, 1)))
-        assert check.of(state.rate) in (rate, ANY)
-        assert check.of(state.initial) in (known[state.name], ANY)
-
-
-def test_unit_check_sees_a_mistake():
-    known = symbols_of("stribeck:yaw")[1]
-    with pytest.raises(AssertionError, match="pure number"):
-        Dimensions(known).of(ast.parse("force*exp(-qd)", mode="eval").body)
-    with pytest.raises(AssertionError, match="different dimension"):
-        Dimensions(known).of(ast.parse("force + speed", mode="eval").body)
 
 
 # Values -----------------------------------------------------------------------------------------
@@ -344,42 +194,6 @@ def test_absent_at_zero_strength_and_there_at_typical(case):
 # Recovery ---------------------------------------------------------------------------------------
 
 
-def recorded(system, p, braked):
-    """A motion of ``system``: what its sensors and inputs say, free of noise."""
-    rng = np.random.default_rng(5)
-    t = np.arange(5000) / 500.0
-    angle = 2 * np.pi * np.outer(t, rng.uniform(0.1, 1.0, size=10))[:, None, :]
-    angle = angle + rng.uniform(0, 6.28, size=(1, 3, 10))
-    size = rng.uniform(0.5, 1.0, size=(3, 10)) * np.array([0.12, 0.1, 0.04])[:, None]
-    q_ref = (size * np.sin(angle)).sum(axis=2) + np.array([0.0, 0.0, 1.1])
-    qd_ref = np.gradient(q_ref, t, axis=0)
-    u = np.zeros((len(t), len(system.inputs)))
-    if "t" in system.inputs:
-        u[:, system.inputs.index("t")] = t
-    where = {name: i for i, name in enumerate(system.inputs)}
-    x0 = np.concatenate([q_ref[0], np.zeros(3), system.initial_memory(q_ref[0], u[0], p)])
-    x, u = simulate_tracking(
-        system.derivative, x0, u, p, 0.002, q_ref, qd_ref,
-        width=WIDTH, n_noise=len(system.noise),
-        force=[where[f"force_{c}"] for c in "xyz"],
-        rate=[where.get(f"force_rate_{c}", -1) for c in "xyz"],
-        curvature=[where.get(f"force_curvature_{c}", -1) for c in "xyz"],
-        brake=[where[f"brake_{a}"] for a in AXES] if braked else (),
-        brake_gain=np.full((len(t), 3), 20.0) if braked else None,
-    )  # fmt: skip
-    quiet, slope = np.zeros(len(system.noise)), np.empty(x.shape[1])
-    qdd = np.empty((len(t), 3))
-    for k in range(len(t)):
-        system.derivative(x[k], u[k], p, quiet, slope)
-        qdd[k] = slope[3:6]
-    true = [x[:, :3], x[:, 3:6], qdd]
-    seen = [a.copy() for a in true]
-    for _ in range(30):  # what the encoders read, so that the model's correction gives the truth
-        corrected = of_mechanism(system, *seen, u, p, t)
-        seen = [s + a - b for s, a, b in zip(seen, true, corrected, strict=True)]
-    return *seen, u, t
-
-
 PLACES = ("", "yaw", "x", "xy", "yaw-extension")
 ELSEWHERE = ("extension", "z")
 RECOVERED = [
@@ -392,7 +206,9 @@ RECOVERED = [
 def test_recovered_from_a_wrong_guess(case):
     system = system_of(case)
     truth = typical(system)
-    data = recorded(system, truth, braked="brake" in case)
+    q, qd, qdd, rest = smooth_motion()
+    along = q, qd, qdd, inputs_of(system, *rest), rest[-1]
+    goal = residual_of(system, truth, *along)
     free = [i for i, p in enumerate(system.parameters) if not p.fixed]
     own = [i for i in free if system.parameters[i].name.startswith(case.replace(":", "."))]
     lower = np.array([system.parameters[i].lower for i in free])
@@ -407,7 +223,7 @@ def test_recovered_from_a_wrong_guess(case):
     def misfit(values):
         p = truth.copy()
         p[free] = values
-        return residual_of(system, p, *data)[::4].ravel()
+        return (residual_of(system, p, *along) - goal)[::4].ravel()
 
     before = np.sqrt(np.mean(misfit(guess) ** 2))
     found = least_squares(

@@ -11,6 +11,7 @@ from motions import (
     memory_within_reason,
     random_inputs,
     random_motion,
+    run_as_python,
     typical_parameters,
 )
 from scipy.integrate import solve_ivp
@@ -26,7 +27,7 @@ BAM = registry.device("bam")
 def placed(name):
     """The device with the fewest axes that can have the effect, and the effect at its last target.
 
-    Many axes take long to compile; `test_effects` has every effect at every target on the BAM.
+    Many axes take long to derive; `test_effects` has every effect at every target on the BAM.
     """
     shipped = map(registry.device, registry.device_names())
     by_size = sorted(shipped, key=lambda device: len(device.coordinates))
@@ -38,7 +39,7 @@ def placed(name):
 
 
 def models():
-    """Every effect once, three in a model: what takes long is to compile one."""
+    """Every effect once, three in a model: what takes long is to derive one."""
     together = {}
     for name in registry.effect_names():
         device, effect = placed(name)
@@ -49,85 +50,104 @@ def models():
             yield pytest.param(device, some, id="+".join(some))
 
 
+def states_of(system, count, seed):
+    """States (T, n_x), inputs and noise of so many moments, and parameters of each."""
+    q, qd, _ = random_motion(system.model.device, count, seed, speed=0.5)
+    qd[::4] *= 1e-3
+    x = np.hstack([q, qd, memory_within_reason(system, count, seed + 1)])
+    u, rng = random_inputs(system, count, seed + 2), np.random.default_rng(seed + 3)
+    p = typical_parameters(system) * rng.uniform(0.9, 1.1, (count, 1))
+    return x, u, p, rng.normal(size=(count, len(system.noise)))
+
+
+def rates_and_readings(functions, system, x, u, p, w):
+    """What `derivative` and `measure` give of each state, one after the other."""
+    rates, readings = np.empty(x.shape), np.empty((len(x), 2 * len(system.coordinates)))
+    for i in range(len(x)):
+        functions.derivative(x[i], u[i], p[i], w[i], rates[i])
+        functions.measure(x[i], u[i], p[i], readings[i])
+    return rates, readings
+
+
 @pytest.mark.parametrize(("device", "effects"), list(models()))
-def test_columns_and_compiled_functions_agree(device, effects):
+def test_columns_and_functions_of_one_state_agree(device, effects):
     """The same residual, acceleration and reading from both, to 1e-12 of their size."""
     system = compile_model(Model(device, effects))
+    printed = run_as_python(system, "compiled", "residual")
     count, n = 40, len(system.coordinates)
     q, qd, qdd = random_motion(device, count, 21, speed=0.5)
     qd[::4] *= 1e-3
     u, z = random_inputs(system, count, 22), memory_within_reason(system, count, 23)
     p = typical_parameters(system)
 
+    def residual(q, qd, qdd, z, u):
+        out = np.empty(q.shape)
+        printed.residual(q, qd, qdd, system.body_forces(q, qd, qdd, p), z, u, p, out)
+        return out
+
     columns = system.applied(q, qd, qdd, z, u, p) - system.required(q, qd, qdd, z, u, p)
-    true = q, qd, qdd
     scale = np.abs(columns).max()
-    np.testing.assert_allclose(system.residual(*true, z, u, p), columns, atol=1e-12 * scale)
+    np.testing.assert_allclose(residual(q, qd, qdd, z, u), columns, atol=1e-12 * scale)
 
     bare = compile_model(Model(device))
-    base = len(bare.parameters)
     used = [system.inputs.index(c) for c in bare.inputs]
-    z0 = np.zeros((count, 0))
-    without = bare.residual(*true, z0, np.ascontiguousarray(u[:, used]), p[:base])
-    added = system.contribution(*true, z, u, p)
+    along = q, qd, qdd, np.zeros((count, 0)), u[:, used], p[: len(bare.parameters)]
+    without = bare.applied(*along) - bare.required(*along)
+    added = system.contribution(q, qd, qdd, z, u, p)
     np.testing.assert_allclose(without + added, columns, atol=1e-12 * scale)
 
-    w, rate = np.zeros(len(system.noise)), np.empty(len(system.states))
-    for i in range(count):
-        x = np.concatenate([true[0][i], true[1][i], z[i]])
-        system.derivative(x, u[i], p, w, rate)
-        row = [a[i][None].copy() for a in true[:2]]
-        again = system.residual(*row, rate[None, n : 2 * n], z[i][None], u[i][None], p)
-        inertia = np.abs(system.mass_matrix(row[0], p)[0] @ rate[n : 2 * n]).max()
-        np.testing.assert_allclose(again, 0.0, atol=1e-12 * max(scale, inertia))
+    x, w = np.hstack([q, qd, z]), np.zeros((count, len(system.noise)))
+    rates, _ = rates_and_readings(printed, system, x, u, [p] * count, w)
+    bends = rates[:, n : 2 * n]
+    inertia = np.abs(np.einsum("tij,tj->ti", system.mass_matrix(q, p), bends)).max()
+    again = residual(q, qd, bends, z, u)
+    np.testing.assert_allclose(again, 0.0, atol=1e-12 * max(scale, inertia))
 
 
-def one_of_each_kind():
-    """Names of effects: every kind and scope once, the others marked long."""
-    seen = set()
-    for name in registry.effect_names():
-        effect = registry.effect(name)
-        known = (effect.kind, effect.scope) in seen
-        seen.add((effect.kind, effect.scope))
-        yield pytest.param(name, marks=pytest.mark.long) if known else name
-
-
-@pytest.mark.parametrize("name", [*one_of_each_kind()])
-def test_rows_and_single_states_agree(name):
-    """The functions for many states at once are those for one, but for rounding."""
-    device, effect = placed(name)
-    system = compile_model(Model(device, (effect,)))
+@pytest.mark.parametrize(
+    ("machine", "effects"),
+    [
+        ("slider", ("presliding:carriage", "actuator_lag:motor")),
+        ("bam", ("transmission_compliance:yaw", "handle_payload")),
+        ("arm", ("gear_loss:two",)),
+    ],
+)
+def test_what_is_compiled_is_what_is_printed(machine, effects):
+    """One model a kind of code: with memory, with encoders that the load moves, of a robot."""
+    device = registry.device_from(ARM) if machine == "arm" else registry.device(machine)
+    system = compile_model(Model(device, effects))
     count = 30
-    q, qd, _ = random_motion(device, count, 41, speed=0.5)
-    qd[::4] *= 1e-3
-    u, z = random_inputs(system, count, 42), memory_within_reason(system, count, 43)
-    x = np.hstack([q, qd, z])
-    p = typical_parameters(system) * np.random.default_rng(44).uniform(0.9, 1.1, (count, 1))
-    w = np.random.default_rng(45).normal(size=(count, len(system.noise)))
+    x, u, p, w = states_of(system, count, 41)
+    expected = rates_and_readings(run_as_python(system, "compiled"), system, x, u, p, w)
+    found = rates_and_readings(system, system, x, u, p, w)
 
     def laid_out(values):
         flat = np.zeros((values.shape[1], ROWS))
         flat[:, :count] = values.T
         return flat.ravel()
 
-    rates, readings = np.zeros(x.shape[1] * ROWS), np.zeros(2 * q.shape[1] * ROWS)
-    system.derivative_rows(count, laid_out(x), laid_out(u), laid_out(p), laid_out(w), rates)
-    system.measure_rows(count, laid_out(x), laid_out(u), laid_out(p), readings)
-    one, reading = np.empty(x.shape[1]), np.empty(2 * q.shape[1])
-    expected_rates, expected_readings = [], []
-    for i in range(count):
-        system.derivative(x[i], u[i], p[i], w[i], one)
-        system.measure(x[i], u[i], p[i], reading)
-        expected_rates.append(one.copy())
-        expected_readings.append(reading.copy())
-    rates = rates.reshape(-1, ROWS)[:, :count].T
-    scale = np.abs(expected_rates).max(axis=0)
-    assert np.all(np.abs(rates - expected_rates) <= 1e-12 * scale)
-    readings = readings.reshape(-1, ROWS)[:, :count].T
-    np.testing.assert_allclose(readings, expected_readings, rtol=1e-12, atol=1e-14)
+    rates, readings = (np.zeros(part.shape[1] * ROWS) for part in expected)
+    system.derivative_rows(count, *map(laid_out, (x, u, p, w)), rates)
+    system.measure_rows(count, *map(laid_out, (x, u, p)), readings)
+    rows = (part.reshape(-1, ROWS)[:, :count].T for part in (rates, readings))
+    for one, many, wanted in zip(found, rows, expected, strict=True):
+        scale = np.abs(wanted).max(axis=0)
+        assert np.all(np.abs(one - wanted) <= 1e-12 * scale)
+        assert np.all(np.abs(many - wanted) <= 1e-12 * scale)
+    n, along = (
+        len(system.coordinates),
+        np.random.default_rng(5).normal(size=(3, count, len(system.coordinates))),
+    )
+    z, q0 = x[:, 2 * n :], p[0]
+    columns = system.applied(*along, z, u, q0) - system.required(*along, z, u, q0)
+    scale = np.abs(columns).max()
+    np.testing.assert_allclose(system.residual(*along, z, u, q0), columns, atol=1e-12 * scale)
 
 
-@pytest.mark.parametrize("name", registry.effect_names())
+MOVING = [n for n in registry.effect_names() if registry.effect(n).kind == "measurement"]
+
+
+@pytest.mark.parametrize("name", ["stribeck", *MOVING])
 def test_reading_of_the_encoders_is_its_offset_from_the_motion(name):
     device, effect = placed(name)
     system = compile_model(Model(device, (effect,)))
@@ -139,10 +159,11 @@ def test_reading_of_the_encoders_is_its_offset_from_the_motion(name):
             change[:, k] = u[:, system.inputs.index(derivative(force, 1))]
     later, sooner = (system.offset(q + by * qd, u + by * change, p) for by in (1e-6, -1e-6))
     true = q + system.offset(q, u, p), qd + (later - sooner) / 2e-6
+    measure = run_as_python(system, "compiled").measure
     for i in range(20):
         x = np.concatenate([true[0][i], true[1][i], np.zeros(len(system.memory_names))])
         read = np.empty(2 * len(system.coordinates))
-        system.measure(x, u[i], p, read)
+        measure(x, u[i], p, read)
         np.testing.assert_allclose(read, [*q[i], *qd[i]], rtol=1e-7, atol=1e-7)
 
 

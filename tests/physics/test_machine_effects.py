@@ -12,15 +12,7 @@ from bampipe.estimate.simulation import simulate_tracking
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.effect import unit_of
 from bampipe.physics.memory import STABLE, STIFF_STEPS
-from bampipe.physics.units import check_effect
 
-MACHINES = ("slider", "servo_pendulum", "magnetic_damper")
-CASES = [
-    (machine, f"{name}:{target}" if target else name)
-    for machine in MACHINES
-    for name in registry.effect_names()
-    for target in registry.effect(name).targets(registry.device(machine))
-]
 RATE = 250.0
 
 
@@ -62,16 +54,6 @@ def typical(system, strength=1.0):
     return np.array(
         [s * strength if p.strength else s for s, p in zip(sizes, system.parameters, strict=True)]
     )
-
-
-@pytest.mark.parametrize("name", registry.effect_names())
-def test_every_effect_has_a_place_in_some_device(name):
-    effect = registry.effect(name)
-    devices = [registry.device_from(ARM), *map(registry.device, registry.device_names())]
-    places = [(device, target) for device in devices for target in effect.targets(device)]
-    assert places
-    for device, target in places:
-        assert check_effect(effect, device, target) == []
 
 
 @pytest.mark.parametrize(("word", "sign"), [("sum", 1.0), ("difference", -1.0)])
@@ -117,12 +99,6 @@ def test_friction_by_pose_is_counted_from_the_middle_of_the_other_axis():
     added = system.contribution(*at, values)
     # The range of the extension is 0.6 to 1.6 m.
     np.testing.assert_allclose(added, [[-(1.5 + 0.7 * 0.5) * 0.2, 0.0, 0.0]], rtol=1e-9)
-
-
-@pytest.mark.parametrize(("machine", "case"), CASES)
-def test_units_are_consistent(machine, case):
-    name, _, target = case.partition(":")
-    assert check_effect(registry.effect(name), registry.device(machine), target) == []
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,9 @@ def arguments(system: System) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.zeros((SAMPLES, 0)), np.zeros((SAMPLES, len(system.inputs))), system.prior
 
 
-@pytest.mark.parametrize("joints", [1, 2, 4, 6, pytest.param(8, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "joints", [1, 4, *(pytest.param(n, marks=pytest.mark.long) for n in (2, 6, 8))]
+)
 def test_every_function_equals_that_of_pinocchio(joints: int) -> None:
     device = random_robot(joints, seed=joints)
     system, reference = compile_model(Model(device)), Reference(device)
@@ -206,7 +208,7 @@ def test_a_body_that_is_not_drawn_may_be_one() -> None:
     assert sd["mass.j1"] == pytest.approx(robot.uncertainty * 0.1 * heaviest)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_six_joints_are_compiled_in_seconds_and_take_less_than_a_microsecond(
     tmp_path: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,6 +5,7 @@ from fractions import Fraction
 
 import pytest
 from motions import declaration
+from small_arm import ARM
 
 from bampipe.errors import InputError
 from bampipe.physics import expression, registry
@@ -113,10 +114,13 @@ def test_built_in_devices_are_consistent(name):
 
 
 @pytest.mark.parametrize("name", registry.effect_names())
-def test_built_in_effects_are_consistent_at_every_target(name):
+def test_built_in_effects_have_a_place_and_are_consistent_at_each(name):
     effect = registry.effect(name)
-    for target in effect.targets(BAM):
-        assert check_effect(effect, BAM, target) == []
+    devices = [registry.device_from(ARM), *map(registry.device, registry.device_names())]
+    places = [(device, target) for device in devices for target in effect.targets(device)]
+    assert places
+    for device, target in places:
+        assert check_effect(effect, device, target) == []
 
 
 def wrong_device(change):

@@ -366,7 +366,7 @@ def test_every_figure_is_saved_as_svg_and_csv(opened: Opened, page_file: Path) -
         assert len(rows) > 1 and len({len(row) for row in rows}) == 1, name
 
 
-@pytest.mark.parametrize("width", [390, 1280, 2560])
+@pytest.mark.parametrize("width", [390, 2560])
 def test_the_page_fits_the_window_in_either_scheme(
     opened: Opened, page_file: Path, width: int
 ) -> None:
@@ -426,7 +426,7 @@ def test_correlations_come_with_the_variables_of_a_diagnosis(
     assert page.get_by_text("No diagnosis of").count() == int(not diagnosed)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_eight_channels_of_a_million_samples(opened: Opened, tmp_path: Path) -> None:
     """What others must wait for: 13.4 MB, 1.5 s of the page's own work, 82 ms a zoom."""
     path = tmp_path / "large.html"

@@ -116,18 +116,6 @@ def test_errors_of_every_axis_stand_beside_the_floor(full: Report) -> None:
         assert float(cells[2]) == pytest.approx(synthetic_run.FLOOR[axis], rel=3e-3)
 
 
-def test_what_the_stages_say_of_themselves_is_passed_on(full: Report) -> None:
-    words = text_of(full.html)
-    assert "All estimates had settled after 16.9 s of the 48.0 s" in words
-    assert "normalised innovation squared is 1.0;" in words
-    assert "The force lags the encoders by 0.120 ± 0.031 ms" in words
-    assert "Error of the predicted force (RMSE): force x 0.123 N" in words
-    assert "A note of the validation." in words
-    assert f"Added since, as model {synthetic_run.CHILD}" in words
-    assert "At the limit of its range" in words
-    assert row_of(full.html[full.html.index("RMSE by trial") :], "t02_free", "yes")[2] == "0.212"
-
-
 def test_trials_set_aside_and_repaired_say_why(full: Report) -> None:
     assert row_of(full.html, "t04_free")[2:] == ["–", "–", "set aside", "force_x frozen"]
     assert row_of(full.html, "t03_free")[-2] == "repaired"
@@ -204,29 +192,6 @@ def test_ladder_shows_every_version_and_what_moved(full: Report) -> None:
     assert "coulomb.yaw fell by 0.21 N·m" in text_of(full.html)
 
 
-def test_a_better_version_that_does_not_count_is_said_with_the_reason(tmp_path: Path) -> None:
-    root = synthetic_run.write_all(tmp_path / "s01")
-    path = root / "compare.json"
-    compared = json.loads(path.read_text())
-    path.write_text(json.dumps(compared | {"best": "base"}))
-    words = text_of(page_of(root))
-    assert "With stribeck:yaw the error would be lower than that of base" in words.replace(
-        " ,", ","
-    )
-    assert "none has a lower error" not in words
-
-
-def test_a_version_without_a_floor_is_not_said_to_have_no_lower_error(tmp_path: Path) -> None:
-    root = synthetic_run.write_all(tmp_path / "s01")
-    path = root / "compare.json"
-    compared = json.loads(path.read_text())
-    compared["ladder"][1]["noise_floor"] = dict.fromkeys(compared["ladder"][1]["noise_floor"])
-    path.write_text(json.dumps(compared | {"best": "base"}))
-    words = text_of(page_of(root))
-    assert "none has a lower error" not in words
-    assert "no noise floor could be computed for it" in words
-
-
 @pytest.mark.parametrize(
     ("verdict", "sets", "title"),
     [
@@ -248,69 +213,6 @@ def test_the_verdict_on_the_session_is_that_of_its_diagnosis(
     fields = diagnosis(axes, sets)
     write_result(root, DiagnoseResult, model=synthetic_run.CHILD, **fields)
     assert title in text_of(page_of(root))
-
-
-@pytest.mark.parametrize(
-    ("held_out", "said"),
-    [
-        ((True, True), "Held-out: each trial predicted with parameters fitted to others."),
-        ((False, True), f"Held-out: trial {synthetic_run.FREE[1]}, which no parameter has seen."),
-        ((False, False), "Held-out: nothing could be held out"),
-    ],
-)
-def test_what_was_held_out_is_said_as_it_was(
-    tmp_path: Path, held_out: tuple[bool, bool], said: str
-) -> None:
-    root = synthetic_run.write_all(tmp_path / "s01")
-    for path in (root / "models").glob("*/validate.json"):
-        content = json.loads(path.read_text())
-        entry = next(iter(content["trials"].values()))
-        names = synthetic_run.FREE[:2]
-        content["trials"] = {
-            name: entry | {"held_out": out} for name, out in zip(names, held_out, strict=True)
-        }
-        path.write_text(json.dumps(content))
-    assert said in text_of(page_of(root))
-
-
-def test_intervals_of_a_model_that_lacks_something_say_so(tmp_path: Path) -> None:
-    root = synthetic_run.write_all(tmp_path / "s01")
-    path = root / "models" / synthetic_run.CHILD / "validate.json"
-    content = json.loads(path.read_text())
-    assert "as if the model lacked nothing" not in text_of(page_of(root))
-    yaw = content["axes"]["yaw"]
-    yaw |= {"standing": "above_floor", "held_out_rmse": 23.0 * yaw["noise_floor"]}
-    path.write_text(json.dumps(content))
-    assert "its held-out error is up to 23.0 times the noise floor" in text_of(page_of(root))
-
-
-def test_the_rate_of_samples_is_that_of_the_clock(tmp_path: Path) -> None:
-    root = synthetic_run.write_all(tmp_path / "s01")
-    path = root / "ingest/trials.parquet"
-    trials = pd.read_parquet(path)
-    grid = json.loads((root / "ingest/session.json").read_text())["sample_rate_hz"]
-    counted = 1 + 0.9 * grid * trials["duration_s"].fillna(0.0)
-    trials["n_samples"] = counted.round().astype(int)
-    write_parquet(path, trials)
-    words = text_of(page_of(root))
-    assert f"Hz on average, put on a grid of {grid:.0f} Hz when filtered" in words
-
-
-def test_a_note_names_few_parameters_and_an_axis_at_rest_has_no_error(tmp_path: Path) -> None:
-    root = synthetic_run.write_all(tmp_path / "s01")
-    folder = root / "models" / synthetic_run.CHILD
-    identified = json.loads((folder / "identify.json").read_text())
-    entries = identified["parameters"]
-    bodies = [f"mass.body_{number}" for number in range(20)]
-    for found in (entries, *(method["parameters"] for method in identified["methods"].values())):
-        found |= dict.fromkeys(bodies, found["mass"])
-    (folder / "identify.json").write_text(json.dumps(identified))
-    validated = json.loads((folder / "validate.json").read_text())
-    validated["trials"]["t02_free"]["yaw"]["held_out_rmse"] = 0.0
-    (folder / "validate.json").write_text(json.dumps(validated))
-    page = page_of(root)
-    assert "other parameters under Identification." in page
-    assert row_of(page[page.index("RMSE by trial") :], "t02_free", "yes")[2] == "–"
 
 
 def test_stiffness_in_both_units_of_bandwidth(full: Report) -> None:

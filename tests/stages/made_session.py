@@ -15,17 +15,9 @@ import numpy as np
 RATE = 500.0
 COUNTS = {"yaw": (21333.3333, 12000), "pitch": (10191.0828, -4000), "extension": (33333.3333, 3000)}
 COLUMNS = (
-    "time_us",
-    "enc_yaw",
-    "enc_pitch",
-    "enc_extension",
-    "force_x_v",
-    "force_y_v",
-    "force_z_v",
-    "brake_yaw",
-    "brake_pitch",
-    "brake_extension",
-)
+    "time_us", "enc_yaw", "enc_pitch", "enc_extension", "force_x_v", "force_y_v", "force_z_v",
+    "brake_yaw", "brake_pitch", "brake_extension",
+)  # fmt: skip
 
 SESSION: dict[str, Any] = {
     "schema": "bampipe.session/1",

@@ -154,15 +154,12 @@ def mat5(t: dict[str, object]) -> bytes:
     return stream.getvalue()
 
 
-def mat73(t: dict[str, np.ndarray], change: Callable[[h5py.File], None] | None = None) -> bytes:
+def mat73(t: dict[str, np.ndarray]) -> bytes:
     stream = io.BytesIO()
     with h5py.File(stream, "w", userblock_size=512) as out:
         for name, values in t.items():
             out[name] = values[None, :]
-        if change is not None:
-            change(out)
-    content = stream.getvalue()
-    return b"MATLAB 7.3 MAT-file".ljust(512) + content[512:]
+    return b"MATLAB 7.3 MAT-file".ljust(512) + stream.getvalue()[512:]
 
 
 def wild_reading(t):
@@ -217,26 +214,18 @@ REFUSED: dict[str, tuple[Damage, str]] = {
         lambda made: lambda root: (root / "session.toml").unlink(),
         "no session.toml in this folder",
     ),
-    "empty session file": (file("", "session.toml"), "'schema' is missing"),
     "session file is binary": (
         file(bytes(range(256)), "session.toml"),
         "session.toml, line 2: not UTF-8",
     ),
-    "session file is UTF-16": (file("a = 1".encode("utf-16"), "session.toml"), "UTF-16"),
     "session file is not TOML": (
         file("schema = 1\nfoo = = 2\n", "session.toml"),
         r"session.toml, line 2: not TOML",
     ),
-    "key twice": (file("device = 1\ndevice = 2\n", "session.toml"), "line 2: not TOML"),
     "another schema": (put("schema", "bampipe.session/9"), 'expected "bampipe.session/1"'),
     "unknown key": (put("sample_rate", 1), 'unknown key "sample_rate", did you mean'),
-    "unknown key in encoder": (put("encoders.yaw.colunm", 1), "did you mean 'column'"),
     "session_id is a path": (put("session_id", "../x"), r'session_id: found "../x"'),
-    "session_id is a number": (put("session_id", 3), "found 3, expected text"),
     "rate is text": (put("sample_rate_hz", "fast"), 'found "fast", expected a number'),
-    "rate is zero": (put("sample_rate_hz", 0), "sample_rate_hz: found 0, expected more than 0"),
-    "rate is NaN": (put("sample_rate_hz", float("nan")), "found nan, expected a finite number"),
-    "rate is true": (put("sample_rate_hz", True), "found true, expected a number"),
     "number too large": (put("encoders.yaw.zero_counts", 10**40), "beyond 2"),
     "date is nonsense": (put("recorded_at", "yesterday"), "recorded_at: found"),
     "unknown device": (put("device", "bom"), "unknown device 'bom', did you mean 'bam'"),
@@ -245,10 +234,6 @@ REFUSED: dict[str, tuple[Damage, str]] = {
     "device file is broken": (
         both(put("device", "my.toml"), file("nonsense", "my.toml")),
         "my.toml, line 1: not TOML",
-    ),
-    "device file is no device": (
-        both(put("device", "my.toml"), file('name = "x"\nfoo = 1', "my.toml")),
-        'my.toml: unknown key "foo"',
     ),
     "no encoders": (put("encoders", {}), "expected at least 1 entry"),
     "axis of another device": (
@@ -266,14 +251,6 @@ REFUSED: dict[str, tuple[Damage, str]] = {
     "axis in the wrong unit": (put("encoders.yaw.unit", "mm"), "brakes.unit: found"),
     "unknown unit": (put("encoders.yaw.unit", "radain"), "did you mean 'rad'"),
     "zero counts_per_unit": (put("encoders.yaw.counts_per_unit", 0), "counts_per_unit: found 0"),
-    "counts_per_unit is text": (
-        put("encoders.yaw.counts_per_unit", "many"),
-        r'encoders.yaw.counts_per_unit: found "many", expected a number',
-    ),
-    "infinite counts_per_unit": (
-        put("encoders.yaw.counts_per_unit", float("inf")),
-        "encoders.yaw.counts_per_unit: found inf",
-    ),
     "one column for two channels": (
         put("encoders.yaw.column", "enc_pitch"),
         "column 'enc_pitch' is used for 2 channels",
@@ -283,12 +260,7 @@ REFUSED: dict[str, tuple[Damage, str]] = {
         put("force.calibration_n_per_v", [[1.0, 0.0], [0.0, 1.0]]),
         "found 2 rows of 2 numbers, expected 3 rows of 3",
     ),
-    "calibration ragged": (
-        put("force.calibration_n_per_v", [[1.0, 0.0, 0.0], [0.0, 1.0], [0.0, 0.0, 1.0]]),
-        "rows of 2 and 3 numbers",
-    ),
     "calibration singular": (put("force.calibration_n_per_v", SQUARE), "singular"),
-    "calibration is text": (put("force.calibration_n_per_v", [["a"]]), 'found "a"'),
     "zero_v of the wrong length": (put("force.zero_v", [0.0]), "zero_v: found 1, expected 3"),
     "calibration for a channel in N": (put("force.unit", "N"), "needs no calibration"),
     "force without its columns": (drop("force.columns"), "'columns' is missing"),
@@ -298,7 +270,6 @@ REFUSED: dict[str, tuple[Damage, str]] = {
         put("brakes.columns", ["brake_yaw", "brake_pich", "brake_extension"]),
         "names no axis, did you mean 'pitch'",
     ),
-    "brake units too few": (put("brakes.unit", "N.m, N.m"), "found 2 units, expected 3"),
     "brake in the wrong unit": (put("brakes.unit", "N, N, N"), 'found "N" for yaw'),
     "channel with a taken name": (
         put("channels", {"force_x": {"column": "a", "unit": "N"}}),
@@ -309,7 +280,6 @@ REFUSED: dict[str, tuple[Damage, str]] = {
         "expected a name of letters, digits",
     ),
     "no trials": (put("trials", []), "expected at least 1 in the list"),
-    "trials is a table": (put("trials", {}), "expected a list"),
     "unknown kind": (put("trials.0.kind", "fre"), "did you mean 'free'"),
     "locked without an axis": (put("trials.0.kind", "locked"), "'locked_axis' is missing"),
     "locked on an unknown axis": (put("trials.2.locked_axis", "yow"), "did you mean 'yaw'"),
@@ -318,17 +288,10 @@ REFUSED: dict[str, tuple[Damage, str]] = {
         put("trials.0.kind", "viscous"),
         "'viscous_n_s_per_m' is missing",
     ),
-    "viscous damping below zero": (
-        both(put("trials.0.kind", "viscous"), put("trials.0.viscous_n_s_per_m", -4)),
-        "expected more than 0",
-    ),
     "trial path leaves the session": (put("trials.0.file", "../x.csv"), "leaves the session"),
-    "trial path leaves it later": (put("trials.0.file", "a/../../x.csv"), "leaves the session"),
     "trial path absolute": (put("trials.0.file", "/etc/passwd"), "absolute path"),
     "trial path of Windows": (put("trials.0.file", "C:\\data\\x.csv"), "absolute path"),
-    "trial path with backslashes": (put("trials.0.file", "trials\\t01.csv"), "not portable"),
     "trial path with a NUL": (put("trials.0.file", "a\0b.csv"), "not portable"),
-    "trial path empty": (put("trials.0.file", ""), "expected text that is not empty"),
     "unit of time unknown": (
         put("time", {"column": "time_us", "unit": "minutes"}),
         'time.unit: found "minutes"',
@@ -342,10 +305,8 @@ REFUSED: dict[str, tuple[Damage, str]] = {
 # name: (damage of the first trial, what its reason must say)
 ASIDE: dict[str, tuple[Damage, str]] = {
     "empty file": (file(""), r"^trials/t01.csv: the file is empty$"),
-    "a byte order mark and nothing else": (file(b"\xfe\xff"), "the file holds no text"),
     "blank lines only": (file("\n  \n\n"), "the file holds no text"),
     "header only": (text(lambda s: s.split("\n")[0] + "\n"), "a header but no samples"),
-    "header without line end": (text(lambda s: s.split("\n")[0]), "a header but no samples"),
     "binary garbage": (file(np.random.default_rng(0).bytes(5000)), "binary data, not text"),
     "garbage in the middle": (
         text(lambda s: s[:70000].encode() + b"\xff\xfe\x00\x01" * 20 + s[70000:].encode()),
@@ -381,10 +342,6 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         renamed(",".join(COLUMNS).replace("enc_yaw", "enc_yow")),
         "row 1: no column 'enc_yaw', did you mean 'enc_yow'",
     ),
-    "column in capitals": (
-        renamed(",".join(COLUMNS).replace("enc_yaw", "ENC_YAW")),
-        "did you mean 'ENC_YAW'",
-    ),
     "column twice": (
         renamed(",".join(COLUMNS).replace("enc_pitch", "enc_yaw")),
         "no column 'enc_pitch'|column 'enc_yaw' stands twice, as columns 2 and 3",
@@ -396,9 +353,7 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         r"^trials/t01.csv, row 30, column 'enc_pitch': found 'oops', expected a number; "
         r'if that means no reading, say missing = \["oops"\] under \[csv\]$',
     ),
-    "hexadecimal in a cell": (cell(31, "enc_pitch", "0x1F"), "row 31, .*found '0x1F'"),
     "a row too short": (line(500, lambda s: s.rsplit(",", 2)[0]), "row 500: 8 cells"),
-    "a row too long": (line(501, lambda s: s + ",1"), "row 501: 11 cells"),
     "two lines in one": (
         text(lambda s: "\n".join(s.split("\n")[:400]) + "".join(s.split("\n")[400:])),
         r"row 400: \d+ cells|far too long",
@@ -411,8 +366,6 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         ),
         "unsupported file extension '.xlsx'",
     ),
-    "a spreadsheet called CSV": (file(b"PK\x03\x04" + bytes(99)), "zip archive or spreadsheet"),
-    "a gzip archive called CSV": (file(b"\x1f\x8b" + bytes(99)), "gzip archive"),
     "Parquet called CSV": (
         lambda made: made.files.update({T01: parquet(made.tables[T01])}),
         r"this is a Parquet file, not \*.csv",
@@ -429,7 +382,6 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         "cannot be used|no such file",
     ),
     "three samples": (rows(lambda n: np.arange(3)), "3 samples over 0.006 s, less than 1 s"),
-    "half a second": (rows(lambda n: np.arange(250)), "250 samples over 0.5 s"),
     "time missing": (samples("time_us", slice(100, 200), np.nan), "100 time stamps are missing"),
     "time stands still": (samples("time_us", slice(None), 5.0), "time stands still"),
     "time backwards": (rows(lambda n: np.arange(n)[::-1]), "time runs backwards throughout"),
@@ -461,17 +413,8 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         samples("force_x_v", slice(300, 320), np.nan),
         "row 302, column 'force_x_v': 20 samples in a row are missing, more than 5",
     ),
-    "NaN here and there, too often": (
-        samples("force_x_v", slice(0, None, 20), np.nan),
-        "50 of 1000 samples are missing, more than 1%",
-    ),
     "a column of NaN": (samples("enc_pitch", slice(None), np.nan), "holds no number at all"),
-    "a column of infinities": (
-        text(lambda s: re.sub(r"(\n(?:[^,\n]*,){4})[^,\n]*", r"\1inf", s)),
-        "column 'force_x_v': holds no number at all",
-    ),
     "force frozen": (samples("force_z_v", slice(200, 800), 0.25), "reads 0.25 without a change"),
-    "force disconnected": (samples("force_z_v", slice(None), 0.0), "frozen"),
     "force out of this world": (samples("force_z_v", 300, 1e9), "which no such machine does"),
     "encoder stuck": (samples("enc_pitch", slice(None), 77.0), "never changes while other axes"),
     "free trial that never moves": (
@@ -531,48 +474,14 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         as_file(".mat", lambda t: mat5({**t, "enc_yaw": "left"})),
         "variable 'enc_yaw': not numbers",
     ),
-    "MATLAB matrix": (
-        as_file(".mat", lambda t: mat5({**t, "enc_yaw": np.zeros((500, 2))})),
-        "variable 'enc_yaw': a 500 by 2 array, expected a vector",
-    ),
-    "MATLAB complex": (
-        as_file(".mat", lambda t: mat5({**t, "enc_yaw": t["enc_yaw"] * 1j})),
-        "not numbers",
-    ),
-    "MATLAB 7.3 cut off": (as_file(".mat", lambda t: mat73(t)[:4000]), "not a sound MATLAB file"),
-    "MATLAB 7.3 linked outside": (
-        as_file(
-            ".mat",
-            lambda t: mat73(
-                {k: v for k, v in t.items() if k != "enc_yaw"},
-                lambda f: f.__setitem__("enc_yaw", h5py.ExternalLink("/etc/x.h5", "/enc_yaw")),
-            ),
-        ),
-        "variable 'enc_yaw': a link",
-    ),
-    "MATLAB 7.3 structure": (
-        as_file(
-            ".mat",
-            lambda t: mat73(
-                {k: v for k, v in t.items() if k != "enc_yaw"},
-                lambda f: f.create_group("enc_yaw"),
-            ),
-        ),
-        "variable 'enc_yaw': a structure",
-    ),
 }
 
 # name: (damage of the first trial, what must be said of it)
 REPAIRED: dict[str, tuple[Damage, str]] = {
     "last line cut off": (text(lambda s: s[:-30]), "last line is cut off: 1 row dropped"),
-    "last cell cut off": (text(lambda s: s[:-3]), "last line is cut off: 1 row dropped"),
     "time in seconds": (
         text(lambda s: re.sub(r"(?m)^(\d+),", lambda m: f"{int(m[1]) * 1e-6:.3f},", s)),
         "time stamps are in s, not us, by the nominal rate: converted",
-    ),
-    "time in milliseconds": (
-        table(lambda t: t["time_us"].__imul__(1e-3)),
-        "time stamps are in ms, not us",
     ),
     "stamps of too few digits": (
         table(lambda t: t["time_us"].__setitem__(slice(None), t["time_us"] // 4000 * 4000)),
@@ -602,7 +511,6 @@ REPAIRED: dict[str, tuple[Damage, str]] = {
         samples("time_us", 100, 1e9),
         "1 row with a time stamp out of order dropped",
     ),
-    "a stamp that falls back": (samples("time_us", 100, 3), "1 row with a time stamp out of order"),
     "a stamp missing": (cell(60, "time_us", ""), "1 row without a time stamp dropped"),
     "clock rolls over": (
         table(lambda t: t.update(time_us=np.mod(t["time_us"] + 2.0**32 - 1e6, 2.0**32))),
@@ -614,7 +522,6 @@ REPAIRED: dict[str, tuple[Damage, str]] = {
     ),
     "counter of 16 bits": (wrap(16), "column 'enc_yaw' wraps at 16 bits .*unwrapped"),
     "counter of 24 bits": (wrap(24), "wraps at 24 bits"),
-    "counter of 32 bits": (wrap(32), "wraps at 32 bits"),
     "a wild encoder reading": (
         table(wild_reading),
         "column 'enc_yaw': 1 wild reading taken out.*1 missing sample interpolated",
@@ -628,7 +535,6 @@ REPAIRED: dict[str, tuple[Damage, str]] = {
         samples("force_x_v", slice(0, 3), np.nan),
         "3 rows with missing samples at the ends dropped",
     ),
-    "an infinity": (cell(70, "force_x_v", "-inf"), "1 missing sample interpolated"),
 }
 
 # name: (damage of the first trial, what is noted; "" for nothing): sound all the same
@@ -636,12 +542,8 @@ SOUND: dict[str, tuple[Damage, str]] = {
     "nothing": (lambda made: None, ""),
     "byte order mark": (text(lambda s: b"\xef\xbb\xbf" + s.encode()), ""),
     "Windows line ends": (text(lambda s: s.replace("\n", "\r\n")), ""),
-    "blank lines at the end": (text(lambda s: s + "\n\n"), ""),
     "blanks after commas": (text(lambda s: s.replace(",", ", ")), ""),
     "UTF-16 with mark": (text(lambda s: s.encode("utf-16")), ""),
-    "UTF-16 without mark": (text(lambda s: s.encode("utf-16-be")), ""),
-    "semicolons": (text(lambda s: s.replace(",", ";")), "columns are separated by semicolons"),
-    "tabs": (text(lambda s: s.replace(",", "\t")), "columns are separated by tabs"),
     "blanks": (text(lambda s: s.replace(",", "   ")), "columns are separated by blanks"),
     "semicolons and decimal commas": (
         text(lambda s: s.replace(",", ";").replace(".", ",")),

@@ -32,12 +32,26 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunFolder]:
     yield simulated_run(tmp_path_factory.mktemp("simulated"))
 
 
-def identified(run: RunFolder, config: identify.Config = FAST) -> dict:
-    """Execute the stage in the run folder; return identify.json, checked."""
-    identify.execute(run, run.root, config, silent)
-    content = read_json(run.path(f"models/{config.model}/identify.json"))
+def identified(run: RunFolder, config: identify.Config = FAST, out: Path | None = None) -> dict:
+    """Execute the stage in ``out``, or in the run folder; return identify.json, checked."""
+    identify.execute(run, out or run.root, config, silent)
+    content = read_json((out or run.root) / f"models/{config.model}/identify.json")
     assert schema_misfits(content, "identify") == []
     return content
+
+
+@pytest.fixture(scope="module")
+def published(simulated: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """What is published of the simulated run, and where its tables are."""
+    out = tmp_path_factory.mktemp("published")
+    return out, identified(simulated, out=out)
+
+
+@pytest.fixture(scope="module")
+def squares(simulated: RunFolder, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    """The same by least squares."""
+    out = tmp_path_factory.mktemp("squares")
+    return out, identified(simulated, replace(FAST, method="least-squares"), out)
 
 
 def assert_recovered(content: dict, truth: dict[str, float]) -> None:
@@ -46,7 +60,7 @@ def assert_recovered(content: dict, truth: dict[str, float]) -> None:
         assert estimate == pytest.approx(value, rel=TOLERANCE[name.split(".")[0]]), name
 
 
-@pytest.mark.parametrize("name", ["open-01", "open-09"])
+@pytest.mark.parametrize("name", ["open-01", pytest.param("open-09", marks=pytest.mark.long)])
 def test_shared_sessions_within_what_is_asked(tmp_path: Path, name: str) -> None:
     run = shared_run(tmp_path / name, name)
     content = identified(run)
@@ -58,8 +72,8 @@ def test_shared_sessions_within_what_is_asked(tmp_path: Path, name: str) -> None
         assert abs(entry["estimate"] - value) < 6.0 * entry["sd"], name_
 
 
-def test_intervals_hold_on_a_simulated_session(simulated: RunFolder) -> None:
-    content = identified(simulated)
+def test_intervals_hold_on_a_simulated_session(published: tuple[Path, dict]) -> None:
+    _, content = published
     assert_recovered(content, TRUTH)
     z = [
         (content["parameters"][name]["estimate"] - value) / content["parameters"][name]["sd"]
@@ -70,17 +84,16 @@ def test_intervals_hold_on_a_simulated_session(simulated: RunFolder) -> None:
     assert content["repeats"] == 0  # linear in its parameters: one pass is enough
 
 
-@pytest.mark.parametrize("factor", [0.2, 5.0])
+@pytest.mark.parametrize("factor", [pytest.param(0.2, marks=pytest.mark.long), 5.0])
 def test_start_does_not_matter(simulated: RunFolder, factor: float) -> None:
     content = identified(simulated, replace(FAST, start_factor=factor))
     assert_recovered(content, TRUTH)
 
 
-def test_least_squares(simulated: RunFolder) -> None:
-    content = identified(simulated, replace(FAST, method="least-squares"))
+def test_least_squares(squares: tuple[Path, dict]) -> None:
+    out, content = squares
     assert_recovered(content, TRUTH)
-    trace = read_parquet(simulated.path("models/base/trace.parquet"))
-    assert len(trace) == 2
+    assert len(read_parquet(out / "models/base/trace.parquet")) == 2
 
 
 def test_least_squares_stand_in_where_the_filter_loses_the_motion(
@@ -182,9 +195,8 @@ def test_a_motion_that_no_noise_explains_is_refused(tmp_path: Path) -> None:
     assert any(note.startswith(said) for note in content["notes"])
 
 
-def test_torque_against_gravity_is_stored(simulated: RunFolder) -> None:
-    identified(simulated)
-    states = read_parquet(simulated.path("models/base/states.parquet"))
+def test_torque_against_gravity_is_stored(published: tuple[Path, dict]) -> None:
+    states = read_parquet(published[0] / "models/base/states.parquet")
     balanced = 3.56 * 9.81 * (states["q_extension"] - 0.461) * np.cos(states["q_pitch"])
     np.testing.assert_allclose(states["torque_gravity_pitch"], balanced, atol=0.02)
     assert not {"torque_gravity_yaw", "torque_gravity_extension"} & set(states)
@@ -218,7 +230,9 @@ def test_the_force_noise_moves_the_encoder_of_an_axis_that_winds_up(tmp_path: Pa
 @pytest.mark.parametrize(
     ("effect", "hidden"),
     [
-        ("encoder_scale:yaw", {"encoder_scale.yaw.error": -0.05}),
+        pytest.param(
+            "encoder_scale:yaw", {"encoder_scale.yaw.error": -0.05}, marks=pytest.mark.long
+        ),
         (
             "position_dependent_friction:extension",
             {
@@ -268,9 +282,9 @@ def test_friction_that_falls_within_a_step(tmp_path: Path) -> None:
         assert by_noise < 0.02 * force["estimate"]
 
 
-def test_least_squares_intervals_hold_once_its_bias_is_off(simulated: RunFolder) -> None:
+def test_least_squares_intervals_hold_once_its_bias_is_off(squares: tuple[Path, dict]) -> None:
     """Filtered motions move what it fits; the replay says by how much."""
-    content = identified(simulated, replace(FAST, method="least-squares"))
+    _, content = squares
     z = []
     for name, value in TRUTH.items():
         entry = content["parameters"][name]
@@ -284,16 +298,16 @@ def test_least_squares_intervals_hold_once_its_bias_is_off(simulated: RunFolder)
 
 
 def test_bounds_agree_with_the_filter_where_noise_is_what_the_sensors_say(
-    simulated: RunFolder,
+    published: tuple[Path, dict],
 ) -> None:
-    content = identified(simulated)
+    _, content = published
     for name in ("viscous.yaw", "coulomb.yaw", "viscous.extension", "coulomb.extension"):
         entry = content["parameters"][name]
         assert 0.75 < entry["filter_sd"] / entry["bound_sd"] < 1.5, name
 
 
-def test_what_cannot_be_identified_is_said(simulated: RunFolder, tmp_path: Path) -> None:
-    content = identified(simulated, replace(FAST, method="least-squares"))
+def test_what_cannot_be_identified_is_said(squares: tuple[Path, dict]) -> None:
+    _, content = squares
     said = content["identifiability"]
     assert "N" in said["together"][0]["members"]
     assert any("no motion tells the parts apart" in line for line in content["notes"])
@@ -314,9 +328,9 @@ def test_two_terms_of_one_shape_are_said_to_move_together(simulated: RunFolder) 
 
 
 def test_innovations_of_the_right_model_pass_and_those_of_a_late_force_do_not(
-    simulated: RunFolder, tmp_path: Path
+    published: tuple[Path, dict], tmp_path: Path
 ) -> None:
-    content = identified(simulated)
+    _, content = published
     for axis, entry in content["innovations"].items():
         assert entry["whiteness"]["white"], (axis, entry)
         assert entry["inputs"]["independent"], (axis, entry)

@@ -27,7 +27,7 @@ from bampipe.run.settings import configure
 from bampipe.stages import ingest
 
 SAMPLES = Path(__file__).parents[2] / "sample_runs"
-NAMES = [f"open-0{number}" for number in range(1, 10)]
+NAMES = ["open-01", *(pytest.param(f"open-0{k}", marks=pytest.mark.long) for k in range(2, 10))]
 
 
 def run_ingest(session: Path, out: Path, **settings: object):

@@ -254,19 +254,9 @@ def test_units_of_logs(text, si, scale):
 @pytest.mark.parametrize(
     "text",
     [
-        "counts",
-        "ticks",
-        "furlong",
-        "N.m.s/rad",
-        "q",
-        "m m m",
-        "2",
-        "1/s",
-        "0 mA",
-        "3e",
-        "20 degC",
-        "m1",
+        "counts", "ticks", "furlong", "N.m.s/rad", "q", "m m m", "2", "1/s", "0 mA", "3e",
+        "20 degC", "m1",
     ],
-)
+)  # fmt: skip
 def test_units_that_are_not_known(text):
     assert unit(text) is None

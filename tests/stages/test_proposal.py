@@ -366,13 +366,6 @@ def write_stage_log(folder: Path, *columns: str) -> None:
     np.savetxt(folder / "a.csv", rows, "%.6f", ",", header=",".join(columns), comments="")
 
 
-def test_a_clock_named_by_its_unit(tmp_path):
-    write_stage_log(tmp_path / "a", "ms", "pos_mm", "load_cell_N")
-    session, proposal = proposed(tmp_path / "a")
-    assert session["time"] == {"column": "ms", "unit": "ms"}
-    assert session["sample_rate_hz"] == 500 and proposal.fill_in == []
-
-
 def test_a_rate_that_nobody_knows_is_refused_until_it_is_given(tmp_path):
     write_stage_log(tmp_path / "a", "pos_mm", "load_cell_N")
     _, proposal = proposed(tmp_path / "a")
@@ -402,29 +395,6 @@ def test_a_force_that_is_not_there_is_asked_for_where_it_is_read(tmp_path, comma
     assert code == 2 and "fill in the name of the column" in err
 
 
-def test_why_a_time_is_no_clock_is_said(tmp_path):
-    log = joint_log(1)
-    log["stamp"][1::4] = log["stamp"][:-1:4][: len(log["stamp"][1::4])]
-    np.savetxt(
-        tmp_path / "a.txt", np.column_stack(list(log.values())), fmt="%.6f", header=" ".join(log)
-    )
-    _, proposal = proposed(tmp_path)
-    (line,) = (line for line in proposal.check if "samples are counted" in line)
-    assert re.search(r"stamp does not change at \d+ of \d+ steps", line)
-
-
-def test_what_is_wrong_with_a_log_is_said_in_one_line(tmp_path, command: Command):
-    rows = [
-        f"{0.01 * k:.2f},{1e-5 * (k % (3 + k // 1200)):.6f},{np.cos(0.01 * k):.4f}"
-        for k in range(2000)
-    ]
-    (tmp_path / "a.csv").write_text("t,angle_rad,torque_nm\n" + "\n".join(rows) + "\n")
-    assert command("init", tmp_path)[0] == 0
-    code, _, err = command("ingest", tmp_path, "--quiet")
-    said = "is sound; a.csv and 3 more: declared free, but never moves"
-    assert code == 2 and said in err and len(err.splitlines()) == 1, err
-
-
 @pytest.mark.parametrize("header", [["Logging to: B.CSV", "t,angle_rad,torque_nm"], []])
 def test_each_recording_of_a_file_is_a_trial(tmp_path, command: Command, header: list[str]):
     t = 0.01 * np.arange(1000)
@@ -447,19 +417,6 @@ def test_each_recording_of_a_file_is_a_trial(tmp_path, command: Command, header:
     code, out, err = command("ingest", tmp_path)
     assert code in (0, 2) and f"row {begins}: " in out + err
     assert "2 recordings in one file; give each a [[trials]] entry with recording = 1" in out + err
-
-
-def test_a_rate_at_which_no_motion_is_logged_is_doubted(tmp_path):
-    """Microseconds under a header that says milliseconds."""
-    t = np.arange(2000)
-    table = np.column_stack([1e4 * t, np.sin(0.01 * t), np.cos(0.01 * t)])
-    header = "t [ms],angle [rad],torque [N.m]"
-    np.savetxt(tmp_path / "a.csv", table, fmt="%.6f", delimiter=",", header=header, comments="")
-    _, proposal = proposed(tmp_path)
-    assert (
-        "0.1 Hz, from the time stamps; motion is not logged so: is its unit right?"
-        in proposal.check
-    )
 
 
 def two_joints(columns: dict[str, str]) -> dict[str, np.ndarray]:
@@ -491,14 +448,6 @@ def test_of_two_joints_without_a_drawing_a_position_has_its_own_drive(tmp_path):
     assert session["encoders"]["joint"]["column"] == "pos_meas1"
     assert session["force"]["columns"] == ["tau1"]
     assert any("2 columns are positions: of a robot?" in line for line in proposal.check)
-
-
-def test_a_position_whose_drive_is_not_there_is_not_driven_by_another_position(tmp_path):
-    table = two_joints({"q1": "pos_deg[0]", "q2": "pos_deg[1]"})
-    write_table(tmp_path / "a.csv", {name: v for name, v in table.items() if "tau" not in name})
-    session, _ = proposed(tmp_path)
-    assert session["encoders"]["joint"] == {"column": "pos_deg[0]", "unit": "deg"}
-    assert "pos_deg[1]" not in str(session["force"])
 
 
 def test_the_files_of_one_recording_are_joined(tmp_path):
@@ -553,18 +502,6 @@ def test_motion_and_force_with_clocks_of_their_own_are_joined(tmp_path, shift: f
     np.testing.assert_allclose(found[name][first][:count], np.cos(2.0 * stamps[:count]), atol=2e-5)
 
 
-def test_one_joint_a_file_is_one_recording(tmp_path):
-    table = two_joints({})
-    for k in (1, 2):
-        one = {"time": table["time [s]"], "q": table[f"q{k}"], "tau": table[f"tau{k}"]}
-        write_table(tmp_path / f"joint{k}.csv", one)
-    session, _ = proposed(tmp_path)
-    assert session["encoders"]["joint"]["column"] == "joint1:q"
-    assert session["force"]["columns"] == ["joint1:tau"]
-    (part,) = session["trials"][0].get("parts", [{}]) or [{}]
-    assert part.get("name") in (None, "joint2")
-
-
 def test_parts_that_no_clock_joins_are_refused(tmp_path, command: Command):
     table = two_joints({})
     write_table(tmp_path / "q.csv", {"q1": table["q1"]})
@@ -603,13 +540,6 @@ def test_units_at_the_end_of_names(tmp_path):
     assert "driven by a current" in proposal.device
 
 
-def test_a_torque_in_whole_units_of_its_name_is_no_count(tmp_path):
-    table = labelled("t_s,pos_deg,vel_deg_s,torque_mNm", q=57.29578, qd=57.29578, u=1e3)
-    write_table(tmp_path / "a.csv", table | {"torque_mNm": np.rint(table["torque_mNm"])})
-    session, proposal = proposed(tmp_path)
-    assert session["force"]["unit"] == "mN.m" and not proposal.fill_in
-
-
 def test_a_distance_slides_under_a_force(tmp_path):
     write_table(tmp_path / "a.csv", labelled("t,dist,w,forc"))
     session, proposal = proposed(tmp_path)
@@ -628,13 +558,6 @@ def test_a_current_position_is_no_current_and_an_acceleration_drives_nothing(tmp
     write_table(tmp_path / "b/a.csv", table)
     session, _ = proposed(tmp_path / "b")
     assert session["force"]["columns"] == ["?"]
-
-
-@pytest.mark.parametrize(("name", "said"), [("q", True), ("q_rad", False)])
-def test_an_axis_of_no_unit_may_slide(tmp_path, name: str, said: bool):
-    write_table(tmp_path / "a.csv", labelled(f"t,{name},w,tau"))
-    assert any("--device slider" in line for line in propose(tmp_path).check) == said
-    assert 'device = "slider"' in propose(tmp_path, "slider").session
 
 
 def test_a_torque_in_per_cent_asks_for_its_gain(tmp_path):

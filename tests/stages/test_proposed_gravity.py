@@ -47,7 +47,7 @@ def joint(torque: str, travel: float, seed: int = 0) -> tuple[np.ndarray, np.nda
     return t, np.round(q / 4e-4) * 4e-4, drive
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.long) for k in (1, 2))])
 @pytest.mark.parametrize(
     ("torque", "travel", "reading"),
     [

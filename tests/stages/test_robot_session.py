@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
@@ -12,9 +11,7 @@ import pytest
 import bampipe
 from bampipe.data.device_file import read_device_file
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.export import Form, export_model
 from bampipe.files import read_json
-from bampipe.physics import Model, compile_model
 from bampipe.physics.base_parameters import base_parameters
 from bampipe.physics.registry import device_from
 
@@ -142,35 +139,3 @@ def test_nothing_is_left_but_noise(run: RunFolder) -> None:
     for axis in JOINTS:
         assert axes[axis]["held_out_rmse"] < 1.5 * axes[axis]["noise_floor"]
         assert axes[axis]["fit_percent"] > 95.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("form", ["urdf", "mjcf"])
-def test_what_is_exported_has_the_dynamics_of_the_identified_model(
-    run: RunFolder, tmp_path: Path, form: Form
-) -> None:
-    text = export_model(run, "base", form)
-    (tmp_path / "arm.xml").write_text(text)
-    read = pin.buildModelFromXML if form == "urdf" else pin.buildModelFromMJCF
-    exported = read(text if form == "urdf" else str(tmp_path / "arm.xml"))
-    data = exported.createData()
-    content = read_json(run.path("models/base/identify.json"))["parameters"]
-    device = device_from(read_device_file(run.root.parent.parent / "arm" / "device.toml"))
-    system = compile_model(Model(device))
-    p, kept = system.prior, ("rotor",) if form == "mjcf" else ()
-    for i, item in enumerate(system.parameters):
-        if item.name in content:
-            p[i] = content[item.name]["estimate"]
-        if not item.name.startswith(("mass", "first", "inertia", *kept)):
-            p[i] = 0.0
-    q, qd, qdd = np.random.default_rng(3).normal(size=(3, 10, 3))
-    u, z = np.zeros((10, len(system.inputs))), np.zeros((10, 0))
-    expected = system.required(q, qd, qdd, z, u, p)
-    rows = [pin.rnea(exported, data, *row).copy() for row in zip(q, qd, qdd, strict=True)]
-    np.testing.assert_allclose(rows, expected, atol=1e-8)
-    joints = {e.get("name"): e for e in ElementTree.fromstring(text).iter("joint")}
-    for joint in JOINTS:
-        losses = joints[joint] if form == "mjcf" else joints[joint].find("dynamics")
-        named = ("damping", "frictionloss" if form == "mjcf" else "friction")
-        for attribute, name in zip(named, ("viscous", "coulomb"), strict=True):
-            assert float(losses.get(attribute)) == content[f"{name}.{joint}"]["estimate"]

@@ -193,11 +193,11 @@ def fit(out, effects, start):
         ("quadratic_drag:yaw", "coefficient", 0.3, 0.1),
         ("gravity_compensator_lag", "time_constant", 0.1, 0.05),
         ("force_delay", "delay", 0.005, 0.08),
-        ("force_gain:x", "error", 0.0, 0.15),
-        ("force_bias:y", "bias", 0.0, 0.1),
-        ("force_drift:z", "rate", 0.0, 0.15),
         ("encoder_scale:yaw", "error", 0.01, 0.15),
-        ("handle_payload", "payload", 0.1, 0.1),
+        pytest.param("force_gain:x", "error", 0.0, 0.15, marks=pytest.mark.long),
+        pytest.param("force_bias:y", "bias", 0.0, 0.1, marks=pytest.mark.long),
+        pytest.param("force_drift:z", "rate", 0.0, 0.15, marks=pytest.mark.long),
+        pytest.param("handle_payload", "payload", 0.1, 0.1, marks=pytest.mark.long),
     ],
 )
 def test_hidden_effect_comes_back_through_the_sensors(
