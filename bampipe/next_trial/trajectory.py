@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -35,6 +35,8 @@ _RAMP_S, _RAMP_SHARE = 2.0, 0.2
 _MOST = 60
 _HALVINGS = 8
 _TINY = 1e-300
+_FIELDS = ("positions", "velocities", "accelerations", "effort")
+"""Of a point of the ROS message."""
 
 
 def read_limits(device: Device, seen: Envelope, where: str) -> dict[str, Extent]:
@@ -88,13 +90,17 @@ def list_trajectories(
         InputError: the weight alone takes more effort than a drive may give.
     """
     seen, found = rehearsal.seen, []
-    bounds = _Bounds.of_limits(limits, seen)
+    stated = np.array([[*one.model_dump().values()] for one in limits.values()]).T
+    usable = stated * np.array([1.0, 1.0, _OF_LIMIT, _OF_LIMIT, _OF_EFFORT])[:, None]
+    known = usable.copy()
+    known[2:4] = np.minimum(usable[2:4], [seen.speed, seen.acceleration])
     for number in range(min(count, _MOST)):
         rng = np.random.default_rng([rehearsal.seed, number])
         beyond = number % 2 == 0
         parts = PARTS if beyond and seconds >= PARTS * SHORTEST_S else 1
-        series = _draw(bounds if beyond else bounds.within(seen), seconds / parts, rng)
-        fitting = _scale_to_effort(rehearsal, bounds.effort, series)
+        reach, most = (seen.wider or seen, usable) if beyond else (seen, known)
+        series = _draw(reach, most, seen.movable, seconds / parts, rng)
+        fitting = _scale_to_effort(rehearsal, usable[4], series)
         if fitting is not None:
             found.append(Primitive({}, fitting.middle, seconds, parts=parts, series=fitting))
     if not found:
@@ -107,63 +113,28 @@ def list_trajectories(
     return found
 
 
-@dataclass(frozen=True)
-class _Bounds:
-    """What trajectories keep to, each (n_q,); a speed of zero where an axis shall rest."""
-
-    low: Array
-    high: Array
-    speed: Array
-    acceleration: Array
-    effort: Array
-
-    @classmethod
-    def of_limits(cls, limits: Mapping[str, Extent], seen: Envelope) -> _Bounds:
-        """A little less than the limits; what the trials have not moved rests."""
-        speed, acceleration, effort = np.array(
-            [(one.speed, one.acceleration, one.effort) for one in limits.values()]
-        ).T
-        moves = np.isin(np.arange(len(speed)), seen.movable)
-        low, high = seen.reach
-        return cls(
-            np.maximum(low, [one.lower for one in limits.values()]),
-            np.minimum(high, [one.upper for one in limits.values()]),
-            _OF_LIMIT * speed * moves, _OF_LIMIT * acceleration, _OF_EFFORT * effort,
-        )  # fmt: skip
-
-    def within(self, seen: Envelope) -> _Bounds:
-        """The same within what the trials have shown."""
-        return replace(
-            self, low=np.maximum(self.low, seen.low), high=np.minimum(self.high, seen.high),
-            speed=np.minimum(self.speed, seen.speed),
-            acceleration=np.minimum(self.acceleration, seen.acceleration),
-        )  # fmt: skip
-
-
-def _draw(bounds: _Bounds, seconds: float, rng: np.random.Generator) -> Series:
+def _draw(
+    reach: Envelope, limits: Array, movable: Sequence[int], seconds: float, rng: np.random.Generator
+) -> Series:
     """A random series that touches one of the bounds of each axis: position, speed, acceleration.
 
     Its amplitudes fall with the number of the harmonic, less or more: slow and wide, or quick.
+
+    Args:
+        reach: ends of each axis; limits: (5, n_q), as in `Extent`; movable: axes that move.
+        seconds: its length; rng: source of what is random.
     """
-    n = len(bounds.low)
-    harmonics = np.arange(1, _HARMONICS + 1)[:, None]
-    fall = harmonics ** -rng.uniform(0.0, 2.0)
+    n = len(reach.low)
+    fall = np.arange(1, _HARMONICS + 1)[:, None] ** -rng.uniform(0.0, 2.0)
     sine, cosine = fall * rng.standard_normal((2, _HARMONICS, n))
-    # Most of the way to either end from wherever it starts.
-    room = bounds.high - bounds.low
-    middle = bounds.low + room * rng.uniform(0.35, 0.65, n)
+    low, high = np.maximum(reach.low, limits[0]), np.minimum(reach.high, limits[1])
+    middle = low + (high - low) * rng.uniform(0.35, 0.65, n)
     unit = Series(middle, sine, cosine, seconds, min(_RAMP_S, _RAMP_SHARE * seconds))
-    low, high, speed, acceleration = unit.extent
-    share = np.min(
-        [
-            (middle - bounds.low) / np.maximum(middle - low, _TINY),
-            (bounds.high - middle) / np.maximum(high - middle, _TINY),
-            bounds.speed / np.maximum(speed, _TINY),
-            bounds.acceleration / np.maximum(acceleration, _TINY),
-        ],
-        axis=0,
-    )
-    return unit.scaled(share)
+    lowest, highest, speed, acceleration = unit.extent
+    room = np.array([middle - low, high - middle, limits[2], limits[3]])
+    taken = np.array([middle - lowest, highest - middle, speed, acceleration])
+    share = np.min(room / np.maximum(taken, _TINY), axis=0)
+    return unit.scaled(share * np.isin(np.arange(n), movable))
 
 
 def _scale_to_effort(rehearsal: Rehearsal, most: Array, series: Series) -> Series | None:
@@ -188,31 +159,29 @@ class Points:
 
     Attributes:
         axes: their names; t: (T,) s.
-        q, qd, qdd: (T, n_q), rad or m and derivatives; effort: (T, n_q) forecast, N.m or N.
+        columns: positions, velocities, accelerations and effort forecast by axis, each (T, n_q).
     """
 
     axes: Sequence[str]
     t: Array
-    q: Array
-    qd: Array
-    qdd: Array
-    effort: Array
+    columns: tuple[Array, Array, Array, Array]
 
     @classmethod
     def of_series(cls, series: Series, rehearsal: Rehearsal) -> Points:
         """`HZ` points a second, and one at the end, where it is at rest again."""
-        count = round(series.seconds * HZ)
-        t = np.linspace(0.0, series.seconds, count + 1)
+        t = np.linspace(0.0, series.seconds, round(series.seconds * HZ) + 1)
         clock, effort = rehearsal.effort(series)
         given = np.stack([np.interp(t, clock, column) for column in effort.T], axis=1)
-        return cls(rehearsal.system.coordinates, t, *series.path(t), given)
+        return cls(rehearsal.system.coordinates, t, (*series.path(t), given))
 
     def extents(self) -> dict[str, Extent]:
         """How far, fast and hard each axis goes."""
-        tops = (np.abs(part).max(axis=0) for part in (self.qd, self.qdd, self.effort))
-        rows = zip(self.axes, self.q.min(axis=0), self.q.max(axis=0), *tops, strict=True)
-        names = ("lower", "upper", "speed", "acceleration", "effort")
-        return {axis: Extent(**dict(zip(names, row, strict=True))) for axis, *row in rows}
+        q, *others = self.columns
+        rows = np.stack([q.min(axis=0), q.max(axis=0), *(np.abs(c).max(axis=0) for c in others)])
+        return {
+            axis: Extent(**dict(zip(Extent.model_fields, row, strict=True)))
+            for axis, row in zip(self.axes, rows.T.tolist(), strict=True)
+        }
 
     def text(self, form: Form, names: Mapping[str, str], sentence: str) -> str:
         """The file: a table, or a trajectory_msgs/JointTrajectory as JSON or YAML.
@@ -221,18 +190,16 @@ class Points:
             form: of the file; names: that a robot's drives go by, where others than the axes'.
             sentence: what to do with it.
         """
-        parts = (self.q, self.qd, self.qdd, self.effort)
         if form == "csv":
             head = ["t", *(f"{n}_{a}" for n in ("q", "qd", "qdd", "effort") for a in self.axes)]
-            rows = np.column_stack([self.t, *parts])
+            rows = np.column_stack([self.t, *self.columns])
             return "\n".join([",".join(head), *(",".join(map(_write, row)) for row in rows), ""])
-        fields = ("positions", "velocities", "accelerations", "effort")
         points = []
         for k, t in enumerate(self.t):
             sec, nanosec = divmod(round(1e9 * float(t)), 10**9)
-            values = ([float(_write(v)) for v in part[k]] for part in parts)
+            values = [[float(_write(v)) for v in column[k]] for column in self.columns]
             clock = {"time_from_start": {"sec": sec, "nanosec": nanosec}}
-            points.append(dict(zip(fields, values, strict=True)) | clock)
+            points.append(dict(zip(_FIELDS, values, strict=True)) | clock)
         header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
         joints = [names.get(axis, axis) for axis in self.axes]
         if form == "json":

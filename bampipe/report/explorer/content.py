@@ -318,7 +318,7 @@ def _describe_effect(diagnosis: DiagnoseResult, axis: str, name: str, share: flo
     ranked = next(
         (one for one in diagnosis.ranking if (one.effect, one.axis) == (name, axis)), None
     )
-    said = diagnosis.descriptions.get(name)
+    said = diagnosis.descriptions.get(name.partition(":")[0])
     sets = [
         {"effects": " + ".join(one.effects) or "none", "probability": one.probability}
         for one in diagnosis.sets

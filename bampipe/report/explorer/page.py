@@ -53,7 +53,7 @@ def explorer_page(results: Results, subtitle: str, beside: Results | None = None
 
 
 def write_page_of_two(first: Path, second: Path) -> Path:
-    """Write the page of two runs into the report of the first, and return its path.
+    """Write the page of two runs beside the folder of the first, and return its path.
 
     Raises:
         InputError: one of them has no results, or they are not of one device.
@@ -66,8 +66,9 @@ def write_page_of_two(first: Path, second: Path) -> Path:
             where=str(second),
             remedy="choose two runs of one device",
         )
-    page = first / f"report/explore_beside_{second.name}.html"
-    write_text(page, explorer_page(results, f"device {device}", beside))
+    page = first.parent / f"{first.name}_beside_{second.name}.html"
+    text = explorer_page(results, f"device {device}", beside)
+    write_text(page, text.replace('href="report.html"', f'href="{first.name}/report/report.html"'))
     return page
 
 

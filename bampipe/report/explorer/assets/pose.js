@@ -82,7 +82,7 @@ function drawPose() {
   const i = grid.nearest(state.cursor ?? state.view[0]);
   const positions = positionsAt(i);
   const { trial, time } = placeOf(grid.x[i]);
-  pose.words.textContent = `Pose in ${trial.id} at ${format(time, 4)} s`;
+  pose.words.textContent = `Pose in ${trial.id} at ${time.toFixed(3)} s`;
   pose.drawing.innerHTML = content.joints.length ? drawArm(placeJoints(positions)) : drawScales(positions);
 }
 
