@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.errors import InputError
-from bampipe.files import json_text
 from bampipe.lists import join_names
 from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.primitives import PARTS, SHORTEST_S, Envelope, Primitive, Series
@@ -203,7 +202,8 @@ class Points:
         header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
         joints = [names.get(axis, axis) for axis in self.axes]
         if form == "json":
-            return json_text({"header": header, "joint_names": joints, "points": points})
+            message = {"header": header, "joint_names": joints, "points": points}
+            return json.dumps(message, indent=1) + "\n"
         # JSON is YAML, so that a point takes a line.
         lines = [f"# trajectory_msgs/msg/JointTrajectory. {sentence}"]
         lines += [f"header: {json.dumps(header)}", f"joint_names: {json.dumps(joints)}", "points:"]

@@ -498,11 +498,11 @@ def test_the_pose_is_that_at_the_cursor(opened: Opened, run: Path, tmp_path: Pat
         points = [[float(value) for value in one.split(",")] for one in pixels]
         # From the side: x to the right, z upwards, one scale; the base stands still.
         drawn.append((np.array(points), np.array([np.zeros(3), base, joint, end])[:, [0, 2]]))
-    scale = -(drawn[0][0][1, 1] - drawn[0][0][0, 1]) / 0.4
+    offsets = np.array([(pixel - pixel[0]) * [1.0, -1.0] for pixel, _ in drawn])
+    truth = np.array([true for _, true in drawn])
+    scale = float(np.sum(offsets * truth) / np.sum(truth**2))
     assert scale > 10.0
-    for pixel, true in drawn:
-        offset = (pixel - pixel[0]) * [1.0, -1.0] / scale
-        np.testing.assert_allclose(offset, true, atol=0.2 / scale)
+    np.testing.assert_allclose(offsets, scale * truth, atol=0.2)
     assert np.ptp([true[3, 0] for _, true in drawn]) > 5.0 / scale
 
 
