@@ -38,8 +38,8 @@ _FIELDS = ("positions", "velocities", "accelerations", "effort")
 """Of a point of the ROS message."""
 
 
-def read_limits(device: Device, seen: Envelope, where: str) -> dict[str, Extent]:
-    """The limits of each axis by name; an acceleration that is not stated is the highest seen.
+def require_limits(device: Device, where: str) -> None:
+    """Refuse a machine that can follow no trajectory, or whose limits are not known.
 
     Raises:
         InputError: the device has no drives, or states no range, speed or effort of an axis.
@@ -68,6 +68,10 @@ def read_limits(device: Device, seen: Envelope, where: str) -> dict[str, Extent]
             remedy=f"state them in {file}, as in [limits.{first}] lower = …, upper = …, speed = …,"
             " effort = … (SI units)",
         )
+
+
+def read_limits(device: Device, seen: Envelope) -> dict[str, Extent]:
+    """The limits of each axis by name; an acceleration that is not stated is the highest seen."""
     return {
         axis: Extent(
             lower=device.limits[axis][0],
@@ -76,7 +80,7 @@ def read_limits(device: Device, seen: Envelope, where: str) -> dict[str, Extent]
             acceleration=device.acceleration_limits.get(axis, float(seen.acceleration[i])),
             effort=device.effort_limits[axis],
         )
-        for i, axis in enumerate(axes)
+        for i, axis in enumerate(c.name for c in device.coordinates)
     }
 
 

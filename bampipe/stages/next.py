@@ -41,7 +41,7 @@ from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import Envelope, imitate_trials
 from bampipe.next_trial.sensitivity import Detectability, find_detectability
 from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity
-from bampipe.next_trial.trajectory import Points, list_trajectories, read_limits
+from bampipe.next_trial.trajectory import Points, list_trajectories, read_limits, require_limits
 from bampipe.phrases.forecast import find_open, read_forecasts
 from bampipe.phrases.proposal import explain_proposal, find_shown, say_trajectory
 from bampipe.physics import System, compile_model
@@ -174,6 +174,8 @@ def _read_case(
 ) -> tuple[_Case, Purpose | Literal["auto"], str]:
     """What is known of the model; the purpose and the parameter that are asked for."""
     model = load_model(run, config.model)
+    if config.trajectory:
+        require_limits(model.device, f"device {model.device.name!r}")
     system = compile_model(model)
     if system.undriven:
         raise InputError(
@@ -181,7 +183,6 @@ def _read_case(
             " can be designed",
             where=f"device {model.device.name!r}",
         )
-    limits: Mapping[str, Extent] = {}
     p, found = identified(run, config.model, system), run.read(IdentifyResult, config.model)
     purpose, parameter = _split(config.purpose, list(found.parameters))
     diagnosed = None
@@ -200,8 +201,7 @@ def _read_case(
     seen = Envelope.of_trials(trials.motions, system, p)
     if not seen.movable:
         raise InputError("no axis moves in the trials at hand", where=str(run.root))
-    if config.trajectory:
-        limits = read_limits(model.device, seen, f"device {model.device.name!r}")
+    limits = read_limits(model.device, seen) if config.trajectory else {}
     recipe = read_recipe(run, config.model, model)
     case = _Case(run, config, recipe, system, p, found, diagnosed, session, seen, limits)
     return case, purpose, parameter

@@ -16,7 +16,7 @@ from bampipe.data.device_file import read_device_file
 from bampipe.errors import InputError
 from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.primitives import Envelope, Primitive, find_beyond
-from bampipe.next_trial.trajectory import HZ, Points, list_trajectories, read_limits
+from bampipe.next_trial.trajectory import HZ, Points, list_trajectories, read_limits, require_limits
 from bampipe.next_trial.words import describe
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.device import Device
@@ -107,7 +107,7 @@ def rehearsal(tmp_path_factory: pytest.TempPathFactory) -> Rehearsal:
 
 @pytest.fixture(scope="module")
 def drawn(rehearsal: Rehearsal) -> list[Primitive]:
-    limits = read_limits(rehearsal.system.model.device, rehearsal.seen, "here")
+    limits = read_limits(rehearsal.system.model.device, rehearsal.seen)
     return list_trajectories(rehearsal, limits, 20.0, 8)
 
 
@@ -182,25 +182,25 @@ def test_a_sentence_says_that_drives_follow_it(drawn: list[Primitive], rehearsal
 def test_what_is_stated_in_the_device_file_joins_what_is_drawn(tmp_path: Path) -> None:
     more = "[limits.turn_2]\nacceleration = 2.5\neffort = 5.0\n"
     device = device_of(tmp_path, more)
-    found = read_limits(device, SEEN, "here")["turn_2"]
+    found = read_limits(device, SEEN)["turn_2"]
     assert (found.lower, found.upper, found.speed) == (-2.0, 2.5, 3.0)
     assert (found.acceleration, found.effort) == (2.5, 5.0)
-    assert read_limits(device, SEEN, "here")["lift_1"].acceleration == SEEN.acceleration[0]
+    assert read_limits(device, SEEN)["lift_1"].acceleration == SEEN.acceleration[0]
 
 
 def test_without_motors_or_limits_a_trajectory_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no motors .*by hand; --plan"):
-        read_limits(registry.device("bam"), SEEN, "here")
+        require_limits(registry.device("bam"), "here")
     drawn = URDF.replace('effort="12.0"', 'effort="0"').replace('velocity="0.4"', 'velocity="0"')
     device = device_of(tmp_path, urdf=drawn)
     with pytest.raises(
         InputError, match=r"speed of slide_3, effort of turn_2.*\[limits\.slide_3\]"
     ):
-        read_limits(device, SEEN, "here")
+        require_limits(device, "here")
 
 
 def test_a_drive_too_weak_for_the_weight_is_said(tmp_path: Path) -> None:
     device = device_of(tmp_path, "[limits.lift_1]\neffort = 8.0\n")
     weak = rehearse(device)
     with pytest.raises(InputError, match="at rest the model takes more than 80 %"):
-        list_trajectories(weak, read_limits(device, SEEN, "here"), 20.0, 2)
+        list_trajectories(weak, read_limits(device, SEEN), 20.0, 2)
