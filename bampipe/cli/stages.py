@@ -251,8 +251,7 @@ def report(
     root = places.find_run(run, options.runs)
     page = root / "report/explore.html"
     if beside:
-        # pandas is slow to import: only here
-        from bampipe.report.explorer.page import write_page_of_two
+        from bampipe.stages.report import write_page_of_two
 
         page = write_page_of_two(root, places.find_run(beside, options.runs))
         if not (options.json or options.quiet):

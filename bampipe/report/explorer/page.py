@@ -7,8 +7,6 @@ import json
 from pathlib import Path
 from string import Template
 
-from bampipe.errors import InputError
-from bampipe.files import write_text
 from bampipe.report import verdicts
 from bampipe.report.document import strip_marks
 from bampipe.report.explorer.content import Content, gather_content
@@ -50,26 +48,6 @@ def explorer_page(results: Results, subtitle: str, beside: Results | None = None
         content["callouts"].append({"tone": verdict.tone, "title": title, "lines": lines})
     content["session"] = " and ".join(names)
     return assemble_page(content, packer, subtitle)
-
-
-def write_page_of_two(first: Path, second: Path) -> Path:
-    """Write the page of two runs beside the folder of the first, and return its path.
-
-    Raises:
-        InputError: one of them has no results, or they are not of one device.
-    """
-    results, beside = Results(first), Results(second)
-    device, other = (one.session.device for one in (results, beside))
-    if device != other:
-        raise InputError(
-            f"it is of device {other!r}, {first.name} of {device!r}",
-            where=str(second),
-            remedy="choose two runs of one device",
-        )
-    page = first.parent / f"{first.name}_beside_{second.name}.html"
-    text = explorer_page(results, f"device {device}", beside)
-    write_text(page, text.replace('href="report.html"', f'href="{first.name}/report/report.html"'))
-    return page
 
 
 def assemble_page(content: Content, packer: Packer, subtitle: str) -> str:
