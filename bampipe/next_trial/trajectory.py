@@ -46,8 +46,8 @@ def require_limits(device: Device, where: str) -> None:
     """
     if not (device.drive or device.prescribed):
         raise InputError(
-            f"device {device.name!r} has no motors that could follow a trajectory: a person moves"
-            f" it, and {join_names(device.forces)} is measured",
+            "it has no motors that could follow a trajectory: a person moves it, and the force is"
+            " measured",
             where=where,
             remedy="record the sentence of `bampipe next` by hand; --plan prints a sheet of trials",
         )
