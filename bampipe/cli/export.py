@@ -27,7 +27,7 @@ def export(
     """Write an identified model for other programs.
 
     json: the device and its effects, every parameter with its uncertainty. urdf: the robot's own
-    URDF, bodies and friction as identified. mjcf: the same with its drives' inertia, for MuJoCo.
+    URDF, bodies and friction as identified. mjcf: the same with its drives and effects, for MuJoCo.
     python, c: one self-contained function of inverse dynamics.
 
     Example: bampipe export 2026-10-03_s01 --as c --out inverse_dynamics.c

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -19,6 +20,7 @@ from bampipe.cli.options import (
     with_stage_options,
 )
 from bampipe.errors import InputError
+from bampipe.files import write_text
 from bampipe.run import models
 from bampipe.run.session_name import session_id
 
@@ -138,6 +140,14 @@ def next_(
             help="With --plan: largest sd of each parameter, as a share of it; 5% if omitted.",
         ),
     ] = "",
+    form: Annotated[
+        str,
+        typer.Option("--as", help="trajectory: a file that motors follow, for robots and axes."),
+    ] = "",
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="With --as: file to write, .csv, .json or .yaml."),
+    ] = None,
     options: StageOptions = DEFAULTS,
 ) -> None:
     """Propose the trial to record next, in one sentence, with its expected result.
@@ -147,7 +157,10 @@ def next_(
     Example: bampipe next 2026-10-03_s01 --for coulomb.yaw --seconds 30
 
     Example: bampipe next 2026-10-03_s01 --plan --sd 2%
+
+    Example: bampipe next robot_arm --as trajectory --out motion.yaml
     """
+    suffix = _choose_trajectory(form, out, plan)
     if sd and not plan:
         raise InputError("--sd needs --plan", remedy="give --plan with it")
     chosen = model
@@ -157,9 +170,37 @@ def next_(
     if not options.list_settings and not options.json:
         # A new proposal closes forecasts that a recorded trial has followed: compare these first.
         print_forecasts(places.find_run(run, options.runs), chosen)
-    plain_stage("next", run, options, chosen, purpose=purpose, seconds=seconds, plan=plan, **more)
+    plain_stage(
+        "next", run, options, chosen, purpose=purpose, seconds=seconds, plan=plan,
+        trajectory=suffix, **more,
+    )  # fmt: skip
+    if suffix and not options.list_settings:
+        file = places.find_run(run, options.runs) / f"models/{chosen}/trajectory.{suffix}"
+        if out is not None:
+            write_text(out, file.read_text(encoding="utf-8"))
+        if not (options.json or options.quiet):
+            show.say(f"trajectory: {out or file}")
     if plan and not (options.json or options.quiet or options.list_settings):
         show.say(f"sheet: {places.find_run(run, options.runs)}/models/{chosen}/protocol.pdf")
+
+
+def _choose_trajectory(form: str, out: Path | None, plan: bool) -> str:
+    """Return the form of the trajectory's file, "" if none is asked for."""
+    if form not in ("", "trajectory"):
+        raise InputError(f"--as: unknown form {form!r}", remedy="--as trajectory")
+    if not form:
+        if out is not None:
+            raise InputError("--out needs --as", remedy="give --as trajectory with it")
+        return ""
+    if plan:
+        raise InputError(
+            "--plan makes a sheet for people, --as trajectory a file for motors",
+            remedy="give one of them",
+        )
+    suffix = "csv" if out is None else out.suffix.lower().removeprefix(".").replace("yml", "yaml")
+    if suffix not in ("csv", "json", "yaml"):
+        raise InputError(f"--out: {out} is no trajectory file", remedy="name it .csv, .json, .yaml")
+    return suffix
 
 
 def _parse_share(text: str) -> float:
@@ -189,12 +230,31 @@ def report(
     open_: Annotated[
         bool, typer.Option("--open", help="Open the page for exploring in the browser.")
     ] = False,
+    beside: Annotated[
+        str,
+        typer.Option(
+            metavar="RUN",
+            help="Another run of the device, on one page for exploring with this one.",
+        ),
+    ] = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
     """Write the report: PDF, web page, and a page for exploring.
 
     Example: bampipe report 2026-10-03_s01 --open
+
+    Example: bampipe report 2026-10-03_s01 --beside 2026-10-04_s01
     """
     plain_stage("report", run, options, detail_model=model)
-    if open_ and not options.list_settings:
-        show.page(places.find_run(run, options.runs) / "report" / "explore.html")
+    if options.list_settings:
+        return
+    root = places.find_run(run, options.runs)
+    page = root / "report/explore.html"
+    if beside:
+        from bampipe.stages.report import write_page_of_two
+
+        page = write_page_of_two(root, places.find_run(beside, options.runs))
+        if not (options.json or options.quiet):
+            show.say(f"both sessions: {page}")
+    if open_:
+        show.page(page)

@@ -98,6 +98,15 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     filled = _filled(kinds, {joint: limits.get(joint, DriveLimits()) for joint in kinds}, motors)
     if source and not table.get("source"):
         filled["source"] = source
+    given = table.get("limits")
+    if isinstance(given, Mapping):
+        # A joint's own table adds to what is drawn of it.
+        drawn = filled["limits"]
+        filled["limits"] = drawn | {
+            joint: {**drawn.get(joint, {}), **own} if isinstance(own, Mapping) else own
+            for joint, own in given.items()
+        }
+        table = {key: value for key, value in table.items() if key != "limits"}
     return {**filled, **table, "robot": robot}
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from xml.etree import ElementTree
 
 import numpy as np
@@ -22,6 +23,12 @@ from bampipe.lists import join_names
 
 Array = NDArray[np.float64]
 
+Attributes = dict[str, str]
+STEP_S = 5e-4
+_FIRM = {"solreffriction": "0.001 1", "solimpfriction": "0.999 0.9999 0.001"}
+"""Of dry friction: as stiff as the time step allows, since MuJoCo's usual one creeps."""
+_TINY = 1e-9
+"""Mass and inertia of a body that stands for the inertia of its joint alone, kg and kg.m2."""
 _WORLD = "world"
 _KINDS = {"revolute": "hinge", "prismatic": "slide"}
 _READ = {name: kind for kind, name in _KINDS.items()}
@@ -30,17 +37,38 @@ _BUILDS = ("include", "replicate", "composite", "flexcomp", "attach", "frame")
 _FLAT = 'write it out flat: mj_saveLastXML, with saveinertial="true" in <compiler>'
 
 
-def mjcf_text(name: str, tree: Tree, gravity: Sequence[float], comment: str) -> str:
+@dataclass
+class Additions:
+    """What an MJCF has beside bodies, joints and a motor each.
+
+    Attributes:
+        joints, drives: attributes of joints and of their motors, by joint, in place of the usual.
+        tendons: attributes of each, and turns of its joints.
+        loads: name, kind of joint and inertia of what only tendons hold.
+        bristles: attributes of motors that are LuGre friction.
+    """
+
+    joints: dict[str, Attributes] = field(default_factory=dict)
+    drives: dict[str, Attributes] = field(default_factory=dict)
+    tendons: list[tuple[Attributes, dict[str, float]]] = field(default_factory=list)
+    loads: list[tuple[str, str, float]] = field(default_factory=list)
+    bristles: list[Attributes] = field(default_factory=list)
+
+
+def mjcf_text(name: str, tree: Tree, gravity: Sequence[float], comment: str, add: Additions) -> str:
     """An MJCF of bodies and joints without shapes, one body a link, one motor a joint that moves.
 
     Args:
         name: of the robot; tree: its links and joints, parents first.
         gravity: in the frame of the link at the root, m/s2.
-        comment: what to say at its head.
+        comment: what to say at its head; add: what else it has.
     """
     root = ElementTree.Element("mujoco", model=name)
     ElementTree.SubElement(root, "compiler", angle="radian", inertiafromgeom="false")
-    ElementTree.SubElement(root, "option", gravity=number_list(gravity))
+    ElementTree.SubElement(
+        root, "option", gravity=number_list(gravity), timestep=number_list([STEP_S]),
+        integrator="implicitfast",
+    )  # fmt: skip
     world = ElementTree.SubElement(root, "worldbody")
     actuators = ElementTree.SubElement(root, "actuator")
     carried = {joint.child for joint in tree.joints}
@@ -58,7 +86,18 @@ def mjcf_text(name: str, tree: Tree, gravity: Sequence[float], comment: str) -> 
         bodies[joint.child] = body
         _write_inertial(body, tree.bodies[joint.child])
         if joint.kind != "fixed":
-            _write_joint(body, actuators, joint)
+            _write_joint(body, actuators, joint, add)
+    for load, kind, inertia in add.loads:
+        body = ElementTree.SubElement(world, "body", name=load)
+        _write_inertial(body, Body(_TINY, np.zeros(3), _TINY * np.eye(3)))
+        ElementTree.SubElement(body, "joint", name=load, type=kind, armature=number_list([inertia]))
+    tendons = ElementTree.SubElement(root, "tendon") if add.tendons else root
+    for attributes, turns in add.tendons:
+        tendon = ElementTree.SubElement(tendons, "fixed", {**_FIRM, **attributes})
+        for moved, turn in turns.items():
+            ElementTree.SubElement(tendon, "joint", joint=moved, coef=number_list([turn]))
+    for attributes in add.bristles:
+        ElementTree.SubElement(actuators, "dcmotor", attributes)
     return document(root, comment)
 
 
@@ -75,16 +114,20 @@ def _write_inertial(element: ElementTree.Element, body: Body) -> None:
 
 
 def _write_joint(
-    body: ElementTree.Element, actuators: ElementTree.Element, joint: TreeJoint
+    body: ElementTree.Element, actuators: ElementTree.Element, joint: TreeJoint, add: Additions
 ) -> None:
     own = joint.limits
     kind = "prismatic" if joint.kind == "prismatic" else "revolute"
+    usual = {
+        "name": joint.name, "type": _KINDS[kind], "axis": number_list(joint.axis),
+        "damping": number_list([own.damping]), "frictionloss": number_list([own.friction]),
+        "armature": number_list([own.armature]),
+    }  # fmt: skip
     moves = ElementTree.SubElement(
-        body, "joint", name=joint.name, type=_KINDS[kind], axis=number_list(joint.axis),
-        damping=number_list([own.damping]), frictionloss=number_list([own.friction]),
-        armature=number_list([own.armature]),
-    )  # fmt: skip
-    motor = ElementTree.SubElement(actuators, "motor", name=f"drive_{joint.name}", joint=joint.name)
+        body, "joint", {**usual, **_FIRM, **add.joints.get(joint.name, {})}
+    )
+    drive = {"name": f"drive_{joint.name}", "joint": joint.name, **add.drives.get(joint.name, {})}
+    motor = ElementTree.SubElement(actuators, "general" if len(drive) > 2 else "motor", drive)
     if own.lower < own.upper:
         moves.set("limited", "true")
         moves.set("range", number_list((own.lower, own.upper)))

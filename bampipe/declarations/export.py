@@ -26,6 +26,7 @@ from bampipe.data.robot_tree import (
 from bampipe.data.robot_xml import number_list, read_xml
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.urdf import changed_urdf, urdf_text
+from bampipe.declarations.mjcf_effects import add_effects
 from bampipe.declarations.model_file import identified, load_model
 from bampipe.errors import InputError
 from bampipe.files import json_text
@@ -95,7 +96,8 @@ def _urdf(run: RunFolder, system: System, p: Array) -> str:
     said = gravity_at(drawn.before, drawn.base)[0] if given_back else None
     if not np.allclose(robot.gravity, said or UPRIGHT):
         lacks.append(f"gravity in the frame of {drawn.base} ({number_list(robot.gravity)})")
-    comment = _head(system, drawn, [*lacks, *_coupled(robot, drives)])
+    lacks += [*_coupled(robot, drives), *(item.name for item in system.model.effects)]
+    comment = _head(drawn, lacks)
     if drawn.file is not None and drawn.is_urdf:
         return changed_urdf(drawn.file, drawn.before, drawn.after, comment)
     return urdf_text(system.model.device.name, drawn.flat, comment)
@@ -103,13 +105,15 @@ def _urdf(run: RunFolder, system: System, p: Array) -> str:
 
 def _mjcf(run: RunFolder, system: System, p: Array) -> str:
     drawn, robot = _drawn(run, system, p), _robot(run, system)
-    comment = _head(system, drawn, _coupled(robot, _drive_inertia(system, p)))
-    return mjcf_text(system.model.device.name, drawn.flat, robot.gravity, comment)
+    names = {identifier(joint.name): joint.name for joint in drawn.flat.joints}
+    drives = np.diag(_drive_inertia(system, p))
+    add, lacks = add_effects(system, p, robot, names, drives)
+    comment = _head(drawn, lacks)
+    return mjcf_text(system.model.device.name, drawn.flat, robot.gravity, comment, add)
 
 
-def _head(system: System, drawn: _Drawn, lacks: Sequence[str]) -> str:
+def _head(drawn: _Drawn, lacks: Sequence[str]) -> str:
     """Where a model comes from, where its masses are, and what of it is not in the text."""
-    lacks = [*lacks, *(item.name for item in system.model.effects)]
     parts = ["identified by bampipe", *drawn.notes]
     return "; ".join([*parts, f"not in it: {', '.join(lacks)}"] if lacks else parts)
 

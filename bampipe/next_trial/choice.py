@@ -52,6 +52,7 @@ class DesignSpace:
         seconds: how long each is; axes: that they are about.
         examples: designs that are tried beside the primitives.
         with_rests: whether an axis may rest at the turns; with_brakes: whether brakes may be on.
+        is_driven: whether the examples alone are tried, which drives follow.
     """
 
     rehearsal: Rehearsal
@@ -60,13 +61,14 @@ class DesignSpace:
     examples: Sequence[Primitive] = ()
     with_rests: bool = False
     with_brakes: bool = False
+    is_driven: bool = False
 
     def list_designs(self) -> tuple[list[Primitive], bool]:
         """The designs to try, and whether that takes so little that none was left out."""
-        rehearsal = self.rehearsal
+        rehearsal, most = self.rehearsal, count_affordable(self.rehearsal, self.seconds)
+        if self.is_driven:
+            return list(self.examples), len(self.examples) < most
         designs = list_primitives(rehearsal.seen, self.seconds, self.axes, self.with_rests)
-        work = self.seconds * rehearsal.sensors.rate_hz * len(rehearsal.system.parameters)
-        most = max(_FEWEST, int(_WORK / work))
         return [*designs[:: -(-len(designs) // most)], *self.examples], len(designs) <= most
 
     def vary(self, design: Primitive) -> Iterator[Primitive]:
@@ -81,6 +83,12 @@ class DesignSpace:
     def follow(self, design: Primitive) -> tuple[Motion, ...]:
         """A design as different people follow it, somebody hasty last."""
         return tuple(self.rehearsal.record(design, version) for version in _VERSIONS)
+
+
+def count_affordable(rehearsal: Rehearsal, seconds: float) -> int:
+    """How many designs of so many seconds may be tried exactly."""
+    work = seconds * rehearsal.sensors.rate_hz * len(rehearsal.system.parameters)
+    return max(_FEWEST, int(_WORK / work))
 
 
 @dataclass(frozen=True)

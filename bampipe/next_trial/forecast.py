@@ -62,7 +62,8 @@ class Forecast:
         device = system.model.device
         axes = device.coordinates
         added = self.added_by(ranked)
-        held = [i for i in range(len(axes)) if i not in design.strokes and not design.example]
+        moved = set(design.strokes) or set(range(len(axes)))
+        held = [i for i in range(len(axes)) if i not in moved]
         farther, faster = (
             tuple(axes[i].name for i in found) for found in find_beyond(design, self.rehearsal.seen)
         )
@@ -104,6 +105,12 @@ class Forecast:
 def describe_moves(design: Primitive, rehearsal: Rehearsal) -> dict[str, Move]:
     """The record of the strokes of a design."""
     axes = rehearsal.system.model.device.coordinates
+    if design.series is not None:
+        extent = zip(axes, *design.series.extent[:3], strict=True)
+        return {
+            axis.name: Move(low=low, high=high, slow=fast, fast=fast, unit=axis.unit)
+            for axis, low, high, fast in extent
+        }
     return {
         axes[i].name: Move(
             low=stroke.low,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bampipe.next_trial.primitives import PEAK, Envelope, Example, Primitive, Stroke
+from bampipe.next_trial.primitives import PEAK, Envelope, Example, Primitive, Series, Stroke
 from bampipe.physics import System
 from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.trials.kinematics import Kinematics
@@ -24,12 +24,10 @@ Array = NDArray[np.float64]
 _SPEED, _RANGE, _TURN, _DRIFT = 0.2, 0.15, 0.1, 0.05
 """How far people are off: speed and range of a trial, each turn and the slow drift of the middle,
 the last two as shares of the range."""
-TRAJECTORY_HZ = 100.0
 HASTY = -1
 """Number of the version of somebody who covers half the range at twice the speed."""
-_BACK_S, _RAMP_S = 1.0, 1.0
-"""Before the end of a trial that is imitated, from where on it turns back; and in which a robot
-gets under way, and comes to rest."""
+_BACK_S = 1.0
+"""Before the end of a trial that is imitated, from where on it turns back."""
 _STEPS = 4
 """Of the search for the force, where what the model requires depends on the force itself."""
 
@@ -59,14 +57,15 @@ class Rehearsal:
         t = np.arange(int(design.seconds * self.sensors.rate_hz)) / self.sensors.rate_hz
         return self._observe(*self._path(given, t, rng, exact=version == 0), given, rng)
 
-    def trajectory(self, design: Primitive) -> tuple[Array, Array]:
-        """Times (T,), s, and positions (T, n_q) of one trial that follows a design exactly."""
-        t = np.arange(int(design.part_s * TRAJECTORY_HZ)) / TRAJECTORY_HZ
-        # It starts and ends at rest, wherever a trial or a stroke is cut.
-        way = np.where(t <= 0.5 * t[-1], _get_under_way(t), t[-1] - _RAMP_S)
-        way -= np.where(t <= 0.5 * t[-1], 0.0, _get_under_way(t[-1] - t))
-        rng = np.random.default_rng([self.seed, 1])
-        return t, self._path(design, way, rng, exact=True)[0]
+    def effort(self, series: Series) -> tuple[Array, Array]:
+        """Times (T,), s, and what the drives give each axis along a series, (T, n_q), N.m or N."""
+        system = self.system
+        t = np.arange(int(series.seconds * self.sensors.rate_hz)) / self.sensors.rate_hz
+        design = Primitive({}, series.middle, series.seconds, series=series)
+        motion = self._prescribe(*series.path(t), design)
+        u = motion.inputs(system.inputs)
+        z = system.memory(*motion.kinematics, u, self.p, motion.t)
+        return t, system.applied(*motion.kinematics, z, u, self.p)
 
     def _path(
         self, design: Primitive, t: Array, rng: np.random.Generator, exact: bool
@@ -74,6 +73,8 @@ class Rehearsal:
         """Position, velocity and acceleration along a design at times ``t``, each (T, n_q)."""
         if design.example is not None:
             return example_path(design.example, t)
+        if design.series is not None:
+            return design.series.path(t)
         n = len(self.system.coordinates)
         q, qd, qdd = np.tile(design.pose, (t.size, 1)), np.zeros((t.size, n)), np.zeros((t.size, n))
         for axis, stroke in design.strokes.items():
@@ -89,6 +90,17 @@ class Rehearsal:
         self, q: Array, qd: Array, qdd: Array, design: Primitive, rng: np.random.Generator
     ) -> Motion:
         """The motion as sensors and filters give it, with the force that the model takes."""
+        system, forces = self.system, self.system.model.device.forces
+        motion = self._prescribe(q, qd, qdd, design)
+        # The design is what the mechanism does. An offset at the reading is that at the truth, but
+        # for its square.
+        read = q - system.offset(q, motion.inputs(system.inputs), self.p)
+        applied = motion.inputs(forces)
+        recording = read_by_sensors(system, motion, read, applied, self.sensors, rng)
+        return self.kinematics.observe(recording, forces)
+
+    def _prescribe(self, q: Array, qd: Array, qdd: Array, design: Primitive) -> Motion:
+        """The motion of the mechanism, with the force that the model takes for it."""
         system, device = self.system, self.system.model.device
         t = np.arange(len(q)) / self.sensors.rate_hz
         channels = {"t": t}
@@ -99,14 +111,7 @@ class Rehearsal:
             channels[brake] = design.field * self.seen.field[i] * np.abs(qd[:, i])
         for force in device.forces:
             channels |= {derivative(force, k): np.zeros(t.size) for k in range(LAST_ORDER + 1)}
-        motion = Motion("design", t, q, qd, qdd, np.zeros_like(q), channels)
-        motion = self._with_force(motion)
-        applied = motion.inputs(device.forces)
-        # The design is what the mechanism does. An offset at the reading is that at the truth, but
-        # for its square.
-        read = q - system.offset(q, motion.inputs(system.inputs), self.p)
-        recording = read_by_sensors(system, motion, read, applied, self.sensors, rng)
-        return self.kinematics.observe(recording, device.forces)
+        return self._with_force(Motion("design", t, q, qd, qdd, np.zeros_like(q), channels))
 
     def _with_force(self, motion: Motion) -> Motion:
         """The motion of the mechanism with the force that leaves no residual."""
@@ -131,7 +136,12 @@ class Rehearsal:
 def follow_roughly(
     design: Primitive, seen: Envelope, rng: np.random.Generator, hastily: bool
 ) -> Primitive:
-    """A design as a person follows it: other speeds and turns, no farther than any design."""
+    """A design as a person follows it: other speeds and turns, no farther than any design.
+
+    Drives follow a series as it is.
+    """
+    if design.series is not None:
+        return design
     if design.example is not None:
         haste = 2.0 if hastily else 1.0 + rng.uniform(-_SPEED, _SPEED)
         reach = 0.5 if hastily else 1.0 - rng.uniform(0.0, _RANGE)
@@ -151,11 +161,6 @@ def follow_roughly(
             fast=speed * stroke.fast,
         )
     return replace(design, strokes=strokes)
-
-
-def _get_under_way(t: Array) -> Array:
-    """How far along a path is at times ``t``, s, of what starts at rest."""
-    return np.where(t < _RAMP_S, 0.5 * t**2 / _RAMP_S, t - 0.5 * _RAMP_S)
 
 
 def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:

@@ -20,10 +20,10 @@ squared, see `PEAK_ACCELERATION` (Flash and Hogan 1985)."""
 PEAK_ACCELERATION = 5.77
 FEWEST_STROKES = 3
 """In a trial: a sweep too slow for so many is made shorter."""
-_PARTS = 2
+PARTS = 2
 """Trials in which motion is recorded that leaves what has been seen: each trial is judged by what
 the others say, and a trial that is the only one of its kind can be judged by none."""
-_SHORTEST_S = 4.0
+SHORTEST_S = 4.0
 """Of each of these."""
 _HIGHEST = 0.6
 _SPEEDS = {"slow": (0.02, 0.08), "moderate": (0.15, 0.35), "fast": (0.35, _HIGHEST)}
@@ -50,6 +50,8 @@ _SPANS = {
 """Ends of the strokes, as shares of the range of the trials. Half of a stroke near the end is as
 far away from elsewhere as all of it: that somebody covers only half of it costs little."""
 _SMALL = (0.45, 0.55)
+_POINTS = 2000
+"""Of a series, at which its extent is taken."""
 _REST_S = 1.0
 GENTLE = 0.12
 """Half the range of an axis that is moved gently, so that it does not rest."""
@@ -227,6 +229,54 @@ class Example:
 
 
 @dataclass(frozen=True)
+class Series:
+    """A motion of all axes for drives: harmonics about a middle that grow from rest and fade to it.
+
+    Attributes:
+        middle: where it starts and ends, (n_q,), rad or m.
+        sine, cosine: amplitudes of the harmonics, (K, n_q).
+        seconds: how long it is, the period of the first harmonic.
+        ramp_s: how long it grows, and fades.
+    """
+
+    middle: Array
+    sine: Array
+    cosine: Array
+    seconds: float
+    ramp_s: float
+
+    def path(self, t: Array) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration, each (T, n_q), at times ``t``, over and over."""
+        t = np.mod(t, self.seconds)
+        w = 2.0 * np.pi / self.seconds * np.arange(1, len(self.sine) + 1)
+        sin, cos = np.sin(t[:, None] * w), np.cos(t[:, None] * w)
+        x = sin @ self.sine + cos @ self.cosine
+        v = (cos * w) @ self.sine - (sin * w) @ self.cosine
+        a = -(sin * w**2) @ self.sine - (cos * w**2) @ self.cosine
+        left = self.seconds - t
+        u = np.clip(np.minimum(t, left) / self.ramp_s, 0.0, 1.0)[:, None]
+        slope = np.where(t < left, 1.0, -1.0)[:, None] / self.ramp_s
+        size = u**4 * (35.0 - 84.0 * u + 70.0 * u**2 - 20.0 * u**3)
+        rate = 140.0 * (u * (1.0 - u)) ** 3 * slope
+        bend = 420.0 * (u * (1.0 - u)) ** 2 * (1.0 - 2.0 * u) / self.ramp_s**2
+        return (
+            self.middle + size * x,
+            size * v + rate * x,
+            size * a + 2.0 * rate * v + bend * x,
+        )
+
+    def scaled(self, share: Array | float) -> Series:
+        """The same with all amplitudes times ``share``, one for each axis or one for all."""
+        return replace(self, sine=share * self.sine, cosine=share * self.cosine)
+
+    @property
+    def extent(self) -> tuple[Array, Array, Array, Array]:
+        """Lowest and highest positions, highest speeds and accelerations, each (n_q,)."""
+        q, qd, qdd = self.path(np.linspace(0.0, self.seconds, _POINTS))
+        return q.min(axis=0), q.max(axis=0), np.abs(qd).max(axis=0), np.abs(qdd).max(axis=0)
+
+
+@dataclass(frozen=True)
 class Primitive:
     """One trial that a person can record, or one in several parts.
 
@@ -238,6 +288,7 @@ class Primitive:
         levels: values at which further channels are held.
         parts: trials in which it is recorded, each as long.
         example: what is imitated where there are no strokes.
+        series: what drives follow where there is neither.
     """
 
     strokes: Mapping[int, Stroke]
@@ -247,6 +298,7 @@ class Primitive:
     levels: Mapping[str, float] | None = None
     parts: int = 1
     example: Example | None = None
+    series: Series | None = None
 
     @property
     def part_s(self) -> float:
@@ -264,7 +316,7 @@ def list_primitives(
     """
     found = _list_within(seen, seen, seconds, axes, with_rests)
     if seen.wider is not None:
-        part_s = max(seconds / _PARTS, min(seconds, _SHORTEST_S))
+        part_s = max(seconds / PARTS, min(seconds, SHORTEST_S))
         others = _list_within(seen.wider, seen, part_s, axes, with_rests)
         found += [
             _in_parts(replace(design, seconds=seconds), seen)
@@ -302,8 +354,8 @@ def imitate_trials(motions: Sequence[Motion], seen: Envelope, seconds: float) ->
 
 def _in_parts(design: Primitive, seen: Envelope) -> Primitive:
     """The same in several trials where it leaves what has been seen, and is long enough."""
-    is_new = any(find_beyond(design, seen)) and design.seconds >= _PARTS * _SHORTEST_S
-    return replace(design, parts=_PARTS if is_new else 1)
+    is_new = any(find_beyond(design, seen)) and design.seconds >= PARTS * SHORTEST_S
+    return replace(design, parts=PARTS if is_new else 1)
 
 
 def find_beyond(
@@ -311,15 +363,16 @@ def find_beyond(
 ) -> tuple[list[int], list[int]]:
     """The axes that go farther than has been seen, and those faster than a share of its speed."""
     slack = _NOTABLE * (seen.high - seen.low)
+    moves = {i: (stroke.low, stroke.high, stroke.fast) for i, stroke in design.strokes.items()}
+    if design.series is not None:
+        moves = dict(enumerate(zip(*design.series.extent[:3], strict=True)))
     farther = [
         i
-        for i, stroke in design.strokes.items()
-        if stroke.low < seen.low[i] - slack[i] or stroke.high > seen.high[i] + slack[i]
+        for i, (low, high, _) in moves.items()
+        if low < seen.low[i] - slack[i] or high > seen.high[i] + slack[i]
     ]
     faster = [
-        i
-        for i, stroke in design.strokes.items()
-        if stroke.fast > (share + _NOTABLE) * float(seen.speed[i])
+        i for i, (_, _, fast) in moves.items() if fast > (share + _NOTABLE) * float(seen.speed[i])
     ]
     return farther, faster
 

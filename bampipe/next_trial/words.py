@@ -16,7 +16,7 @@ from bampipe.next_trial.primitives import (
     Stroke,
     find_beyond,
 )
-from bampipe.physics.device import Device
+from bampipe.physics.device import Coordinate, Device
 
 _AGAIN = 1.2
 """Of the length of a trial that is imitated: what lasts longer goes through it more than once."""
@@ -31,6 +31,11 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
     axes = device.coordinates
     if design.example is not None:
         return f"{_imitate(design, design.example, device)}{_with(design, device)}."
+    if design.series is not None:
+        text = (
+            f"Let the drives follow the trajectory, for {design.seconds:.3g} s{_in_parts(design)}"
+        )
+        return f"{text}{_with(design, device)}{_say_beyond(design, seen, axes)}."
     first = next(iter(design.strokes))
     beside = [i for i, one in design.strokes.items() if one.gentle]
     strokes = {i: one for i, one in design.strokes.items() if i not in beside}
@@ -48,8 +53,7 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
         )
         text = f"Move {join_names(names)} back and forth at once, {each}"
     text += f", for {design.seconds:.3g} s"
-    if design.parts > 1:
-        text += f" in {design.parts} trials of {design.part_s:.3g} s"
+    text += _in_parts(design)
     if beside:
         about = join_names(_about(design.strokes[i], axes[i].unit) for i in beside)
         others = join_names(axes[i].name for i in beside)
@@ -57,11 +61,12 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
     still = [i for i in range(len(axes)) if i not in design.strokes]
     if still:
         text += f"; leave {join_names(axes[i].name for i in still)} alone"
-    text += _with(design, device)
-    farther, faster = ([axes[i].name for i in group] for group in find_beyond(design, seen))
-    if farther or faster:
-        text += _beyond(farther, faster)
-    return text + "."
+    return f"{text}{_with(design, device)}{_say_beyond(design, seen, axes)}."
+
+
+def _in_parts(design: Primitive) -> str:
+    """In how many trials it is recorded, if in more than one."""
+    return f" in {design.parts} trials of {design.part_s:.3g} s" if design.parts > 1 else ""
 
 
 def _with(design: Primitive, device: Device) -> str:
@@ -105,8 +110,11 @@ def _two_figures(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
-def _beyond(farther: Sequence[str], faster: Sequence[str]) -> str:
+def _say_beyond(design: Primitive, seen: Envelope, axes: Sequence[Coordinate]) -> str:
     """What a design asks of the machine that no trial at hand has asked."""
+    farther, faster = ([axes[i].name for i in group] for group in find_beyond(design, seen))
+    if not (farther or faster):
+        return ""
     if farther and faster and set(farther) == set(faster):
         text = f"{join_names(farther)} farther and faster"
     else:

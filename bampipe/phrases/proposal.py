@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from bampipe.lists import join_names
-from bampipe.results.next import AS_FORECAST, Detectable, NextResult
+from bampipe.results.next import AS_FORECAST, Detectable, NextResult, Trajectory
 
 _SHOWN = 3
 """Parameters or effects that a sentence names."""
@@ -20,6 +20,28 @@ def say_sizes(table: Mapping[str, Detectable], names: Iterable[str]) -> str:
     """Return effects with the sizes from which on a proposed trial shows them."""
     sizes = (f"{name} from {table[name].with_proposal:.2g} {table[name].unit}" for name in names)
     return f"{join_names((size.rstrip() for size in sizes), _SHOWN)} on"
+
+
+def say_trajectory(found: Trajectory) -> list[str]:
+    """Return what a trajectory for drives uses of its limits, and what nobody has checked."""
+    most = []
+    for name in ("speed", "acceleration", "effort"):
+        shares = {
+            a: getattr(found.used[a], name) / getattr(v, name) for a, v in found.limits.items()
+        }
+        axis = max(shares, key=lambda a: shares[a])
+        most.append(f"{100.0 * shares[axis]:.0f} % of the {name} ({axis})")
+    said = [
+        f"The trajectory uses at most {join_names(most)} that its limits allow. Check it for"
+        " collisions: the model knows none."
+    ]
+    if found.assumed:
+        axes = join_names(found.assumed, _SHOWN)
+        said.append(
+            f"No acceleration is stated of {axes} ([limits]): the highest seen in these trials is"
+            " the limit."
+        )
+    return said
 
 
 def find_shown(table: Mapping[str, Detectable]) -> tuple[str, ...]:

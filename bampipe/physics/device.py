@@ -139,6 +139,10 @@ class Limits(Declaration):
     lower: PhysicalNumber = Field(description="Least position, rad or m")
     upper: PhysicalNumber = Field(description="Largest position, rad or m")
     speed: Positive | None = Field(default=None, description="Highest speed, rad/s or m/s")
+    acceleration: Positive | None = Field(default=None, description="Highest, rad/s2 or m/s2")
+    effort: Positive | None = Field(
+        default=None, description="Largest that its drive may give, N.m or N"
+    )
 
     def cross_faults(self) -> Iterator[InputError]:
         if not self.lower < self.upper:
@@ -273,6 +277,18 @@ class Device(Declaration):
         """Highest speed of each coordinate of which one is known, rad/s or m/s."""
         drawn = {j.name: j.velocity for j in self.robot.moving if j.velocity} if self.robot else {}
         return drawn | {axis: e.speed for axis, e in self.ranges.items() if e.speed is not None}
+
+    @property
+    def acceleration_limits(self) -> Mapping[str, float]:
+        """Highest acceleration of each coordinate of which one is stated, rad/s2 or m/s2."""
+        stated = {axis: entry.acceleration for axis, entry in self.ranges.items()}
+        return {axis: value for axis, value in stated.items() if value is not None}
+
+    @property
+    def effort_limits(self) -> Mapping[str, float]:
+        """Largest effort of each coordinate's drive of which one is known, N.m or N."""
+        drawn = {j.name: j.effort for j in self.robot.moving if j.effort} if self.robot else {}
+        return drawn | {axis: e.effort for axis, e in self.ranges.items() if e.effort is not None}
 
     def cross_faults(self) -> Iterator[InputError]:
         missing = [key for key in _NEEDED if key not in self.model_fields_set]

@@ -108,6 +108,28 @@ class Detectable(Record):
     with_proposal: Size | None = Field(default=None, description="With the first proposal recorded")
 
 
+class Extent(Record):
+    """How far, fast and hard an axis moves: what it may do, or what it does."""
+
+    lower: float = Field(description="Position, rad or m")
+    upper: float
+    speed: Size = Field(description="Highest, rad/s or m/s")
+    acceleration: Size = Field(description="Highest, rad/s2 or m/s2")
+    effort: Size = Field(description="Largest, N.m or N")
+
+
+class Trajectory(Record):
+    """What drives follow in each trial of the first proposal."""
+
+    file: str = Field(description="Of the run")
+    seconds: Size
+    limits: dict[str, Extent] = Field(description="By axis")
+    assumed: Names = Field(
+        description="Axes without a stated acceleration: their limit is the highest seen"
+    )
+    used: dict[str, Extent] = Field(description="By axis; effort is the model's forecast")
+
+
 class PlannedTrial(Record):
     """One trial of a plan."""
 
@@ -170,3 +192,4 @@ class NextResult(Result):
         description="Effects that the first proposal would reveal, and the present trials do not",
     )
     plan: Plan | None = None
+    trajectory: Trajectory | None = None

@@ -14,38 +14,51 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.data.chain import read_tree
+from bampipe.data.robot_tree import identifier
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
+from bampipe.declarations.export import DRAWING
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session, system_of, without_members
 from bampipe.errors import InputError, NothingToDoError, choose_from
 from bampipe.estimate.simulation import Runaway
-from bampipe.files import digest_content, write_json
+from bampipe.files import digest_content, write_json, write_text
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import sensor_noise
 from bampipe.next_trial.choice import (
     DesignSpace,
     RankedDesign,
+    count_affordable,
     find_best_of_each,
     rank_designs,
 )
 from bampipe.next_trial.discrimination import Comparison
 from bampipe.next_trial.forecast import Forecast
-from bampipe.next_trial.motion import TRAJECTORY_HZ, Rehearsal
+from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.plan import Goal, plan_trials, record_plan
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import Envelope, imitate_trials
 from bampipe.next_trial.sensitivity import Detectability, find_detectability
 from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity
+from bampipe.next_trial.trajectory import Points, list_trajectories, read_limits, require_limits
 from bampipe.phrases.forecast import find_open, read_forecasts
-from bampipe.phrases.proposal import explain_proposal, find_shown
+from bampipe.phrases.proposal import explain_proposal, find_shown, say_trajectory
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.next import Detectable, NextResult, Plan, Proposal, Purpose
+from bampipe.results.next import (
+    Detectable,
+    Extent,
+    NextResult,
+    Plan,
+    Proposal,
+    Purpose,
+    Trajectory,
+)
 from bampipe.results.validate import JudgedError, ValidateResult
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials, trial_of_block
@@ -63,7 +76,7 @@ OUTPUTS = (
     "models/{model}/next.json",
     "models/{model}/forecasts/*.json",
     "models/{model}/protocol*.pdf",
-    "models/{model}/trajectory*.csv",
+    "models/{model}/trajectory.*",
 )
 
 Array = NDArray[np.float64]
@@ -87,6 +100,8 @@ class Config(Criteria):
             shown; the name of a parameter; or ``auto``: what the diagnosis asks for.
         seconds: length of the trial.
         plan: whether to make a set of trials, and its protocol sheet.
+        trajectory: ``csv``, ``json`` or ``yaml``: the trial is a trajectory that drives follow, in
+            a file of this form; empty: it is a motion that a person follows.
         sd: goal of the plan for every standard deviation, as a share of the estimate.
         confusion: goal of the plan for every chance of confusing two effects.
         seed: seed of the variation between people, and of sensor noise.
@@ -97,6 +112,7 @@ class Config(Criteria):
     purpose: str = "auto"
     seconds: Annotated[float, Field(ge=4, le=600)] = 20.0
     plan: bool = False
+    trajectory: Literal["", "csv", "json", "yaml"] = ""
     sd: Annotated[float, Field(gt=0, lt=1)] = 0.05
     confusion: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
     seed: Count = 0
@@ -116,6 +132,7 @@ class _Case:
     diagnosed: DiagnoseResult | None
     session: Session
     seen: Envelope
+    limits: Mapping[str, Extent]
 
     @property
     def fitted(self) -> list[Motion]:
@@ -132,24 +149,24 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     ranked = _rank(forecast, space, parameter, progress)
     progress(0.9, "what they are expected to give")
     result = _record(case, forecast, parameter, ranked)
+    if config.trajectory:
+        result = _write_trajectory(out, case, forecast.rehearsal, ranked[0], result)
     if config.plan:
         progress(0.92, "planning a set of trials")
         plan = _plan(case, forecast, space, ranked, result.proposals[0])
         result = result.model_copy(update={"plan": plan})
     result.write(out)
     _write_earlier(run, out, result)
-    device, followed = case.system.model.device, ""
-    if device.robot is not None:
-        followed = _write_trajectory(out, config.model, forecast.rehearsal, ranked[0])
     if result.plan is not None:
         # typst is slow to import: only here
         from bampipe.report.protocol import protocol_sheet
 
+        device = case.system.model.device
         by_hand = not (device.drive or device.prescribed)
         name = run.read(IngestResult).session_id
         sheet = protocol_sheet(result.plan, name, config.model, by_hand)
         (out / f"models/{config.model}/protocol.pdf").write_bytes(sheet)
-    return _summary(result, followed)
+    return _summary(result)
 
 
 def _read_case(
@@ -157,6 +174,8 @@ def _read_case(
 ) -> tuple[_Case, Purpose | Literal["auto"], str]:
     """What is known of the model; the purpose and the parameter that are asked for."""
     model = load_model(run, config.model)
+    if config.trajectory:
+        require_limits(model.device, f"device {model.device.name!r}")
     system = compile_model(model)
     if system.undriven:
         raise InputError(
@@ -182,8 +201,9 @@ def _read_case(
     seen = Envelope.of_trials(trials.motions, system, p)
     if not seen.movable:
         raise InputError("no axis moves in the trials at hand", where=str(run.root))
+    limits = read_limits(model.device, seen) if config.trajectory else {}
     recipe = read_recipe(run, config.model, model)
-    case = _Case(run, config, recipe, system, p, found, diagnosed, session, seen)
+    case = _Case(run, config, recipe, system, p, found, diagnosed, session, seen, limits)
     return case, purpose, parameter
 
 
@@ -222,6 +242,10 @@ def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Prog
 def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
     """The designs to try, trials at hand among them."""
     seconds, brakes = case.config.seconds, case.system.model.device.brakes
+    if case.limits:
+        count = count_affordable(forecast.rehearsal, seconds)
+        drawn = list_trajectories(forecast.rehearsal, case.limits, seconds, count)
+        return DesignSpace(forecast.rehearsal, seconds, (), drawn, is_driven=True)
     free = [motion for motion in case.fitted if not _is_braked(motion, brakes)]
     examples, of_effects = imitate_trials(free, case.seen, seconds), forecast.purpose != "precision"
     # No parameters are fitted to what has the brakes on, but for those of brakes.
@@ -318,15 +342,27 @@ def _plan(
     return record_plan(forecast, goal, plan_trials(forecast, options, goal))
 
 
-def _write_trajectory(out: Path, model: str, rehearsal: Rehearsal, best: RankedDesign) -> str:
-    """Write what a robot's controller follows, where a person follows a sentence; say where."""
-    t, q = rehearsal.trajectory(best.design)
-    head, file = ",".join(["t", *rehearsal.system.coordinates]), f"models/{model}/trajectory.csv"
-    np.savetxt(out / file, np.column_stack([t, q]), "%.6f", ",", header=head, comments="")
-    return (
-        f"{file} of the run has the positions of the joints along it, {TRAJECTORY_HZ:g} a"
-        " second; check them for collisions, of which the model knows none."
+def _write_trajectory(
+    out: Path, case: _Case, rehearsal: Rehearsal, best: RankedDesign, result: NextResult
+) -> NextResult:
+    """Write what drives follow in each trial of the best design, and record how far it goes."""
+    config, series = case.config, best.design.series
+    assert config.trajectory and series is not None
+    points = Points.of_series(series, rehearsal)
+    file = f"models/{config.model}/trajectory.{config.trajectory}"
+    # Drives go by the names of the drawing, of which a coordinate's may be another spelling.
+    drawn = read_tree(case.run.path(DRAWING)).joints if case.run.exists(DRAWING) else ()
+    names = {identifier(joint.name): joint.name for joint in drawn}
+    write_text(out / file, points.text(config.trajectory, names, result.sentence))
+    stated = case.system.model.device.acceleration_limits
+    followed = Trajectory(
+        file=file,
+        seconds=series.seconds,
+        limits=dict(case.limits),
+        assumed=tuple(axis for axis in case.limits if axis not in stated),
+        used=points.extents(),
     )
+    return result.model_copy(update={"trajectory": followed})
 
 
 def _write_earlier(run: RunFolder, out: Path, result: NextResult) -> None:
@@ -392,18 +428,16 @@ def _is_braked(motion: Motion, brakes: Mapping[str, str]) -> bool:
     return any(motion.channels[name].any() for name in brakes.values() if name in motion.channels)
 
 
-def _summary(result: NextResult, followed: str) -> dict[str, object]:
-    """The sentence first, then why and what for; the runners-up beside their worth.
-
-    Args:
-        result: what is proposed; followed: where a robot's controller finds it, "" without one.
-    """
-    planned = [f"plan: {result.plan.sentence}"] if result.plan is not None else []
+def _summary(result: NextResult) -> dict[str, object]:
+    """The sentence first, then why and what for; the runners-up beside their worth."""
+    more = [f"plan: {result.plan.sentence}"] if result.plan is not None else []
+    if result.trajectory is not None:
+        more += say_trajectory(result.trajectory)
     return {
         "headline": result.sentence,
         "why": result.why,
         "expected": result.expected,
-        "notes": [result.why, result.expected, *planned, *([followed] if followed else [])],
+        "notes": [result.why, result.expected, *more],
         "purpose": result.purpose,
         "proposals": [
             {"worth": one.worth, "sentence": one.sentence} for one in result.proposals[:_SHOWN]

@@ -7,6 +7,8 @@ from pathlib import Path
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import RunFolder
+from bampipe.errors import InputError
+from bampipe.files import write_text
 from bampipe.progress import Progress
 from bampipe.schema import STRICT
 
@@ -65,3 +67,26 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         "figures": sorted(report.figures),
         "headline": f"report/report.pdf, report.html, explore.html; {len(report.figures)} figures",
     }
+
+
+def write_page_of_two(first: Path, second: Path) -> Path:
+    """Write the page of two runs beside the folder of the first, and return its path.
+
+    Raises:
+        InputError: one of them has no results, or they are not of one device.
+    """
+    from bampipe.report.explorer.page import explorer_page
+    from bampipe.report.results import Results
+
+    results, beside = Results(first), Results(second)
+    device, other = (one.session.device for one in (results, beside))
+    if device != other:
+        raise InputError(
+            f"it is of device {other!r}, {first.name} of {device!r}",
+            where=str(second),
+            remedy="choose two runs of one device",
+        )
+    page = first.parent / f"{first.name}_beside_{second.name}.html"
+    text = explorer_page(results, f"device {device}", beside)
+    write_text(page, text.replace('href="report.html"', f'href="{first.name}/report/report.html"'))
+    return page

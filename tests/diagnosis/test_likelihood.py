@@ -140,6 +140,18 @@ def test_an_effect_that_is_taken_away_has_the_change_that_takes_it_away(line):
     assert gone.base[0] == pytest.approx(given[0], abs=1e-3)
 
 
+def test_what_another_parameter_can_replace_is_taken_away_at_no_cost(line):
+    """Of two parameters that do the same, the trials determine the sum alone."""
+    y, base = line
+    both = np.array([[0.5, 0.0], [0.5, 0.0], [0.0, 1.0]])
+    held = replace(problem_of(y, base), to_parameters=both)
+    loose = replace(held, loose=np.array([[1.0], [-1.0], [0.0]]))
+    assert loose.hold({1: -3.0})[1].shape == (2, 2)
+    assert held.hold({1: -3.0})[1].shape == (2, 1)
+    _, free = loose.hold({1: -3.0, 2: 0.0})
+    assert free.shape == (2, 1) and free[1, 0] == pytest.approx(0.0, abs=1e-12)
+
+
 def test_a_few_samples_that_no_replay_has_do_not_decide_under_heavy_tails(line):
     y, base = line
     y = y.copy()

@@ -22,12 +22,16 @@ import synthetic_run
 from hypothesis import given
 from hypothesis import strategies as st
 from made_results import write_result
+from scipy.spatial.transform import Rotation
 
 from bampipe.data.store import write_parquet
+from bampipe.errors import InputError
+from bampipe.files import read_json, toml_text, write_json, write_text
 from bampipe.report.explorer.packing import PackedColumn, Packer
 from bampipe.report.explorer.page import explorer_page
 from bampipe.report.results import Results
 from bampipe.results.ingest import IngestResult
+from bampipe.stages.report import write_page_of_two
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -426,6 +430,118 @@ def test_correlations_come_with_the_variables_of_a_diagnosis(
     assert page.get_by_text("No diagnosis of").count() == int(not diagnosed)
 
 
+def test_a_bar_opens_the_evidence_of_an_effect(opened: Opened, page_file: Path, run: Path) -> None:
+    page = opened(page_file)
+    found = read_json(run / "models/base/diagnose.json")
+    share = found["axes"]["yaw"]["probabilities"]["stribeck:yaw"]
+    verdict = page.locator(".verdict").filter(has_text="yaw, base")
+    button = verdict.locator(".bar").filter(has_text="stribeck:yaw")
+    assert button.locator(".share").inner_text() == f"{100 * share:.0f} %"
+    width, whole = (one.bounding_box()["width"] for one in (button.locator(".fill"), button))
+    assert width / whole == pytest.approx(share, abs=0.02)
+    assert verdict.locator(".evidence").inner_text() == ""
+    button.click()
+    said = verdict.locator(".evidence").inner_text()
+    (row,) = [one for one in found["ranking"] if one["effect"] == "stribeck:yaw"]
+    for number in (row["held_out_rmse_before"], row["held_out_rmse_after"]):
+        assert f"{number:.3g} N·m with" in said
+    verdict.locator(".bar").filter(has_text="presliding:yaw").click()
+    said = verdict.locator(".evidence").inner_text()
+    text = found["descriptions"]["presliding"]
+    assert text["looks_like"] in said and "presliding:yaw: 3 %" in said
+    page.get_by_role("button", name="Residual maps of yaw").click()
+    assert page.locator("text=residual yaw by velocity").first.is_visible()
+    verdict.locator(".bar").filter(has_text="presliding:yaw").click()
+    assert verdict.locator(".evidence").inner_text() == ""
+
+
+# A joint that turns about y, one that slides along its x, one that follows the first.
+JOINTS = {
+    "yaw": {"kind": "revolute", "position": [0.0, 0.0, 0.4], "axis": [0.0, 1.0, 0.0]},
+    "extension": {"kind": "prismatic", "after": "yaw", "rotation": [0.0, 0.3, 0.0],
+                  "axis": [1, 0, 0], "position": [0.3, 0.0, 0.0], "center": [0.1, 0.0, 0.2]},
+}  # fmt: skip
+
+
+def test_the_pose_is_that_at_the_cursor(opened: Opened, run: Path, tmp_path: Path) -> None:
+    """Ends of links in the drawing against rotations by SciPy; axes as scales of other devices."""
+    root = tmp_path / "s06"
+    shutil.copytree(run, root)
+    path = tmp_path / "page.html"
+    path.write_text(explorer_page(Results(root), ""))
+    page = opened(path)
+    assert page.locator("#pose circle.dial").count() == 2
+    page.context.close()
+    write_text(root / "ingest/device.toml", toml_text({"robot": {"joints": JOINTS}}))
+    path.write_text(explorer_page(Results(root), ""))
+    page = opened(path)
+    samples = pd.read_parquet(root / "ingest/samples.parquet")
+    trial = samples[samples["trial_id"] == synthetic_run.FREE[0]].reset_index(drop=True)
+    drawn = []
+    page.locator(".canvas").first.focus()
+    page.keyboard.press("PageDown")
+    for _ in range(4):
+        page.locator(".canvas").first.focus()
+        for _ in range(12):
+            page.keyboard.press("ArrowRight")
+        words = page.locator("#pose figcaption").inner_text()
+        assert words.startswith(f"Pose in {synthetic_run.FREE[0]} at ")
+        at = float(words.removesuffix(" s").rpartition(" ")[2])
+        row = trial.iloc[(trial["t"] - at).abs().argmin()]
+        turn = Rotation.from_euler("y", row["q_yaw"])
+        inner = turn * Rotation.from_euler("y", 0.3)
+        base = np.array([0.0, 0.0, 0.4])
+        joint = base + turn.apply([0.3, 0.0, 0.0]) + inner.apply([row["q_extension"], 0.0, 0.0])
+        end = joint + inner.apply([0.1, 0.0, 0.2])
+        lines = page.locator("#pose polyline").all()
+        ends = [lines[k].get_attribute("points").split() for k in (0, 1)]
+        pixels = [ends[0][0], ends[0][1], ends[1][1], ends[1][2]]
+        points = [[float(value) for value in one.split(",")] for one in pixels]
+        # From the side: x to the right, z upwards, one scale; the base stands still.
+        drawn.append((np.array(points), np.array([np.zeros(3), base, joint, end])[:, [0, 2]]))
+    offsets = np.array([(pixel - pixel[0]) * [1.0, -1.0] for pixel, _ in drawn])
+    truth = np.array([true for _, true in drawn])
+    scale = float(np.sum(offsets * truth) / np.sum(truth**2))
+    assert scale > 10.0
+    np.testing.assert_allclose(offsets, scale * truth, atol=0.2)
+    assert np.ptp([true[3, 0] for _, true in drawn]) > 5.0 / scale
+
+
+def test_two_sessions_stand_on_one_page(opened: Opened, run: Path, tmp_path: Path) -> None:
+    roots = [tmp_path / name for name in ("s07", "s08")]
+    for root in roots:
+        shutil.copytree(run, root)
+        session = read_json(root / "ingest/session.json") | {"session_id": root.name}
+        write_json(root / "ingest/session.json", session)
+    found = read_json(roots[1] / "models/base/identify.json")
+    found["parameters"]["mass"]["estimate"] = 123.0
+    write_json(roots[1] / "models/base/identify.json", found)
+    page = opened(write_page_of_two(*roots))
+    assert page.locator("h1").inner_text() == "Sessions s07 and s08"
+    assert page.locator(".callout .title").count() == 2
+    shown, stored = (
+        csv_of(page, "torque yaw"),
+        pd.read_parquet(run / "models/base/residuals.parquet"),
+    )
+    names = [f"{root.name} {trial}" for root in roots for trial in stored["trial_id"]]
+    assert shown["trial"].tolist() == names
+    assert shown["t (s)"].to_numpy() == pytest.approx(np.tile(stored["t"], 2), abs=1e-6)
+    # Each session is predicted by its own models.
+    own = shown["trial"].str.startswith("s07")
+    for name, rows in (("s07 base (N·m)", own), ("s08 base (N·m)", ~own)):
+        assert shown[name][rows].notna().all() and shown[name][~rows].isna().all()
+    assert shown["measured (N·m)"].notna().all()
+    table = csv_of(page, "Parameter map").set_index("parameter")
+    assert table.loc["mass", "s08 base"] == 123.0 != table.loc["mass", "s07 base"]
+    write_json(
+        roots[1] / "ingest/session.json",
+        read_json(roots[1] / "ingest/session.json") | {"device": "x"},
+    )
+    with pytest.raises(InputError, match="two runs of one device"):
+        write_page_of_two(*roots)
+
+
+@pytest.mark.slow
 @pytest.mark.long
 def test_eight_channels_of_a_million_samples(opened: Opened, tmp_path: Path) -> None:
     """What others must wait for: 13.4 MB, 1.5 s of the page's own work, 82 ms a zoom."""

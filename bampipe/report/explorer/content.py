@@ -9,6 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from bampipe.errors import InputError
+from bampipe.files import read_toml
+from bampipe.lists import join_names
+from bampipe.report.document import strip_marks
 from bampipe.report.explorer.packing import Packer
 from bampipe.report.results import R, Results
 from bampipe.report.wording import format_unit, name_trial_state, split_name
@@ -35,47 +39,107 @@ class _Span:
     offset: float
 
 
-def gather_content(results: Results, packer: Packer) -> Content:
-    """Return everything that the page shows; channels as blocks of ``packer``."""
-    spans = _place_trials(results)
+@dataclass(frozen=True)
+class _Session:
+    """One of the sessions on the page; ``prefix``: before the names of its trials and models."""
+
+    results: Results
+    prefix: str
+
+    def table(self, path: str, columns: Sequence[str] | None = None) -> pd.DataFrame | None:
+        """A Parquet file with trials named as on the page; None where there is none, or no row."""
+        frame = self.results.table(path, columns)
+        if frame is None or frame.empty:
+            return None
+        return frame.assign(trial_id=self.prefix + frame["trial_id"]) if self.prefix else frame
+
+
+@dataclass(frozen=True)
+class _Version:
+    """One model of one session; ``label``: its short name on the page."""
+
+    session: _Session
+    model: str
+    label: str
+
+    def table(self, name: str) -> pd.DataFrame | None:
+        """A Parquet file of the model, as `_Session.table` returns it."""
+        return self.session.table(self.session.results.model_file(name, self.model))
+
+
+def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
+    """Return everything that the page shows; channels as blocks of ``packer``.
+
+    Args:
+        sessions: of one device; trials and models of the second stand behind those of the first.
+        packer: what packs their channels.
+
+    Raises:
+        InputError: the sessions have other axes.
+    """
+    results = sessions[0]
+    for other in sessions[1:]:
+        if other.axes != results.axes:
+            raise InputError(
+                f"axes {join_names(other.axes)} are not those of {results.root.name}",
+                where=str(other.root),
+                remedy="show two sessions of one device",
+            )
+    alone = len(sessions) == 1
+    shown = [_Session(one, "" if alone else f"{one.session.session_id} ") for one in sessions]
+    versions = [
+        _Version(one, model, one.prefix + (f"version {k}" if k else model))
+        for one in shown
+        for k, model in enumerate(one.results.models)
+    ]
+    spans = _place_trials(shown)
     grids = _Grids(spans, packer)
-    _add_residuals(results, grids)
-    _add_map_variables(results, grids)
-    _add_recorded(results, grids)
-    models = [_describe_model(results, number, name) for number, name in enumerate(results.models)]
+    _add_residuals(results, versions, grids)
+    _add_map_variables(results, versions, grids)
+    _add_recorded(shown, grids)
     axes = [
         {"name": a, "noun": results.name_force(a), "unit": format_unit(results.force_unit(a))}
         for a in results.axes
     ]
     return {
-        "models": models,
-        "shown": results.models.index(results.model) if models else 0,
+        "models": [_describe_model(version) for version in versions],
+        "shown": results.models.index(results.model) if results.models else 0,
         "axes": axes,
         "trials": [asdict(span) for span in spans],
         "grids": grids.described,
         "channels": grids.channels,
-        "maps": _list_maps(results),
-        "windows": _list_windows(results),
-        "ladder": _list_errors(results),
-        "parameters": _list_parameters(results),
-        "correlations": _list_correlations(results),
-        "tables": [table for table in _make_tables(results) if table["rows"]],
+        "maps": _list_maps(versions),
+        "windows": _list_windows(versions),
+        "ladder": _list_errors(results, versions),
+        "parameters": _list_parameters(results, versions),
+        "correlations": _list_correlations(versions),
+        "verdicts": _list_verdicts(versions),
+        "joints": _list_joints(results),
+        "tables": [table for table in _make_tables(shown, versions) if table["rows"]],
     }
 
 
-def _place_trials(results: Results) -> list[_Span]:
+def _place_trials(sessions: Sequence[_Session]) -> list[_Span]:
     """Return the trials that were read, one after the other."""
     found, start = [], 0.0
-    for row in results.trials.to_dict("records"):
-        name = str(row["trial_id"])
-        times = results.table("ingest/samples.parquet", ["t"], trial=name)
-        if times is None or times.empty:
-            continue
-        first, last = float(times["t"].iloc[0]), float(times["t"].iloc[-1])
-        stop = start + last - first
-        found.append(_Span(name, str(row["kind"]), start, stop, start - first))
-        start = stop + _BREAK_S
+    for session in sessions:
+        for row in session.results.trials.to_dict("records"):
+            name = str(row["trial_id"])
+            times = session.results.table("ingest/samples.parquet", ["t"], trial=name)
+            if times is None or times.empty:
+                continue
+            first, last = float(times["t"].iloc[0]), float(times["t"].iloc[-1])
+            stop = start + last - first
+            kind = str(row["kind"])
+            found.append(_Span(session.prefix + name, kind, start, stop, start - first))
+            start = stop + _BREAK_S
     return found
+
+
+def _join(frames: Iterable[pd.DataFrame | None]) -> pd.DataFrame | None:
+    """Return the rows of all sessions that have some; None where none has."""
+    found = [frame for frame in frames if frame is not None]
+    return pd.concat(found, ignore_index=True) if len(found) > 1 else next(iter(found), None)
 
 
 class _Grids:
@@ -115,99 +179,103 @@ class _Grids:
         self.channels.append({"grid": grid, **asdict(packed), **meaning})
 
 
-def _add_residuals(results: Results, grids: _Grids) -> None:
-    for number, model in enumerate(results.models):
-        frame = results.table(results.model_file("residuals.parquet", model))
-        if frame is None or frame.empty:
+def _add_residuals(results: Results, versions: Sequence[_Version], grids: _Grids) -> None:
+    frames = [version.table("residuals.parquet") for version in versions]
+    # What was measured is the same in every version of a session.
+    first = {v.session.prefix: f for v, f in reversed([*zip(versions, frames, strict=True)])}
+    measured = _join(first[prefix] for prefix in dict.fromkeys(v.session.prefix for v in versions))
+    if measured is None:
+        return
+    rows = grids.start("residuals", measured)
+    axes = [axis for axis in results.axes if f"torque_measured_{axis}" in rows]
+    for axis in axes:
+        about: Content = {"axis": axis, "unit": format_unit(results.force_unit(axis))}
+        grids.add("residuals", rows[f"torque_measured_{axis}"], role="measured", **about)
+        if f"moving_{axis}" in rows:
+            grids.add("residuals", rows[f"moving_{axis}"], role="moving", axis=axis, unit="")
+    for number, frame in enumerate(frames):
+        own = None if frame is None else grids.align("residuals", frame)
+        if own is None:
             continue
-        first = "residuals" not in grids.described
-        rows = grids.start("residuals", frame) if first else grids.align("residuals", frame)
-        if rows is None:
-            continue
-        for axis in results.axes:
-            if f"torque_measured_{axis}" not in rows:
-                continue
+        for axis in axes:
             unit = format_unit(results.force_unit(axis))
-            if first:
-                measured = rows[f"torque_measured_{axis}"]
-                grids.add("residuals", measured, role="measured", axis=axis, unit=unit)
-                if f"moving_{axis}" in rows:
-                    moving = rows[f"moving_{axis}"]
-                    grids.add("residuals", moving, role="moving", axis=axis, unit="")
+            about = {"axis": axis, "unit": unit, "model": number}
             for role, column in (("predicted", "torque_predicted"), ("residual", "residual")):
-                values = rows[f"{column}_{axis}"]
-                grids.add("residuals", values, role=role, axis=axis, model=number, unit=unit)
+                grids.add("residuals", own[f"{column}_{axis}"], role=role, **about)
 
 
-def _add_map_variables(results: Results, grids: _Grids) -> None:
+def _add_map_variables(results: Results, versions: Sequence[_Version], grids: _Grids) -> None:
     if "residuals" not in grids.described:
         return
-    for model in results.models:
-        frame = results.table(results.model_file("map_variables.parquet", model))
+    found: dict[str, pd.Series] = {}
+    for version in versions:
+        frame = version.table("map_variables.parquet")
         rows = None if frame is None else grids.align("residuals", frame)
         if rows is None:
             continue
-        for column in rows.columns:
-            axis, _, variable = str(column).partition(".")
-            known = any(
-                c["role"] == "variable" and (c["axis"], c["label"]) == (axis, variable)
-                for c in grids.channels
-            )
-            if axis in results.axes and variable and not known:
-                grids.add("residuals", rows[column], role="variable", axis=axis, label=variable)
+        for column in map(str, rows.columns):
+            axis, _, variable = column.partition(".")
+            if axis in results.axes and variable:
+                # Of the first version of a session that has it.
+                known = found.get(column)
+                found[column] = rows[column] if known is None else known.fillna(rows[column])
+    for column, values in found.items():
+        axis, _, variable = column.partition(".")
+        grids.add("residuals", values, role="variable", axis=axis, label=variable)
 
 
-def _add_recorded(results: Results, grids: _Grids) -> None:
-    samples = results.table("ingest/samples.parquet")
+def _add_recorded(sessions: Sequence[_Session], grids: _Grids) -> None:
+    results = sessions[0].results
+    samples = _join(one.table("ingest/samples.parquet") for one in sessions)
     session = results.session
-    if samples is not None and len(samples):
+    if samples is not None:
         rows = grids.start("recorded", samples)
         units = {
             name: session.force.unit for name in (*session.force.columns, *session.force.noise_sd)
         }
         units |= {name: one.unit for name, one in {**session.brakes, **session.channels}.items()}
         labels = {name: split_name(name) for name in units}
-        units |= {f"q_{axis}": results.unit(axis) for axis in session.axes}
-        labels |= {f"q_{axis}": f"position {axis}" for axis in session.axes}
+        positions = {f"q_{axis}": axis for axis in session.axes}
+        units |= {name: results.unit(axis) for name, axis in positions.items()}
+        labels |= {name: f"position {axis}" for name, axis in positions.items()}
         for name in (str(column) for column in rows.columns if str(column) in units):
             about = {"label": labels[name], "unit": format_unit(units[name])}
+            about |= {"position": positions[name]} if name in positions else {}
             grids.add("recorded", rows[name], role="recorded", **about)
     path = "filter/kinematics.parquet"
     rates = [axis for axis in results.axes if f"qd_{axis}" in results.columns(path)]
-    motion = results.table(path, ["trial_id", "t", *(f"qd_{axis}" for axis in rates)])
-    if rates and motion is not None and len(motion):
+    wanted = ["trial_id", "t", *(f"qd_{axis}" for axis in rates)]
+    motion = _join(one.table(path, wanted) for one in sessions) if rates else None
+    if motion is not None:
         rows = grids.start("motion", motion)
         for axis in rates:
             about = {"label": f"velocity {axis}", "unit": format_unit(results.rate_unit(axis))}
             grids.add("motion", rows[f"qd_{axis}"], role="motion", **about)
 
 
-def _label_model(number: int, name: str) -> str:
-    return name if number == 0 else f"version {number}"
-
-
-def _describe_model(results: Results, number: int, name: str) -> Content:
+def _describe_model(version: _Version) -> Content:
+    results, name = version.session.results, version.model
     compared, validated = results.read(CompareResult), results.read(ValidateResult, name)
     added = [rung.added for rung in (compared.ladder if compared else ()) if rung.model == name]
     axes = validated.axes if validated else {}
     return {
-        "name": name,
-        "label": _label_model(number, name),
+        "name": version.session.prefix + name,
+        "label": version.label,
         "added": (added and added[0]) or "",
         "effects": list(results.effects(name)),
         "floors": {axis: entry.noise_floor for axis, entry in axes.items()},
     }
 
 
-def _read_all(results: Results, kind: type[R]) -> list[tuple[int, R]]:
+def _read_all(versions: Sequence[_Version], kind: type[R]) -> list[tuple[int, R]]:
     """Return a result of every model that has it, each with the number of the model."""
-    found = ((number, results.read(kind, name)) for number, name in enumerate(results.models))
+    found = ((k, one.session.results.read(kind, one.model)) for k, one in enumerate(versions))
     return [(number, one) for number, one in found if one is not None]
 
 
-def _list_maps(results: Results) -> list[Content]:
+def _list_maps(versions: Sequence[_Version]) -> list[Content]:
     found = []
-    for number, diagnosis in _read_all(results, DiagnoseResult):
+    for number, diagnosis in _read_all(versions, DiagnoseResult):
         for axis, maps in diagnosis.maps.items():
             for variable, one in maps.items():
                 band = one.model_dump(mode="json", include={"center", "mean", "low", "high"})
@@ -217,18 +285,62 @@ def _list_maps(results: Results) -> list[Content]:
     return found
 
 
-def _list_windows(results: Results) -> list[Content]:
+def _list_windows(versions: Sequence[_Version]) -> list[Content]:
     """Return the worst windows, those of the latest diagnosis first."""
     return [
-        {"model": number, **window.model_dump(), "unit": format_unit(window.unit)}
-        for number, diagnosis in reversed(_read_all(results, DiagnoseResult))
+        {
+            **window.model_dump(),
+            "model": number,
+            "trial_id": versions[number].session.prefix + window.trial_id,
+            "unit": format_unit(window.unit),
+        }
+        for number, diagnosis in reversed(_read_all(versions, DiagnoseResult))
         for window in diagnosis.worst_windows
     ]
 
 
-def _list_errors(results: Results) -> Content:
+def _list_verdicts(versions: Sequence[_Version]) -> list[Content]:
+    """Return, by model and axis, the probability of each effect and what it rests on."""
+    found = []
+    for number, diagnosis in reversed(_read_all(versions, DiagnoseResult)):
+        for axis, verdict in diagnosis.axes.items():
+            names = {name: share for name, share in verdict.probabilities.items() if share > 0.0}
+            effects = [
+                _describe_effect(diagnosis, axis, name, share)
+                for name, share in sorted(names.items(), key=lambda pair: -pair[1])
+            ]
+            about = {"model": number, "axis": axis, "sentence": strip_marks(verdict.sentence)}
+            found.append({**about, "unknown": verdict.unknown, "effects": effects})
+    return found
+
+
+def _describe_effect(diagnosis: DiagnoseResult, axis: str, name: str, share: float) -> Content:
+    ranked = next(
+        (one for one in diagnosis.ranking if (one.effect, one.axis) == (name, axis)), None
+    )
+    said = diagnosis.descriptions.get(name.partition(":")[0])
+    sets = [
+        {"effects": " + ".join(one.effects) or "none", "probability": one.probability}
+        for one in diagnosis.sets
+        if name in one.effects
+    ]
+    entry = None if ranked is None else ranked.model_dump(mode="json", exclude={"effect", "axis"})
+    if entry is not None:
+        entry["unit"] = format_unit(entry["unit"])
+    text = None if said is None else said.model_dump(mode="json")
+    return {"name": name, "probability": share, "ranked": entry, "said": text, "sets": sets}
+
+
+def _list_joints(results: Results) -> list[Content]:
+    """Return the joints of a robot as its device file declares them; none of other devices."""
+    path = results.root / "ingest/device.toml"
+    robot = read_toml(path).get("robot", {}) if path.is_file() else {}
+    return [{"name": name, **joint} for name, joint in robot.get("joints", {}).items()]
+
+
+def _list_errors(results: Results, versions: Sequence[_Version]) -> Content:
     """Return, by axis, held-out error and noise floor of each version, in their order."""
-    validated = dict(_read_all(results, ValidateResult))
+    validated = dict(_read_all(versions, ValidateResult))
     ladder: Content = {}
     for axis in results.axes:
         errors = {n: one.axes[axis] for n, one in validated.items() if axis in one.axes}
@@ -237,13 +349,14 @@ def _list_errors(results: Results) -> Content:
                 {"error": errors[n].held_out_rmse, "floor": errors[n].noise_floor}
                 if n in errors
                 else {"error": None, "floor": None}
-                for n in range(len(results.models))
+                for n in range(len(versions))
             ]
     return ladder
 
 
-def _list_parameters(results: Results) -> list[Content]:
-    identified = [results.read(IdentifyResult, model) for model in results.models]
+def _list_parameters(results: Results, versions: Sequence[_Version]) -> list[Content]:
+    known = dict(_read_all(versions, IdentifyResult))
+    identified = [known.get(number) for number in range(len(versions))]
     names = {name: p.unit for one in identified if one for name, p in one.parameters.items()}
     found = []
     for name in results.order_parameters(names):
@@ -255,9 +368,9 @@ def _list_parameters(results: Results) -> list[Content]:
     return found
 
 
-def _list_correlations(results: Results) -> list[Content]:
+def _list_correlations(versions: Sequence[_Version]) -> list[Content]:
     found = []
-    for number, identified in _read_all(results, IdentifyResult):
+    for number, identified in _read_all(versions, IdentifyResult):
         if not identified.covariance.names:
             continue
         covariance = np.array(identified.covariance.matrix)
@@ -271,13 +384,15 @@ def _list_correlations(results: Results) -> list[Content]:
     return found
 
 
-def _make_tables(results: Results) -> Iterable[Content]:
-    yield _make_trials(results)
-    for number, diagnosis in reversed(_read_all(results, DiagnoseResult)):
-        yield _make_candidates(diagnosis, _label_model(number, diagnosis.model))
+def _make_tables(sessions: Sequence[_Session], versions: Sequence[_Version]) -> Iterable[Content]:
+    for session in sessions:
+        yield _make_trials(session)
+    for number, diagnosis in reversed(_read_all(versions, DiagnoseResult)):
+        yield _make_candidates(diagnosis, versions[number].label)
 
 
-def _make_trials(results: Results) -> Content:
+def _make_trials(session: _Session) -> Content:
+    results = session.results
     validated = results.read(ValidateResult)
     trials = validated.trials if validated else {}
     axes = results.order_axes(validated.axes) if validated else ()
@@ -293,11 +408,12 @@ def _make_trials(results: Results) -> Content:
                 (known[axis].held_out_rmse or None) if axis in known else None for axis in axes
             ]
             whole = part == name and np.isfinite(seconds)
-            rows.append([part, kind, state, seconds if whole else None, *errors])
+            rows.append([session.prefix + part, kind, state, seconds if whole else None, *errors])
     heads = [f"RMSE {axis} ({format_unit(results.force_unit(axis))})" for axis in axes]
     note = f"Held-out errors of model {results.model}." if axes else ""
     head = ["Trial", "Kind", "State", "Duration (s)", *heads]
-    return {"title": "Trials", "note": note, "head": head, "rows": rows}
+    title = f"Trials {session.prefix}".strip()
+    return {"title": title, "note": note, "head": head, "rows": rows}
 
 
 def _make_candidates(diagnosis: DiagnoseResult, label: str) -> Content:

@@ -9,33 +9,48 @@ from string import Template
 
 from bampipe.report import verdicts
 from bampipe.report.document import strip_marks
-from bampipe.report.explorer.content import gather_content
+from bampipe.report.explorer.content import Content, gather_content
 from bampipe.report.explorer.packing import Packer
 from bampipe.report.results import Results
 
 _ASSETS = Path(__file__).parent / "assets"
-SCRIPTS = ("data", "statistics", "figure", "traces", "maps", "charts", "tables", "main")
+SCRIPTS = (
+    "data",
+    "statistics",
+    "figure",
+    "traces",
+    "maps",
+    "charts",
+    "tables",
+    "effects",
+    "pose",
+    "main",
+)
 """The page's own scripts, in the order in which they are read."""
 
 
-def explorer_page(results: Results, subtitle: str) -> str:
+def explorer_page(results: Results, subtitle: str, beside: Results | None = None) -> str:
     """Return the page for exploring ``results``.
 
     Args:
         results: the run folder's.
         subtitle: device and date.
+        beside: those of another session of the device, to be shown on the same page.
     """
     packer = Packer()
-    content = gather_content(results, packer)
-    verdict = verdicts.judge_session(results)
-    lines = [strip_marks(line) for line in verdict.text.splitlines()]
-    title = strip_marks(verdict.title)
-    content["verdict"] = {"tone": verdict.tone, "title": title, "lines": lines}
-    content["session"] = results.session.session_id
+    sessions = [results] if beside is None else [results, beside]
+    content = gather_content(sessions, packer)
+    names = [one.session.session_id for one in sessions]
+    content["callouts"] = []
+    for name, verdict in zip(names, map(verdicts.judge_session, sessions), strict=True):
+        title = strip_marks(verdict.title if beside is None else f"{name}: {verdict.title}")
+        lines = [strip_marks(line) for line in verdict.text.splitlines()]
+        content["callouts"].append({"tone": verdict.tone, "title": title, "lines": lines})
+    content["session"] = " and ".join(names)
     return assemble_page(content, packer, subtitle)
 
 
-def assemble_page(content: dict[str, object], packer: Packer, subtitle: str) -> str:
+def assemble_page(content: Content, packer: Packer, subtitle: str) -> str:
     """Return the page that shows ``content``, whose columns ``packer`` holds."""
     scripts = "\n".join(_read_asset(f"{name}.js") for name in SCRIPTS)
     blocks = "\n".join(
@@ -43,7 +58,7 @@ def assemble_page(content: dict[str, object], packer: Packer, subtitle: str) -> 
         for number, text in enumerate(packer.blocks)
     )
     return Template(_read_asset("explorer.html")).substitute(
-        title=html.escape(f"Session {content['session']}"),
+        title=html.escape(f"Session{'s' * len(content['callouts'][1:])} {content['session']}"),
         subtitle=html.escape(subtitle),
         uplot_licence=_read_asset("uPlot-LICENSE.txt").strip(),
         uplot_style=_read_asset("uPlot.min.css").strip(),

@@ -3,6 +3,7 @@
 const structure = {};
 const ladders = [];
 const LAGS_S = 1;
+const FAINTEST = 1e-10;
 const NAME_PX = 150; // room for the name of a variable in one line
 
 /** Make the figures of the axis in question anew. */
@@ -45,10 +46,12 @@ function drawStructure() {
   const sources = [{ channel: measured, label: "measured", colour: "ink" }, ...residuals.map((channel) => ({ channel, label: `residual, ${labelOf(channel.model)}`, colour: colourOf(channel.model) }))];
   const spectra = sources.map((source) => spectrum(pieces(source.channel, ...view), rate));
   const { frequency } = spectra[0];
+  // What a filter has left of a density far beyond the band has no place on a logarithmic axis.
+  const least = FAINTEST * Math.max(...spectra.flatMap((one) => one.density));
   if (frequency.length) {
     structure.spectrum.show({
       x: frequency,
-      lines: sources.map((source, k) => ({ ...source, values: spectra[k].density.map((v) => (v > 0 ? v : null)) })),
+      lines: sources.map((source, k) => ({ ...source, values: spectra[k].density.map((v) => (v > least ? v : null)) })),
       xRange: [frequency[0], frequency.at(-1)],
     });
   }

@@ -21,7 +21,7 @@ function download(name, type, text) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
 
-const fileName = (title, ending) => `${content.session}-${title.toLowerCase().replace(/[^a-z0-9]+/g, "-")}.${ending}`;
+const fileName = (title, ending) => `${content.session.replaceAll(" ", "-")}-${title.toLowerCase().replace(/[^a-z0-9]+/g, "-")}.${ending}`;
 const csvCell = (value) => {
   const text = value === null || value === undefined || Number.isNaN(value) ? "" : String(value);
   return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;

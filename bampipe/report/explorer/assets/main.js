@@ -8,6 +8,7 @@ function viewChanged() {
   waiting = setTimeout(() => {
     drawMaps();
     drawStructure();
+    drawPose();
   }, 120);
 }
 
@@ -19,6 +20,7 @@ function setCursor(time, spoken = false, drawn = spoken) {
     if (drawn) trace.figure.pointAt(time);
   }
   for (const map of maps.values()) map.point();
+  drawPose();
   if (!spoken || time === null) return;
   const { trial, time: local } = placeOf(time);
   const values = [...traces.values()].map((trace) => {
@@ -157,11 +159,9 @@ function buildControls() {
 }
 
 function showVerdict() {
-  const { tone, title, lines } = content.verdict;
   const plain = (words) => words.replace(/[*`]/g, "");
-  document.getElementById("verdict").append(
-    make("div", { class: `callout ${tone}` }, make("p", { class: "title" }, plain(title)), ...lines.map((line) => make("p", {}, plain(line)))),
-  );
+  const callouts = content.callouts.map(({ tone, title, lines }) => make("div", { class: `callout ${tone}` }, make("p", { class: "title" }, plain(title)), ...lines.map((line) => make("p", {}, plain(line)))));
+  document.getElementById("verdict").append(...callouts);
 }
 
 /** The axis whose error stands highest over its floor. */
@@ -181,6 +181,7 @@ function repaint() {
 async function start() {
   content.models.forEach((_, k) => state.models.add(k));
   showVerdict();
+  buildEffects();
   buildTables();
   if (!content.trials.length) {
     document.getElementById("plots").append(make("p", {}, "No trial of this session could be used: the table of trials says why."));
@@ -200,6 +201,7 @@ async function start() {
   document.querySelectorAll('[name="axis"]').forEach((one) => (one.checked = one.value === axis));
   await showTraces(new Set(shown.map((one) => one.id)));
   document.documentElement.dataset.ready = String(Math.round(performance.now()));
+  await buildPose();
   buildStructure();
   await buildMaps();
   drawStructure();

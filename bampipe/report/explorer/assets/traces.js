@@ -132,7 +132,8 @@ function timeTicks(min, max, width) {
     const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
     return { splits, texts: splits.map((at) => `${(at - offset).toFixed(digits)} s`) };
   }
-  const most = Math.max(1, Math.floor(width / 90));
+  const longest = Math.max(...seen.map((trial) => trial.id.length));
+  const most = Math.max(1, Math.floor(width / Math.max(90, 7.5 * longest)));
   const every = Math.ceil(seen.length / most);
   const named = seen.filter((_, k) => k % every === 0);
   const middle = (trial) => (Math.max(trial.start, min) + Math.min(trial.stop, max)) / 2;

@@ -1,0 +1,245 @@
+"""Effects of a robot's model as MuJoCo has them: polynomial joints, tendons, motors, bristles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bampipe.data.mjcf import STEP_S, Additions
+from bampipe.data.robot_xml import number_list
+from bampipe.physics import System, registry
+from bampipe.physics.effect import BoundEffect
+from bampipe.physics.robot import Robot
+
+Array = NDArray[np.float64]
+
+_FAR = 1e6
+"""Where a spring on one side ends on the other, rad or m."""
+_BRISTLE, _SETTLE_S = 1e-5, 1e-5
+"""Travel in which a bristle that stands for Stribeck friction gives way, rad or m, and its damping
+over its stiffness: more of it acts a step late."""
+_AS_LOGGED: Mapping[str, float] = {"gain": 1.0, "offset": 0.0, "delay": 0.0, "lag": 0.0}
+
+
+@dataclass
+class _Writer:
+    """Collects what effects add to a robot, and those that it has no place for.
+
+    Attributes:
+        system, p: the model and its parameters; robot: its joints.
+        names: of the drawing, by that of the coordinate.
+        armature: inertia of each joint's drives, less what tendons have of it.
+        add: what goes into the MJCF; lacks: effects that do not, and how others differ.
+        friction: what is left of each joint's Coulomb friction.
+        springs: coefficients of position, its square and cube by joint, N.m or N.
+        drives: what stands between each drive's input and its joint.
+    """
+
+    system: System
+    p: Array
+    robot: Robot
+    names: Mapping[str, str]
+    armature: dict[str, float]
+    add: Additions = field(default_factory=Additions)
+    lacks: list[str] = field(default_factory=list)
+    friction: dict[str, float] = field(default_factory=dict)
+    springs: dict[str, Array] = field(default_factory=dict)
+    drives: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    def value(self, name: str) -> float:
+        """A parameter of the model by its name."""
+        return float(self.p[self.system.index(name)])
+
+    def tendon(self, turns: Mapping[str, float], **attributes: float | str) -> None:
+        """A tendon over joints with what acts on the sum of their turns."""
+        for joint in turns:
+            if "armature" in attributes:
+                self.armature[joint] -= turns[joint] ** 2 * float(attributes["armature"])
+        shown = {k: v if isinstance(v, str) else number_list([v]) for k, v in attributes.items()}
+        joints = {self.names.get(joint, joint): turn for joint, turn in turns.items()}
+        self.add.tendons.append(({"name": f"tendon_{len(self.add.tendons) + 1}", **shown}, joints))
+
+    def set_joint(self, axis: str, **attributes: float | Array) -> None:
+        """Give a joint attributes in place of its own."""
+        shown = {k: number_list(np.atleast_1d(v)) for k, v in attributes.items()}
+        self.add.joints.setdefault(self.names[axis], {}).update(shown)
+
+    def bristles(self, axis: str, *numbers: float) -> None:
+        """LuGre friction at a joint: a motor that never drives it."""
+        joint = self.names[axis]
+        given = {"joint": joint, "motorconst": "1e-6", "resistance": "1"}
+        name = f"friction_{len(self.add.bristles) + 1}_{joint}"
+        self.add.bristles.append({"name": name, **given, "lugre": number_list(numbers)})
+
+    def drive(self, force: str) -> dict[str, float]:
+        """What stands between a drive's input and its joint, to be changed."""
+        return self.drives.setdefault(force, {**_AS_LOGGED})
+
+    def left_of_friction(self, axis: str) -> float:
+        """Coulomb friction of a joint that no bristle has yet."""
+        return self.friction.get(axis, self.value(f"coulomb.{axis}"))
+
+    def write(self, item: BoundEffect) -> None:
+        """Add one effect, or note that it has no place."""
+        name, act = item.effect.name, _WRITERS.get(item.effect.name)
+        # A lab's own effect may have the name of one of these.
+        if act is not None and item.effect.declaration == registry.effect(name).declaration:
+            short = {q.name.removeprefix(f"{item.prefix}."): q.name for q in item.parameters}
+            values = {key: self.value(full) for key, full in short.items()}
+            if act(self, item, SimpleNamespace(**values)):
+                return
+        self.lacks.append(item.name)
+
+    def finish(self) -> None:
+        """Give joints and drives what motors and effects make together."""
+        for name, motor in self.robot.motors.items():
+            if len(motor.turns) > 1:
+                kinds = ("rotor_inertia", "viscous", "coulomb")
+                inertia, viscous, coulomb = (self.value(f"{kind}_{name}") for kind in kinds)
+                self.tendon(motor.turns, armature=inertia, damping=viscous, frictionloss=coulomb)
+        for axis, inertia in self.armature.items():
+            self.set_joint(axis, armature=inertia)
+        for axis, c in self.friction.items():
+            self.set_joint(axis, frictionloss=c)
+        for axis, numbers in self.springs.items():
+            self.set_joint(axis, stiffness=numbers)
+        for axis in self.system.coordinates:
+            one = self.drive(f"torque_{axis}")
+            if one == _AS_LOGGED:
+                continue
+            given = {"gainprm": number_list([one["gain"]])}
+            given |= {"biastype": "affine", "biasprm": number_list([one["offset"], 0.0, 0.0])}
+            if one["lag"] > 0.0:
+                given |= {"dyntype": "filterexact", "dynprm": number_list([one["lag"]])}
+            if one["delay"] > 0.0:
+                kept = str(math.ceil(one["delay"] / STEP_S) + 2)
+                given |= {"delay": number_list([one["delay"]]), "nsample": kept}
+                given["interp"] = "linear"
+            self.add.drives[self.names[axis]] = given
+
+
+_Act = Callable[[_Writer, BoundEffect, SimpleNamespace], bool]
+"""Writes an effect, its parameters by their short names; False where it has no place."""
+
+
+def _spring(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
+    numbers = [v.stiffness, getattr(v, "bending", 0.0), getattr(v, "stiffening", 0.0)]
+    w.springs[item.target] = w.springs.get(item.target, np.zeros(3)) + np.array(numbers)
+    w.drive(f"torque_{item.target}")["offset"] += v.offset
+    return True
+
+
+def _drag(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
+    linear = max(w.value(f"viscous.{item.target}"), 0.0)
+    w.set_joint(item.target, damping=np.array([linear, v.coefficient, 0.0]))
+    return True
+
+
+def _stop(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
+    ends = (-_FAR, v.position) if item.effect.name == "upper_stop" else (v.position, _FAR)
+    w.tendon({item.target: 1.0}, stiffness=v.stiffness, springlength=number_list(ends))
+    return True
+
+
+def _load(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
+    axis, half = item.target, 0.5 * getattr(v, "gap", 0.0)
+    load = f"load_{w.names[axis]}"
+    kind = next(c.kind for c in w.system.model.device.coordinates if c.name == axis)
+    w.add.loads.append((load, "slide" if kind == "linear" else "hinge", v.inertia))
+    w.tendon(
+        {load: 1.0, axis: -1.0},
+        stiffness=v.inertia * v.frequency**2,
+        damping=2.0 * v.damping * v.frequency * v.inertia,
+        springlength=number_list([-half, half]),
+    )
+    if half:
+        w.lacks.append(f"of {item.name} its weight, and that nothing damps it within the gap")
+    return True
+
+
+def _presliding(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
+    left = w.left_of_friction(item.target) - v.force
+    if left >= 0.0:
+        w.friction[item.target] = left
+        w.bristles(item.target, v.force / v.distance, 0.0, v.force, v.force, 1.0)
+    return bool(left >= 0.0)
+
+
+def _stribeck(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
+    least = w.left_of_friction(item.target)
+    if least <= 0.0 or v.force <= 0.0:
+        return False
+    w.friction[item.target] = 0.0
+    stiffness = (least + v.force) / _BRISTLE
+    w.bristles(item.target, stiffness, _SETTLE_S * stiffness, least, least + v.force, v.speed)
+    return True
+
+
+def _pair(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
+    turns = dict(
+        zip(item.axes, (1.0, 1.0 if item.effect.name.endswith("_sum") else -1.0), strict=True)
+    )
+    if not hasattr(v, "inertia"):
+        w.tendon(turns, damping=v.viscous, frictionloss=v.coulomb)
+    elif v.inertia >= 0.0:
+        w.tendon(turns, armature=v.inertia)
+    return bool(getattr(v, "inertia", 0.0) >= 0.0)
+
+
+def _drive(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
+    every = [f"torque_{axis}" for axis in w.system.coordinates]
+    forces = [item.target] if item.target else every
+    if w.robot.motors or not {*forces} <= {*every}:
+        return False
+    late = getattr(v, "time_constant", 0.0)
+    for force in forces:
+        one = w.drive(force)
+        one["gain"] -= getattr(v, "error", 0.0)
+        one["offset"] -= getattr(v, "bias", 0.0)
+        one["delay"] += getattr(v, "delay", 0.0)
+        # As the effect's own formula rounds it off.
+        one["lag"] += 0.5 * (late + math.sqrt(late**2 + 4e-6)) if late else 0.0
+    return True
+
+
+_WRITERS: Mapping[str, _Act] = {
+    **dict.fromkeys(("return_spring", "cable_torque"), _spring),
+    "quadratic_drag": _drag,
+    **dict.fromkeys(("upper_stop", "lower_stop"), _stop),
+    **dict.fromkeys(("flexible_load", "loose_load"), _load),
+    "presliding": _presliding,
+    "stribeck": _stribeck,
+    **{
+        f"{what}_of_{how}": _pair
+        for what in ("friction", "inertia")
+        for how in ("sum", "difference")
+    },
+    # In the armature of the joint already.
+    "inertia_mismatch": lambda w, item, v: True,
+    **dict.fromkeys(
+        ("force_gain", "force_bias", "actuator_lag", "actuator_delay", "drive_delay"), _drive
+    ),
+}
+
+
+def add_effects(
+    system: System, p: Array, robot: Robot, names: Mapping[str, str], drives: Array
+) -> tuple[Additions, list[str]]:
+    """What a model's effects and shared motors add to an MJCF, and which find no place in it.
+
+    Args:
+        system, p: the model and its parameters (n_p,); robot: its joints.
+        names: the drawing's name of each coordinate's joint.
+        drives: inertia of the drives at each joint, (n_q,).
+    """
+    writer = _Writer(system, p, robot, names, dict(zip(system.coordinates, drives, strict=True)))
+    # Presliding takes its part of the friction before Stribeck's takes the rest.
+    for item in sorted(system.model.effects, key=lambda item: item.effect.name == "stribeck"):
+        writer.write(item)
+    writer.finish()
+    return writer.add, writer.lacks
