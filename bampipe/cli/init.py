@@ -20,6 +20,9 @@ def init(
         str,
         typer.Option(help="Names of the columns of texts without a header, as t,q,tau_nm."),
     ] = "",
+    episodes: Annotated[
+        str, typer.Option(help="Of a data set of LeRobot: those that become trials, as 0:20 or 7.")
+    ] = "",
     dry: Annotated[
         bool, typer.Option("--dry", help="Print the session file instead of writing it.")
     ] = False,
@@ -33,10 +36,14 @@ def init(
     Example: bampipe init logs/2026-10-03 --device slider --dry
 
     Example: bampipe init logs/2026-10-03 --names time_s,angle_deg,current_mA
+
+    Example: bampipe init datasets/so101_pick --episodes 0:20
     """
     from bampipe.setup.proposal import propose, write_proposal
 
-    proposal = propose(folder, device, [name for name in names.split(",") if name.strip()])
+    proposal = propose(
+        folder, device, [name for name in names.split(",") if name.strip()], episodes
+    )
     written = [] if dry else write_proposal(folder, proposal)
     if json:
         show.print_json(
