@@ -59,7 +59,7 @@ LAWS = {
         "errors lists results phrases physics estimate trials identification diagnosis",
     ),
     "declarations": law(
-        "numpy pydantic", "errors files lists schema stages.base results physics data"
+        "numpy scipy pandas pydantic", "errors files lists schema stages.base results physics data"
     ),
     "simulator": law(
         "numpy scipy pandas pyarrow numba pydantic",

@@ -15,7 +15,9 @@ from bampipe.run import models
 
 def export(
     run: RunArgument = None,
-    form: Annotated[str, typer.Option("--as", help="json, urdf, mjcf, python or c.")] = "json",
+    form: Annotated[
+        str, typer.Option("--as", help="json, urdf, mjcf, python, c, mcap or rrd.")
+    ] = "json",
     model: Annotated[
         str, typer.Option(help="Model that is written; the best confirmed one if omitted.")
     ] = "",
@@ -30,17 +32,32 @@ def export(
     URDF, bodies and friction as identified. mjcf: the same with its drives' inertia, for MuJoCo.
     python, c: one self-contained function of inverse dynamics.
 
+    mcap, rrd: a recording for Foxglove or Rerun, of all models: torques measured and predicted,
+    residuals, worst windows and verdicts as markers, a robot's pose by its drawing.
+
     Example: bampipe export 2026-10-03_s01 --as c --out inverse_dynamics.c
+
+    Example: bampipe export 2026-10-03_s01 --as mcap --out s01.mcap
     """
     from bampipe.data.run_folder import RunFolder
     from bampipe.declarations.export import FORMS, export_model
-    from bampipe.files import write_text
+    from bampipe.declarations.recording import gather_recording, recording_forms
+    from bampipe.files import atomic_writer, write_text
 
+    if pack := recording_forms().get(form):
+        root = places.find_run(run, runs)
+        path = out or Path(f"{root.name}.{form}")
+        packed = pack(gather_recording(RunFolder(root)))
+        with atomic_writer(path) as stream:
+            stream.write(packed)
+        show.say(f"{path}: {root.name}, {len(packed) / 1e6:.1f} MB")
+        return
+    every = (*FORMS, *recording_forms())
     chosen = next((known for known in FORMS if known == form), None)
     if chosen is None:
         raise InputError(
-            f"unknown form {form!r}{did_you_mean(form, FORMS)}",
-            remedy=f"--as {', '.join(FORMS)}",
+            f"unknown form {form!r}{did_you_mean(form, every)}",
+            remedy=f"--as {', '.join(every)}",
         )
     root = places.find_run(run, runs)
     counting = models.choose_model(root, model)

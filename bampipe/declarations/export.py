@@ -27,6 +27,7 @@ from bampipe.data.robot_xml import number_list, read_xml
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.urdf import changed_urdf, urdf_text
 from bampipe.declarations.model_file import identified, load_model
+from bampipe.declarations.recording import DRAWING
 from bampipe.errors import InputError
 from bampipe.files import json_text
 from bampipe.lists import join_names
@@ -38,8 +39,6 @@ from bampipe.results.identify import IdentifyResult
 Array = NDArray[np.float64]
 Form = Literal["json", "urdf", "mjcf", "python", "c"]
 FORMS: tuple[Form, ...] = get_args(Form)
-DRAWING = "ingest/robot.xml"
-"""The URDF or MJCF that a session brought."""
 
 
 def export_model(run: RunFolder, name: str, form: Form) -> str:

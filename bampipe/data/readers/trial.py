@@ -190,7 +190,7 @@ def need(module: str, extra: str, name: str) -> ModuleType:
     except ImportError as error:
         package = module.partition(".")[0]
         raise InputError(
-            f"reading this file needs {package}, which is not installed",
+            f"this needs {package}, which is not installed",
             where=name,
             remedy=f"pip install 'bampipe[{extra}]'",
         ) from error
