@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.options import RUNS, RunArgument, RunsOption
+from bampipe.cli.options import RUNS, BestModelOption, RunArgument, RunsOption
 from bampipe.errors import InputError, did_you_mean
 from bampipe.run import models
 
@@ -18,9 +18,7 @@ def export(
     form: Annotated[
         str, typer.Option("--as", help="json, urdf, mjcf, python, c, mcap or rrd.")
     ] = "json",
-    model: Annotated[
-        str, typer.Option(help="Model that is written; the best confirmed one if omitted.")
-    ] = "",
+    model: BestModelOption = "",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="File to write; printed if omitted.")
     ] = None,

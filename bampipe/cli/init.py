@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import show
+from bampipe.cli.options import JsonOption, QuietOption
 
 
 def init(
@@ -26,8 +27,8 @@ def init(
     dry: Annotated[
         bool, typer.Option("--dry", help="Print the session file instead of writing it.")
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No advice.")] = False,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Propose a session.toml for a folder of logs, every guess marked; nothing is overwritten.
 
