@@ -38,11 +38,13 @@ def export(
     Example: bampipe export 2026-10-03_s01 --as mcap --out s01.mcap
     """
     from bampipe.data.run_folder import RunFolder
+    from bampipe.declarations import mcap_file, rerun_file
     from bampipe.declarations.export import FORMS, export_model
-    from bampipe.declarations.recording import gather_recording, recording_forms
+    from bampipe.declarations.recording import gather_recording
     from bampipe.files import atomic_writer, write_text
 
-    if pack := recording_forms().get(form):
+    recordings = {"mcap": mcap_file.pack_recording, "rrd": rerun_file.pack_recording}
+    if pack := recordings.get(form):
         root = places.find_run(run, runs)
         path = out or Path(f"{root.name}.{form}")
         packed = pack(gather_recording(RunFolder(root)))
@@ -50,7 +52,7 @@ def export(
             stream.write(packed)
         show.say(f"{path}: {root.name}, {len(packed) / 1e6:.1f} MB")
         return
-    every = (*FORMS, *recording_forms())
+    every = (*FORMS, *recordings)
     chosen = next((known for known in FORMS if known == form), None)
     if chosen is None:
         raise InputError(

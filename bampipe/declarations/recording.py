@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -169,10 +169,3 @@ def _pose_links(
         places = joint.offset + np.outer(slides * at, joint.turn @ axis)
         frames.append(Frame(joint.parent, joint.child, places, turned.as_quat()))
     return times, tuple(frames)
-
-
-def recording_forms() -> dict[str, Callable[[Recording], bytes]]:
-    """The writers of recordings, by their ``--as`` and file extension."""
-    from bampipe.declarations import mcap_file, rerun_file
-
-    return {"mcap": mcap_file.pack_recording, "rrd": rerun_file.pack_recording}
