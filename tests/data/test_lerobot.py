@@ -1,6 +1,8 @@
 """Data sets in the layout of LeRobot v3.0: vectors by name, an episode a trial."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -129,6 +131,16 @@ def test_a_data_set_without_a_drive_is_refused_with_what_can_be_found(tmp_path):
     with pytest.raises(InputError, match="inertia, weight and friction cannot be found") as error:
         propose(tmp_path)
     assert "shoulder_pan.pos 0.10 s, as a first-order lag of 1.6 Hz" in str(error.value)
+    page = Path(__file__).parents[2] / "docs/raw_log_format.md"
+    (servo,) = (
+        text
+        for text in re.findall(r"```toml\n(.*?)```", page.read_text(), re.S)
+        if 'name = "servo"' in text
+    )
+    (tmp_path / "servo.toml").write_text(servo.replace("elbow", "elbow_flex"))
+    proposed = propose(tmp_path, "servo.toml")
+    assert proposed.fill_in[0].startswith("the column of goal")
+    assert 'elbow_flex = { column = "observation.state.elbow_flex.pos"' in proposed.session
 
 
 @pytest.mark.parametrize(

@@ -143,8 +143,8 @@ def _refuse_goals(folder: Path, found: Survey) -> None:
             f"; what can be: each servo's own loop follows its goal late ({loops})" if loops else ""
         ),
         where=str(folder),
-        remedy="record the servos' current or load with the state; or name a device file of your"
-        " own whose input is the goal: --device FILE",
+        remedy="record the servos' current or load with the state; or identify a loop with its load"
+        " by a device file whose input is the goal: --device FILE",
     )
 
 
