@@ -54,8 +54,8 @@ def diagnose(name: str, run: bampipe.Run | Path, truth: Mapping[str, Any]) -> Sc
     begun = time.perf_counter()
     try:
         found = bampipe.diagnose(run, "base", jobs=1, trust_setup=True)
-    except bampipe.InputError as problem:
-        return Scores(name, **known, failure=str(problem))
+    except Exception as problem:  # a crash is a failure of this session, not of the benchmark
+        return Scores(name, **known, failure=f"{type(problem).__name__}: {problem}")
     axes = found["axes"]
     return Scores(
         name, **known,
@@ -109,8 +109,9 @@ def record_and_diagnose(seed: int, clean: bool) -> Scores:
             run = bampipe.run_session(
                 root / "session", runs=root / "runs", pipeline=str(root / "calibration.toml")
             )
-        except bampipe.InputError as problem:
-            return Scores(f"{machine} {day} {seed}", **named, failure=str(problem))
+        except Exception as problem:
+            failure = f"{type(problem).__name__}: {problem}"
+            return Scores(f"{machine} {day} {seed}", **named, failure=failure)
         return diagnose(f"{machine} {day} {seed}", run, named)
 
 

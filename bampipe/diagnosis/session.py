@@ -49,9 +49,9 @@ Task = TypeVar("Task")
 Returned = TypeVar("Returned")
 
 _STEPS = 8
-_SHARES = (1.0, 0.3, 0.1)
+_SHARES = (1.0, 0.3, 0.1, 0.03)
 _CONVERGED = 0.2
-"""Fall of the negative log likelihood, nats, below which a fit ends."""
+"""Fall of the negative log likelihood that a step promises, nats, below which a fit ends."""
 _STOPPING_WIDTH = 0.125
 """Sign width, times the device's, of the replay whose friction stops it: a 32nd leaves the same."""
 _SEED = 7
@@ -214,33 +214,43 @@ class Session:
             noise = describe_noise(replays, stopping, evidence, samples)
         likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
         evidence, problem = self._descend(recipe, evidence, likelihood)
+        log_likelihood = problem.log_likelihood()
         likelihood = likelihood.with_heavy_tails(problem, c.tails)
         likelihood = likelihood.with_equal_weights(problem, lacking)
         evidence, problem = self._descend(recipe, evidence, likelihood)
-        return Fit(recipe, evidence, likelihood, problem)
+        return Fit(recipe, evidence, likelihood, problem, log_likelihood)
 
     def _descend(
         self, recipe: Recipe, evidence: Evidence, likelihood: Likelihood
     ) -> tuple[Evidence, Problem]:
-        """Gauss-Newton steps to the most likely parameters, within their bounds."""
-        problem = likelihood.pose(evidence)
-        solved = problem.solve()
+        """Gauss-Newton steps to the most likely parameters, within their bounds.
+
+        A step is judged by the cost where it leads, nuisance parameters at their best there: what a
+        linear problem promises of a shape can be far from what it keeps.
+
+        Raises:
+            ValueError: fewer samples are clear of standstill than there are parameters.
+        """
+        problem, count = likelihood.pose(evidence), len(evidence.free)
+        if sum(map(len, problem.y)) <= count:
+            raise ValueError("fewer samples clear of standstill than parameters")
+        here = problem.solve_nuisance(count).cost
         for _ in range(_STEPS):
-            step = problem.to_parameters @ solved.base
+            promised = problem.solve()
+            if here - promised.cost < _CONVERGED:
+                break
+            step = problem.to_parameters @ promised.base
             for share in _SHARES:
                 p = evidence.p.copy()
-                p[list(evidence.free)] += share * step[: len(evidence.free)]
+                p[list(evidence.free)] += share * step[:count]
                 moved = self.linearise(recipe, np.clip(p, *_bounds(evidence.system)), evidence)
                 tried = likelihood.pose(moved)
-                there = tried.solve()
-                if there.cost < solved.cost + _CONVERGED:
+                there = tried.solve_nuisance(count).cost
+                if there < here:
                     break
             else:
                 break
-            fall = solved.cost - there.cost
-            evidence, problem, solved = moved, tried, there
-            if fall < _CONVERGED:
-                break
+            evidence, problem, here = moved, tried, there
         return evidence, problem
 
     def judge(self, recipe: Recipe, p: Array) -> Fit:
@@ -255,7 +265,8 @@ class Session:
         stopping = self.replay_stopping(recipe, evidence)
         noise = describe_noise(replays, stopping, evidence, samples)
         likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
-        return Fit(recipe, evidence, likelihood, likelihood.pose(evidence))
+        problem = likelihood.pose(evidence)
+        return Fit(recipe, evidence, likelihood, problem, problem.log_likelihood())
 
     def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
         """Fit a model with noise that is the same for all samples of an axis, without replays."""
@@ -265,7 +276,7 @@ class Session:
         noise = describe_noise([nothing, nothing], nothing, evidence, samples)
         flat = Likelihood.of(evidence, samples, noise, 0.0, 0.0)
         evidence, problem = self._descend(recipe, evidence, flat)
-        return Fit(recipe, evidence, flat, problem)
+        return Fit(recipe, evidence, flat, problem, problem.log_likelihood())
 
     def try_fit(self, recipe: Recipe, start: Array) -> Fit | None:
         """`fit`; None where the model cannot be replayed."""
@@ -289,12 +300,15 @@ class Fit:
     Attributes:
         recipe: the model; evidence: its residual and slopes there.
         likelihood: noise and weights; problem: the weighted linear problem.
+        log_likelihood: by that noise, normal, nats: of fits with noise of different replays, the
+            most likely has the largest.
     """
 
     recipe: Recipe
     evidence: Evidence
     likelihood: Likelihood
     problem: Problem
+    log_likelihood: float
 
     @cached_property
     def solved(self) -> Solved:
@@ -354,7 +368,7 @@ class Fit:
 
     @cached_property
     def held_out_rmse(self) -> Array:
-        """Error on trials that the parameters have not seen, (n_q,), N.m or N, by a linear step.
+        """Error on trials that parameters have not seen, nor timing, (n_q,), N.m or N, linearised.
 
         With one group of trials only, that of the fit.
         """
@@ -362,7 +376,7 @@ class Fit:
         group_of = np.array(e.folds.groups)
         groups = [group_of[here.trial] for here in samples]
         plain = [take_samples(e.residual, here, axis) for axis, here in enumerate(samples)]
-        slopes = [take_samples(e.jacobian, here, axis) for axis, here in enumerate(samples)]
+        slopes = [take_samples(e.slopes, here, axis) for axis, here in enumerate(samples)]
         xx, xy, yy = p.sums()
         squares = np.zeros(len(samples))
         for group in np.unique(group_of):

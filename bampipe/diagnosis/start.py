@@ -8,21 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.diagnosis.criteria import Criteria
-from bampipe.diagnosis.select import change_set, open_search, start_of
-from bampipe.diagnosis.session import Session, system_of
+from bampipe.diagnosis.search import names
+from bampipe.diagnosis.select import open_search, start_of
+from bampipe.diagnosis.session import Fit, Session, system_of
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.measured import MeasuredTrials
 
 Array = NDArray[np.float64]
 
 _ANY_SIZE = 1e-9
+_REPLICATES = 6
 
 
 def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
-    """Starting values of every parameter of a model, its effects taken one after the other.
+    """Starting values of every parameter of a model.
 
-    The device's parameters start at their priors and are fitted; the shape of each effect is
-    searched over its range, where a descent from the prior would stay in the nearest valley.
+    The device's parameters start at their priors and are fitted; the shapes of the effects are
+    searched over their range as a diagnosis does, all of them together as far as each has a
+    strength beside the others: a descent from the prior would stay in the nearest valley.
 
     Args:
         trials: the measured trials; recipe: the model.
@@ -30,14 +33,21 @@ def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
     Returns:
         (n_p,), within the bounds.
     """
-    session = Session(trials, Criteria(size=_ANY_SIZE))
-    current = replace(recipe, effects=())
-    fit = session.fit_plainly(current, system_of(current).prior)
-    for effect in recipe.effects:
-        wider = change_set(current, [(effect, ())])
-        with open_search(session, fit, only=(effect,)) as search:
-            found = search.refine([(k,) for _, k in search.best_beside((), 1, shapes=3)], 4)
-            keys = min(found, key=search.cost, default=None)
-            start = start_of(search, keys or (), wider)
-        current, fit = wider, session.fit_plainly(wider, start)
-    return fit.evidence.p
+    session = Session(trials, Criteria(size=_ANY_SIZE, replicates=_REPLICATES))
+    current, left = replace(recipe, effects=()), recipe.effects
+    fit = _fit(session, current, session.fit_plainly(current, system_of(current).prior).evidence.p)
+    while left:
+        with open_search(session, fit, only=left) as search:
+            sets = [one for beam in search.beam(len(left)) for one in beam]
+            keys = min(sets, key=lambda one: (-len(one[1]), one[0]))[1] if sets else ()
+            found = names(keys) or left[:1]
+            current = replace(current, effects=(*current.effects, *found))
+            start = start_of(search, keys, current)
+        fit, left = _fit(session, current, start), tuple(e for e in left if e not in found)
+    known = {q.name: v for q, v in zip(fit.evidence.system.parameters, fit.evidence.p, strict=True)}
+    return np.array([known[q.name] for q in system_of(recipe).parameters])
+
+
+def _fit(session: Session, recipe: Recipe, start: Array) -> Fit:
+    """A fit with the noise and the bias of its replays, without them where it runs away."""
+    return session.try_fit(recipe, start) or session.fit_plainly(recipe, start)

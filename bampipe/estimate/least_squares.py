@@ -206,13 +206,13 @@ def minimise(
         problem: the model as residuals.
         start: (np,) parameters to start from.
         trials: which trials to use; all by default.
-        most_iterations: the most Gauss-Newton steps.
+        most_iterations: the most Gauss-Newton steps; with 0 the model is linearised at ``start``.
         known: slopes that need not be taken again.
         at_start: these trials linearised at ``start``, where they have been.
         tolerance: change of the cost, the negative log likelihood a sample, at which it ends.
 
     Raises:
-        ValueError: fewer samples are clear of standstill than there are parameters.
+        ValueError: to fit, fewer samples are clear of standstill than there are parameters.
         InputError: the residual or its slope at ``start`` is not a finite number.
     """
     chosen = list(range(problem.n_trials)) if trials is None else list(trials)
@@ -221,7 +221,7 @@ def minimise(
     stacked = at_start or [stacked_residual(problem, trial, p, known) for trial in chosen]
     for trial, s in zip(chosen, stacked, strict=True):
         _require_finite(problem, trial, s, p)
-    if sum(int(s.used.sum()) for s in stacked) <= problem.free.size:
+    if most_iterations and sum(int(s.used.sum()) for s in stacked) <= problem.free.size:
         raise ValueError("fewer samples clear of standstill than parameters")
     start_at = _Linearised(problem, chosen, p, stacked)
     found = descend(start_at, problem.lower, problem.upper, most_iterations, tolerance)

@@ -19,13 +19,17 @@ from bampipe.diagnosis.session import Fit, Session
 from bampipe.errors import InputError
 from bampipe.estimate.bounded import invert_scaled
 from bampipe.estimate.influence import RemovedStretch, find_worst_stretch
-from bampipe.estimate.least_squares import BLOCKS_A_PARAMETER, Problem, covariance_by_blocks
+from bampipe.estimate.least_squares import (
+    BLOCKS_A_PARAMETER,
+    Problem,
+    covariance_by_blocks,
+    minimise,
+)
 from bampipe.estimate.simulation import Runaway
 from bampipe.identification.estimates import Estimate, filtered_states, input_timing
 from bampipe.physics import System
 from bampipe.physics.recipe import Recipe
 from bampipe.results.identify import Convergence, StateBound
-from bampipe.trials.evidence import gather_evidence
 from bampipe.trials.likelihood import (
     hold_parameters,
     lay_out_samples,
@@ -42,10 +46,10 @@ _REPLICATES = 6
 _LACKING = 3.0
 """What is left over what sensors, filters and the discrepancy explain, from which on weights by
 these say nothing: a verdict has it that something unknown remains there."""
-_PASSES = 3
+_PASSES = 6
 """Most fits of a model that is nonlinear in its parameters, each with replicates of the last."""
-_SETTLED = 0.3
-"""Standard deviations by which such a fit moves at most."""
+_SETTLED = 1.0
+"""Gain of log likelihood, nats, below which such a fit is the last; the most likely one counts."""
 _FARTHEST = 3.0
 """Standard deviations that a nonlinear fit moves at most where a trial is left out."""
 _PERIODS = 10
@@ -254,29 +258,30 @@ def fit_squares(
         ValueError: fewer samples are clear of standstill than there are parameters.
     """
     session = Session(trials, Criteria(replicates=_REPLICATES))
-    plain = gather_evidence(
-        system, trials.motions, trials.band, start, trials.folds, most_iterations=30
-    )
     problem = problem_of(system, trials.motions, trials.band, timing=trials.timed)
-    at, found = plain.p, None
+    # Effects with a shape stay as they were searched: friction that stops would bend them.
+    effects = () if problem.linear else system.model.effects
+    plain = problem_of(
+        system, trials.motions, trials.band, held=[q.name for e in effects for q in e.parameters]
+    )
+    begun = minimise(plain, np.append(start, 0.0), trials.folds.fitted_trials).p[:-1]
+    at, found = begun, None
     with suppress(Runaway):
-        for _ in range(0 if not remove_bias else 1 if problem.linear else _PASSES):
+        for number in range(0 if not remove_bias else 1 if problem.linear else _PASSES):
             again = _with_values(
                 session.fit(recipe, at, lacking=_LACKING), trials, problem, block_s
             )
-            settled = found is not None and _is_settled(found, again)
-            found, at = again, again.fit.evidence.p
-            if settled:
+            # Replicates of a model that is off one way put the fit off the other way.
+            there = again.fit.evidence.p
+            at = there if found is None else 0.5 * (at + there)
+            gain = again.fit.log_likelihood - found.fit.log_likelihood if found else np.inf
+            found = again if gain > 0.0 else found
+            if number > 1 and gain < _SETTLED:
                 break
     if found is None:
-        alike = session.fit_plainly(recipe, plain.p)
+        alike = session.fit_plainly(recipe, begun)
         found = replace(_with_values(alike, trials, problem, block_s), replayed=False)
     return found
-
-
-def _is_settled(one: SquaresFit, other: SquaresFit) -> bool:
-    moved = np.abs(other.p - one.p)[other.free]
-    return bool(np.all(moved <= _SETTLED * np.maximum(other.sd, 1e-300)))
 
 
 def _with_values(fit: Fit, trials: MeasuredTrials, problem: Problem, block_s: float) -> SquaresFit:

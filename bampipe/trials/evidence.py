@@ -92,6 +92,14 @@ class Evidence:
             by_timing=tuple(self.by_timing[k] for k in trials if self.by_timing),
         )
 
+    @cached_property
+    def slopes(self) -> list[Array]:
+        """By trial, `jacobian` and behind it, where it is open, `by_timing`, (K, n_q, n)."""
+        if not self.by_timing:
+            return list(self.jacobian)
+        pairs = zip(self.jacobian, self.by_timing, strict=True)
+        return [np.append(x, by[:, :, None], axis=2) for x, by in pairs]
+
     @property
     def sizes(self) -> list[int]:
         """Samples of each trial that its residual stands for."""
@@ -212,7 +220,7 @@ def gather_evidence(
         timing: least and largest change of the inputs' timing, s, that may be weighed beside it.
 
     Raises:
-        ValueError: fewer samples than parameters.
+        ValueError: fewer samples than parameters, where steps are to be taken.
     """
     problem = problem_of(system, motions, band)
     fitted = folds.fitted_trials

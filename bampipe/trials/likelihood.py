@@ -346,6 +346,17 @@ class Problem:
         """The change of the model's own parameters that is most likely."""
         return solve_bounded(self, *self.sums())
 
+    def log_likelihood(self) -> float:
+        """Of the samples at the solution, nats, up to a constant that no weights change."""
+        roots = [float(np.mean(np.log(r))) if r.size else 0.0 for r in self.likelihood.root]
+        return float(self.independent @ roots) - self.solve().cost
+
+    def solve_nuisance(self, count: int) -> Solved:
+        """The nuisance parameters that are most likely where the first ``count``, the model's own,
+        stay as they are.
+        """
+        return solve_bounded(self, *self.sums(), absent=dict.fromkeys(range(count), 0.0))
+
 
 def _correlate(values: Array, samples: Samples, lags: int) -> Array:
     """Autocorrelation of values (n,) within trials, (lags + 1,); one and zeros of nothing."""
@@ -402,16 +413,12 @@ def _pose(
     if evidence.factors:  # in units of what is measured: small factors explain nothing
         ratio = np.array(likelihood.factors) / np.array(evidence.factors)
         weights = tuple(root * by for root, by in zip(weights, ratio, strict=True))
-    jacobian: Sequence[Array] = evidence.jacobian
     timing = evidence.timing if evidence.by_timing else ()
-    if timing:
-        pairs = zip(evidence.jacobian, evidence.by_timing, strict=True)
-        jacobian = [np.append(x, by[:, :, None], axis=2) for x, by in pairs]
-    n = jacobian[0].shape[2]
+    n = evidence.slopes[0].shape[2]
     full = []
     for axis, here in enumerate(samples):
         columns = np.zeros((len(here.rows), n + 2 * n_q))
-        columns[:, :n] = take_samples(jacobian, here, axis)
+        columns[:, :n] = take_samples(evidence.slopes, here, axis)
         columns[:, n + axis] = -bias[axis]
         columns[:, n + n_q + axis] = -likelihood.noise.stopping[axis]
         full.append(columns * weights[axis][:, None])
@@ -425,10 +432,12 @@ def _pose(
     y = [r * w for r, w in zip(residual, weights, strict=True)]
     weight = [s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)]
     normal = sum(w * (x.T @ x) for w, x in zip(weight, full, strict=True)) + np.diag(precision)
-    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    values, vectors = np.linalg.eigh(normal / size / size[:, None])
+    # A parameter that changes nothing, as a shape does whose strength is zero, stays as it is.
+    size = np.sqrt(np.diag(normal))
+    per_unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    values, vectors = np.linalg.eigh(normal * per_unit * per_unit[:, None])
     kept = values > _DETERMINED * values[-1]
-    to = vectors[:, kept] / np.sqrt(values[kept]) / size[:, None]
+    to = vectors[:, kept] / np.sqrt(values[kept]) * per_unit[:, None]
     effects = evidence.system.model.effects
     return Problem(
         likelihood, tuple(y), tuple(x @ to for x in full),
@@ -549,13 +558,15 @@ def hold_parameters(
         values: by number of the parameter.
     """
     fixed, free = np.zeros(n), np.eye(n)
-    rows = to_parameters[list(values)]
+    rows, wanted = to_parameters[list(values)], np.array(list(values.values()))
     if not rows.size:
         return fixed, free
     nb = rows.shape[1]
-    u, size, vt = np.linalg.svd(rows)
+    # Each row in its own unit; what does not move is held already.
+    per_unit = 1.0 / np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
+    u, size, vt = np.linalg.svd(rows * per_unit[:, None])
     rank = int(np.sum(size > 1e-9 * max(float(size[0]), 1e-300)))
-    fixed[:nb] = vt[:rank].T @ ((u.T @ np.array(list(values.values())))[:rank] / size[:rank])
+    fixed[:nb] = vt[:rank].T @ ((u.T @ (wanted * per_unit))[:rank] / size[:rank])
     free = np.zeros((n, n - rank))
     free[:nb, : nb - rank] = vt[rank:].T
     free[nb:, nb - rank :] = np.eye(n - nb)

@@ -47,7 +47,7 @@ class MeasuredTrials:
         blocks: how many of the motions are blocks of the only trial that is not held out.
         late_s: time by which inputs were sampled after positions, taken off already; limit_s: the
             most that it may be, zero where it is not estimated.
-        timed: whether the trials show such a time, so that each candidate has one of its own.
+        timed: whether that time is open, so that each model has one of its own.
     """
 
     motions: Sequence[Motion]
@@ -140,7 +140,7 @@ def read_measured_trials(
         Folds.of_trials(names, held_out, fitted),
         late_s=late_s,
         limit_s=timing.limit if timing is not None else 0.0,
-        timed=late_s != 0.0,
+        timed=timing is not None and timing.limit > 0.0,
     )
     alone = [k for k, name in enumerate(names) if name not in held_out]
     return _with_blocks(trials, alone[0], held_out) if len(alone) == 1 else trials

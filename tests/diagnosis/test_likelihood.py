@@ -9,6 +9,7 @@ import pytest
 
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session, system_of
+from bampipe.identification.least_squares_estimate import fit_squares
 from bampipe.trials.likelihood import (
     Likelihood,
     Noise,
@@ -176,3 +177,17 @@ def test_what_comes_back_with_the_motion_counts_as_few_independent_samples(fitte
     assert np.all(counted(replay) > 0.8 * before)
     assert np.all(counted([np.cos(2.5 * s.rows) for s in like.samples]) > 0.8 * before)
     assert np.all(counted(forces) < 0.3 * before)
+
+
+def test_a_shape_is_found_from_a_start_far_away(record):
+    """Where a step promises more than it keeps, and where no strength tells the shape."""
+    trials, recipe = record("bam", 8, "stribeck:extension", creep=False)
+    wider = replace(recipe, effects=(*recipe.effects, "stribeck:extension"))
+    system, start = system_of(wider), system_of(recipe).prior
+    known = fit_squares(trials, recipe, system_of(recipe), start, 2.0).p
+    names = [q.name for q in system.parameters]
+    for force, speed in [(1.4, 0.02), (3.0, 0.009), (0.3, 0.02), (0.0, 0.012)]:
+        begun = np.array([*known[:-1], force, speed])
+        found = fit_squares(trials, wider, system, begun, 2.0).p
+        assert found[names.index("stribeck.extension.force")] == pytest.approx(2.45, rel=0.05)
+        assert found[names.index("stribeck.extension.speed")] == pytest.approx(0.0183, rel=0.05)
