@@ -96,6 +96,7 @@ def gather_recording(run: RunFolder) -> Recording:
     signals: dict[str, tuple[Array, dict[str, Array]]] = {}
     for model in models:
         rows = read_parquet(run.path(f"models/{model}/residuals.parquet"))
+        rows = rows.iloc[np.argsort(_place_rows(rows, offsets), kind="stable")]
         times = _place_rows(rows, offsets)
         for axis in session.axes:
             if f"residual_{axis}" not in rows:

@@ -14,6 +14,7 @@ import synthetic_run
 from made_results import write_result
 
 from bampipe.data.run_folder import RunFolder
+from bampipe.data.store import write_parquet
 from bampipe.declarations import mcap_file, recording, rerun_file
 from bampipe.errors import InputError
 from bampipe.results.ingest import IngestResult
@@ -41,13 +42,15 @@ def residuals(run: RunFolder, model: str) -> pd.DataFrame:
 
 
 def test_a_recording_has_every_model_and_a_marker_at_every_worst_window(run: RunFolder) -> None:
+    mixed = residuals(run, synthetic_run.CHILD).sort_values("t", kind="stable")
+    write_parquet(run.path(f"models/{synthetic_run.CHILD}/residuals.parquet"), mixed)
     found = recording.gather_recording(run)
     times, columns = found.signals["yaw"]
     assert set(columns) == {
         "measured", "predicted_base", "residual_base", f"predicted_{CHILD}", f"residual_{CHILD}",
     }  # fmt: skip
     assert found.units["yaw"] == "N.m" and found.units["extension"] == "N"
-    child = residuals(run, synthetic_run.CHILD)
+    child = residuals(run, synthetic_run.CHILD).sort_values(["trial_id", "t"])
     np.testing.assert_allclose(columns[f"residual_{CHILD}"], child["residual_yaw"])
     np.testing.assert_allclose(
         columns[f"predicted_{CHILD}"], child["torque_measured_yaw"] - child["residual_yaw"]
