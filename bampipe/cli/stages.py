@@ -198,11 +198,26 @@ def compare(
     """
     if other is None:
         plain_stage("compare", run, options)
-    else:
-        from bampipe.cli.pair import compare_pair
+        return
+    from bampipe.api.pair import compare_runs
+    from bampipe.files import write_text
+    from bampipe.report.pair import build_page, tabulate_pair
 
-        roots = places.find_run(run, options.runs), places.find_run(other, options.runs)
-        compare_pair(*roots, model, out, options)
+    first, second = (places.find_run(one, options.runs) for one in (run, other))
+    with show.Watcher(options.quiet or options.json) as watcher:
+        progress = watcher.follow(f"{first.name}, {second.name}", "compare")
+        pair = compare_runs(first, second, model, progress)
+    if out is not None:
+        write_text(out, build_page(pair))
+    if options.json:
+        show.print_json(pair.model_dump(mode="json"))
+        return
+    for line in (*pair.sentences, *pair.notes):
+        show.say(line)
+    for table in tabulate_pair(pair):
+        show.print_block(table)
+    advice = f"open {out}" if out is not None else f"bampipe compare {first} {second} --out FILE"
+    show.print_advice(advice, options.quiet)
 
 
 @with_stage_options

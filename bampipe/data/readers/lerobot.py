@@ -24,7 +24,8 @@ from bampipe.files import read_json_table
 
 INFO = "meta/info.json"
 EPISODE = "episode_index"
-_NO_READINGS = ("frame_index", EPISODE, "index", "task_index")
+NO_READINGS = ("frame_index", EPISODE, "index", "task_index")
+"""Columns with the number of a row, an episode or a task."""
 STATE = "observation.state"
 REMARK = (
     "a data set of LeRobot, an episode a trial; it states no units: its servos count in degrees, or"
@@ -114,11 +115,6 @@ def vector_columns(path: Path, schema: pa.Schema) -> dict[str, tuple[str, int]]:
         for place in range(size):
             found[field.name + (names[place] if names else f"[{place}]")] = (field.name, place)
     return found
-
-
-def is_reading(name: str) -> bool:
-    """Whether a column is more than the number of a row, an episode or a task."""
-    return name not in _NO_READINGS
 
 
 def role_of(name: str) -> str:

@@ -73,7 +73,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
     schema = pq.read_schema(path)
     found = dict.fromkeys(lerobot.vector_columns(path, schema), "")
     for field in schema:
-        if not lerobot.is_reading(field.name) and lerobot.EPISODE in schema.names:
+        if field.name in lerobot.NO_READINGS and lerobot.EPISODE in schema.names:
             continue
         if any(check(field.type) for check in _NUMBERS):
             stated = (field.metadata or {}).get(b"unit") or b""
