@@ -12,7 +12,7 @@ import pytest
 
 from bampipe.data.readers import columns_of, read_trial
 from bampipe.data.recording import read_recording
-from bampipe.data.session import Clock
+from bampipe.data.session import Clock, TrialEntry
 from bampipe.data.survey import survey
 from bampipe.errors import InputError
 from bampipe.setup.proposal import propose
@@ -107,6 +107,9 @@ def test_an_episode_is_a_trial_however_short_the_one_before_it(tmp_path):
         ("000.parquet", 2), ("000.parquet", 3), ("001.parquet", 1),
     ]  # fmt: skip
     column = "observation.state.shoulder_pan.pos"
+    whole = TrialEntry(file=trials[0].file, kind="free")
+    with pytest.raises(InputError, match="another recording begins: 3 recordings in one file"):
+        read_recording(tmp_path, whole, [column], Clock(unit="samples"))
     clock = Clock(column="timestamp", unit="s")
     for trial, episode in zip(trials, episodes[1:4], strict=True):
         raw = read_recording(tmp_path, trial, ["timestamp", column], clock)

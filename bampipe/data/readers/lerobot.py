@@ -76,7 +76,7 @@ def open_dataset(folder: Path, episodes: str = "") -> DataSet | None:
         except (pa.ArrowException, OSError, IndexError) as error:
             what = f"no sound Parquet file with a column {EPISODE}"
             raise InputError(what, where=str(path), remedy="download it again") from error
-        starts = [0, *begun_at(column)] if len(column) else []
+        starts = [0, *_changes(column)] if len(column) else []
         found[path.relative_to(folder).as_posix()] = [int(column[at]) for at in starts]
     known = sorted(number for numbers in found.values() for number in numbers)
     match = re.fullmatch(r"(?:(\d*):(\d*)|(\d+))", episodes or ":")
@@ -93,14 +93,20 @@ def open_dataset(folder: Path, episodes: str = "") -> DataSet | None:
     return DataSet(kept, chosen)
 
 
-def begun_at(numbers: np.ndarray) -> tuple[int, ...]:
-    """Rows from which on another episode stands, by the number of the episode of each, (T,)."""
+def episodes_begin(path: Path) -> tuple[int, ...]:
+    """Rows of a file from which on another episode stands; none outside of a data set."""
+    if not _features_of(path):
+        return ()
+    return _changes(pq.read_table(path, columns=[EPISODE]).column(0).to_numpy())
+
+
+def _changes(numbers: np.ndarray) -> tuple[int, ...]:
     return tuple(int(at) for at in np.flatnonzero(np.diff(numbers)) + 1)
 
 
 def vector_columns(path: Path, schema: pa.Schema) -> dict[str, tuple[str, int]]:
     """The column and the place in it of every element of vectors of numbers, by its name."""
-    features = _features(path.parents[2]) if path.parent.parent.name == "data" else {}
+    features = _features_of(path)
     found = {}
     for field in schema:
         kind = field.type
@@ -111,7 +117,7 @@ def vector_columns(path: Path, schema: pa.Schema) -> dict[str, tuple[str, int]]:
         named = _names(features.get(field.name, {}))
         size = kind.list_size if pa.types.is_fixed_size_list(kind) else len(named)
         size = size or _first_length(path, field.name)
-        names = [f".{name}" for name in named] if len(named) == size else []
+        names = [f".{name}" for name in named] if len({*named}) == len(named) == size else []
         for place in range(size):
             found[field.name + (names[place] if names else f"[{place}]")] = (field.name, place)
     return found
@@ -143,6 +149,11 @@ def describe_loops(t: np.ndarray, columns: Mapping[str, np.ndarray]) -> str:
         band = f", as a first-order lag of {0.159 / lag:.2g} Hz" if lag else ""
         said.append(f"{joint.strip('.')} {lag:.2f} s{band}")
     return "; ".join(said)
+
+
+def _features_of(path: Path) -> dict[str, Any]:
+    """The features of the data set that a file is of, none where it is of none."""
+    return _features(path.parents[2]) if path.parent.parent.name == "data" else {}
 
 
 def _features(folder: Path) -> dict[str, Any]:

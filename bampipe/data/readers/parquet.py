@@ -57,11 +57,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         raise InputError(f"{done} rows, where it claims {rows}", where=name)
     for column in wanted.datetimes:
         values[column] = moments.seconds(values[column])
-    begun: tuple[int, ...] = ()
-    if lerobot.EPISODE in schema.names:
-        numbers = pq.read_table(path, columns=[lerobot.EPISODE]).column(0).to_numpy()
-        begun = lerobot.begun_at(numbers)
-    return RawTrial(values, first_row=1, begun=begun)
+    return RawTrial(values, first_row=1, begun=lerobot.episodes_begin(path))
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
