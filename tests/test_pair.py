@@ -22,14 +22,14 @@ from bampipe.results.pair import PairResult
 
 THICKER = 1.4
 STAGES = 'stages = ["ingest", "filter", "identify", "validate", "compare"]'
-RECORDED = Conditions(creep=True, trials=6, seconds=6.0)
+RECORDED = Conditions(creep=True, trials=8, seconds=8.0)
 
 
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Run folders of one joint: two of it as it is, with more damping, and with Stribeck friction.
 
-    Each has three trials; the first session those that the others do not have.
+    Each has four trials; the first session those that the others do not have.
     """
     root = tmp_path_factory.mktemp("pair")
     (root / "short.toml").write_text(
@@ -47,14 +47,14 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         ("first", {}),
         ("same", {}),
         ("thick", {}),
-        ("stick", {"stribeck:joint": 1.6}),
+        ("stick", {"stribeck:joint": 1.0}),
     ):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(joint, "_draw_specimen", draw_thicker if name == "thick" else draw)
             independent.record("joint", root / name, 5, effects, RECORDED)
         path = root / name / "session.toml"
         head, *trials = path.read_text().split("[[trials]]")
-        kept = trials[:3] if name == "first" else trials[3:]
+        kept = trials[:4] if name == "first" else trials[4:]
         path.write_text("[[trials]]".join([head, *kept]))
         run = bampipe.run_session(
             root / name, runs=root / "runs", pipeline=str(root / "short.toml")
