@@ -24,7 +24,7 @@ _ALONE, _SEVERAL = 7, 5
 _WIDE = 300.0
 """Ratio of the ends of a range from which on its grid has `_MORE` values more."""
 _MORE = 4
-_MOST, _MOST_OF_STATES = 60, 300
+_MOST, _MOST_OF_STATES = 60, 120
 """Shapes on a grid: of an effect without and with internal states, whose shape decides when things
 happen, not only how large they are."""
 _DIVERGED = 1e30

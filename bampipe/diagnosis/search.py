@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
 from bampipe.trials.likelihood import (
+    NOTHING,
     Problem,
     Samples,
     hold_parameters,
@@ -212,6 +213,9 @@ class Search:
         bounds = np.array([x for key in keys for x in self.dictionary.bounds(key[0])]).reshape(
             -1, 2
         )
+        spread = np.array([s for key in keys for s in self.dictionary.spreads(key[0])])
+        # What a strength of any size leaves as it is has none.
+        bounds[np.einsum("a,akk->k", self._weight, xx[:, nb:, nb:]) * spread**2 < NOTHING**2] = 0.0
         solved = solve_bounded(p, xx, xy, self.yy, bounds[:, 0], bounds[:, 1], absent, self._weight)
         b, weight, n = solved.unknowns, solved.weight, xx.shape[1]
         held = [slice(i.start - nb, i.stop - nb) for i in places]
@@ -239,7 +243,6 @@ class Search:
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)
             if min(sizes) < self.least_size:
                 return Solution(np.inf)
-            spread = np.array([s for key in keys for s in self.dictionary.spreads(key[0])])
             shapes = sum(len(key[1]) for key in keys)
             penalty += float(penalise(inside, spread[used], b[nb:][used], shapes))
         cost = solved.cost - float(volume.sum()) + penalty
@@ -396,7 +399,8 @@ class Search:
         mom = np.where(valid, moment[place], 0.0)
         low, high = self.low[place], self.high[place]
         own = np.einsum("kww->kw", np.tensordot(weight, self.own, 1))
-        active = valid & (np.einsum("kww->kw", block) > 1e-6 * own)
+        least = np.maximum(1e-6 * own, (NOTHING / np.where(valid, self.spread[place], 1.0)) ** 2)
+        active = valid & (np.einsum("kww->kw", block) > least)
         gain = np.zeros(len(self.places))
         for _ in range(widest + 1):
             masked = block * (active[:, :, None] & active[:, None, :])

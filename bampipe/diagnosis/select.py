@@ -235,8 +235,14 @@ def _explore(search: Search, room: int, deep: int) -> Pool:
     pool: Pool = {}
     search.keep(pool, ())
     lead = search.cost(())
-    for rest in search.without_one(()):
-        search.keep(pool, rest)
+    rest: tuple[Key, ...] | None = ()
+    while rest is not None:  # backward elimination, as far as each member less is more probable
+        fewer, least = search.without_one(rest), search.cost(rest)
+        for keys in fewer:
+            search.keep(pool, keys)
+        rest = min(
+            (keys for keys in fewer if search.cost(keys) < least), key=search.cost, default=None
+        )
     for keys in search.refine(search.swaps((), pool), 2):
         search.keep(pool, keys)
     for beam in search.beam(deep):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.diagnosis.criteria import Criteria
-from bampipe.diagnosis.search import names
+from bampipe.diagnosis.search import gone, names
 from bampipe.diagnosis.select import open_search, start_of
 from bampipe.diagnosis.session import Fit, Session, system_of
 from bampipe.physics.recipe import Recipe
@@ -38,8 +38,8 @@ def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
     fit = _fit(session, current, session.fit_plainly(current, system_of(current).prior).evidence.p)
     while left:
         with open_search(session, fit, only=left) as search:
-            sets = [one for beam in search.beam(len(left)) for one in beam]
-            keys = min(sets, key=lambda one: (-len(one[1]), one[0]))[1] if sets else ()
+            sets = [s for beam in search.beam(len(left)) for s in beam if not gone(s[1])]
+            keys = min(sets, key=lambda s: (-len(s[1]), s[0]))[1] if sets else ()
             found = names(keys) or left[:1]
             current = replace(current, effects=(*current.effects, *found))
             start = start_of(search, keys, current)

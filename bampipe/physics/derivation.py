@@ -244,10 +244,9 @@ def _build_device_torque(d: Vocabulary, w: Sequence[Any]) -> list[Any]:
 
 
 def _find_dry_friction(d: Vocabulary, other: Sequence[Any]) -> list[Any]:
-    """What of ``other`` turns with the sign of the motion, by axis."""
-    slid = sp.Dummy()
+    """What of ``other`` turns with the sign of the motion, by axis: half of what both differ by."""
     signs = [d.sgn(rate) for rate in d.qd]
-    return [-sp.diff(e.subs(sign, slid), slid) for e, sign in zip(other, signs, strict=True)]
+    return [(e.subs(s, -1) - e.subs(s, 1)) / 2 for e, s in zip(other, signs, strict=True)]
 
 
 def _constants(d: Vocabulary) -> list[Any]:

@@ -32,6 +32,8 @@ _SPEEDS = 12
 """Classes of speed in which the variance of replays is averaged, finer where an axis is slow."""
 _LEAST = 1e-3
 """Of the mean variance: no sample weighs more than a thousand average ones."""
+NOTHING = 1e-4
+"""Standard deviations by which a parameter moves what is measured over all of its range: none."""
 _DETERMINED = 1e-9
 """Of the largest eigenvalue of the scaled normal equations, below which a direction of the model's
 own parameters is not determined by the trials, and stays."""
@@ -432,9 +434,11 @@ def _pose(
     y = [r * w for r, w in zip(residual, weights, strict=True)]
     weight = [s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)]
     normal = sum(w * (x.T @ x) for w, x in zip(weight, full, strict=True)) + np.diag(precision)
-    # A parameter that changes nothing, as a shape does whose strength is zero, stays as it is.
-    size = np.sqrt(np.diag(normal))
-    per_unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
+    # What changes nothing over its range stays, as a shape does whose strength is zero.
+    size, parameters = np.sqrt(np.diag(normal)), evidence.system.parameters
+    reach = np.ones(size.size)
+    reach[: len(evidence.free)] = [parameters[i].sd or 1.0 for i in evidence.free]
+    per_unit = np.divide(1.0, size, out=np.zeros_like(size), where=size * reach > NOTHING)
     values, vectors = np.linalg.eigh(normal * per_unit * per_unit[:, None])
     kept = values > _DETERMINED * values[-1]
     to = vectors[:, kept] / np.sqrt(values[kept]) * per_unit[:, None]
@@ -559,14 +563,16 @@ def hold_parameters(
     """
     fixed, free = np.zeros(n), np.eye(n)
     rows, wanted = to_parameters[list(values)], np.array(list(values.values()))
+    # Each row in its own unit; what does not move is held already.
+    norm = np.linalg.norm(rows, axis=1)
+    moves = norm > 0.0
+    rows, wanted = rows[moves] / norm[moves, None], wanted[moves] / norm[moves]
     if not rows.size:
         return fixed, free
     nb = rows.shape[1]
-    # Each row in its own unit; what does not move is held already.
-    per_unit = 1.0 / np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
-    u, size, vt = np.linalg.svd(rows * per_unit[:, None])
-    rank = int(np.sum(size > 1e-9 * max(float(size[0]), 1e-300)))
-    fixed[:nb] = vt[:rank].T @ ((u.T @ (wanted * per_unit))[:rank] / size[:rank])
+    u, size, vt = np.linalg.svd(rows)
+    rank = int(np.sum(size > 1e-9 * float(size[0])))
+    fixed[:nb] = vt[:rank].T @ ((u.T @ wanted)[:rank] / size[:rank])
     free = np.zeros((n, n - rank))
     free[:nb, : nb - rank] = vt[rank:].T
     free[nb:, nb - rank :] = np.eye(n - nb)

@@ -41,10 +41,10 @@ def test_what_only_an_axis_far_above_the_noise_shows_is_as_sure_as_its_share(wit
 def test_a_grid_over_several_shapes_covers_each_of_their_ranges(name):
     item = compile_candidate(build_candidate_model(registry.device("slider"), name))
     grid = Dictionary(None, (), {name: item}, AXIS).grid(name)
-    assert len(set(grid)) == len(grid) <= 300
+    assert len(set(grid)) == len(grid) <= 120
     values = [sorted({shape[k] for _, shape in grid}) for k in range(len(grid[0][1]))]
     own = [item.parameters[i].name.rpartition(".")[2] for i in item.searched_indices]
-    assert len(values[own.index("gap")]) == max(map(len, values)) >= 9
+    assert len(values[own.index("gap")]) == max(map(len, values)) >= 8
     for each in values:
         assert len(each) >= 3
         assert each[0] <= 0.2 and each[-1] >= 0.8

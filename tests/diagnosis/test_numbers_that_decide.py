@@ -34,6 +34,7 @@ NUMERICAL = {
         "0.3": "nats by which it goes on",
         "0.5": "the middle of a range, towards which slopes are taken",
         "_LEAST_SLOPE": "below it the equation has no scale, and its cost no meaning",
+        "NOTHING": "what moves nothing over its whole range cannot be told from rounding",
     },
 }
 """By room that decides: numbers that are compared with, and why each is no criterion."""

@@ -9,6 +9,7 @@ import pytest
 from sessions import bam, diagnose_trials, take_timing_off
 
 from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.select import select_effects
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.physics import registry
 
@@ -149,3 +150,11 @@ def test_the_pose_of_an_arm_is_no_reason_to_doubt_it(record):
     trials, _ = record("bam", 6)
     _, found = diagnose_trials(trials, bam(), only=("handle_payload", "force_gain:y"))
     assert found.selected == ()
+
+
+def test_a_hysteresis_of_a_damper_is_found_from_a_model_without_dry_friction(record):
+    """The share of a friction that the first model does not have: what stands in for it goes."""
+    trials, recipe = record("damper", 71001, "hysteresis:piston")
+    session = Session(trials, Criteria())
+    start = session.fit_plainly(recipe, system_of(recipe).prior).evidence.p
+    assert select_effects(session, recipe, start).effects == ("hysteresis:piston",)

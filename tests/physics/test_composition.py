@@ -242,6 +242,25 @@ def test_friction_by_load_builds_up_after_a_reversal_as_the_rest():
     assert ends[1] - ends[0] == pytest.approx(40.0 + 50.0 + 60.0, rel=1e-6)
 
 
+def test_friction_by_direction_pushes_nothing_that_rests_and_is_no_part_of_what_turns():
+    """Beside a hysteresis of all dry friction, whose share is half of what both ways differ by."""
+    device = registry.device("magnetic_damper")
+    system = compile_model(Model(device, ["hysteresis:piston", "asymmetric_coulomb:piston"]))
+    p = {"coulomb.piston": 40.0, "hysteresis.piston.share": 1.0,
+         "asymmetric_coulomb.piston.difference": 5.0}  # fmt: skip
+    values = np.array([p.get(x.name, 0.0) for x in system.parameters])
+    u, one = np.zeros((1, len(system.inputs))), np.array([[0.1]])
+
+    def required(rate, deflection):
+        z = np.array([[deflection]])
+        return system.required(0 * one, rate * one, 0 * one, z, u, values)[0, 0]
+
+    assert required(0.0, 0.0) == pytest.approx(0.0, abs=1e-9)
+    forwards, backwards = required(1.0, 1.0), required(-1.0, -1.0)
+    assert 0.5 * (forwards - backwards) == pytest.approx(40.0, rel=1e-6)
+    assert 0.5 * (forwards + backwards) == pytest.approx(5.0, rel=1e-6)
+
+
 def test_parameters_that_multiply_each_other_are_not_fitted_as_if_they_added_up():
     model = Model(registry.device("bam"), ["base_tilt"])
     system = compile_model(model)
