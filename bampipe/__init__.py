@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         write_report,
     )
     from bampipe.api.opened import Picture, Run, open_run
+    from bampipe.api.pair import compare_runs
 
 __version__ = "0.1.0"
 
@@ -43,6 +44,7 @@ __all__ = [
     "Picture",
     "Run",
     "compare",
+    "compare_runs",
     "diagnose",
     "draft",
     "extend",
@@ -58,14 +60,16 @@ __all__ = [
     "write_report",
 ]
 
-_OPENED = ("Picture", "Run", "open_run")
+_MODULES = {
+    **dict.fromkeys(("Picture", "Run", "open_run"), "bampipe.api.opened"),
+    "compare_runs": "bampipe.api.pair",
+}
 
 
 def __getattr__(name: str) -> object:
     if name not in __all__:
         raise AttributeError(f"module 'bampipe' has no attribute {name!r}")
-    module = "bampipe.api.opened" if name in _OPENED else "bampipe.api.actions"
-    return getattr(import_module(module), name)
+    return getattr(import_module(_MODULES.get(name, "bampipe.api.actions")), name)
 
 
 def __dir__() -> list[str]:

@@ -51,7 +51,7 @@ LAWS = {
         "errors lists results phrases physics estimate trials identification diagnosis",
     ),
     "declarations": law(
-        "numpy pydantic", "errors files lists schema stages.base results physics data"
+        "numpy scipy pandas pydantic", "errors files lists schema stages.base results physics data"
     ),
     "simulator": law(
         "numpy scipy pandas pyarrow numba pydantic",
@@ -79,12 +79,13 @@ LAWS = {
         "numpy scipy", "progress errors lists files results phrases data report run stages.base"
     ),
     "api": law(
-        "pandas",
-        "progress errors files lists results phrases physics report run stages data declarations",
+        "numpy pandas",
+        "progress errors files lists results phrases physics report run stages data declarations "
+        "trials diagnosis",
     ),
     "cli": law(
         "typer rich bampipe",
-        "progress api errors files results phrases run lab stages physics diagnosis data "
+        "progress api errors files results phrases report run lab stages physics diagnosis data "
         "declarations monitor setup simulator",
     ),
 }

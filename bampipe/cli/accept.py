@@ -8,30 +8,21 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
+from bampipe.cli.options import RUNS, BestModelOption, QuietOption, RunArgument, RunsOption
 from bampipe.data.run_folder import RunFolder
 from bampipe.run import accepted, models
 
 
 def accept(
-    run: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[RUN]",
-            help="Run folder, or its name under runs/; the most recent run if omitted.",
-        ),
-    ] = None,
-    model: Annotated[
-        str, typer.Option(help="Model whose parameters count; the best confirmed one if omitted.")
-    ] = "",
+    run: RunArgument = None,
+    model: BestModelOption = "",
     force: Annotated[bool, typer.Option("--force", help="Even if a gate failed.")] = False,
     folder: Annotated[
         Path | None,
         typer.Option("--accepted", help="Folder to write to; accepted/ beside runs if omitted."),
     ] = None,
-    runs: Annotated[
-        Path, typer.Option("--runs", envvar="BAMPIPE_RUNS", help="Folder of the run folders.")
-    ] = Path("runs"),
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No advice.")] = False,
+    runs: RunsOption = RUNS,
+    quiet: QuietOption = False,
 ) -> None:
     """Accept a session's parameters as the device's reference for the gates of later runs.
 

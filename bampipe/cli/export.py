@@ -8,17 +8,17 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.options import RUNS, RunArgument, RunsOption
+from bampipe.cli.options import RUNS, BestModelOption, RunArgument, RunsOption
 from bampipe.errors import InputError, did_you_mean
 from bampipe.run import models
 
 
 def export(
     run: RunArgument = None,
-    form: Annotated[str, typer.Option("--as", help="json, urdf, mjcf, python or c.")] = "json",
-    model: Annotated[
-        str, typer.Option(help="Model that is written; the best confirmed one if omitted.")
-    ] = "",
+    form: Annotated[
+        str, typer.Option("--as", help="json, urdf, mjcf, python, c, mcap or rrd.")
+    ] = "json",
+    model: BestModelOption = "",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="File to write; printed if omitted.")
     ] = None,
@@ -30,17 +30,34 @@ def export(
     URDF, bodies and friction as identified. mjcf: the same with its drives and effects, for MuJoCo.
     python, c: one self-contained function of inverse dynamics.
 
+    mcap, rrd: a recording for Foxglove or Rerun, of all models: torques measured and predicted,
+    residuals, worst windows and verdicts as markers, a robot's pose by its drawing.
+
     Example: bampipe export 2026-10-03_s01 --as c --out inverse_dynamics.c
+
+    Example: bampipe export 2026-10-03_s01 --as mcap --out s01.mcap
     """
     from bampipe.data.run_folder import RunFolder
+    from bampipe.declarations import mcap_file, rerun_file
     from bampipe.declarations.export import FORMS, export_model
-    from bampipe.files import write_text
+    from bampipe.declarations.recording import gather_recording
+    from bampipe.files import atomic_writer, write_text
 
+    recordings = {"mcap": mcap_file.pack_recording, "rrd": rerun_file.pack_recording}
+    if pack := recordings.get(form):
+        root = places.find_run(run, runs)
+        path = out or Path(f"{root.name}.{form}")
+        packed = pack(gather_recording(RunFolder(root)))
+        with atomic_writer(path) as stream:
+            stream.write(packed)
+        show.say(f"{path}: {root.name}, {len(packed) / 1e6:.1f} MB")
+        return
+    every = (*FORMS, *recordings)
     chosen = next((known for known in FORMS if known == form), None)
     if chosen is None:
         raise InputError(
-            f"unknown form {form!r}{did_you_mean(form, FORMS)}",
-            remedy=f"--as {', '.join(FORMS)}",
+            f"unknown form {form!r}{did_you_mean(form, every)}",
+            remedy=f"--as {', '.join(every)}",
         )
     root = places.find_run(run, runs)
     counting = models.choose_model(root, model)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from bampipe.cli import show
+from bampipe.cli.options import RUNS, QuietOption, RunsOption
 from bampipe.errors import InputError, choose_from
 from bampipe.run import publish
 
@@ -18,11 +18,9 @@ def fetch(
         list[str] | None,
         typer.Argument(metavar="[SESSION...]", help="Sessions to fetch; all if omitted."),
     ] = None,
-    runs: Annotated[
-        Path, typer.Option("--runs", envvar="BAMPIPE_RUNS", help="Folder to fetch into.")
-    ] = Path("runs"),
+    runs: RunsOption = RUNS,
     force: Annotated[bool, typer.Option("--force", help="Replace runs that differ.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No advice.")] = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Fetch runs that `bampipe run --publish URL` published, every file checked.
 

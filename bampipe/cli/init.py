@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import show
+from bampipe.cli.options import JsonOption, QuietOption
 
 
 def init(
@@ -20,11 +21,14 @@ def init(
         str,
         typer.Option(help="Names of the columns of texts without a header, as t,q,tau_nm."),
     ] = "",
+    episodes: Annotated[
+        str, typer.Option(help="Of a data set of LeRobot: those that become trials, as 0:20 or 7.")
+    ] = "",
     dry: Annotated[
         bool, typer.Option("--dry", help="Print the session file instead of writing it.")
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No advice.")] = False,
+    json: JsonOption = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Propose a session.toml for a folder of logs, every guess marked; nothing is overwritten.
 
@@ -33,10 +37,14 @@ def init(
     Example: bampipe init logs/2026-10-03 --device slider --dry
 
     Example: bampipe init logs/2026-10-03 --names time_s,angle_deg,current_mA
+
+    Example: bampipe init datasets/so101_pick --episodes 0:20
     """
     from bampipe.setup.proposal import propose, write_proposal
 
-    proposal = propose(folder, device, [name for name in names.split(",") if name.strip()])
+    proposal = propose(
+        folder, device, [name for name in names.split(",") if name.strip()], episodes
+    )
     written = [] if dry else write_proposal(folder, proposal)
     if json:
         show.print_json(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bampipe.cli import show
-from bampipe.cli.options import RUNS, RunsOption
+from bampipe.cli.options import RUNS, JsonOption, QuietOption, RunsOption
 from bampipe.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,9 +27,9 @@ def lab(
     out: Annotated[
         Path | None, typer.Option(help="Folder to write to; lab/ beside the runs if omitted.")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print the trends as JSON.")] = False,
+    json: JsonOption = False,
     runs: RunsOption = RUNS,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress, no advice.")] = False,
+    quiet: QuietOption = False,
 ) -> None:
     """Compare all sessions: one data set, control charts, and which session drifted and why.
 
@@ -54,15 +54,10 @@ def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> Lab:
     """Write the lab's folder for the runs in ``runs``."""
     from bampipe.lab.collect import collect
     from bampipe.lab.folders import lab_folder
-    from bampipe.run.events import Event
 
     folder = out or lab_folder(runs)
     with show.Watcher(quiet) as watcher:
-
-        def progress(fraction: float, message: str) -> None:
-            watcher(Event(str(folder), "lab", "progress", fraction, message))
-
-        return collect(runs, folder, progress=progress)
+        return collect(runs, folder, progress=watcher.follow(str(folder), "lab"))
 
 
 def refresh(runs: Path, several: bool, quiet: bool) -> None:

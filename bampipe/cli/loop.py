@@ -14,6 +14,7 @@ from bampipe.cli.one_stage import one_stage, print_settings, whole_pipeline
 from bampipe.cli.options import (
     DEFAULTS,
     RUNS,
+    BestModelOption,
     ForceOption,
     JsonOption,
     NoWaitOption,
@@ -31,9 +32,7 @@ from bampipe.run import batch, models
 @with_stage_options
 def diagnose(
     run: RunArgument = None,
-    model: Annotated[
-        str, typer.Option(help="Model to diagnose; the best confirmed one if omitted.")
-    ] = "",
+    model: BestModelOption = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
     """Find the effects that a model lacks, axis by axis, with their probabilities.
@@ -56,9 +55,7 @@ def diagnose(
 @with_stage_options
 def draft(
     run: RunArgument = None,
-    model: Annotated[
-        str, typer.Option(help="Model to draft for; the best confirmed one if omitted.")
-    ] = "",
+    model: BestModelOption = "",
     curve: Annotated[
         bool,
         typer.Option("--curve", help="Draft a curve through points instead, for prediction alone."),
@@ -108,9 +105,7 @@ def extend(
         bool,
         typer.Option("--draft", help="With --auto: draft a formula where no effect has a name."),
     ] = False,
-    model: Annotated[
-        str, typer.Option(help="Model to extend; the best confirmed one if omitted.")
-    ] = "",
+    model: BestModelOption = "",
     force: ForceOption = False,
     runs: RunsOption = RUNS,
     no_wait: NoWaitOption = False,

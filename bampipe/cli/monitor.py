@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bampipe.cli import places, show
+from bampipe.cli.options import RUNS, BestModelOption, RunsOption
 from bampipe.errors import InputError
 from bampipe.run import models
 
@@ -33,9 +34,7 @@ def monitor(
     run: Annotated[
         str, typer.Option("--run", help="Run folder or name; the most recent run if omitted.")
     ] = "",
-    model: Annotated[
-        str, typer.Option("--model", help="Model of the run; the best confirmed one if omitted.")
-    ] = "",
+    model: BestModelOption = "",
     device: Annotated[
         str, typer.Option("--device", help="Without a run: a built-in device or a device file.")
     ] = "",
@@ -62,9 +61,7 @@ def monitor(
     ] = False,
     json: Annotated[bool, typer.Option("--json", help="JSON lines on a terminal too.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No remarks.")] = False,
-    runs: Annotated[
-        Path, typer.Option("--runs", envvar="BAMPIPE_RUNS", help="Folder of the run folders.")
-    ] = Path("runs"),
+    runs: RunsOption = RUNS,
 ) -> None:
     """Follow a log as it grows: state, parameters with bounds, and an alarm.
 

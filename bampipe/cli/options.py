@@ -44,6 +44,10 @@ ModelOption = Annotated[
     str, typer.Option("--model", help="Only this model; else base, and the others that were run.")
 ]
 
+BestModelOption = Annotated[
+    str, typer.Option("--model", help="A model of the run; the best confirmed one if omitted.")
+]
+
 RUNS = Path("runs")
 
 

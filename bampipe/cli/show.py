@@ -14,10 +14,12 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from bampipe.errors import InputError, printable
+from bampipe.progress import Progress
 from bampipe.run.events import Event
 from bampipe.run.request import Outcome
 
 if TYPE_CHECKING:
+    from bampipe.report.document import Table
     from bampipe.results.compare import Rung
     from bampipe.results.identify import EffectEstimate
 
@@ -221,8 +223,6 @@ def _print_trials(content: Mapping[str, object]) -> None:
 
 def _print_ladder(rungs: Sequence[Rung]) -> None:
     """Print one row a model version: its held-out error over the noise floor, axis by axis."""
-    from bampipe.results.compare import horizons_of
-
     axes = list(dict.fromkeys(axis for rung in rungs for axis in rung.held_out_rmse))
     rows = []
     for rung in rungs:
@@ -236,49 +236,20 @@ def _print_ladder(rungs: Sequence[Rung]) -> None:
     heads = (head for axis in axes for head in (f"{axis}, {units.get(axis, '')}", "/ floor"))
     say("\nladder: error on held-out trials, and over its noise floor")
     print_table(["model", "added", *heads], rows)
-    if any(rung.free_run for rung in rungs):
-        _print_free_runs(rungs)
-    if horizons := horizons_of(rungs):
-        _print_drift(rungs, horizons)
+    if any(rung.free_run or rung.drift for rung in rungs):
+        # matplotlib is slow to import: only here
+        from bampipe.report.sections.ladder import tabulate_runs
+
+        for table in tabulate_runs(rungs, axes):
+            print_block(table)
 
 
-def _print_free_runs(rungs: Sequence[Rung]) -> None:
-    """Print how far each model version, left to itself, ends up from the measured positions."""
-    units = {axis: found.unit for rung in rungs for axis, found in rung.free_run.items()}
-    rows = []
-    for rung in rungs:
-        cells = [rung.model, (rung.free_run_mode or "").replace("_", " ")]
-        for one in map(rung.free_run.get, units):
-            shown = (one.mean_absolute, one.rmse, one.relative_error_percent) if one else ()
-            cells += [format_cell(value) for value in shown] or [""] * 3
-        rows.append(cells)
-    heads = (
-        head
-        for axis, unit in units.items()
-        for head in (f"{axis}, mean abs., {unit}", f"RMS, {unit}", "%")
-    )
-    say("\nfree run: position error of the model left to itself over held-out trials")
-    print_table(["model", "loop", *heads], rows)
-    for rung in rungs:
-        if not rung.free_run and rung.free_run_reason:
-            say(f"  {rung.model}: {rung.free_run_reason}")
-
-
-def _print_drift(rungs: Sequence[Rung], horizons: Sequence[float]) -> None:
-    """Print how far each model version drifts within each horizon."""
-    units = {axis: found.unit for rung in rungs for axis, found in rung.drift.items()}
-    rows = []
-    for rung in rungs:
-        cells = [rung.model]
-        for found in map(rung.median_drift, units):
-            values = (found.get(horizon) for horizon in horizons)
-            cells.append(" / ".join("–" if value is None else f"{value:.2g}" for value in values))
-        rows.append(cells)
-    within = " / ".join(f"{horizon:g}" for horizon in horizons)
-    say(f"\ndrift: distance from the measured position after {within} s left to itself, median")
-    if any("–" in cell for row in rows for cell in row):
-        say("–: runs away, drifts further than the axis itself moves, or the axis hardly moves")
-    print_table(["model", *(f"{axis}, {unit}" for axis, unit in units.items())], rows)
+def print_block(table: Table) -> None:
+    """Print a table of a report, with its caption above and its note below."""
+    say(f"\n{table.caption}")
+    print_table([column.title for column in table.read_columns()], table.rows)
+    if table.note:
+        say(table.note)
 
 
 def print_outcome(result: Outcome) -> None:
@@ -403,6 +374,14 @@ class Watcher:
             self._write(event, name)
         else:
             self._draw(event, name)
+
+    def follow(self, run: str, step: str) -> Progress:
+        """Return what a step calls to say how far it is."""
+
+        def show_progress(fraction: float, message: str) -> None:
+            self(Event(run, step, "progress", fraction, message))
+
+        return show_progress
 
     def _write(self, event: Event, name: str) -> None:
         """A line where a step starts, and one every so often while it goes on."""

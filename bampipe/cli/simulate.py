@@ -50,7 +50,6 @@ def simulate(
     Example: bampipe simulate sessions/trial --effect stribeck:yaw --seed 1
     """
     batch.limit_threads(1)
-    from bampipe.run.events import Event
     from bampipe.simulator.session import Config, simulate_session
 
     parameters: dict[str, float] = {}
@@ -73,11 +72,7 @@ def simulate(
         file_format=file_format,
     )
     with show.Watcher(quiet or json) as watcher:
-
-        def progress(fraction: float, message: str) -> None:
-            watcher(Event(out.name, "simulate", "progress", fraction, message))
-
-        content = simulate_session(out, config, progress)
+        content = simulate_session(out, config, watcher.follow(out.name, "simulate"))
     if json:
         show.print_json(content)
         return

@@ -13,6 +13,7 @@ from bampipe.cli.forecast import print_forecasts
 from bampipe.cli.one_stage import one_stage, plain_stage, print_settings
 from bampipe.cli.options import (
     DEFAULTS,
+    BestModelOption,
     ModelOption,
     RunArgument,
     SessionArgument,
@@ -118,9 +119,7 @@ def validate(
 @with_stage_options
 def next_(
     run: RunArgument = None,
-    model: Annotated[
-        str, typer.Option(help="Model to design for; the best confirmed one if omitted.")
-    ] = "",
+    model: BestModelOption = "",
     purpose: Annotated[
         str,
         typer.Option(
@@ -213,20 +212,58 @@ def _parse_share(text: str) -> float:
 
 
 @with_stage_options
-def compare(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
-    """Print the ladder: held-out error of each model version against the noise floor.
+def compare(
+    run: RunArgument = None,
+    other: Annotated[
+        str | None,
+        typer.Argument(metavar="[RUN_B]", help="A second session of the device: what changed?"),
+    ] = None,
+    model: Annotated[
+        str, typer.Option(help="Of two runs: the model of both; else the best of each.")
+    ] = "",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Of two runs: a page to write, as HTML.")
+    ] = None,
+    options: StageOptions = DEFAULTS,
+) -> None:
+    """Print the ladder of a run's models; of two runs, what changed between the sessions.
+
+    Two sessions of one device are compared by parameters, verdicts and residuals, and by what the
+    model of each predicts for the trials of the other. A model that does not travel is refitted in
+    one parameter after another, and else diagnosed on those trials.
 
     Example: bampipe compare 2026-10-03_s01
+
+    Example: bampipe compare 2026-10-03_s01 2026-11-14_s01 --out changed.html
     """
-    plain_stage("compare", run, options)
+    if other is None:
+        plain_stage("compare", run, options)
+        return
+    from bampipe.api.pair import compare_runs
+    from bampipe.files import write_text
+    from bampipe.report.pair import build_page, tabulate_pair
+
+    first, second = (places.find_run(one, options.runs) for one in (run, other))
+    with show.Watcher(options.quiet or options.json) as watcher:
+        progress = watcher.follow(f"{first.name}, {second.name}", "compare")
+        pair = compare_runs(first, second, model, progress)
+    if out is not None:
+        write_text(out, build_page(pair))
+    if options.json:
+        show.print_json(pair.model_dump(mode="json"))
+        return
+    for line in (*pair.sentences, *pair.notes):
+        show.say(line)
+    for table in tabulate_pair(pair):
+        show.print_block(table)
+    advice = f"open {out}" if out is not None else f"bampipe compare {first} {second} --out FILE"
+    show.print_advice(advice, options.quiet)
 
 
 @with_stage_options
 def report(
     run: RunArgument = None,
-    model: Annotated[
-        str, typer.Option("--model", help="Shown in detail; the best confirmed one if omitted.")
-    ] = "",
+    model: BestModelOption = "",
     open_: Annotated[
         bool, typer.Option("--open", help="Open the page for exploring in the browser.")
     ] = False,

@@ -190,7 +190,7 @@ def _one_of(raw: RawTrial, entry: TrialEntry, clock: Clock) -> RawTrial:
         return raw
     if entry.recording is None or entry.recording > count:
         at = starts[min(1, count - 1)]
-        what = "the header stands again" if at in raw.begun else "time starts again"
+        what = "another recording begins" if at in raw.begun else "time starts again"
         raise InputError(
             f"{what}: {count} recordings in one file" if count > 1 else "one recording only",
             where=f"{entry.file}, row {raw.rows[at]}",

@@ -11,7 +11,15 @@ import numpy as np
 
 from bampipe.data.looks import describe, find_roles
 from bampipe.data.parts import are_axes, join_parts
-from bampipe.data.readers import EXTENSIONS, TEXTS, RawTrial, columns_of, objects, read_trial
+from bampipe.data.readers import (
+    EXTENSIONS,
+    TEXTS,
+    RawTrial,
+    columns_of,
+    lerobot,
+    objects,
+    read_trial,
+)
 from bampipe.data.readers.trial import Dialect
 from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
@@ -35,7 +43,7 @@ _WORDS = {
     "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
     " nanoseconds millis micros milliseconds microseconds",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
-    " wanted con ctrl",
+    " wanted con ctrl action",
     "brake": "brake bremse",
     "acceleration": "acc accel acceleration qdd ddq beschleunigung",
     "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate",
@@ -131,18 +139,20 @@ class Survey:
         return [column for column in self.columns if column.role in roles]
 
 
-def survey(folder: Path, names: Sequence[str] = ()) -> Survey:
+def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Survey:
     """Look through the logs in ``folder`` and the folders in it.
 
     Args:
         folder: of the logs.
         names: of the columns, where they are texts without a header.
+        episodes: of a data set of LeRobot, those that are wanted; see `lerobot.open_dataset`.
 
     Raises:
         InputError: no such folder, no log in it, too many, or none that can be read.
     """
-    logs = _Logs(folder, Dialect(names=tuple(names)))
-    logs.look_through(_paths(folder))
+    dataset = lerobot.open_dataset(folder, episodes)
+    logs = _Logs(folder, Dialect(names=tuple(names)), dataset)
+    logs.look_through([folder / file for file in dataset.episodes] if dataset else _paths(folder))
     trials, common = logs.choose()
     read: tuple[SurveyedColumn, ...] = ()
     sound = []
@@ -163,6 +173,8 @@ def survey(folder: Path, names: Sequence[str] = ()) -> Survey:
     if guessed and sound[0].file.lower().endswith(".json"):
         beside = objects.stated_units(folder / sound[0].file, sound[0].file)
         columns = tuple(_with_unit_beside(c, columns, beside) for c in columns)
+    if dataset is not None:
+        logs.remarks = [lerobot.REMARK]
     return Survey(tuple(sound), columns, (*logs.remarks, *guessed), tuple(logs.passed))
 
 
@@ -197,6 +209,7 @@ class _Logs:
 
     folder: Path
     dialect: Dialect
+    dataset: lerobot.DataSet | None = None
     found: dict[str, dict[str, str]] = field(default_factory=dict)
     passed: list[tuple[str, str]] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
@@ -355,6 +368,9 @@ class _Logs:
         Raises:
             InputError: it cannot be read.
         """
+        if self.dataset is not None:
+            places = self.dataset.recordings(trial.file)
+            return [trial.model_copy(update={"recording": n}) for n in places]
         path = self.folder / trial.file
         self.scanned += path.stat().st_size
         columns = self.found[trial.file]
@@ -514,7 +530,7 @@ def _role(name: str, stated: str) -> str:
     if len(roles) > 1 and max(map(len, said)) == 1:
         return ""  # x_F: letters that stand for several quantities
     named = next(iter(roles), "")
-    return named or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
+    return named or lerobot.role_of(name) or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
 
 
 def _role_by_suffix(suffix: str) -> str:

@@ -28,6 +28,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.data.urdf import changed_urdf, urdf_text
 from bampipe.declarations.mjcf_effects import add_effects
 from bampipe.declarations.model_file import identified, load_model
+from bampipe.declarations.recording import DRAWING
 from bampipe.errors import InputError
 from bampipe.files import json_text
 from bampipe.lists import join_names
@@ -39,8 +40,6 @@ from bampipe.results.identify import IdentifyResult
 Array = NDArray[np.float64]
 Form = Literal["json", "urdf", "mjcf", "python", "c"]
 FORMS: tuple[Form, ...] = get_args(Form)
-DRAWING = "ingest/robot.xml"
-"""The URDF or MJCF that a session brought."""
 
 
 def export_model(run: RunFolder, name: str, form: Form) -> str:

@@ -1,4 +1,4 @@
-"""Parquet files: one row a sample."""
+"""Parquet files: one row a sample; columns of vectors element by element."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from bampipe.data.readers import moments
+from bampipe.data.readers import lerobot, moments
 from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size
 from bampipe.errors import InputError
 
@@ -30,9 +30,12 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         path, memory_map=False, buffer_size=_BUFFER, read_dictionary=[*wanted.datetimes]
     ) as file:
         schema = file.schema_arrow
-        check_columns(schema.names, wanted.columns, name)
-        for column in wanted.columns:
+        vectors = lerobot.vector_columns(path, schema)
+        check_columns([*schema.names, *vectors], wanted.columns, name)
+        plain = [column for column in wanted.columns if column not in vectors]
+        for column in plain:
             _check_kind(schema.field(column).type, column in wanted.datetimes, name, column)
+        stored = dict.fromkeys([*plain, *(vectors[c][0] for c in wanted.columns if c in vectors)])
         rows = file.metadata.num_rows
         check_size(rows, wanted, name)
         values = {
@@ -40,9 +43,12 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
             for column in wanted.columns
         }
         done = 0
-        for batch in file.iter_batches(BATCH_ROWS, columns=list(wanted.columns), use_threads=False):
+        for batch in file.iter_batches(BATCH_ROWS, columns=list(stored), use_threads=False):
             for column in wanted.columns:
-                cells = batch.column(column)
+                where, place = vectors.get(column, (column, None))
+                cells = batch.column(where)
+                if place is not None:
+                    cells = pc.list_element(cells, place)
                 values[column][done : done + batch.num_rows] = _numbers(
                     cells, wanted.datetimes.get(column), f"{name}, column '{column}'", done + 1
                 )
@@ -51,7 +57,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         raise InputError(f"{done} rows, where it claims {rows}", where=name)
     for column in wanted.datetimes:
         values[column] = moments.seconds(values[column])
-    return RawTrial(values, first_row=1)
+    return RawTrial(values, first_row=1, begun=lerobot.episodes_begin(path))
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
@@ -60,8 +66,11 @@ def columns(path: Path, name: str) -> dict[str, str]:
     Raises:
         InputError: not a sound Parquet file.
     """
-    found = {}
-    for field in pq.read_schema(path):
+    schema = pq.read_schema(path)
+    found = dict.fromkeys(lerobot.vector_columns(path, schema), "")
+    for field in schema:
+        if field.name in lerobot.NO_READINGS and lerobot.EPISODE in schema.names:
+            continue
         if any(check(field.type) for check in _NUMBERS):
             stated = (field.metadata or {}).get(b"unit") or b""
             found[field.name] = stated.decode("utf-8", "replace")

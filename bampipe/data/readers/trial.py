@@ -65,7 +65,7 @@ class RawTrial:
         remarks: what was found out about the file, one sentence each.
         units: units that the file itself gives to its columns.
         resumed: after lines that hold no sample, the sample that follows and its row.
-        begun: samples before which the header stands once more, as of another recording.
+        begun: samples at which another recording begins: the header stands again, or an episode.
         since: of columns of dates and times, where known, their first moment, ns since 1970.
     """
 
@@ -190,7 +190,7 @@ def need(module: str, extra: str, name: str) -> ModuleType:
     except ImportError as error:
         package = module.partition(".")[0]
         raise InputError(
-            f"reading this file needs {package}, which is not installed",
+            f"this needs {package}, which is not installed",
             where=name,
             remedy=f"pip install 'bampipe[{extra}]'",
         ) from error

@@ -200,10 +200,10 @@ def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Fig
     names = sorted(maps, key=lambda name: -maps[name].variance_share)[:_MAPS]
     figure, panels = style.make_grid(len(names), 3, 1.65, column_width=1.9)
     for number, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        _draw_map(panel, name, maps[name], style.VERMILLION, "the model")
+        draw_map(panel, name, maps[name], style.VERMILLION, "the model")
         shown = [maps[name]]
         if name in later:
-            _draw_map(panel, name, later[name], style.BLUE, "with the effects found")
+            draw_map(panel, name, later[name], style.BLUE, "with the effects found")
             shown.append(later[name])
         panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
         bands = [np.array(values) for one in shown for values in (one.low, one.high)]
@@ -218,7 +218,8 @@ def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Fig
     return style.finish(figure, f"residual-maps-{model}-{axis}", caption, panels[:1])
 
 
-def _draw_map(panel: Any, name: str, shown: ResidualMap, colour: str, title: str) -> None:
+def draw_map(panel: Any, name: str, shown: ResidualMap, colour: str, title: str) -> None:
+    """Draw the mean residual with its band over one variable of a map."""
     mean, low, high = (np.array(values) for values in (shown.mean, shown.low, shown.high))
     values = None if shown.unit else _name_values(name, shown.center)
     if values is None:

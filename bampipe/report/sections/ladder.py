@@ -36,10 +36,7 @@ def section(results: Results) -> Section | None:
     rungs = compared.ladder
     axes = results.order_axes({axis for rung in rungs for axis in rung.held_out_rmse})
     blocks: list[Block] = [_tabulate_errors(results, rungs, axes), _draw(results, rungs, axes)]
-    if any(rung.free_run for rung in rungs):
-        blocks.append(_tabulate_free_runs(results, rungs, axes))
-    if horizons_of(rungs):
-        blocks.append(_tabulate_drift(results, rungs, axes))
+    blocks += tabulate_runs(rungs, axes)
     if compared.parameters:
         blocks.append(_tabulate_parameters(results, rungs, compared.parameters))
     if compared.moved:
@@ -62,13 +59,25 @@ def _tabulate_errors(results: Results, rungs: Sequence[Rung], axes: Sequence[str
     return Table(caption, " | ".join(("Version | Added", *heads)), rows)
 
 
-def _tabulate_free_runs(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
+def tabulate_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> list[Table]:
+    """Return how far each version left to itself is off: over whole trials, and within horizons."""
+    found = [_tabulate_free_runs(rungs, axes)] if any(rung.free_run for rung in rungs) else []
+    return [*found, _tabulate_drift(rungs, axes)] if horizons_of(rungs) else found
+
+
+def _choose_scales(
+    sizes: Mapping[str, Sequence[float]], units: Mapping[str, str]
+) -> dict[str, tuple[float, str]]:
+    return {axis: choose_scale(found, units.get(axis, "")) for axis, found in sizes.items()}
+
+
+def _tabulate_free_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
     """Position error of each version left to itself: mean absolute, and relative to the motion."""
     runs = {axis: [rung.free_run.get(axis) for rung in rungs] for axis in axes}
-    scales = {
-        axis: choose_scale((one.mean_absolute for one in found if one), results.unit(axis))
-        for axis, found in runs.items()
-    }
+    scales = _choose_scales(
+        {axis: [one.mean_absolute for one in found if one] for axis, found in runs.items()},
+        {axis: one.unit for found in rungs for axis, one in found.free_run.items()},
+    )
     rows = []
     for number, rung in enumerate(rungs):
         cells = []
@@ -87,14 +96,14 @@ def _tabulate_free_runs(results: Results, rungs: Sequence[Rung], axes: Sequence[
     return Table(caption, " | ".join(("Version | Loop", *heads)), rows, " ".join(reasons))
 
 
-def _tabulate_drift(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
+def _tabulate_drift(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
     """How far each version drifts within each horizon: the medians."""
     horizons = horizons_of(rungs)
     drifts = {axis: [rung.median_drift(axis) for rung in rungs] for axis in axes}
-    scales = {
-        axis: choose_scale((x for one in found for x in one.values()), results.unit(axis))
-        for axis, found in drifts.items()
-    }
+    scales = _choose_scales(
+        {axis: [x for one in found for x in one.values()] for axis, found in drifts.items()},
+        {axis: one.unit for found in rungs for axis, one in found.drift.items()},
+    )
     rows = []
     for number, rung in enumerate(rungs):
         cells = []

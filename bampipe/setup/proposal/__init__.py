@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bampipe.data.survey import survey
+from bampipe.data.readers import lerobot
+from bampipe.data.survey import DRIVERS, Survey, survey
 from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.lists import join_names
@@ -57,13 +58,16 @@ class ProposedSession:
     passed: list[str]
 
 
-def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> ProposedSession:
+def propose(
+    folder: Path, device: str = "", names: Sequence[str] = (), episodes: str = ""
+) -> ProposedSession:
     """Propose a session file for the logs in ``folder``; writes nothing.
 
     Args:
         folder: with logs, in it or in folders below.
         device: a built-in device or a device file in the folder; guessed where empty.
         names: of the columns, where the logs are texts without a header.
+        episodes: those that are wanted of a data set of LeRobot, as 0:20.
 
     Raises:
         InputError: no logs, a session file is there already, or no such device.
@@ -74,7 +78,9 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
             where=str(folder),
             remedy=f"it is left alone; to run it: bampipe run {folder}",
         )
-    found = survey(folder, names)
+    found = survey(folder, names, episodes)
+    if not device and not found.of(*DRIVERS):
+        _refuse_goals(folder, found)
     notes = Notes(check=list(found.remarks))
     found, registers = signed_readings(fresh_readings(found, notes))
     chosen = find_device(folder, found, device)
@@ -115,6 +121,30 @@ def propose(folder: Path, device: str = "", names: Sequence[str] = ()) -> Propos
         passed=[
             f"{name}: {reason.removeprefix(name).lstrip(':, ')}" for name, reason in found.passed
         ],
+    )
+
+
+def _refuse_goals(folder: Path, found: Survey) -> None:
+    """Refuse a data set of LeRobot in which goals are all that is known of the drives.
+
+    Raises:
+        InputError: it is so.
+    """
+    columns = {column.name: column.values for column in found.columns}
+    if not any(name.startswith(lerobot.STATE) for name in columns):
+        return
+    loops = ""
+    if found.of("time"):
+        loops = lerobot.describe_loops(found.of("time")[0].values, columns)
+    raise InputError(
+        "no effort, current or load is recorded: what moved the joints is not known, so that"
+        " inertia, weight and friction cannot be found"
+        + (
+            f"; what can be: each servo's own loop follows its goal late ({loops})" if loops else ""
+        ),
+        where=str(folder),
+        remedy="record the servos' current or load with the state; or identify a loop with its load"
+        " by a device file whose input is the goal: --device FILE",
     )
 
 

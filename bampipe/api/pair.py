@@ -1,0 +1,387 @@
+"""Two sessions of one device side by side: what changed, and whether a model travels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from bampipe.api import actions
+from bampipe.api.opened import open_run
+from bampipe.data.run_folder import RunFolder
+from bampipe.declarations.model_file import identified, load_model
+from bampipe.diagnosis.shape import variables
+from bampipe.errors import InputError
+from bampipe.lists import join_names
+from bampipe.phrases import diagnosis as diagnosis_phrases
+from bampipe.phrases import pair as phrases
+from bampipe.physics import System, compile_model
+from bampipe.progress import Progress, silent
+from bampipe.results.diagnose import DiagnoseResult, ResidualMap
+from bampipe.results.floor import AT_FLOOR, FLOOR_SDS
+from bampipe.results.identify import BaseEstimate, IdentifyResult, ParameterEstimate
+from bampipe.results.intervals import NORMAL_95
+from bampipe.results.pair import (
+    FAMILY_ERROR,
+    Journey,
+    PairResult,
+    ParameterChange,
+    Refit,
+    SessionOfPair,
+    StateChange,
+    Travel,
+)
+from bampipe.results.validate import ValidateResult
+from bampipe.run import models
+from bampipe.trials.evidence import Evidence, gather_evidence
+from bampipe.trials.measured import read_measured_trials
+
+Array = NDArray[np.float64]
+
+_MAPPED = ("position", "velocity", "direction")
+_BINS, _FEWEST, _SHOWN = 8, 12, 5
+_LEAST_GAIN = 0.03
+"""Share of an axis' error above its limit that a further parameter has to remove."""
+_STEPS = 4
+"""Gauss-Newton steps of a refit of parameters in which the residual is not linear."""
+
+
+@dataclass(frozen=True)
+class _Side:
+    """A session with one of its models."""
+
+    name: str
+    run: RunFolder
+    model: str
+    system: System
+    p: Array
+    found: IdentifyResult
+    validated: ValidateResult
+
+    @classmethod
+    def read(cls, root: Path, name: str, model: str) -> _Side:
+        run, model = RunFolder(root), models.choose_model(root, model)
+        found, validated = run.read(IdentifyResult, model), run.read(ValidateResult, model)
+        system = compile_model(load_model(run, model))
+        p = identified(run, model, system)
+        return cls(name, run, model, system, p, found, validated)
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        return tuple(effect.name for effect in self.system.model.effects)
+
+    def predict(self, other: _Side) -> Evidence:
+        """This model on the trials of ``other``, not refitted."""
+        trials = read_measured_trials(other.run, self.system, timing=other.found.input_timing)
+        return gather_evidence(
+            self.system, trials.motions, trials.band, self.p, trials.folds, most_iterations=0
+        )
+
+    def covariance(self, evidence: Evidence) -> Array:
+        """Of the free parameters, (n_free, n_free); 0 of what is not estimated."""
+        known = self.found.covariance
+        free = [self.system.parameters[i].name for i in evidence.free]
+        frame = pd.DataFrame(known.matrix, list(known.names), list(known.names))
+        return np.asarray(frame.reindex(index=free, columns=free, fill_value=0.0))
+
+    def describe(self) -> SessionOfPair:
+        verdicts = {}
+        if self.run.exists(DiagnoseResult.file(self.model)):
+            found = self.run.read(DiagnoseResult, self.model)
+            verdicts = {axis: diagnosis_phrases.verdict(found, axis) for axis in found.axes}
+        return SessionOfPair(session=self.name, model=self.model, verdicts=verdicts)
+
+
+def compare_runs(
+    first: str | Path,
+    second: str | Path,
+    model: str = "",
+    progress: Progress = silent,
+) -> PairResult:
+    """Compare two identified sessions of one device.
+
+    Args:
+        first, second: run folders.
+        model: of both; the best confirmed one of each where empty.
+        progress: called with the share done.
+
+    Raises:
+        InputError: other devices, axes or parameters, one run twice, or a stage has not run.
+    """
+    roots = [open_run(run).root for run in (first, second)]
+    differ = roots[0].name != roots[1].name
+    a, b = (_Side.read(root, root.name if differ else str(root), model) for root in roots)
+    notes = _require_one_device(a, b)
+    progress(0.1, f"the model of {a.name} on {b.name}, and the reverse")
+    there, back = a.predict(b), b.predict(a)
+    journeys = []
+    for one, other, evidence in ((a, b, there), (b, a, back)):
+        progress(0.3, f"what the model of {one.name} lacks on {other.name}")
+        journeys.append(_describe_journey(one, other, evidence))
+    progress(0.9, "residual by state")
+    parameters, alone = _compare_parameters(a, b)
+    notes += [f"Only {name} has {join_names(some)}." for name, some in alone.items() if some]
+    pair = PairResult(
+        device=a.system.model.device.name,
+        first=a.describe(),
+        second=b.describe(),
+        parameters=parameters,
+        states=_compare_states(a, a.predict(a), there),
+        journeys=tuple(journeys),
+        notes=tuple(notes),
+    )
+    return pair.model_copy(update={"sentences": tuple(phrases.describe_pair(pair))})
+
+
+def _require_one_device(a: _Side, b: _Side) -> list[str]:
+    """Refuse sessions that cannot be compared; return what to know of others."""
+    if a.run.root.resolve() == b.run.root.resolve():
+        raise InputError("this is one run twice", where=str(a.run.root))
+    facts = [_list_facts(side.system) for side in (a, b)]
+    for what, here in facts[0].items():
+        there = facts[1][what]
+        if here != there:
+            only = (join_names(sorted(x - y)) or "none" for x, y in ((here, there), (there, here)))
+            raise InputError(
+                f"the sessions differ in {what}: {' only in '.join([next(only), a.name])},"
+                f" {' only in '.join([next(only), b.name])}",
+                where=str(b.run.root),
+                remedy="compare sessions of one device",
+            )
+    one, other = (side.system.model.device.declaration for side in (a, b))
+    keys = {*one, *other} - {"name", "summary", "source"}
+    changed = sorted(key for key in keys if one.get(key) != other.get(key))
+    notes = [f"The device files differ in {join_names(changed)}."] if changed else []
+    if a.effects != b.effects:
+        notes.append("The models differ, so that their common parameters stand beside others.")
+    return notes
+
+
+def _list_facts(system: System) -> dict[str, set[str]]:
+    """What sessions of one device have in common, whatever the effects in their models."""
+    of_effects = {q.name for effect in system.model.effects for q in effect.parameters}
+    own = (q for q in system.parameters if q.name not in of_effects)
+    return {
+        "device": {system.model.device.name},
+        "axes": {*system.coordinates},
+        "parameters": {f"{q.name} ({q.unit})" for q in own},
+    }
+
+
+def _compare_parameters(
+    a: _Side, b: _Side
+) -> tuple[dict[str, ParameterChange], dict[str, list[str]]]:
+    """Common parameters; and those of one model only, by session."""
+    tables: list[dict[str, ParameterEstimate | BaseEstimate]] = []
+    for side in (a, b):
+        every, inertial = side.found.parameters, side.found.inertial
+        bases = side.found.base_parameters or ()
+        tables.append(
+            {name: entry for name, entry in every.items() if name not in inertial}
+            | {base.combination: base for base in bases if base.shown}
+        )
+    common = [name for name in tables[0] if name in tables[1]]
+    pairs = {name: (tables[0][name], tables[1][name]) for name in common}
+    z = []
+    for x, y in pairs.values():
+        sd = math.hypot(x.sd, y.sd)
+        z.append((y.estimate - x.estimate) / sd if sd else 0.0)
+    p_values = correct_p_values(z)
+    changes = {
+        name: ParameterChange(
+            first=x.estimate, first_sd=x.sd, second=y.estimate, second_sd=y.sd, unit=x.unit,
+            standard_errors=ratio, p_value=p, changed=p < FAMILY_ERROR,
+        )
+        for (name, (x, y)), ratio, p in zip(pairs.items(), z, p_values, strict=True)
+    }  # fmt: skip
+    sides = zip((a, b), tables, strict=True)
+    return changes, {side.name: [n for n in some if n not in common] for side, some in sides}
+
+
+def correct_p_values(z: Sequence[float]) -> list[float]:
+    """Two-sided p-values of standard normal numbers, corrected for their number (Holm 1979)."""
+    p = np.array([math.erfc(abs(value) / math.sqrt(2.0)) for value in z])
+    order, found = np.argsort(p), np.ones(len(p))
+    found[order] = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
+    return [float(value) for value in np.minimum(found, 1.0)]
+
+
+def _compare_states(a: _Side, here: Evidence, there: Evidence) -> tuple[StateChange, ...]:
+    """Residual of the model of ``a`` on both sessions by state, in bins of equal count."""
+    spread, found, every = a.covariance(here), [], []
+    for axis, name in enumerate(a.system.coordinates):
+        pairs = zip(variables(here, axis), variables(there, axis), strict=True)
+        for one, other in ((x, y) for x, y in pairs if x.name in _MAPPED):
+            x, y = (np.concatenate(v.values) for v in (one, other))
+            edges = np.unique(np.quantile(np.append(x, y), np.linspace(0.0, 1.0, _BINS + 1)))
+            if one.name == "direction":
+                edges = np.array([-1.5, 0.0, 1.5])
+            bins = [_bin_residual(e, axis, v, edges) for e, v in ((here, x), (there, y))]
+            both = bins[0].index.intersection(bins[1].index)
+            first, second = (table.loc[both] for table in bins)
+            change = (second - first).to_numpy()[:, 4:]
+            of_model = np.einsum("bi,ij,bj->b", change, spread, change)
+            sd = np.sqrt(first["sd"] ** 2 + second["sd"] ** 2 + of_model)
+            z = ((second["mean"] - first["mean"]) / np.maximum(sd, 1e-300)).tolist()
+            found.append((name, one, first, second, len(z)))
+            every += z
+    p_values = iter(correct_p_values(every))
+    return tuple(
+        StateChange(
+            axis=axis, variable=variable.name, first=_make_map(first, variable.unit),
+            second=_make_map(second, variable.unit),
+            p_values=tuple(next(p_values) for _ in range(count)),
+        )
+        for axis, variable, first, second, count in found
+    )  # fmt: skip
+
+
+def _bin_residual(e: Evidence, axis: int, values: Array, edges: Array) -> pd.DataFrame:
+    """By bin: center, mean residual, its standard error sd, count, and the mean slopes.
+
+    The error is that of the scatter between trials where it is more than that of the samples.
+    """
+    use = np.concatenate([used[:, axis] for used in e.used])
+    trial = np.repeat(np.arange(len(e.used)), [len(used) for used in e.used])[use]
+    residual = np.concatenate([r[:, axis] for r in e.residual])[use]
+    slopes = np.concatenate([s[:, axis] for s in e.jacobian])[use]
+    which = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)[use]
+    frame = pd.DataFrame({"center": values[use], "mean": residual})
+    count = frame.groupby(which).size()
+    means = pd.concat([frame, pd.DataFrame(slopes)], axis=1).groupby(which).mean()
+    independent = np.maximum(count * e.band.independent_share[axis], 2.0)
+    within = frame["mean"].groupby(which).std(ddof=0) / np.sqrt(independent)
+    off = frame["mean"] - means["mean"].reindex(which).to_numpy()
+    by_trial = off.groupby([which, trial]).sum()
+    between = np.sqrt((by_trial**2).groupby(level=0).sum()) / count
+    means.insert(2, "sd", np.maximum(within, between))
+    means.insert(3, "count", count)
+    return means[count >= _FEWEST]
+
+
+def _make_map(bins: pd.DataFrame, unit: str) -> ResidualMap:
+    half = NORMAL_95 * bins["sd"]
+    return ResidualMap(
+        unit=unit, center=tuple(bins["center"]), mean=tuple(bins["mean"]),
+        low=tuple(bins["mean"] - half), high=tuple(bins["mean"] + half),
+        count=tuple(map(int, bins["count"])), variance_share=0.0,
+    )  # fmt: skip
+
+
+def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
+    """The model of one session on the trials of the other, and what would make it travel."""
+    judged = list(np.flatnonzero(e.folds.judged))
+    count = np.maximum(e.sums.count[judged].sum(axis=0), 1.0)
+    of_spread = np.einsum("kaij,ij->a", e.sums.xx[judged], model.covariance(e))
+    spread = np.sqrt(np.maximum(of_spread, 0.0) / count)
+    error = np.sqrt(e.sums.yy[judged].sum(axis=0) / count)
+    axes, own = {}, []
+    for i, axis in enumerate(e.system.coordinates):
+        judge = trials.validated.axes[axis]
+        least = judge.noise_floor
+        if least is None or model.validated.axes[axis].standing != "at_floor":
+            # It lacks something on its own trials, too, which is no change.
+            least = max(judge.held_out_rmse, least or 0.0)
+        limit = AT_FLOOR * math.hypot(least, spread[i]) + FLOOR_SDS * judge.noise_floor_sd
+        axes[axis] = Travel(
+            error=error[i], uncertainty=spread[i], own_error=judge.held_out_rmse,
+            noise_floor=judge.noise_floor, limit=limit, unit=judge.unit,
+            travels=bool(error[i] <= limit),
+        )  # fmt: skip
+        own.append(max(limit, 1e-12))
+    journey = Journey(model_of=model.name, trials_of=trials.name, effects=model.effects, axes=axes)
+    if not journey.failed:
+        return journey
+    limits = np.array(own)
+    alone = [_refit(e, [k], limits) for k in range(len(e.free))]
+    alone.sort(key=lambda one: float(np.sum((np.array([*one.errors.values()]) / limits) ** 2)))
+    together = _refit_together(e, limits)
+    update: dict[str, object] = {"alone": tuple(alone[:_SHOWN]), "together": together}
+    doubtful = {*journey.failed} - {*(together.travels if together is not None else ())}
+    doubtful |= {a for a, v in trials.validated.axes.items() if v.standing == "above_floor"}
+    if doubtful:
+        update |= _find_lacking(model, trials, doubtful)
+    return journey.model_copy(update=update)
+
+
+def _refit_together(e: Evidence, limits: Array) -> Refit | None:
+    """Parameters added one at a time while each brings some axis nearer to its limit."""
+    chosen: list[int] = []
+    error = np.sqrt(e.sums.yy.sum(axis=0) / np.maximum(e.sums.count.sum(axis=0), 1.0))
+    while len(chosen) < len(e.free) and np.any(error > limits):
+        left = [k for k in range(len(e.free)) if k not in chosen]
+        tried = {k: _solve(e, [*chosen, k], limits)[1] for k in left}
+        best = min(left, key=lambda k: _sum_excess(tried[k], limits))
+        if _sum_excess(tried[best], limits) > _sum_excess(error, limits) - _LEAST_GAIN:
+            break
+        chosen.append(best)
+        error = tried[best]
+    return _refit(e, chosen, limits) if chosen else None
+
+
+def _sum_excess(error: Array, limits: Array) -> float:
+    """Log of the errors over their limits, summed over the axes above them."""
+    return float(np.sum(np.log(np.maximum(error / limits, 1.0))))
+
+
+def _refit(e: Evidence, chosen: list[int], limits: Array) -> Refit:
+    """Refit the free parameters numbered ``chosen``, the others held."""
+    start, free = e.p, list(e.free)
+    step, error = _solve(e, chosen, limits)
+    if not all(e.system.constant[free[k]] for k in chosen):
+        for _ in range(_STEPS):
+            p = e.p.copy()
+            p[[free[k] for k in chosen]] += step
+            e = gather_evidence(e.system, e.motions, e.band, p, e.folds, most_iterations=0)
+            step, error = _solve(e, chosen, limits)
+    names = [e.system.parameters[free[k]].name for k in chosen]
+    change = e.p[[free[k] for k in chosen]] + step - start[[free[k] for k in chosen]]
+    return Refit(
+        changes=dict(zip(names, map(float, change), strict=True)),
+        errors=dict(zip(e.system.coordinates, map(float, error), strict=True)),
+        travels=tuple(
+            axis for axis, x, y in zip(e.system.coordinates, error, limits, strict=True) if x <= y
+        ),
+    )
+
+
+def _solve(e: Evidence, chosen: list[int], limits: Array) -> tuple[Array, Array]:
+    """A linear step of some free parameters, and the error on trials left out of it, (n_q,)."""
+    sums, groups = e.sums, np.array(e.folds.groups)
+    fitted, judged = np.array(e.folds.fitted), np.array(e.folds.judged)
+    xx = sums.xx[:, :, chosen][:, :, :, chosen]
+    xy, weight = sums.xy[:, :, chosen], limits**-2
+
+    def solve(rows: NDArray[np.bool_]) -> Array:
+        left = np.einsum("kaij,a->ij", xx[rows], weight)
+        right = np.einsum("kai,a->i", xy[rows], weight)
+        step = np.linalg.lstsq(left, right, rcond=1e-12)[0]
+        return np.asarray(np.clip(step, e.lower[chosen], e.upper[chosen]))
+
+    total = np.zeros(len(limits))
+    for group in np.unique(groups[judged]):
+        others = fitted & (groups != group)
+        step, inside = solve(others if others.any() else fitted), judged & (groups == group)
+        total += sums.yy[inside].sum(axis=0) - 2.0 * xy[inside].sum(axis=0) @ step
+        total += np.einsum("kaij,i,j->a", xx[inside], step, step)
+    count = np.maximum(sums.count[judged].sum(axis=0), 1.0)
+    return solve(fitted), np.sqrt(np.maximum(total, 0.0) / count)
+
+
+def _find_lacking(model: _Side, trials: _Side, axes: Collection[str]) -> dict[str, object]:
+    """What the model's like in the other session lacks on ``axes``; without one, its own model."""
+    root, found = trials.run.root, models.names(trials.run.root)
+    alike = (m for m in found if {*models.read(root, m).effects} == {*model.effects})
+    name = next(alike, trials.model)
+    if not trials.run.exists(DiagnoseResult.file(name)):
+        try:
+            actions.diagnose(root, name)
+        except InputError as error:
+            return {"reason": error.what}
+    lacking = trials.run.read(DiagnoseResult, name).axes
+    return {"lacking": {a: lacking[a] for a in axes if lacking[a].verdict != "nothing_missing"}}

@@ -1,0 +1,99 @@
+"""Two sessions of one device: tables for page and terminal, and the residual by state."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bampipe.report import style
+from bampipe.report.document import Block, Bullets, Callout, Document, Figure, Section, Table, Tone
+from bampipe.report.page import page
+from bampipe.report.sections.diagnosis import draw_map
+from bampipe.report.wording import count_noun, format_digits, format_p_value, format_unit
+from bampipe.results.pair import PairResult
+
+
+def tabulate_pair(pair: PairResult) -> list[Table]:
+    """Return parameters, verdicts, predictions and refits; tables without rows left out."""
+    sides, axes = (pair.first, pair.second), list(pair.journeys[0].axes)
+    parameters = [
+        (
+            name, *map(format_digits, (one.first, one.first_sd, one.second, one.second_sd)),
+            format_unit(one.unit), format_digits(one.standard_errors),
+            format_p_value(one.p_value), "yes" if one.changed else "",
+        )
+        for name, one in pair.parameters.items()
+    ]  # fmt: skip
+    verdicts = [
+        (axis, *(side.verdicts.get(axis, "not diagnosed") for side in sides)) for axis in axes
+    ]
+    travels = [
+        (
+            one.model_of, one.trials_of, axis,
+            *map(format_digits, (e.error, e.own_error, e.noise_floor, e.limit)),
+            format_unit(e.unit), "yes" if e.travels else "no",
+        )
+        for one in pair.journeys
+        for axis, e in one.axes.items()
+    ]  # fmt: skip
+    refits = [
+        (
+            one.model_of, ", ".join(f"{name} {by:+.3g}" for name, by in refit.changes.items()),
+            *(format_digits(refit.errors[axis]) for axis in axes), ", ".join(refit.travels),
+        )
+        for one in pair.journeys
+        for refit in (*one.alone, one.together)
+        if refit is not None and (refit is not one.together or len(refit.changes) > 1)
+    ]  # fmt: skip
+    a, b = (side.session for side in sides)
+    heads = " | ".join(f"{side.session} ({side.model})" for side in sides)
+    columns = f"Parameter | >{a} | >sd | >{b} | >sd | Unit | >Change/se | >p (Holm) | Changed"
+    found = [
+        Table("Parameters", columns, parameters, "Change/se: difference over its standard error."),
+        Table("Verdicts", f"Axis | {heads}", verdicts),
+        Table(
+            "Prediction of the other session's trials, RMSE",
+            "Model of | Trials of | Axis | >Error | >Own model | >Floor | >Limit | Unit | Travels",
+            travels,
+            "Own model: held-out error of that session's own. Travels: error within the limit.",
+        ),
+        Table(
+            "Some parameters refitted to the other session",
+            f"Model of | Refitted, others held ~1 | {''.join(f'>Error {x} | ' for x in axes)}"
+            "Travels on",
+            refits,
+        ),
+    ]
+    return [table for table in found if table.rows]
+
+
+def build_page(pair: PairResult) -> str:
+    """Return the page as HTML."""
+    changed = any(one.changed for one in pair.parameters.values())
+    changed |= any(one.failed for one in pair.journeys)
+    tone: Tone = "attention" if changed else "good"
+    verdict = "The device changed" if changed else "Nothing changed beyond chance"
+    blocks: list[Block] = [Callout(tone, verdict, "\n".join(pair.sentences))]
+    blocks += [Bullets(pair.notes)] * bool(pair.notes)
+    with style.use_style():
+        blocks += [*tabulate_pair(pair), *(_draw_states(pair, a) for a in pair.journeys[0].axes)]
+    title = f"{pair.first.session} and {pair.second.session}"
+    sections = (Section("What changed", tuple(blocks)),)
+    return page(Document(title, f"device {pair.device}", sections))
+
+
+def _draw_states(pair: PairResult, axis: str) -> Figure:
+    states = [one for one in pair.states if one.axis == axis and one.p_values]
+    figure, panels = style.make_grid(max(len(states), 1), 3, 1.8)
+    for panel, one in zip(panels, states, strict=False):
+        for shown, colour, side in (
+            (one.first, style.BLUE, pair.first),
+            (one.second, style.VERMILLION, pair.second),
+        ):
+            draw_map(panel, one.variable, shown, colour, side.session)
+        panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
+        panel.set_title(f"{count_noun(one.changed, 'bin')} of {len(one.p_values)} changed")
+        bands = [np.array(v) for m in (one.first, one.second) for v in (m.low, m.high)]
+        style.set_limits(panel, bands, zero=True)
+    panels[0].set_ylabel(style.label_axis("mean residual", pair.journeys[0].axes[axis].unit))
+    caption = f"Residual of the model of {pair.first.session} on {axis}, trials of both sessions."
+    return style.finish(figure, f"states-{axis}", caption, panels[:1])
