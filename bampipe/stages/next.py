@@ -17,8 +17,8 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.data.chain import read_tree
 from bampipe.data.robot_tree import identifier
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
-from bampipe.declarations.export import DRAWING
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
+from bampipe.declarations.recording import DRAWING
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session, system_of, without_members
 from bampipe.errors import InputError, NothingToDoError, choose_from

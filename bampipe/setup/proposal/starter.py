@@ -14,7 +14,8 @@ from bampipe.setup.proposal.gravity import Weight
 _NAMELESS = (
     "enc encoder pos position angle counts ticks displacement disp stroke present actual act"
     " measured meas current state value deg degree degrees rad radian radians vel velocity speed"
-    " header feedback column ang motion dist percent rec log data mot motor field run runs observation"
+    " header feedback column ang motion dist percent rec log data mot motor field run runs"
+    " observation"
 )
 """Words in the name of a position that name no axis."""
 _FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "eff", "torque", "tau"}
