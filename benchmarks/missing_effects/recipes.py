@@ -13,7 +13,7 @@ from independent.draws import draw_session
 
 VERSION = "1.0"
 TABLE = Path(__file__).with_name("recipes.tsv")
-PARTS = {"development": 50001, "test": 40001}
+PARTS = {"development": 50001, "test": 81001}
 """First seed of each part."""
 HIDDEN, CLEAN = 300, 150
 """Sessions of a part, with and without something hidden."""
