@@ -39,6 +39,8 @@ from bampipe.physics.vocabulary import Vocabulary, constant_symbol
 LONGEST_S = 60.0
 """Processor time that a derivation may take: the BAM takes 1 s, a planar arm with four links 23 s.
 Sympy's simplification has no bound of its own: 17 operations can take it an hour."""
+_LARGE = 100
+"""Operations of a slope that is not differentiated again."""
 
 
 def derive(model: Model, named_constants: bool = False) -> Equations:
@@ -389,7 +391,11 @@ def _find_dependence(
         slopes = [*by_axis.values()]
         slope_symbols, bodily = _collect_symbols(slopes), symbol in motion.numbers
         candidates = slope_symbols.intersection(p[: i + 1])
-        curving = {s for s in candidates if any(sp.diff(slope, s) != 0 for slope in slopes)}
+        large = [slope for slope in slopes if slope.count_ops() > _LARGE]
+        small = [slope for slope in slopes if slope not in large]
+        # What a large slope has a symbol of it bends by: terms that cancel are in small ones.
+        curving = candidates & _collect_symbols(large)
+        curving |= {s for s in candidates - curving if any(sp.diff(e, s) != 0 for e in small)}
         linear = symbol not in curving and symbol not in elsewhere
         constant = linear and not slope_symbols & varying
         lasts = constant and not bodily and slope_symbols.isdisjoint(motion.names)
