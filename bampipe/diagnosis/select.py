@@ -159,13 +159,18 @@ def select_effects(
             moved: Fit | None = None
             last |= number == _MOST_ROUNDS - 1
             better = [(c, k) for c, k in sorted(pool.values()) if c < none - _WORTH]
-            for _, keys in [] if last else better[:_TRIED]:
+            broken: list[set[Key]] = []
+            for _, keys in [] if last else better:
+                # More beside what did not keep its promise promises the same.
+                if len(broken) == _TRIED or any(one <= {*keys} for one in broken):
+                    continue
                 wider = change_set(current.recipe, keys)
                 members = frozenset(wider.effects)
                 if members in fits:
                     # By its own noise the set is not the better one: the earlier one is the last.
                     earlier = fits[members]
                     if earlier is None or not is_better(current, earlier, search.solve(keys)):
+                        broken.append({*keys})
                         continue
                     moved, last = earlier, True
                     break
@@ -173,6 +178,7 @@ def select_effects(
                 fits[members] = moved = session.try_fit(wider, start_of(search, keys, wider))
                 if moved is not None and is_better(current, moved, search.solve(keys)):
                     break
+                broken.append({*keys})
                 fits[members] = moved = None
             if moved is None:
                 # What promised more by its linear problem did not keep that when it was fitted.

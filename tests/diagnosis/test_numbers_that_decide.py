@@ -26,6 +26,7 @@ NUMERICAL = {
     "select": {
         "2": "tasks from which on processes share them",
         "_MOST_ROUNDS": "work, not a judgement",
+        "_TRIED": "work, not a judgement",
         "_WORTH": "half a nat: a set that is no better is weighed, but not fitted",
         "_MINOR": "what is put off until the rest is fitted, and weighed then",
     },
