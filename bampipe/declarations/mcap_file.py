@@ -54,7 +54,7 @@ def pack_recording(recording: Recording) -> bytes:
         message = {"level": _WARNING if marker.warns else _INFO, "message": marker.text}
         add(channel, marker.time, {**message, "name": recording.name, "file": "", "line": 0})
     if recording.frames:
-        _add_poses(recording, open_topic, add)
+        _add_poses(recording, open_topic, add, stamp)
     if recording.urdf:
         text = {"data": {"type": "string"}}
         add(
@@ -70,7 +70,7 @@ def _split(nanoseconds: int) -> dict[str, int]:
     return dict(zip(("sec", "nsec"), divmod(nanoseconds, 10**9), strict=True))
 
 
-def _add_poses(recording: Recording, open_topic: Any, add: Any) -> None:
+def _add_poses(recording: Recording, open_topic: Any, add: Any, stamp: Any) -> None:
     number, text = {"type": "number"}, {"type": "string"}
     transform = {
         "timestamp": _TIME, "parent_frame_id": text, "child_frame_id": text,
@@ -80,7 +80,7 @@ def _add_poses(recording: Recording, open_topic: Any, add: Any) -> None:
     fields = {"transforms": {"type": "array", "items": {"type": "object", "properties": transform}}}
     channel = open_topic("/tf", "foxglove.FrameTransforms", fields)
     for k, time in enumerate(recording.times):
-        at = _split(round(recording.start * 1e9) + round(time * 1e9))
+        at = _split(stamp(time))
         transforms = [
             {
                 "timestamp": at, "parent_frame_id": one.parent, "child_frame_id": one.child,

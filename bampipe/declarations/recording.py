@@ -158,7 +158,7 @@ def _pose_links(
     }
     frames: list[Frame] = []
     waiting = list(tree.joints)
-    while waiting:  # a link that hangs on none of them is placed already
+    while waiting:  # next is a joint whose parent link no waiting joint carries
         joint = next(j for j in waiting if all(j.parent != other.child for other in waiting))
         waiting.remove(joint)
         at = q.get(joint.name, np.zeros(len(times)))

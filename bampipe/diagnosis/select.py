@@ -161,25 +161,25 @@ def select_effects(
             better = [(c, k) for c, k in sorted(pool.values()) if c < none - _WORTH]
             broken: list[set[Key]] = []
             for _, keys in [] if last else better:
-                # More beside what did not keep its promise promises the same.
-                if len(broken) == _TRIED or any(one <= {*keys} for one in broken):
+                if len(broken) == _TRIED:
+                    break
+                # A larger set promises no more than the one in it whose fit fell short.
+                if any(one <= {*keys} for one in broken):
                     continue
                 wider = change_set(current.recipe, keys)
                 members = frozenset(wider.effects)
-                if members in fits:
-                    # By its own noise the set is not the better one: the earlier one is the last.
-                    earlier = fits[members]
-                    if earlier is None or not is_better(current, earlier, search.solve(keys)):
-                        broken.append({*keys})
-                        continue
-                    moved, last = earlier, True
-                    break
-                progress(0.15 + 0.1 * number, f"fitting {', '.join(names(keys))}")
-                fits[members] = moved = session.try_fit(wider, start_of(search, keys, wider))
+                if fresh := members not in fits:
+                    progress(0.15 + 0.1 * number, f"fitting {', '.join(names(keys))}")
+                    fits[members] = session.try_fit(wider, start_of(search, keys, wider))
+                moved = fits[members]
                 if moved is not None and is_better(current, moved, search.solve(keys)):
+                    # By its own noise a set fitted before is not the better one: it is the last.
+                    last |= not fresh
                     break
                 broken.append({*keys})
-                fits[members] = moved = None
+                moved = None
+                if fresh:
+                    fits[members] = None
             if moved is None:
                 # What promised more by its linear problem did not keep that when it was fitted.
                 pool = {n: (c, k) for n, (c, k) in pool.items() if c >= none - _WORTH}

@@ -265,8 +265,7 @@ class Session:
         stopping = self.replay_stopping(recipe, evidence)
         noise = describe_noise(replays, stopping, evidence, samples)
         likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
-        problem = likelihood.pose(evidence)
-        return Fit(recipe, evidence, likelihood, problem, problem.log_likelihood())
+        return Fit(recipe, evidence, likelihood, likelihood.pose(evidence))
 
     def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
         """Fit a model with noise that is the same for all samples of an axis, without replays."""
@@ -276,7 +275,7 @@ class Session:
         noise = describe_noise([nothing, nothing], nothing, evidence, samples)
         flat = Likelihood.of(evidence, samples, noise, 0.0, 0.0)
         evidence, problem = self._descend(recipe, evidence, flat)
-        return Fit(recipe, evidence, flat, problem, problem.log_likelihood())
+        return Fit(recipe, evidence, flat, problem)
 
     def try_fit(self, recipe: Recipe, start: Array) -> Fit | None:
         """`fit`; None where the model cannot be replayed."""
@@ -300,15 +299,15 @@ class Fit:
     Attributes:
         recipe: the model; evidence: its residual and slopes there.
         likelihood: noise and weights; problem: the weighted linear problem.
-        log_likelihood: by that noise, normal, nats: of fits with noise of different replays, the
-            most likely has the largest.
+        log_likelihood: under the normal noise of its replays, nats, to rank fits whose noise comes
+            from different replays; nan where the model was not fitted with such noise.
     """
 
     recipe: Recipe
     evidence: Evidence
     likelihood: Likelihood
     problem: Problem
-    log_likelihood: float
+    log_likelihood: float = float("nan")
 
     @cached_property
     def solved(self) -> Solved:
@@ -399,7 +398,8 @@ class Fit:
         group_of = np.array(e.folds.groups)
         groups = [group_of[here.trial] for here in samples]
         plain = [take_samples(e.residual, here, axis) for axis, here in enumerate(samples)]
-        slopes = [take_samples(e.slopes, here, axis) for axis, here in enumerate(samples)]
+        joined = e.slopes
+        slopes = [take_samples(joined, here, axis) for axis, here in enumerate(samples)]
         xx, xy, yy = p.sums()
         squares = np.zeros(len(samples))
         for group in np.unique(group_of):

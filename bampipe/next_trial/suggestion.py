@@ -69,8 +69,7 @@ def compare_alternatives(session: Session, final: Fit, asked: Ambiguity) -> Comp
     known = {q.name: v for q, v in zip(e.system.parameters, e.p, strict=True)}
     start = np.array([known[q.name] for q in system_of(recipe).parameters])
     evidence = session.linearise(recipe, start)
-    problem = final.likelihood.pose(evidence)
-    bare = Fit(recipe, evidence, final.likelihood, problem, problem.log_likelihood())
+    bare = Fit(recipe, evidence, final.likelihood, final.likelihood.pose(evidence))
     others = {*session.candidate_names(recipe)} - members
     with open_search(session, bare, others) as search:
         found = [_fit_alternative(search, recipe, *pair) for pair in asked.odds.items()]

@@ -23,7 +23,7 @@ def say_sizes(table: Mapping[str, Detectable], names: Iterable[str]) -> str:
 
 
 def say_trajectory(found: Trajectory) -> list[str]:
-    """Return what a trajectory for drives uses of its limits, and what nobody has checked."""
+    """Say how much of each limit a trajectory uses, and which limits were not stated."""
     most = []
     for name in ("speed", "acceleration", "effort"):
         shares = {

@@ -391,10 +391,10 @@ def _find_dependence(
         slopes = [*by_axis.values()]
         slope_symbols, bodily = _collect_symbols(slopes), symbol in motion.numbers
         candidates = slope_symbols.intersection(p[: i + 1])
-        large = [slope for slope in slopes if slope.count_ops() > _LARGE]
-        small = [slope for slope in slopes if slope not in large]
-        # What a large slope has a symbol of it bends by: terms that cancel are in small ones.
-        curving = candidates & _collect_symbols(large)
+        sized = [(slope, slope.count_ops() > _LARGE) for slope in slopes]
+        small = [slope for slope, is_large in sized if not is_large]
+        # A large slope is taken to vary with every symbol in it: terms cancel in small ones only.
+        curving = candidates & _collect_symbols(slope for slope, is_large in sized if is_large)
         curving |= {s for s in candidates - curving if any(sp.diff(e, s) != 0 for e in small)}
         linear = symbol not in curving and symbol not in elsewhere
         constant = linear and not slope_symbols & varying

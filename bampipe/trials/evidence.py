@@ -92,9 +92,12 @@ class Evidence:
             by_timing=tuple(self.by_timing[k] for k in trials if self.by_timing),
         )
 
-    @cached_property
+    @property
     def slopes(self) -> list[Array]:
-        """By trial, `jacobian` and behind it, where it is open, `by_timing`, (K, n_q, n)."""
+        """By trial, `jacobian` and, where the timing is open, `by_timing` behind it, (K, n_q, n).
+
+        Joined anew each time: kept, it would double the memory that an evidence takes.
+        """
         if not self.by_timing:
             return list(self.jacobian)
         pairs = zip(self.jacobian, self.by_timing, strict=True)

@@ -451,11 +451,12 @@ def _pose(
         ratio = np.array(likelihood.factors) / np.array(evidence.factors)
         weights = tuple(root * by for root, by in zip(weights, ratio, strict=True))
     timing = evidence.timing if evidence.by_timing else ()
-    n = evidence.slopes[0].shape[2]
+    slopes = evidence.slopes
+    n = slopes[0].shape[2]
     full = []
     for axis, here in enumerate(samples):
         columns = np.zeros((len(here.rows), n + 2 * n_q))
-        columns[:, :n] = take_samples(evidence.slopes, here, axis)
+        columns[:, :n] = take_samples(slopes, here, axis)
         columns[:, n + axis] = -bias[axis]
         columns[:, n + n_q + axis] = -likelihood.noise.stopping[axis]
         full.append(columns * weights[axis][:, None])

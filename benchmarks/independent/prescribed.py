@@ -83,7 +83,7 @@ def record(
         state = own.bit_generator.state
         q = _waves(own, t, c.pace)[0]
         own.bit_generator.state = state
-        x, u, w = _waves(own, t + late, c.pace)  # what the drive is told now acts then
+        x, u, w = _waves(own, t + late, c.pace)  # a command acts `late` seconds after it is logged
         sign = np.tanh(u / SIGN_WIDTH)
         dry = truth["coulomb.joint"] + falls * np.exp(-((u / falls_over) ** 2))
         torque = truth["inertia"] * w + truth["moment"] * np.sin(x) + dry * sign
