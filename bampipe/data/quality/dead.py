@@ -38,7 +38,7 @@ def find_equal_runs(values: np.ndarray, t: np.ndarray) -> list[tuple[int, int]]:
     changes = np.diff(values)
     moved = changes[changes != 0.0]
     # A set-point goes on the way it went, and an input at its limit stays there.
-    if moved.size < 2 or np.mean(moved[1:] * moved[:-1] < 0.0) < _UNSTEADY:
+    if moved.size < 2 or np.mean(np.diff(np.sign(moved)) != 0.0) < _UNSTEADY:
         return []
     starts, stops = find_runs(changes == 0.0)
     stops = stops + 1
