@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.estimate import filterpy_engine
-from bampipe.estimate.unscented import FilterModel, FilterSettings, Trial, filter_trials
+from bampipe.estimate.unscented import ALPHA, FilterModel, FilterSettings, Trial, filter_trials
 from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.system import System
@@ -266,7 +266,7 @@ def by_dynamax(problem: Problem, python: str, folder: Path, repeats: int) -> Mea
         folder / "problem.npz", u=trial.u, y=trial.y, p=problem.model.parameters[:-1],
         nx=problem.model.n_states, noise_sd=settings.noise_sd, reading_sd=settings.reading_sd,
         mean=ahead.mean[1], covariance=ahead.covariance[1], dt=dt,
-        steps=int(steps[0]), alpha=settings.points.alpha,
+        steps=int(steps[0]), alpha=ALPHA,
         logarithmic=int(np.flatnonzero(problem.model.logarithmic)[0]), repeats=repeats,
     )  # fmt: skip
     source = ["def derivative(x, u, p, w, dx):", *body_of_derivative(problem.system)]

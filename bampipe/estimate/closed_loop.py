@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bampipe.compiled import njit, record_type
 from bampipe.estimate.runge_kutta import runge_kutta
-from bampipe.estimate.simulation import PLANT, make_plant, require_finite, stable_steps
+from bampipe.estimate.simulation import MAX_STEP_S, PLANT, make_plant, require_finite, stable_steps
 from bampipe.model_functions import COMMAND, DERIVATIVE, MEASURE
 
 Array = NDArray[np.float64]
@@ -116,7 +116,6 @@ def simulate_controlled(
     force: Sequence[int],
     rate_hz: float = 0.0,
     limits: Sequence[tuple[float, float]] = (),
-    max_step: float = 2.5e-4,
 ) -> tuple[Array, Array, Array]:
     """Integrate machine and controller together from ``x0``: a free run in closed loop.
 
@@ -124,7 +123,7 @@ def simulate_controlled(
     it integrates starts where its first command is nearest to the recorded one.
 
     Args:
-        derivative, x0, p, dt, width, n_noise, max_step: as in `simulate`.
+        derivative, x0, p, dt, width, n_noise: as in `simulate`.
         measure: compiled h(x, u, p, y): what the encoders read.
         command: compiled c(y, r, s, out): commands from readings, references, gains and the states
             of the controller; and the rates of these.
@@ -148,7 +147,7 @@ def simulate_controlled(
     total[:, columns] = 0.0
     readings = np.zeros((len(u), 2 * len(width)))
     bounds = np.array(limits, dtype=np.float64).reshape(-1, 2)
-    plant = make_plant(p, n_noise, width, max_step)
+    plant = make_plant(p, n_noise, width, MAX_STEP_S)
     measure(x[0], total[0], plant.p, readings[0])
     states = _first_states(command, readings[0], references[0], recorded, bounds)
     controller = _Controller(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from bampipe.errors import InputError
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.unscented import (
+    ALPHA,
     FilteredTrial,
     FilterFailure,
     FilterModel,
@@ -129,8 +130,7 @@ def _make_filter(
         model.measure(point[:nx].copy(), u[k], p, reading)
         return reading[settings.observed].copy()
 
-    chosen = settings.points
-    points = MerweScaledSigmaPoints(n + nw, chosen.alpha, chosen.beta, chosen.kappa)
+    points = MerweScaledSigmaPoints(n + nw, ALPHA, 2.0, 0.0)
     ukf = UnscentedKalmanFilter(n + nw, ny, 1.0, hx=read, fx=move, points=points)
     ukf.x = np.concatenate([trial.x, np.zeros(n - nx + nw)])
     ukf.P = np.zeros((n + nw, n + nw))

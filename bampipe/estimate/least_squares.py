@@ -104,25 +104,6 @@ class Problem:
     multiplied: NDArray[np.int64] | None = None
 
 
-@dataclass(frozen=True)
-class Minimum:
-    """Where a descent to the least squares ended.
-
-    Attributes:
-        p: (np,) parameters, those not free as given.
-        stacked: by trial, linearised at ``p``.
-        iterations: Gauss-Newton steps taken.
-        converged: whether the last step no longer changed the fit.
-        at_bound: (n_free,) which parameters ended on a bound.
-    """
-
-    p: Array
-    stacked: tuple[Stacked, ...]
-    iterations: int
-    converged: bool
-    at_bound: NDArray[np.bool_]
-
-
 def residual_and_slopes(
     problem: Problem, trial: int, p: Array, columns: Sequence[int] | None = None
 ) -> tuple[Array, Array]:
@@ -196,7 +177,7 @@ def minimise(
     known: KnownSlopes | None = None,
     at_start: Sequence[Stacked] | None = None,
     tolerance: float = 1e-10,
-) -> Minimum:
+) -> Linearised:
     """Find the free parameters that leave the least squares, weighted by axis, within their bounds.
 
     Each axis is weighted by the scatter of its own residual, which is iterated; parameters in
@@ -223,17 +204,18 @@ def minimise(
         _require_finite(problem, trial, s, p)
     if most_iterations and sum(int(s.used.sum()) for s in stacked) <= problem.free.size:
         raise ValueError("fewer samples clear of standstill than parameters")
-    start_at = _Linearised(problem, chosen, p, stacked)
-    found = descend(start_at, problem.lower, problem.upper, most_iterations, tolerance)
-    return Minimum(
-        p=found.last.p, stacked=tuple(found.last.stacked), iterations=found.iterations,
-        converged=found.converged, at_bound=found.at_bound,
-    )  # fmt: skip
+    start_at = Linearised(problem, chosen, p, stacked)
+    return descend(start_at, problem.lower, problem.upper, most_iterations, tolerance)
 
 
 @dataclass(frozen=True)
-class _Linearised:
-    """The chosen trials, linearised at parameters ``p``: what `descend` follows."""
+class Linearised:
+    """Trials, linearised at parameters ``p``: what `descend` follows.
+
+    Attributes:
+        problem, trials: the model, and the numbers of the trials.
+        p: (np,) parameters, those not free as given; stacked: by trial, linearised there.
+    """
 
     problem: Problem
     trials: Sequence[int]
@@ -269,7 +251,7 @@ class _Linearised:
             moment -= slope.T @ (s.residual * weight).reshape(-1)
         return normal, moment
 
-    def moved(self, value: Array, share: float) -> _Linearised:
+    def moved(self, value: Array, share: float) -> Linearised:
         p = self.p.copy()
         p[self.problem.free] = value
         if self.problem.linear:

@@ -92,7 +92,7 @@ class NormalEquations:
         """
         normal = np.tensordot(weight, self.xx.sum(axis=0), 1) + np.diag(self.precision)
         moment = weight @ self.xy.sum(axis=0) + self.precision * self.known
-        return solve_bounded(normal, moment, lower, upper).x
+        return solve_bounded(normal, moment, lower, upper)
 
     def squares(self, values: Array) -> Array:
         """Sum of squared residuals left with coefficients ``values`` (P,), (K, n_q).

@@ -17,7 +17,7 @@ bounds are kept all along, by clamping sigma points and mean.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -25,12 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.estimate.propagation import Estimated
-from bampipe.estimate.sigma_points import SigmaPoints
 from bampipe.estimate.square_root import (
     DONE,
     INNOVATION_NOT_POSITIVE,
     NOT_FINITE,
-    STATE_NOT_POSITIVE,
     Levels,
     Output,
     Samples,
@@ -42,11 +40,12 @@ Array = NDArray[np.float64]
 
 _REASONS = {
     NOT_FINITE: "the predicted motion grew without bound",
-    STATE_NOT_POSITIVE: "the covariance of the state lost positive definiteness",
     INNOVATION_NOT_POSITIVE: "the covariance of the innovation lost positive definiteness",
 }
-
-
+ALPHA = (2.0 - 3.0**0.5) ** 0.5
+"""Spread of the scaled sigma points (Van der Merwe 2004, with beta = 2 and kappa = 0): the smallest
+that makes no weight in a covariance negative. That of the central point is zero with it, so that a
+covariance is a sum of positive terms; with the usual 1e-3, rounding alone costs nine digits."""
 _NOT_A_SPREAD = (
     "the spread of the parameters is not positive definite any more: priors far too wide, or"
     " parameters that cannot be distinguished"
@@ -152,7 +151,6 @@ class FilterSettings:
         reading_sd: (ny,) standard deviation of the measurement noise.
         noise_sd: (nw,) standard deviation of the process noise of one sample.
         walk_sd: (nt,) random walk of the parameters, per square root of a second.
-        points: spread and weights of the sigma points.
         longest_step: longest Runge-Kutta step, s.
         stride: store the distribution of every so many samples.
     """
@@ -161,7 +159,6 @@ class FilterSettings:
     reading_sd: Array
     noise_sd: Array
     walk_sd: Array
-    points: SigmaPoints = field(default_factory=SigmaPoints)
     longest_step: float = 1e-3
     stride: int = 1
 
@@ -265,17 +262,13 @@ def filter_trials(
         FilterFailure: the covariance lost positive definiteness or a number is not finite.
     """
     nx = model.n_states
-    n = nx + model.free.size
 
     def filter_one(
         index: int, trial: Trial, theta: Array, covariance: Array
     ) -> tuple[FilteredTrial, Array, Array]:
         mean = np.concatenate([trial.x, theta])
-        joint = np.zeros((n, n))
-        joint[:nx, :nx] = np.diag(np.square(trial.x_sd))
-        joint[nx:, nx:] = covariance
         try:
-            root = lower_root(joint)
+            root = join_roots(trial.x_sd, covariance)
             filtered = run_kernel(model, settings, trial, mean, root, settings.stride)
         except FilterFailure as failure:
             raise FilterFailure(index, failure.sample, failure.reason) from None
@@ -340,10 +333,10 @@ def run_kernel(
         _array(model.logarithmic, np.bool_), *model.range, _array(settings.observed, np.int64),
         model.reads_parameters,
     )  # fmt: skip
-    spread, _, centre, other = settings.points.weights(n + nw)
+    spread = ALPHA**2 * (n + nw)
     levels = Levels(
         _array(settings.noise_sd), _array(settings.walk_sd), _array(settings.reading_sd),
-        spread, centre, other, float(settings.longest_step), int(stride),
+        spread, 0.5 / spread, float(settings.longest_step), int(stride),
     )  # fmt: skip
     samples = Samples(*map(_array, (trial.t, trial.u, trial.input_curvature, trial.y)))
     ended, sample = filter_square_root(
@@ -388,22 +381,25 @@ def _array(values: Any, kind: type = np.float64) -> NDArray[Any]:
     return np.require(values, dtype=kind, requirements=["C", "W"])
 
 
-def lower_root(covariance: Array) -> Array:
-    """Return the lower L with L L^T = covariance (n, n); zero variances give zero columns.
+def join_roots(x_sd: Array, covariance: Array) -> Array:
+    """Lower root (n, n) of the covariance of a state and of parameters that are independent of it.
 
-    Rounding may leave a covariance of nearly dependent variables a little short of definite: then
-    a part in 10^12 is added to each variance.
+    Zero variances give zero columns. Rounding may leave a covariance of nearly dependent variables
+    a little short of definite: then a part in 10^12 is added to each variance.
+
+    Args:
+        x_sd: (nx,) standard deviations of the state; covariance: (nt, nt) of the parameters.
 
     Raises:
         ValueError: the matrix is not positive semidefinite.
     """
-    known = np.diag(covariance) == 0.0
-    root = np.zeros_like(covariance)
-    keep = np.flatnonzero(~known)
-    part = covariance[np.ix_(keep, keep)]
+    nx, n = x_sd.size, x_sd.size + len(covariance)
+    joint, root = np.zeros((2, n, n))
+    joint[:nx, :nx], joint[nx:, nx:] = np.diag(np.square(x_sd)), covariance
+    keep = np.ix_(*2 * [np.flatnonzero(np.diag(joint))])
     for added in (0.0, 1e-12):
         try:
-            root[np.ix_(keep, keep)] = np.linalg.cholesky(part + added * np.diag(np.diag(part)))
+            root[keep] = np.linalg.cholesky(joint[keep] + added * np.diag(np.diag(joint[keep])))
         except np.linalg.LinAlgError:
             continue
         return root

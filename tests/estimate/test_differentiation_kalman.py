@@ -77,9 +77,8 @@ def test_likelihood_recovers_the_noises(order: int) -> None:
     }
     fit = fits[order]
     assert fit.model.noise_sd == pytest.approx(noise_sd, rel=0.05)
-    assert fit.model.density == pytest.approx(density, rel=0.4)
-    assert fit.innovation_variance == pytest.approx(1.0)
-    assert not fit.at_limit
+    ratio = density / noise_sd**2 / RATE ** (2 * order - 1)
+    assert fit.model.ratio == pytest.approx(ratio, rel=0.4)
     assert max(fits, key=lambda k: fits[k].log_likelihood) == order
 
 
@@ -117,7 +116,8 @@ def test_bands_hold_for_the_motion_they_assume(order: int) -> None:
 
 @pytest.mark.parametrize("order", ks.ORDERS)
 def test_bandwidth_and_ratio_are_inverse(order: int) -> None:
-    assert ks.bandwidth(ks.ratio_for(22.0, order, RATE), order, RATE) == pytest.approx(22.0)
+    model = ks.MotionModel(order, 1e-5, ks.ratio_for(22.0, order, RATE), RATE)
+    assert model.bandwidth_hz == pytest.approx(22.0)
 
 
 def test_a_trial_at_rest() -> None:
