@@ -15,11 +15,10 @@ from __future__ import annotations
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import lsq_linear
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array, Flags
 
 _RANK_TOLERANCE = 1e-12
 """Of the largest eigenvalue, at unit diagonal: what lies below is rounding."""
@@ -31,7 +30,7 @@ _SMALLEST_SHARE = 1e-3
 """Of a Gauss-Newton step, after which halving it ends."""
 
 
-def scaled_eigenbasis(matrix: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+def scaled_eigenbasis(matrix: Array) -> tuple[Array, Array, Array, Flags]:
     """Eigenvectors of normal equations in coefficients that make their diagonal one.
 
     A coefficient that nothing is known of keeps its scale and is a null vector by itself.
@@ -104,7 +103,7 @@ def _solve_within(normal: Array, moment: Array, lower: Array, upper: Array) -> A
     return np.asarray(np.clip(x, lower, upper))
 
 
-def _least_norm(basis: tuple[Array, Array, Array, NDArray[np.bool_]], moment: Array) -> Array:
+def _least_norm(basis: tuple[Array, Array, Array, Flags], moment: Array) -> Array:
     """Solution without bounds, (n,), zero along directions that are undetermined.
 
     Args:

@@ -7,7 +7,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.signal import butter, periodogram, sosfiltfilt
 
-from bampipe.estimate.differentiation import Array, Derivatives, extend, linear_noise_gains
+from bampipe.arrays import Array
+from bampipe.estimate.differentiation import Derivatives, extend, linear_noise_gains
 
 _REACH = 6
 """Samples on either side that a derivative of an input is made of."""

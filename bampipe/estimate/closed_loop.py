@@ -7,14 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import float64, int64, void
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Indices
 from bampipe.compiled import njit, record_type
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.simulation import MAX_STEP_S, PLANT, make_plant, require_finite, stable_steps
 from bampipe.model_functions import COMMAND, DERIVATIVE, MEASURE
-
-Array = NDArray[np.float64]
 
 _V = float64[::1]
 _M = float64[:, ::1]
@@ -30,7 +28,7 @@ class _Controller(NamedTuple):
         out: (nf + n_s,) its commands and the rates of its states.
     """
 
-    columns: NDArray[np.int64]
+    columns: Indices
     ticks: int
     states: Array
     limits: Array

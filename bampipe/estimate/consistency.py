@@ -12,10 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array, Flags
 
 FEWEST_READINGS = 0.1
 """Share of a window below which a reading is of no use; a slow sensor leaves cells empty too."""
@@ -96,7 +95,7 @@ class WindowTest:
         self.windows = 0
         self._waiting = np.zeros((0, 1 + 2 * n_readings))
 
-    def take(self, nis: Array, squares: Array, present: NDArray[np.bool_]) -> list[float]:
+    def take(self, nis: Array, squares: Array, present: Flags) -> list[float]:
         """Add samples; return the mean NIS of a reading of each window that is now whole.
 
         Args:

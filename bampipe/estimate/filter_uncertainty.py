@@ -11,12 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.unscented import Stored
-
-Array = NDArray[np.float64]
-
 
 _BLOCKS = 3
 """Least blocks for each parameter: fewer hardly scatter, for their scores add up to nothing."""

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.unscented import (
@@ -25,8 +25,6 @@ from bampipe.estimate.unscented import (
     Trial,
     in_sequence,
 )
-
-Array = NDArray[np.float64]
 
 
 def filter_trials_by_filterpy(

@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.signal import butter, find_peaks, sosfiltfilt
 
+from bampipe.arrays import Array
 from bampipe.estimate.white_noise import white_noise_sd
-
-Array = NDArray[np.float64]
 
 _TREMOR_HZ = 5.0
 _PROMINENCE = 0.3

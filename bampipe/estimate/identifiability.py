@@ -13,12 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import rfft
 
+from bampipe.arrays import Array
 from bampipe.estimate.bounded import scaled_eigenbasis
-
-Array = NDArray[np.float64]
 
 _WEAK, _SMALLEST_PART = 0.1, 0.3
 """Eigenvalue of the information scaled to a unit diagonal below which a direction is weak, and

@@ -23,8 +23,9 @@ import numpy as np
 from numba import boolean, float64, int64, void
 from scipy.optimize import minimize_scalar
 
+from bampipe.arrays import Array, Flags
 from bampipe.compiled import njit, record_type
-from bampipe.estimate.differentiation import Array, Derivatives, Flags
+from bampipe.estimate.differentiation import Derivatives
 
 ORDERS = (3, 4)
 _SETTLED = 1e-10

@@ -14,14 +14,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.errors import InputError
 from bampipe.estimate.bounded import descend, invert_scaled
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
-
-Array = NDArray[np.float64]
 
 BLOCKS_A_PARAMETER = 3
 """Fewer blocks a parameter, and their scatter knows a standard deviation to a third only. Of 320
@@ -48,7 +46,7 @@ class Stacked:
 
     residual: Array
     slope: Array
-    used: NDArray[np.bool_]
+    used: Flags
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class KnownSlopes:
     """
 
     by_trial: Sequence[Array] | Mapping[int, Array]
-    holds: NDArray[np.bool_]
+    holds: Flags
 
 
 @dataclass(frozen=True)
@@ -90,18 +88,18 @@ class Problem:
 
     residual: Residual
     n_trials: int
-    free: NDArray[np.int64]
+    free: Indices
     lower: Array
     upper: Array
     step: Array
     linear: bool
-    constant: NDArray[np.bool_]
+    constant: Flags
     band: Band
-    standstill: Sequence[NDArray[np.bool_]]
+    standstill: Sequence[Flags]
     precision: Array
     known: Array
     slopes: Slopes | None = None
-    multiplied: NDArray[np.int64] | None = None
+    multiplied: Indices | None = None
 
 
 def residual_and_slopes(
@@ -318,7 +316,7 @@ def _scatter(stacked: Sequence[Stacked]) -> Array:
 def covariance_by_blocks(
     rows: Sequence[tuple[Array, Array]],
     precision: Array,
-    blocks: Sequence[NDArray[np.int64]],
+    blocks: Sequence[Indices],
     independent: Sequence[float],
 ) -> Array:
     """Covariance (P, P) by the scatter of the scores of blocks of time (White; Newey and West).

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterModel,
@@ -15,8 +15,6 @@ from bampipe.estimate.unscented import (
     join_roots,
     run_kernel,
 )
-
-Array = NDArray[np.float64]
 
 
 class OnlineFilter:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import savgol_filter
 
-from bampipe.estimate.differentiation import Array, Derivatives, linear_noise_gains
+from bampipe.arrays import Array
+from bampipe.estimate.differentiation import Derivatives, linear_noise_gains
 
 _DEGREE = 4
 

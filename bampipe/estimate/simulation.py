@@ -15,16 +15,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import float64, int64, void
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from bampipe.arrays import Array, Indices
 from bampipe.compiled import njit, record_type
 from bampipe.errors import InputError
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.triangular import cholesky, forward_substitute
 from bampipe.model_functions import DERIVATIVE
-
-Array = NDArray[np.float64]
 
 _V = float64[::1]
 _M = float64[:, ::1]
@@ -85,11 +83,11 @@ class _Arm(NamedTuple):
         at, moving: (n,) places in the state of what it moves by each coordinate, and of its rate.
     """
 
-    at: NDArray[np.int64]
-    moving: NDArray[np.int64]
-    force: NDArray[np.int64]
-    rate: NDArray[np.int64]
-    curvature: NDArray[np.int64]
+    at: Indices
+    moving: Indices
+    force: Indices
+    rate: Indices
+    curvature: Indices
     natural_frequency: float
     damping_ratio: float
     bandwidth: float
@@ -98,7 +96,7 @@ class _Arm(NamedTuple):
 class _Brakes(NamedTuple):
     """Columns with the commands, and gain (T, n_q)."""
 
-    columns: NDArray[np.int64]
+    columns: Indices
     gain: Array
 
 
@@ -310,7 +308,7 @@ def simulate_tracking(
     brake_gain: Array | None = None,
     smooth: Sequence[int] = (),
     max_step: float = MAX_STEP_S,
-    moved_first: NDArray[np.int64] | None = None,
+    moved_first: Indices | None = None,
 ) -> tuple[Array, Array]:
     """Integrate the model under given inputs plus an arm that holds it near a given motion.
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import float64, int64, types
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.compiled import njit, record_type
 from bampipe.estimate.propagation import (
     ESTIMATED,
@@ -29,8 +29,6 @@ from bampipe.estimate.triangular import (
     transpose,
 )
 from bampipe.model_functions import DERIVATIVE_ROWS, MEASURE_ROWS
-
-Array = NDArray[np.float64]
 
 DONE = 0
 NOT_FINITE = 1

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.estimate.propagation import Estimated
 from bampipe.estimate.square_root import (
     DONE,
@@ -35,8 +36,6 @@ from bampipe.estimate.square_root import (
     allocate,
     filter_square_root,
 )
-
-Array = NDArray[np.float64]
 
 _REASONS = {
     NOT_FINITE: "the predicted motion grew without bound",
@@ -94,13 +93,13 @@ class FilterModel:
     measure_rows: Callable[..., Any]
     n_states: int
     parameters: Array
-    free: NDArray[np.int64]
+    free: Indices
     lower: Array
     upper: Array
     reads_parameters: bool = True
 
     @cached_property
-    def logarithmic(self) -> NDArray[np.bool_]:
+    def logarithmic(self) -> Flags:
         """(nt,) which parameters are estimated as logarithms."""
         return np.asarray(self.lower > 0.0)
 
@@ -155,7 +154,7 @@ class FilterSettings:
         stride: store the distribution of every so many samples.
     """
 
-    observed: NDArray[np.int64]
+    observed: Indices
     reading_sd: Array
     noise_sd: Array
     walk_sd: Array

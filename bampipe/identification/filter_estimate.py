@@ -7,8 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
 from bampipe.estimate.filter_uncertainty import choose_block, leave_out, sandwich_covariance
 from bampipe.estimate.unscented import (
@@ -55,8 +55,6 @@ from bampipe.results.rounding import significant
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.disturbances import part_trials
 from bampipe.trials.motion import Motion, trial_names, trial_sizes
-
-Array = NDArray[np.float64]
 
 _RESTARTS = 3
 """Searches from least squares, each with four times the process noise of the one before."""
@@ -151,7 +149,7 @@ class _Filtering:
         """(nt,) how well that is known."""
         return np.append(self.task.known, self.late_sd)
 
-    def clear(self, place: int) -> NDArray[np.bool_]:
+    def clear(self, place: int) -> Flags:
         """Which samples of a trial are clear of reversals, (T, n_q)."""
         return clear_of_reversal_mask(self.motions[place], self.task.system, self.trials[place].t)
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.next_trial.motion import HASTY, Rehearsal
 from bampipe.next_trial.primitives import (
     Primitive,
@@ -17,8 +17,6 @@ from bampipe.next_trial.primitives import (
     vary_surroundings,
 )
 from bampipe.trials.motion import Motion
-
-Array = NDArray[np.float64]
 
 _VERSIONS = (1, 2, 3, 4, HASTY)
 """As followed by different people."""

@@ -9,9 +9,9 @@ from itertools import combinations
 from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_residual
 from bampipe.diagnosis.session import Fit, Session
@@ -21,8 +21,6 @@ from bampipe.trials.folds import Folds
 from bampipe.trials.likelihood import Likelihood, Noise, lay_out_samples, take_samples
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
-
-Array = NDArray[np.float64]
 
 _STEP = 1e-3
 """Of a parameter, for the slope of what its effect adds to the residual."""
@@ -177,7 +175,7 @@ class Comparison:
         return seen, Likelihood.of(seen, samples, noise, c.bias_error, c.discrepancy)
 
     @cached_property
-    def _noise_by_speed(self) -> list[tuple[Array, Array, NDArray[np.int64]]]:
+    def _noise_by_speed(self) -> list[tuple[Array, Array, Indices]]:
         """By axis: speeds at hand in order, the variance of replays there, and their classes."""
         e, likelihood, found = self.fit.evidence, self.fit.likelihood, []
         speeds = [np.abs(m.qd[e.band.thinned_rows(len(m.t))]) for m in e.motions]

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.next_trial.choice import RankedDesign
 from bampipe.next_trial.discrimination import Comparison
 from bampipe.next_trial.motion import Rehearsal
@@ -16,8 +16,6 @@ from bampipe.next_trial.primitives import Primitive, find_beyond
 from bampipe.next_trial.sensitivity import Detectability
 from bampipe.next_trial.words import describe
 from bampipe.results.next import ExpectedSd, Move, Proposal, Purpose
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

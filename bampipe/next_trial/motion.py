@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.next_trial.primitives import PEAK, Envelope, Example, Primitive, Series, Stroke
 from bampipe.physics import System
 from bampipe.physics.device import LAST_ORDER, derivative
@@ -18,8 +18,6 @@ from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
 from bampipe.trials.replay import read_by_sensors
 from bampipe.trials.sensors import Sensors
-
-Array = NDArray[np.float64]
 
 _SPEED, _RANGE, _TURN, _DRIFT = 0.2, 0.15, 0.1, 0.05
 """How far people are off: speed and range of a trial, each turn and the slow drift of the middle,

@@ -8,8 +8,8 @@ from functools import reduce
 from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.next_trial.choice import RankedDesign
 from bampipe.next_trial.discrimination import Sums
 from bampipe.next_trial.forecast import Forecast, describe_moves
@@ -17,8 +17,6 @@ from bampipe.next_trial.precision import Expected
 from bampipe.next_trial.primitives import FEWEST_STROKES, Primitive
 from bampipe.next_trial.words import describe
 from bampipe.results.next import Plan, PlannedConfusion, PlannedSd, PlannedTrial
-
-Array = NDArray[np.float64]
 
 _MOST_DESIGNS = 8
 """In a plan: what more of them would do is better asked once these are there."""

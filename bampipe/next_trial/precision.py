@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.least_squares import stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.identification.filter_choice import FilterChoice
@@ -17,8 +17,6 @@ from bampipe.physics import System
 from bampipe.results.identify import IdentifyResult
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import problem_of
-
-Array = NDArray[np.float64]
 
 _BLOCK_S = FilterChoice.block_s
 _ALIKE = 0.2

@@ -6,13 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.physics import System
 from bampipe.trials.measured import trial_of_block
 from bampipe.trials.motion import Motion
-
-Array = NDArray[np.float64]
 
 PEAK = 1.875
 """Highest over mean speed of a stroke of least jerk; of the acceleration, over travel per time

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
+from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_residual
 from bampipe.diagnosis.criteria import Criteria
@@ -22,8 +22,6 @@ from bampipe.physics.parameter import Parameter
 from bampipe.results.next import Detectable
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
-
-Array = NDArray[np.float64]
 
 _FACTORS = np.geomspace(1e-4, 100.0, 241)
 """Of the typical strength: a factor of 1.06 from one to the next, with straight lines between. What

@@ -12,16 +12,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.primitives import PARTS, SHORTEST_S, Envelope, Primitive, Series
 from bampipe.physics.device import Device
 from bampipe.results.next import Extent
-
-Array = NDArray[np.float64]
 
 Form = Literal["csv", "json", "yaml"]
 HZ = 100.0

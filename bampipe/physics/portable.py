@@ -9,15 +9,12 @@ from __future__ import annotations
 import re
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.physics.codegen import portable_expressions
 from bampipe.physics.derivation import derive
 from bampipe.physics.model import Model
 
-Array = NDArray[np.float64]
 Language = Literal["python", "c"]
 
 _PYTHON = '''"""{title}

@@ -8,9 +8,9 @@ from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from bampipe.arrays import Array, Flags
 from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.expression import Name
 from bampipe.physics.newton_euler import (
@@ -32,8 +32,6 @@ from bampipe.schema import (
     Several,
     Text,
 )
-
-Array = NDArray[np.float64]
 
 _LARGEST = 1e9
 """Of a drawn body, kg, m or kg.m2: sums over the bodies stay below what a parameter can be."""
@@ -264,7 +262,7 @@ class Robot(Declaration):
         )
 
     @cached_property
-    def matters(self) -> NDArray[np.bool_]:
+    def matters(self) -> Flags:
         """Which inertial numbers change the force of some joint, (joints, 10)."""
         return np.abs(self.regressor).max(axis=0).reshape(-1, INERTIAL) > _NO_EFFECT * max(
             float(np.abs(self.regressor).max(initial=0.0)), 1.0

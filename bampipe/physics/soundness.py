@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.physics.model import Model
 from bampipe.physics.system import System, compile_model
-
-Array = NDArray[np.float64]
 
 _SINGULAR = 1e-9
 """Least eigenvalue of a mass matrix, beside the largest inertias along the motion."""

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bampipe import generated_code
+from bampipe.arrays import Array
 from bampipe.physics.system import System
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,16 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.errors import InputError, did_you_mean
 from bampipe.files import read_toml
 from bampipe.physics import Model, registry
 from bampipe.physics.device import Device
 from bampipe.physics.effect import BoundEffect, Effect
 from bampipe.physics.system import System, compile_model
-
-Array = NDArray[np.float64]
 
 STIFFNESS = {"rotary": 2200.0, "linear": 109e3}
 """Typical transmission stiffness (Table I), N.m/rad and N/m."""
