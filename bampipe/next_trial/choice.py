@@ -10,12 +10,7 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.next_trial.motion import HASTY, Rehearsal
-from bampipe.next_trial.primitives import (
-    Primitive,
-    find_beyond,
-    list_primitives,
-    vary_surroundings,
-)
+from bampipe.next_trial.primitives import Primitive, find_beyond, list_primitives, vary_surroundings
 from bampipe.trials.motion import Motion
 
 _VERSIONS = (1, 2, 3, 4, HASTY)

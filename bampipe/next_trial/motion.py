@@ -167,7 +167,7 @@ def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
     It is never faster than the trial, as it would be were its end joined to its beginning.
 
     Args:
-        example: the trial, and how it is followed; t: (T,) times from 0 on, s.
+        t: (T,) times from 0 on, s.
     """
     motion = example.motion
     clock = motion.t - motion.t[0]

@@ -50,11 +50,10 @@ def require_limits(device: Device, where: str) -> None:
             remedy="record the sentence of `bampipe next` by hand; --plan prints a sheet of trials",
         )
     axes = [c.name for c in device.coordinates]
-    stated = {
-        "lower and upper": device.limits,
-        "speed": device.speed_limits,
+    stated: dict[str, Mapping[str, object]] = {
+        "lower and upper": device.limits, "speed": device.speed_limits,
         "effort": device.effort_limits,
-    }
+    }  # fmt: skip
     lacking = {name: [a for a in axes if a not in known] for name, known in stated.items()}
     if any(lacking.values()):
         said = [f"{name} of {join_names(of, 3)}" for name, of in lacking.items() if of]

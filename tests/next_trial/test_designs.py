@@ -447,7 +447,7 @@ def made_precision(
 
 def test_twice_the_information_narrows_an_uncertainty_by_the_root_of_two():
     known = made_precision(0.01, 0.01, 10_000)
-    after = known.sd_with(known.information, 20.0)
+    after = known.expect(known.information, 20.0).median
     assert after[0] == pytest.approx(0.01 / np.sqrt(2.0), rel=1e-3)
     assert known.gain(known.information) == pytest.approx(0.5 * np.log(2.0))
 
@@ -462,15 +462,15 @@ def test_what_trials_are_worth_for_one_parameter_is_the_fall_of_its_logarithm():
 def test_what_few_blocks_widen_goes_with_more_of_them():
     few = made_precision(0.01 * np.sqrt(6 / 4), 0.01, 6)
     nothing = np.zeros((2, 2))
-    assert few.sd_with(nothing, 0.0)[0] < few.sd[0]
-    assert few.sd_with(nothing, 1000.0)[0] == pytest.approx(0.01, rel=0.02)
+    assert few.expect(nothing, 0.0).median[0] < few.sd[0]
+    assert few.expect(nothing, 1000.0).median[0] == pytest.approx(0.01, rel=0.02)
 
 
 def test_what_methods_disagree_by_is_diluted_and_what_a_calibration_leaves_open_stays():
     known = made_precision(np.sqrt(0.01**2 + 0.04**2 + 0.02**2), 0.01, 10_000, 0.04, 0.02)
     nothing, much = np.zeros((2, 2)), 1e6 * known.information
-    assert known.sd_with(nothing, 0.0)[0] == pytest.approx(known.sd[0], rel=1e-3)
-    assert known.sd_with(much, 20.0)[0] == pytest.approx(0.02, rel=1e-3)
+    assert known.expect(nothing, 0.0).median[0] == pytest.approx(known.sd[0], rel=1e-3)
+    assert known.expect(much, 20.0).median[0] == pytest.approx(0.02, rel=1e-3)
     threefold = known.expect(3.0 * known.information, 20.0)
     noise = 0.01**2 / 4.0 + 0.02**2
     # At least it is diluted; mostly it goes, for a method that was misled is found out.
