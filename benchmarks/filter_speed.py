@@ -104,10 +104,7 @@ def make_problem(device: str, seconds: float, seed: int) -> Problem:
         if name in frame:
             u[:, place] = frame[name]
     model = FilterModel(
-        derivative=system.derivative,
-        measure=system.measure,
-        derivative_rows=system.derivative_rows,
-        measure_rows=system.measure_rows,
+        functions=system,
         n_states=2 * n,
         parameters=np.append(system.prior, 0.0),
         free=np.arange(len(system.parameters)),

@@ -120,12 +120,12 @@ def _make_filter(
         late = p[-1] * ((u[k] - u[k - 1]) / dt - 0.25 * p[-1] * (c0 + c1))
         start, end = u[k - 1] - late, u[k] - late
         substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
-        advance(model.derivative, x, start, end, c0, c1, p, w, dt, substeps, work)
+        advance(model.functions.derivative, x, start, end, c0, c1, p, w, dt, substeps, work)
         return np.concatenate([x, point[nx:n], np.zeros(nw)])
 
     def read(point: Array, k: int) -> Array:
         model.place_parameters(point[nx:n], p)
-        model.measure(point[:nx].copy(), u[k], p, reading)
+        model.functions.measure(point[:nx].copy(), u[k], p, reading)
         return reading[settings.observed].copy()
 
     points = MerweScaledSigmaPoints(n + nw, ALPHA, 2.0, 0.0)

@@ -70,11 +70,8 @@ class FilterModel:
     """What the filter must know of a model.
 
     Attributes:
-        derivative: compiled f(x, u, p, w, dx), of type ``signatures.DERIVATIVE``.
-        measure: compiled h(x, u, p, y), of type ``signatures.MEASURE``.
-        derivative_rows, measure_rows: the same of many states at once, of types
-            ``signatures.DERIVATIVE_ROWS`` and ``signatures.MEASURE_ROWS``: what the compiled
-            filter calls, with all its sigma points.
+        functions: with the compiled functions ``derivative_rows`` and ``measure_rows``, of the
+            kinds in `bampipe.model_functions`; for filterpy also ``derivative`` and ``measure``.
         n_states: length of x.
         parameters: (np + 1,) values of all parameters, then the timing of the inputs: the time
             by which they were sampled after the positions, s. Channels of one sample are never
@@ -87,10 +84,7 @@ class FilterModel:
             not, the filter need not work them out twice a step.
     """
 
-    derivative: Callable[..., Any]
-    measure: Callable[..., Any]
-    derivative_rows: Callable[..., Any]
-    measure_rows: Callable[..., Any]
+    functions: Any
     n_states: int
     parameters: Array
     free: Indices
@@ -339,8 +333,8 @@ def run_kernel(
     )  # fmt: skip
     samples = Samples(*map(_array, (trial.t, trial.u, trial.input_curvature, trial.y)))
     ended, sample = filter_square_root(
-        model.derivative_rows, model.measure_rows, estimated, levels, samples, mean, root, out,
-        allocate(n, model.n_states, trial.u.shape[1], ny, nw, p),
+        model.functions.derivative_rows, model.functions.measure_rows, estimated, levels, samples,
+        mean, root, out, allocate(n, model.n_states, trial.u.shape[1], ny, nw, p),
     )  # fmt: skip
     if ended != DONE:
         raise FilterFailure(0, sample, _REASONS[ended])
@@ -366,11 +360,8 @@ def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
             break
         held |= outside
         shift = np.clip(theta, lower, upper)[held] - theta[held]
-        value = (
-            theta
-            + covariance[:, held]
-            @ np.linalg.lstsq(covariance[np.ix_(held, held)], shift, rcond=None)[0]
-        )
+        pull = np.linalg.lstsq(covariance[np.ix_(held, held)], shift, rcond=None)[0]
+        value = theta + covariance[:, held] @ pull
         value[held] = np.clip(theta, lower, upper)[held]
     return np.asarray(value)
 

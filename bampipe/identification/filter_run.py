@@ -255,10 +255,7 @@ def build_filter_model(
         half = 0.5 * float(np.median(np.diff(trials[0].t)))
         places, lower, upper = [*places, len(system.parameters)], [*lower, -half], [*upper, half]
     return FilterModel(
-        derivative=system.derivative,
-        measure=system.measure,
-        derivative_rows=system.derivative_rows,
-        measure_rows=system.measure_rows,
+        functions=system,
         n_states=len(system.states),
         parameters=np.append(start, late_s),
         free=np.array(places, dtype=np.int64),

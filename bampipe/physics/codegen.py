@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any
 
 import sympy as sp
@@ -76,17 +76,11 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]
     _print_Heaviside = _print_sign = _print_Abs = _print_tanh = _print_Function
     _print_sin = _print_cos = _print_tan = _print_exp = _print_log = _print_atan = _print_Function
 
-    def _nest_calls(self, name: str, arguments: Sequence[Any]) -> str:
-        text = self._print(arguments[0])
-        for argument in arguments[1:]:
-            text = f"{name}({text}, {self._print(argument)})"
-        return text
-
     def _print_Max(self, expr: Any) -> str:
-        return self._nest_calls("maximum", expr.args)
+        name, parts = _NAMES[type(expr).__name__], map(self._print, expr.args)
+        return reduce(lambda text, part: f"{name}({text}, {part})", parts)
 
-    def _print_Min(self, expr: Any) -> str:
-        return self._nest_calls("minimum", expr.args)
+    _print_Min = _print_Max
 
     def _print_Pow(self, expr: Any, **_: Any) -> str:
         base, exponent = expr.as_base_exp()
@@ -133,7 +127,7 @@ class Bodies:
 
     Attributes:
         names: intermediates that it gives, in order; none where the device is no robot.
-        source: of the module; empty without names.
+        source: of the module.
     """
 
     names: tuple[Any, ...]
@@ -143,8 +137,6 @@ class Bodies:
 def bodies_at_state(e: Equations) -> Bodies:
     """``bodies(x, p)``: what the mass matrix and the bias take from a robot's bodies."""
     names, block = _print_bodies(e, [*_upper_entries(e), *e.bias])
-    if not names:
-        return Bodies((), "")
     lines = [*unpack_groups({"x": [*e.q, *e.qd], "p": e.p}, block.used), *block.lines]
     lines += [f"return ({', '.join(block.values)},)"]
     returned = f"types.UniTuple(types.float64, {len(names)})"
@@ -156,8 +148,6 @@ def bodies_at_state(e: Equations) -> Bodies:
 def bodies_along_motion(e: Equations) -> Bodies:
     """``bodies(q, qd, qdd, p, out)``: the forces that a robot's bodies require, (T, names)."""
     names, block = _print_bodies(e, e.dynamics)
-    if not names:
-        return Bodies((), "")
     row = unpack_groups({"q": e.q, "qd": e.qd, "qdd": e.qdd}, block.used, "row, {}")
     row += [*block.lines, *(f"out[row, {i}] = {v}" for i, v in enumerate(block.values))]
     body = [*unpack_groups({"p": e.p}, block.used), *_indent_loop("for row in range(len(q)):", row)]
@@ -170,7 +160,7 @@ def _print_bodies(e: Equations, results: Sequence[Any]) -> tuple[tuple[Any, ...]
     """Those of ``e.steps`` that ``results`` take as they are, and their text."""
     wanted: set[Any] = set().union(*(sp.sympify(x, strict=True).free_symbols for x in results))
     names = tuple(name for name, _ in e.steps if name in wanted)
-    return names, print_block(names, e.steps) if names else Block(set(), [], [])
+    return names, print_block(names, e.steps)
 
 
 def _upper_entries(e: Equations) -> list[Any]:

@@ -75,15 +75,15 @@ class _Points:
             late, c0, c1 = self.p[-1], *self.curvature[k - 1 : k + 1]
             shift = 0.25 * late**2 * (c0 + c1) - late * (self.u[k] - self.u[k - 1]) / dt
             runge_kutta(
-                self.model.derivative, x, self.u[k - 1] + shift, self.u[k] + shift, c0, c1,
-                self.p, w, dt, substeps, work,
+                self.model.functions.derivative, x, self.u[k - 1] + shift, self.u[k] + shift, c0,
+                c1, self.p, w, dt, substeps, work,
             )  # fmt: skip
             point[: self.nx] = x
 
     def read(self, points: np.ndarray, k: int) -> np.ndarray:
         found, output = np.empty((len(points), 2 * self.nx)), np.empty(2 * self.nx)
         for point, row in zip(points, found, strict=True):
-            self.model.measure(self.place(point), self.u[k], self.p, output)
+            self.model.functions.measure(self.place(point), self.u[k], self.p, output)
             row[:] = output
         return found[:, self.settings.observed]
 
