@@ -15,7 +15,6 @@ import pytest
 from motions import of_mechanism
 from scipy.optimize import least_squares
 
-from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
 
 BAM = registry.device("bam")
@@ -232,13 +231,6 @@ def test_recovered_from_a_wrong_guess(case):
     after = np.sqrt(np.mean(found.fun**2))
     assert after < 0.02 * before
     np.testing.assert_allclose(found.x, truth[free], rtol=0.03)
-
-
-def test_unknown_effect_and_target_are_named():
-    with pytest.raises(InputError, match="did you mean 'stribeck'"):
-        Model(BAM, ["stribek:yaw"])
-    with pytest.raises(InputError, match="stribeck:pitch"):
-        Model(BAM, ["stribeck:pich"])
 
 
 def test_dry_friction_is_what_turns_with_the_motion_of_an_axis():
