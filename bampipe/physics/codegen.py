@@ -148,12 +148,18 @@ def bodies_at_state(e: Equations) -> Bodies:
 def bodies_along_motion(e: Equations) -> Bodies:
     """``bodies(q, qd, qdd, p, out)``: the forces that a robot's bodies require, (T, names)."""
     names, block = _print_bodies(e, e.dynamics)
-    row = unpack_groups({"q": e.q, "qd": e.qd, "qdd": e.qdd}, block.used, "row, {}")
+    return Bodies(names, _print_along_motion("bodies", _select_groups(e, "q qd qdd"), e.p, block))
+
+
+def _print_along_motion(
+    name: str, groups: Mapping[str, Sequence[Any]], p: Sequence[Any], block: Block
+) -> str:
+    """Module of a compiled function of groups of columns, then p and out, that fills out's rows."""
+    row = unpack_groups(groups, block.used, "row, {}")
     row += [*block.lines, *(f"out[row, {i}] = {v}" for i, v in enumerate(block.values))]
-    body = [*unpack_groups({"p": e.p}, block.used), *_indent_loop("for row in range(len(q)):", row)]
-    arguments, kinds = "q, qd, qdd, p, out", "M, M, M, V, M"
-    source = compiled_function("bodies", arguments, body, kinds=kinds, options="")
-    return Bodies(names, SCALAR_HEADER + source)
+    body = [*unpack_groups({"p": p}, block.used), *_indent_loop("for row in range(len(q)):", row)]
+    arguments, kinds = ", ".join([*groups, "p, out"]), ", ".join(["M"] * len(groups) + ["V", "M"])
+    return SCALAR_HEADER + compiled_function(name, arguments, body, kinds=kinds, options="")
 
 
 def _print_bodies(e: Equations, results: Sequence[Any]) -> tuple[tuple[Any, ...], Block]:
@@ -245,8 +251,17 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
         "initial_memory": ("q u p", e.initial),
         "compensation": ("q qd z u p", [expr for expr in e.compensation if expr != 0]),
     }
+    return _print_over_columns(e, results, ())
+
+
+def _print_over_columns(
+    e: Equations,
+    results: Mapping[str, tuple[str, Sequence[Any]]],
+    steps: Sequence[tuple[Any, Any]],
+) -> str:
+    """Module of functions over columns: by name, their groups and what they return."""
     return ARRAY_HEADER + "".join(
-        function_source(name, _select_groups(e, groups), exprs)
+        function_source(name, _select_groups(e, groups), exprs, steps)
         for name, (groups, exprs) in results.items()
     )
 
@@ -280,10 +295,7 @@ def dynamics_source(e: Equations) -> str:
         "mass_matrix": ("q p", [m for row in e.mass for m in row]),
         "energy": ("q qd p", [e.kinetic, e.potential]),
     }
-    return ARRAY_HEADER + "".join(
-        function_source(name, _select_groups(e, groups), exprs, e.steps)
-        for name, (groups, exprs) in results.items()
-    )
+    return _print_over_columns(e, results, e.steps)
 
 
 def compiled_function(
@@ -414,12 +426,7 @@ def residual_source(e: Equations, bodies: Sequence[Any]) -> str:
     ]
     block = print_block(residual, e.steps, bodies)
     groups = {**_select_groups(e, "q qd qdd"), "b": bodies, **_select_groups(e, "z u")}
-    row = unpack_groups(groups, block.used, "row, {}")
-    row += block.lines + [f"out[row, {i}] = {v}" for i, v in enumerate(block.values)]
-    body = [*unpack_groups({"p": e.p}, block.used), *_indent_loop("for row in range(len(q)):", row)]
-    kinds = "M, M, M, M, M, M, V, M"
-    arguments = "q, qd, qdd, b, z, u, p, out"
-    return SCALAR_HEADER + compiled_function("residual", arguments, body, kinds=kinds, options="")
+    return _print_along_motion("residual", groups, e.p, block)
 
 
 def law_source(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import cached_property
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -249,24 +250,21 @@ class Robot(Declaration):
         place = {joint.name: i for i, joint in enumerate(self.joints)}
         return tuple(
             Link(
-                place.get(joint.after, -1),
-                joint.kind == "prismatic",
+                place.get(joint.after, -1), joint.kind == "prismatic",
                 _keep_integers(np.array(joint.axis) / math.hypot(*joint.axis)),
                 _keep_integers(np.array(joint.position)),
                 _matrix_rows(rotation_matrix(joint.rotation)),
-                place.get(joint.follows, -1),
-                joint.ratio,
-                joint.zero,
+                place.get(joint.follows, -1), joint.ratio, joint.zero,
             )
             for joint in self.joints
-        )
+        )  # fmt: skip
 
     @cached_property
     def matters(self) -> Flags:
         """Which inertial numbers change the force of some joint, (joints, 10)."""
-        return np.abs(self.regressor).max(axis=0).reshape(-1, INERTIAL) > _NO_EFFECT * max(
-            float(np.abs(self.regressor).max(initial=0.0)), 1.0
-        )
+        size = np.abs(self.regressor)
+        largest = max(float(size.max(initial=0.0)), 1.0)
+        return size.max(axis=0).reshape(-1, INERTIAL) > _NO_EFFECT * largest
 
     @cached_property
     def regressor(self) -> Array:
@@ -275,9 +273,7 @@ class Robot(Declaration):
         n, moving = len(self.joints), len(self.moving)
         samples = 40 * max(n, 1)
         entries = self.columns(*(rng.uniform(-2.0, 2.0, (moving, samples)).T for _ in range(3)))
-        table = np.array(
-            [[np.broadcast_to(c, samples) for link in row for c in link] for row in entries]
-        )
+        table = np.array([[np.broadcast_to(c, samples) for c in chain(*row)] for row in entries])
         return np.ascontiguousarray(table.transpose(0, 2, 1).reshape(-1, INERTIAL * n))
 
     def describe_mass(self, place: int, factor: float) -> str:

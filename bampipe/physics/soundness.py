@@ -19,7 +19,6 @@ def require_sound(
     """Refuse a motion on which the equations of motion cannot be solved.
 
     Args:
-        system: the model.
         q, qd, qdd: motion of the mechanism, (T, n_q), rad or m and derivatives.
         u: inputs, (T, n_u); p: parameters, (n_p,); t: time, (T,), s.
         where: what to call the motion in messages.

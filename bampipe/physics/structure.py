@@ -72,11 +72,7 @@ class Structure:
 
 
 def structure(system: System) -> Structure:
-    """Return the structure of a model, derived once and then read from the cache.
-
-    Args:
-        system: the compiled model.
-    """
+    """The structure of a model, derived once and then read from the cache."""
 
     def generate() -> tuple[dict[str, Any], dict[str, str]]:
         from bampipe.physics.structure_code import structure_code
