@@ -91,13 +91,23 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]
             return "(" + "*".join([factor] * int(exponent)) + ")"
         if exponent.is_Integer and exponent < 0:
             return f"(1.0/({self._print(base**-exponent)}))"
-        return f"({self._print(base)})**({self._print(exponent)})"
+        return self._print_power(self._print(base), self._print(exponent))
+
+    def _print_power(self, base: str, exponent: str) -> str:
+        return f"({base})**({exponent})"
 
     def _print_Rational(self, expr: Any) -> str:
         return f"({float(expr)!r})"
 
     def _print_Float(self, expr: Any) -> str:
         return repr(float(expr))
+
+
+class _PortablePrinter(_Printer):
+    """Prints powers as Python and C both take them."""
+
+    def _print_power(self, base: str, exponent: str) -> str:
+        return f"pow({base}, {exponent})"
 
 
 @dataclass(frozen=True)
@@ -175,13 +185,16 @@ def _upper_entries(e: Equations) -> list[Any]:
 
 
 def print_block(
-    results: Sequence[Any], steps: Sequence[tuple[Any, Any]] = (), known: Sequence[Any] = ()
+    results: Sequence[Any],
+    steps: Sequence[tuple[Any, Any]] = (),
+    known: Sequence[Any] = (),
+    kind: type[_Printer] = _Printer,
 ) -> Block:
     """The text of ``results``, with those of ``steps`` in front that they need.
 
     Those in ``known`` have been assigned before.
     """
-    printer = _Printer()
+    printer = kind()
     used: set[Any] = set().union(*(sp.sympify(e, strict=True).free_symbols for e in results))
     needed = []
     for name, value in reversed(steps):
@@ -237,7 +250,7 @@ def portable_expressions(
         for f, o in zip(e.dynamics, e.other, strict=True)
     ]
     steps = [(name, value.xreplace(numbers)) for name, value in e.steps]
-    block = print_block(required, steps)
+    block = print_block(required, steps, kind=_PortablePrinter)
     return block.lines, block.values, [symbol for symbol in e.u if symbol in block.used]
 
 
