@@ -275,7 +275,7 @@ class Session:
         """
         evidence = self.linearise(recipe, p, judged=True)
         likelihood = self.weight_samples(recipe, evidence)
-        return Fit(recipe, evidence, likelihood, likelihood.pose(evidence))
+        return Fit(recipe, evidence, likelihood, likelihood.pose(evidence), given=True)
 
     def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
         """Fit a model with noise that is the same for all samples of an axis, without replays."""
@@ -311,6 +311,7 @@ class Fit:
         likelihood: noise and weights; problem: the weighted linear problem.
         log_likelihood: under the normal noise of its replays, nats, to rank fits whose noise comes
             from different replays; nan where the model was not fitted with such noise.
+        given: whether its parameters are given, so that nuisance parameters alone are fitted.
     """
 
     recipe: Recipe
@@ -318,10 +319,13 @@ class Fit:
     likelihood: Likelihood
     problem: Problem
     log_likelihood: float = float("nan")
+    given: bool = False
 
     @cached_property
     def solved(self) -> Solved:
         """The solution of its linear problem, next to zero but for the nuisance parameters."""
+        if self.given:
+            return self.problem.solve_nuisance(len(self.evidence.free))
         return self.problem.solve()
 
     @cached_property
@@ -343,12 +347,12 @@ class Fit:
         like, levels = self.likelihood, []
         parts = zip(
             like.noise.residuals, like.noise.bias, self.bias, like.bias_variance,
-            self.problem.y, like.root, strict=True,
+            self.rows_beyond_bias, strict=True,
         )  # fmt: skip
-        for of_replays, b, bias, variance, y, root in parts:
+        for of_replays, b, bias, variance, left in parts:
             rows = of_replays - b + bias
             square = np.mean(rows**2, axis=1) if b.size else np.zeros(len(rows))
-            off = rms(y / root) ** 2 - float(np.median(square))
+            off = rms(left + bias) ** 2 - float(np.median(square))
             more = float(variance.mean()) if b.size else 0.0
             levels.append(np.sqrt(square + np.clip(off, 0.0, more)))
         return NoiseFloor.of_errors([*np.array(levels).T])
