@@ -453,7 +453,7 @@ class Search:
         only = np.flatnonzero(self.widths == 1)
         square, moment = block[only, 0, 0], mom[only, 0]
         x = np.clip(moment / np.maximum(square, 1e-300), low[only, 0], high[only, 0])
-        held = np.where(square > 1e-6 * own[only, 0], (moment - 0.5 * square * x) * x, 0.0)
+        held = np.where(square > least[only, 0], (moment - 0.5 * square * x) * x, 0.0)
         gain[only] = np.maximum(held, 0.0)
         return gain
 
@@ -466,7 +466,7 @@ class Search:
         # Close to those of this set: most weights are found in two passes from there.
         self._weight = self.solve(keys).weight
         gains, have = self.gains(keys), {name.removeprefix("-") for name, _ in keys}
-        tried: dict[str, float] = {}
+        tried: dict[str, int] = {}
         best: dict[str, tuple[float, Key]] = {}
         for k in np.argsort(-gains):
             key = self.places[k]
@@ -480,8 +480,7 @@ class Search:
             ):
                 continue
             cost = self.cost((*keys, key))
-            # A shape that its bounds rule out says nothing yet of the others.
-            tried[name] = tried.get(name, 0.0) + (1.0 if np.isfinite(cost) else 0.5)
+            tried[name] = tried.get(name, 0) + 1
             if np.isfinite(cost) and cost < best.get(name, (np.inf,))[0]:
                 best[name] = cost, key
         return sorted(best.values())

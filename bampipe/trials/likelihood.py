@@ -560,6 +560,8 @@ def solve_bounded(
 ) -> Solved:
     """Minimise the negative log likelihood: weights of the axes and bounds found in turn.
 
+    An unknown that leaves its bounds is held at the one it left by.
+
     Args:
         problem: the model's own columns, which are the first of all.
         xx, xy, yy: sums of products by axis, (n_q, n, n), (n_q, n), (n_q,).
@@ -574,10 +576,11 @@ def solve_bounded(
     precision, moment = np.zeros((n, n)), np.zeros(n)
     precision[:nb, :nb], moment[:nb] = p.precision, p.moment
     fixed_at = dict(absent or {})
-    held = np.zeros(n - nb, dtype=bool)
+    held, bound = np.zeros(n - nb, dtype=bool), np.zeros(n - nb)
     weight = independent / np.maximum(yy, 1e-300) if weight is None else weight
     for _ in range(_PASSES):
         fixed, free = p.hold(fixed_at, n)
+        fixed[nb:] = bound
         chosen = free[:, np.append(np.ones(free.shape[1] - n + nb, dtype=bool), ~held)]
         for _ in range(_REWEIGHTS):
             normal = np.tensordot(weight, xx, 1) + precision
@@ -596,11 +599,12 @@ def solve_bounded(
         if not out.any() and not fresh:
             break
         held |= out
+        bound[out] = np.clip(b[nb:], low, high)[out]
         fixed_at |= {k: float(p.lower[k] if below[k] else p.upper[k]) for k in fresh}
     cost = float(independent @ (0.5 * np.log(left / p.count)))
     off = b[:nb]
     cost += p.prior_cost + 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
-    return Solved(b, held, left, weight, cost)
+    return Solved(b, held & (bound == 0.0), left, weight, cost)
 
 
 def solve_scaled(normal: Array, right: Array) -> Array:
