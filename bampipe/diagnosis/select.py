@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
 from bampipe.diagnosis.probability import Weighed, weigh_sets
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.search import Pool, Search, Solution, added, gone, names
+from bampipe.diagnosis.search import Pool, Search, added, gone, names
 from bampipe.diagnosis.session import (
     Fit,
     Session,
@@ -172,7 +172,7 @@ def select_effects(
                     progress(0.15 + 0.1 * number, f"fitting {', '.join(names(keys))}")
                     fits[members] = session.try_fit(wider, start_of(search, keys, wider))
                 moved = fits[members]
-                if moved is not None and is_better(current, moved, search.solve(keys)):
+                if moved is not None and is_better(current, moved, search, keys):
                     # By its own noise a set fitted before is not the better one: it is the last.
                     last |= not fresh
                     break
@@ -217,11 +217,11 @@ def _leave_out(session: Session, fit: Fit, weighed: Weighed, given: Collection[s
     return session.try_fit(less, np.array([known[q.name] for q in system_of(less).parameters]))
 
 
-def is_better(before: Fit, after: Fit, promised: Solution) -> bool:
+def is_better(before: Fit, after: Fit, search: Search, keys: Sequence[Key]) -> bool:
     """Whether a fitted set is more probable, by the weights of the model without it.
 
     Args:
-        before, after: the model without and with it; promised: its linear problem solved.
+        before, after: the model without and with it; search: beside the former; keys: the set.
     """
     if any(len(a) != len(b) for a, b in zip(before.problem.y, after.problem.y, strict=True)):
         return True
@@ -233,9 +233,9 @@ def is_better(before: Fit, after: Fit, promised: Solution) -> bool:
             ]
             ratio = max(squares[1], 1e-300) / max(squares[0], 1e-300)
             gained -= 0.5 * before.problem.independent[axis] * float(np.log(ratio))
+    promised, taken = search.solve(keys), search.volume_where_fitted(keys, after.evidence)
     # What a fit ends at may take more off the measured quantity than its linear problem promised.
-    taken = before.problem.independent * (after.log_slope - before.log_slope)
-    volume = float(np.minimum(promised.volume, taken).sum())
+    volume = -np.inf if taken is None else float(np.minimum(promised.volume, taken).sum())
     return gained + volume - promised.penalty > _WORTH
 
 

@@ -47,7 +47,8 @@ class Impedance:
 
     The arm demands the acceleration ``natural_frequency**2 * (q_ref - q) + 2 * damping_ratio *
     natural_frequency * (qd_ref - qd)`` of every coordinate; the handle force that would give it
-    passes a critically damped second-order low-pass, as muscle does.
+    passes a critically damped second-order low-pass, as muscle does, so that the force has
+    continuous derivatives.
 
     Attributes:
         natural_frequency: rad/s; 0 leaves the mechanism to the given force alone.
@@ -76,7 +77,7 @@ class Plant(NamedTuple):
 
 
 class _Arm(NamedTuple):
-    """The arm: columns of the inputs with its force, and its `Impedance`.
+    """The arm: columns of the inputs with its force and derivatives, and its `Impedance`.
 
     Attributes:
         at, moving: (n,) places in the state of what it moves by each coordinate, and of its rate.
@@ -85,6 +86,8 @@ class _Arm(NamedTuple):
     at: Indices
     moving: Indices
     force: Indices
+    rate: Indices
+    curvature: Indices
     natural_frequency: float
     damping_ratio: float
     bandwidth: float
@@ -117,7 +120,7 @@ class _Workspace(NamedTuple):
 
 
 PLANT = record_type(Plant, _V, _V, _V, float64)
-_ARM = record_type(_Arm, _I, _I, _I, float64, float64, float64)
+_ARM = record_type(_Arm, _I, _I, _I, _I, _I, float64, float64, float64)
 _WORKSPACE = record_type(_Workspace, _M, _M, _M, _M, _V, _V, _V, _V)
 
 
@@ -215,7 +218,7 @@ def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt, work):  # type
 
     Without columns of force there is no arm, and ``q_ref``, ``qd_ref`` are not read.
     """
-    force, bandwidth = arm.force, arm.bandwidth
+    force, rate, curvature, bandwidth = arm.force, arm.rate, arm.curvature, arm.bandwidth
     pull, pull_rate, goal, speed = work.pull, work.pull_rate, work.goal, work.speed
     brake, brake_gain, steps = brakes.columns, brakes.gain, work.steps
     n, nf = plant.width.shape[0], force.shape[0]
@@ -230,6 +233,11 @@ def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt, work):  # type
             pull[j] = goal[j] + (gap + slope * dt) * fade
             pull_rate[j] = (pull_rate[j] - bandwidth * slope * dt) * fade
             u[k + 1, force[j]] += pull[j]
+            if rate.shape[0] > 0 and rate[j] >= 0:
+                u[k + 1, rate[j]] += pull_rate[j]
+            if curvature.shape[0] > 0 and curvature[j] >= 0:
+                second = bandwidth * (goal[j] - pull[j]) - 2.0 * pull_rate[j]
+                u[k + 1, curvature[j]] += bandwidth * second
         for i in range(brake.shape[0]):
             speed[i] += follow * (x[k, n + i] - speed[i])
             u[k + 1, brake[i]] += brake_gain[k, i] * abs(speed[i])
@@ -293,6 +301,8 @@ def simulate_tracking(
     width: Array,
     n_noise: int,
     force: Sequence[int],
+    rate: Sequence[int] = (),
+    curvature: Sequence[int] = (),
     impedance: Impedance | None = None,
     brake: Sequence[int] = (),
     brake_gain: Array | None = None,
@@ -312,6 +322,9 @@ def simulate_tracking(
         q_ref, qd_ref: (T, n_q) motion that the arm wants.
         force: columns of ``u`` with the handle force, N. They may be fewer than coordinates; the
             arm's force is then the least-squares one. Without any there is no arm.
+        rate, curvature: columns with its first and second derivative, where the model has them;
+            they receive those of the arm's force. In the order of ``force``, -1 for one
+            that the model does not use.
         impedance: of the arm; by default 12 rad/s, critically damped.
         brake: columns with the brake command of each coordinate, in their order, or none.
         brake_gain: (T, n_q) damping that the brakes render: each command is this times the
@@ -343,7 +356,8 @@ def simulate_tracking(
         derivative, x, total, make_plant(p, n_noise, width, max_step),
         _Arm(
             moved_first[:, 0].copy(), moved_first[:, 1].copy(),
-            np.array(force, dtype=np.int64),
+            np.array(force, dtype=np.int64), np.array(rate, dtype=np.int64),
+            np.array(curvature, dtype=np.int64),
             arm.natural_frequency, arm.damping_ratio, arm.bandwidth,
         ),
         _Brakes(np.array(brake[: gain.shape[1]], dtype=np.int64), gain),

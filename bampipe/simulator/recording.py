@@ -12,7 +12,7 @@ from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.system import System
-from bampipe.simulator.specimen import Config, Specimen
+from bampipe.simulator.specimen import Config, Specimen, input_column
 from bampipe.simulator.true_trials import TrueTrial
 
 ENCODERS = {
@@ -101,14 +101,15 @@ def _sensed_force(specimen: Specimen, true: TrueTrial) -> Array:
 
     zero = _sensor_inputs(system, true, np.zeros_like(late))
     constant = corrected(zero)
-    if any(derivative(f, k) in system.inputs for f in names for k in _TOO_HIGH):
+    if any(input_column(system, derivative(f, k)) >= 0 for f in names for k in _TOO_HIGH):
         raise InputError("an input effect with a third derivative cannot be simulated")
     response = np.zeros((3, len(late), nf, nf))
     for order in range(3):
         for j, f in enumerate(names):
-            if (name := derivative(f, order)) in system.inputs:
+            column = input_column(system, derivative(f, order))
+            if column >= 0:
                 u = zero.copy()
-                u[:, system.inputs.index(name)] = 1.0
+                u[:, column] = 1.0
                 response[order, :, :, j] = corrected(u) - constant
     side = late - constant
     if not response[1:].any():

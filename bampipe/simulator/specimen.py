@@ -112,6 +112,11 @@ def _device(name: str) -> Device:
     return device
 
 
+def input_column(system: System, name: str) -> int:
+    """Column of an input in u, -1 where the model has no use for it."""
+    return system.inputs.index(name) if name in system.inputs else -1
+
+
 def draw_specimen(config: Config) -> tuple[Specimen, dict[str, float]]:
     """Draw the specimen; also the strength of each effect by canonical name."""
     device = _device(config.device)

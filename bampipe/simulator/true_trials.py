@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.arrays import Array
-from bampipe.errors import InputError
 from bampipe.estimate.simulation import Impedance, simulate_tracking
-from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
-from bampipe.simulator.specimen import Config, Specimen
+from bampipe.physics.device import Coordinate, Device, derivative
+from bampipe.simulator.specimen import Config, Specimen, input_column
 
 REACH = {"rotary": 0.65, "linear": 0.8}
 """Largest wanted motion as a share of half the range: people use more of a rod than of a turn."""
@@ -74,9 +73,7 @@ def simulate_moving_trial(
     if "t" in system.inputs:
         u[:, system.inputs.index("t")] = t
     force = [system.inputs.index(f) for f in device.forces]
-    rates = {derivative(f, k) for f in device.forces for k in range(1, len(INPUT_ORDERS))}
-    if rates & {*system.inputs}:
-        raise InputError("an effect by the time derivative of a force cannot be simulated")
+    slopes = [[input_column(system, derivative(f, k)) for f in device.forces] for k in (1, 2)]
     n = len(device.coordinates)
     brakes = [system.inputs.index(device.brakes[c.name]) for c in device.coordinates] if (
         viscous or set(device.brakes) == {c.name for c in device.coordinates}
@@ -90,7 +87,7 @@ def simulate_moving_trial(
         x, total = simulate_tracking(
             system.derivative, x0, u, p, dt, q_ref, qd_ref,
             width=system.sign_widths, n_noise=len(system.noise), force=force,
-            impedance=arm, brake=brakes,
+            rate=slopes[0], curvature=slopes[1], impedance=arm, brake=brakes,
             brake_gain=gain if viscous else None, moved_first=system.moved_first,
         )  # fmt: skip
         pose = x[:, :n]

@@ -14,7 +14,7 @@ WIDTH = np.array([2.5e-4])
 
 @njit(types.void(*[types.float64[::1]] * 5), error_model="numpy")
 def slider(x, u, p, w, dx):
-    """A mass; u: force, brake; p: mass, viscous, Coulomb."""
+    """A mass; u: force, brake, force rate; p: mass, viscous, Coulomb."""
     dx[0] = x[1]
     drag = p[1] * x[1] + (p[2] + u[1]) * np.tanh(x[1] / 2.5e-4)
     dx[1] = (u[0] + w[0] - drag) / p[0]
@@ -125,6 +125,16 @@ def test_replay_with_other_friction_stays_near_the_motion():
     moving = np.abs(x[:, 1]) > 0.1
     extra = (total[:, 0] - u[:, 0])[moving] * np.sign(x[moving, 1])
     assert np.median(extra) == pytest.approx(1.0, abs=0.15)  # the arm supplies the added friction
+
+
+def test_the_rate_of_the_arm_force_is_its_rate():
+    t = 0.002 * np.arange(4000)
+    q_ref = 0.15 * np.sin(2 * np.pi * 0.4 * t)[:, None]
+    _, u = track(
+        np.zeros((4000, 3)), [3.5, 10.0, 3.5], q_ref, np.gradient(q_ref, t, axis=0), rate=[2]
+    )
+    np.testing.assert_allclose(u[2:-2, 2], np.gradient(u[:, 0], t)[2:-2], atol=2.0)
+    assert np.corrcoef(u[2:-2, 2], np.gradient(u[:, 0], t)[2:-2])[0, 1] > 0.999
 
 
 def test_brakes_render_the_damping():
