@@ -223,9 +223,7 @@ def by_c(problem: Problem, folder: Path, options: list[str], repeats: int) -> Me
     compiled.argtypes = [ctypes.c_int, *[pointer] * 8, ctypes.c_double, pointer]
     nx = problem.model.n_states
     n = nx + problem.mean.size
-    spread, _, centre, other = settings.points.weights(n + settings.noise_sd.size)
-    if centre != 0.0:
-        raise SystemExit("the C kernel leaves out the centre, whose weight must be zero")
+    spread = ALPHA**2 * (n + settings.noise_sd.size)
     root = np.zeros((n, n))
     root[:nx, :nx] = np.diag(problem.trial.x_sd)
     root[nx:, nx:] = np.linalg.cholesky(problem.covariance)
@@ -235,7 +233,7 @@ def by_c(problem: Problem, folder: Path, options: list[str], repeats: int) -> Me
         mean = np.concatenate([problem.trial.x, problem.mean])
         failed = compiled(
             len(problem.trial.t), problem.trial.t, problem.trial.u, problem.trial.y, mean,
-            root.copy(), settings.noise_sd, settings.reading_sd, np.array([spread, other]),
+            root.copy(), settings.noise_sd, settings.reading_sd, np.array([spread, 0.5 / spread]),
             settings.longest_step, means,
         )  # fmt: skip
         if failed:
