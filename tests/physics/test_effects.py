@@ -13,6 +13,7 @@ from functools import cache
 import numpy as np
 import pytest
 from motions import of_mechanism
+from motions import typical_parameters as typical
 from scipy.optimize import least_squares
 
 from bampipe.physics import Model, compile_model, registry
@@ -32,15 +33,6 @@ brake_residual_torque transmission_compliance backlash force_bias force_gain for
 force_delay force_drift force_application_point encoder_scale shear_thinning upper_stop lower_stop
 maxwell_slip unbalance friction_by_pose
 """
-
-
-def typical(system, strength=1.0):
-    """Parameters with every effect at ``strength`` times its typical size."""
-    values = []
-    for p in system.parameters:
-        value = p.prior if p.typical is None else p.typical
-        values.append(value * strength if p.strength else value)
-    return np.array(values)
 
 
 def effect_of(case):
