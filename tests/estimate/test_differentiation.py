@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
 from bampipe.estimate.differentiation import (
     Derivatives,
@@ -15,7 +15,6 @@ from bampipe.estimate.differentiation import (
 )
 from bampipe.trials.motion import TIMING_ORDERS, Motion, input_derivatives
 
-Array = NDArray[np.float64]
 RATE = 500.0
 RESOLUTION = 5e-5
 NOISE_SD = RESOLUTION / np.sqrt(12.0)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.estimate import kalman_smoother as ks
 
-Array = NDArray[np.float64]
 RATE = 500.0
 
 
@@ -26,7 +25,7 @@ def walk(order: int, density: float, count: int, seed: int) -> Array:
     return x
 
 
-def textbook(y: Array, seen: NDArray[np.bool_], model: ks.MotionModel) -> tuple[Array, Array]:
+def textbook(y: Array, seen: Flags, model: ks.MotionModel) -> tuple[Array, Array]:
     """Return smoothed states and covariances by Rauch, Tung and Striebel's recursion."""
     step, noise = ks.transition(model.order)
     noise = noise * model.ratio
