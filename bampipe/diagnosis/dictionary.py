@@ -92,7 +92,9 @@ class Dictionary:
         """The shapes of a candidate at which its columns are made to begin with."""
         ranges = self.ranges[name]
         each = _ALONE if len(ranges) == 1 else _SEVERAL
-        counts = [each + _MORE * (r.by_ratio and r.high / r.low > _WIDE) for r in ranges]
+        counts = [
+            max(each + _MORE * (r.by_ratio and r.high / r.low > _WIDE), r.fewest) for r in ranges
+        ]
         states = self.candidates[name].system.model.effects[-1].effect.states
         most = _MOST_OF_STATES if len(ranges) > 3 else _MOST_OF_THREE
         while np.prod(counts) > (most if states else _MOST):
