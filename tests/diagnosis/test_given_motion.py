@@ -15,7 +15,7 @@ from independent_runs import PIPELINE, record_trials
 import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.diagnosis.criteria import Criteria
-from bampipe.diagnosis.select import change_set, is_better, open_search
+from bampipe.diagnosis.select import change_set, gain_when_fitted, open_search
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import device_from
@@ -59,4 +59,4 @@ def test_a_drive_that_hardly_acts_any_more_explains_nothing(tmp_path: Path) -> N
     with open_search(session, before, only=("drive_sag:joint",)) as search:
         assert search.volume_where_fitted(keys, same.evidence) == pytest.approx([0.0])
         assert search.volume_where_fitted(keys, weaker.evidence) is None
-        assert not is_better(before, small, search, keys)
+        assert gain_when_fitted(before, small, search, keys) == -np.inf
