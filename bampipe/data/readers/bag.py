@@ -121,7 +121,9 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
             where=f"{name}, column '{clock_column}'",
             remedy=f"give {clock.topic}:{RECORDED} or {clock.topic}:{STAMP} under [time]",
         )
-    of = _chosen(streams, fields, name)
+    # The stream that has most of the columns, then most messages, comes first.
+    ranked = sorted(streams, key=lambda s: (-len(s.cells), -len(s.recorded)))
+    of = {c: next(s for s in ranked if c in s.cells) for c, f in fields.items() if not f.is_time}
     # The stream of most columns on the topic of the time gives the samples.
     here = [of[c] for c, f in fields.items() if f.topic == clock.topic and not f.is_time]
     alike = [stream for stream in streams if stream.topic == clock.topic]
@@ -191,18 +193,6 @@ def _kind(message: Any) -> tuple[Any, ...]:
     return (*sorted(names), "", *empty)
 
 
-def _chosen(streams: list[_Stream], fields: Mapping[str, Field], name: str) -> dict[str, _Stream]:
-    """The stream that each column is taken from: that which has most of the columns, then most
-    messages.
-    """
-    ranked = sorted(streams, key=lambda s: (-len(s.cells), -len(s.recorded)))
-    return {
-        column: next(stream for stream in ranked if column in stream.cells)
-        for column, field in fields.items()
-        if not field.is_time
-    }
-
-
 def _left_out(topic: str, streams: list[_Stream], used: list[_Stream]) -> str:
     """What to say of the messages on a topic that are not used."""
     here = [stream for stream in streams if stream.topic == topic]
@@ -217,11 +207,7 @@ def _left_out(topic: str, streams: list[_Stream], used: list[_Stream]) -> str:
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names of the numbers in the first message of each kind; times have the unit s.
-
-    Raises:
-        InputError: as :func:`read`.
-    """
+    """Names of the numbers in the first message of each kind; times have the unit s."""
     found: dict[str, str] = {}
     seen: set[tuple[Any, ...]] = set()
     for topic, _, message in _messages(path, (), name):
@@ -287,13 +273,19 @@ def _messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[st
     Raises:
         InputError: not installed, damaged, or a topic is missing.
     """
-    need("rosbags.highlevel", "ros", name)
-    in_json = path.suffix.lower() == ".mcap" and _holds_json(path, name)
-    yield from (_json_messages if in_json else _ros_messages)(path, topics, name)
-
-
-def _ros_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
     highlevel = need("rosbags.highlevel", "ros", name)
+    if path.suffix.lower() == ".mcap":
+        with path.open("rb") as stream:
+            source = need("mcap.reader", "ros", name).make_reader(stream)
+            summary = source.get_summary()
+            channels = summary.channels.values() if summary else ()
+            in_json = {c.topic for c in channels if c.message_encoding == "json"}
+            if in_json:
+                check_columns(sorted(in_json), topics, name)
+                for _, channel, message in source.iter_messages(topics=list(topics) or None):
+                    if channel.topic in in_json:
+                        yield channel.topic, message.log_time, json.loads(message.data)
+                return
     with highlevel.AnyReader([path]) as reader:
         check_columns(sorted(reader.topics), topics, name)
         chosen = [c for c in reader.connections if not topics or c.topic in topics]
@@ -301,25 +293,3 @@ def _ros_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tupl
             raise InputError("holds no messages", where=name)
         for connection, moment, raw in reader.messages(connections=chosen):
             yield connection.topic, moment, reader.deserialize(raw, connection.msgtype)
-
-
-def _holds_json(path: Path, name: str) -> bool:
-    """Whether an MCAP file holds JSON messages rather than those of ROS."""
-    with path.open("rb") as stream:
-        summary = need("mcap.reader", "ros", name).make_reader(stream).get_summary()
-    channels = summary.channels.values() if summary else ()
-    return any(channel.message_encoding == "json" for channel in channels)
-
-
-def _json_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
-    with path.open("rb") as stream:
-        source = need("mcap.reader", "ros", name).make_reader(stream)
-        known = {
-            channel.topic
-            for channel in source.get_summary().channels.values()
-            if channel.message_encoding == "json"
-        }
-        check_columns(sorted(known), topics, name)
-        for _, channel, message in source.iter_messages(topics=list(topics) or None):
-            if channel.topic in known:
-                yield channel.topic, message.log_time, json.loads(message.data)

@@ -61,11 +61,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names of the columns that hold numbers or moments; the unit is "datetime" for these.
-
-    Raises:
-        InputError: not a sound Parquet file.
-    """
+    """Names of the columns that hold numbers or moments; the unit is "datetime" for these."""
     schema = pq.read_schema(path)
     found = dict.fromkeys(lerobot.vector_columns(path, schema), "")
     for field in schema:

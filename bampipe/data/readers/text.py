@@ -94,11 +94,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
 
 
 def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, str]:
-    """Names and units of the columns of numbers, or of moments (unit "datetime").
-
-    Raises:
-        InputError: as :func:`read`.
-    """
+    """Names and units of the columns of numbers, or of moments (unit "datetime")."""
     dialect = dialect or Dialect()
     with opened(path, dialect, name) as (stream, _):
         head = _head(stream, name)
