@@ -12,10 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bampipe.data.lumping import LumpedBodies
 from bampipe.data.mjcf import mjcf_tree
 from bampipe.data.rigid_body import Body
-from bampipe.data.robot_tree import MOVING, DriveLimits, Tree, TreeJoint, gravity_at, identifier
+from bampipe.data.robot_tree import (
+    MOVING,
+    DriveLimits,
+    LumpedBodies,
+    Tree,
+    TreeJoint,
+    gravity_at,
+    identifier,
+)
 from bampipe.data.robot_xml import DEEPEST, read_xml
 from bampipe.data.urdf import urdf_tree
 from bampipe.errors import InputError, did_you_mean

@@ -24,7 +24,7 @@ from bampipe.data.readers.trial import Dialect
 from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
 from bampipe.data.session.channels import CLOCK_UNITS
-from bampipe.data.session.places import lexically_inside
+from bampipe.data.session.file import lexically_inside
 from bampipe.data.units import RecordedUnit, spelled, unit
 from bampipe.errors import InputError
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from bampipe.data.chain import read_tree
 from bampipe.data.device_file import tree_of_robot
-from bampipe.data.lumping import put_bodies
 from bampipe.data.mjcf import mjcf_text
 from bampipe.data.rigid_body import Body, symmetric
 from bampipe.data.robot_tree import (
@@ -22,6 +21,7 @@ from bampipe.data.robot_tree import (
     gravity_at,
     hold_beside,
     identifier,
+    put_bodies,
 )
 from bampipe.data.robot_xml import number_list, read_xml
 from bampipe.data.run_folder import RunFolder

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,7 +15,6 @@ from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, SetupResult
 from bampipe.setup.finding import Finding, spoilt_axes
-from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, drawn_robot, is_drawn
 from bampipe.setup.search import Search, shorten
@@ -27,6 +28,19 @@ _FARTHEST = {"rotary": (62.8, "degrees"), "linear": (20.0, "millimetres")}
 logged; and the unit that such a number usually is in."""
 _MANY = 8
 """Most names that a message lists."""
+
+
+@dataclass(frozen=True)
+class Placeholder:
+    """A scale that stands at exactly 1.
+
+    Attributes:
+        signals: whose readings it scales.
+        sentence: what stands where, without a full stop.
+    """
+
+    signals: tuple[str, ...]
+    sentence: str
 
 
 def inspect_setup(
@@ -45,7 +59,7 @@ def inspect_setup(
     short = shorten(motions)
     _require_scale(system, short)
     signals = Signals.of_session(system, session)
-    placeholders = find_placeholders(system, session)
+    placeholders = _find_placeholders(system, session)
     search = Search(system, short, band, folds, signals)
     held = search.judge(())
     if is_drawn(system):
@@ -163,3 +177,34 @@ def _require_scale(system: System, motions: Sequence[Motion]) -> None:
         where=f"device {system.model.device.name!r}",
         remedy="make a constant of one that is known, such as the gain of the input",
     )
+
+
+def _find_placeholders(system: System, session: IngestResult) -> tuple[Placeholder, ...]:
+    """Return scales of exactly 1: counts of an encoder, calibrations, constants of the input."""
+    found = [
+        Placeholder((axis,), f"counts_per_unit of {axis} is 1")
+        for axis, encoder in session.axes.items()
+        if encoder.counts_per_unit is not None and abs(encoder.counts_per_unit) == 1.0
+    ]
+    force = session.force
+    if force.raw_unit == "V":
+        ones = tuple(
+            name
+            for name, row in zip(force.columns, force.calibration, strict=True)
+            if sorted(map(abs, row)) == [0.0] * (len(row) - 1) + [1.0]
+        )
+        if ones:
+            found.append(Placeholder(ones, f"calibration_n_per_v of {', '.join(ones)} is 1"))
+    device = system.model.device
+    used = {
+        node.id
+        for tree in device.applied.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Name)
+    }
+    for name, constant in device.constants.items():
+        if name in used and constant.value == 1.0 and constant.unit:
+            source = f", source {constant.source!r}" if constant.source else ""
+            sentence = f"{name} of the device file is 1 {constant.unit}{source}"
+            found.append(Placeholder(tuple(device.forces), sentence))
+    return tuple(found)

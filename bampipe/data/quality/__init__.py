@@ -25,7 +25,6 @@ from bampipe.data.quality.clock import (
     refuse_length,
     time_to_seconds,
 )
-from bampipe.data.quality.dead import note_dead_stretches
 from bampipe.data.quality.encoders import (
     check_velocity,
     integrate,
@@ -33,9 +32,12 @@ from bampipe.data.quality.encoders import (
     refuse_fractions,
     unwrap,
 )
+from bampipe.data.quality.faulty_readings import (
+    interpolate_spikes,
+    leave_out_rails,
+    note_dead_stretches,
+)
 from bampipe.data.quality.motion import refuse_wrong_brakes, refuse_wrong_motion
-from bampipe.data.quality.rails import leave_out_rails
-from bampipe.data.quality.spikes import interpolate_spikes
 from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable
 from bampipe.data.quality.thinning import thin, thinning_factor
 from bampipe.data.readers import RawTrial

@@ -22,12 +22,11 @@ from bampipe.physics import registry
 from bampipe.physics.device import KINDS, Device
 from bampipe.setup.hypotheses import MOST_TRAVEL
 from bampipe.setup.proposal.encoders import measured_position
-from bampipe.setup.proposal.gravity import weight_of
 from bampipe.setup.proposal.joints import chain_logged
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import SLIDING, in_counts, position_in_si, scale_to, slides
-from bampipe.setup.proposal.starter import Drive, starter_device
+from bampipe.setup.proposal.starter import Drive, starter_device, weight_of
 
 DEVICE = "device.toml"
 _SCHEMA = "bampipe.device/1"

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.quality.encoders import integral
 from bampipe.data.quality.stamps import find_fresh_rows
 from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
 from bampipe.data.units import unit
-from bampipe.data.velocity import integral
 from bampipe.setup.proposal.notes import Notes
 
 SLIDING = frozenset(["stroke", "displacement", "disp", "dist", "weg", "hub", "carriage", "piston"])
