@@ -43,19 +43,8 @@ class Branches(InputError):
             behind each.
     """
 
-    def __init__(
-        self,
-        what: str,
-        *,
-        where: str = "",
-        remedy: str = "",
-        others: Sequence[InputError] = (),
-        stem: str = "",
-        chains: Mapping[str, Sequence[tuple[str, str]]] | None = None,
-    ) -> None:
-        super().__init__(what, where=where, remedy=remedy, others=others)
-        self.stem = stem
-        self.chains = chains or {}
+    stem: str = ""
+    chains: Mapping[str, Sequence[tuple[str, str]]] = {}
 
 
 @dataclass(frozen=True)
@@ -246,22 +235,16 @@ def _link(name: str, tree: Tree, where: str) -> str:
 
 def _refuse_loops(above: Mapping[str, TreeJoint], where: str) -> None:
     """Refuse links that hang on themselves, or too many one behind another."""
-    depth: dict[str, int] = {}
+    deepest = 0
     for first in above:
-        path = [first]
-        while path[-1] in above and path[-1] not in depth:
-            parent = above[path[-1]].parent
-            if parent in path:
-                raise InputError(f"the joints above {parent!r} form a loop", where=where)
-            if len(path) > DEEPEST:
-                raise InputError(f"more than {DEEPEST} links one behind another", where=where)
-            path.append(parent)
-        reached = depth.get(path.pop(), 0)
-        for link in reversed(path):
-            reached += 1
-            depth[link] = reached
-        if reached > DEEPEST:
-            raise InputError(f"more than {DEEPEST} links one behind another", where=where)
+        link, depth = first, 0
+        while link in above and depth <= DEEPEST:
+            link, depth = above[link].parent, depth + 1
+            if link == first:
+                raise InputError(f"the joints above {first!r} form a loop", where=where)
+        deepest = max(deepest, depth)
+    if deepest > DEEPEST:
+        raise InputError(f"more than {DEEPEST} links one behind another", where=where)
 
 
 def _only_root(tree: Tree, where: str) -> str:
@@ -304,12 +287,13 @@ def _only_end(tree: Tree, base: str, where: str) -> str:
         common = [level[0] for level in takewhile(lambda level: len(set(level)) == 1, levels)]
         stem = next((j.child for j in tree.joints if common and j.name == common[-1]), "")
         behind = {joint.name: joint.child for joint in tree.joints}
-        raise Branches(
+        error = Branches(
             f"the joints branch; chains end at {join_names(others, _MANY)}",
             where=where,
             remedy='choose one: base = "..." and tip = "..." in [robot] of a device file'
             + (f'; tip = "{stem}" ends before they branch' if stem else ""),
-            stem=stem,
-            chains={end: [(name, behind[name]) for name in chains[end]] for end in others},
         )
+        error.stem = stem
+        error.chains = {end: [(name, behind[name]) for name in chains[end]] for end in others}
+        raise error
     return longest

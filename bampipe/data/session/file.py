@@ -6,7 +6,7 @@ import datetime
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated, Any, Literal
@@ -221,6 +221,13 @@ def _with_ids(trials: tuple[TrialEntry, ...]) -> tuple[TrialEntry, ...]:
     return trials
 
 
+def _no_axis(name: str, axes: Sequence[str], where: str, what: str = "") -> InputError:
+    remedy = f"the axes are {', '.join(axes)}"
+    return InputError(
+        f"no {what}axis '{name}'{did_you_mean(name, axes)}", where=where, remedy=remedy
+    )
+
+
 class Session(Declaration):
     """session.toml: one recording session, its channels and its trials."""
 
@@ -340,20 +347,12 @@ class Session(Declaration):
         for encoder in self.encoders:
             for other in encoder.also_reads:
                 if other not in axes or other == encoder.axis:
-                    yield InputError(
-                        f"no other axis '{other}'{did_you_mean(other, axes)}",
-                        where=f"encoders.{encoder.axis}.also_reads",
-                        remedy=f"the axes are {', '.join(axes)}",
-                    )
+                    yield _no_axis(other, axes, f"encoders.{encoder.axis}.also_reads", "other ")
         units = {encoder.axis: encoder.unit for encoder in self.encoders}
         for channel in self.channels:
             axis = channel.second_encoder_of
             if axis and axis not in axes:
-                yield InputError(
-                    f"no axis '{axis}'{did_you_mean(axis, axes)}",
-                    where=f"channels.{channel.name}.second_encoder_of",
-                    remedy=f"the axes are {', '.join(axes)}",
-                )
+                yield _no_axis(axis, axes, f"channels.{channel.name}.second_encoder_of")
             elif axis and channel.unit != units[axis]:
                 yield InputError(
                     f"a unit of {channel.unit or 'a pure number'}, expected one of {units[axis]}",
@@ -373,11 +372,7 @@ class Session(Declaration):
         for number, trial in enumerate(self.trials):
             place = f"trials[{number}]"
             if trial.locked_axis is not None and trial.locked_axis not in axes:
-                yield InputError(
-                    f"no axis '{trial.locked_axis}'{did_you_mean(trial.locked_axis, axes)}",
-                    where=f"{place}.locked_axis",
-                    remedy=f"the axes are {', '.join(axes)}",
-                )
+                yield _no_axis(trial.locked_axis, axes, f"{place}.locked_axis")
             for other in self.trials[:number]:
                 # The same file twice without stretches is left to ingest, which uses it once.
                 stretches = {(t.start_s, t.end_s) for t in (trial, other)}
