@@ -27,6 +27,7 @@ from bampipe.data.session.channels import CLOCK_UNITS
 from bampipe.data.session.file import lexically_inside
 from bampipe.data.units import RecordedUnit, spelled, unit
 from bampipe.errors import InputError
+from bampipe.lists import join_names
 
 MOST_FILES = 500
 _SMALL = 1 << 16
@@ -69,6 +70,11 @@ _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
 _PRESENT = frozenset(["current", "curr", "cur"])
 _LONGEST_WORD = 2
 """Letters at the end of a name that are a word rather than a unit, such as the in of pos_in."""
+_JOINED = {
+    "rows": "row by row",
+    "time": "by their times",
+    "start": "by their times, as if started together",
+}
 _UNIT_WORDS = {
     "time": ("us", "ms", "ns", "s"),
     "position": ("rad", "deg", "mm", "cm", "m"),
@@ -226,7 +232,7 @@ class _Logs:
                 if not columns:
                     raise InputError("no column of numbers in it")
                 small = path.stat().st_size < _SMALL and path.suffix.lower() in TEXTS
-                if small and len(self._read_one(name, columns, _first(columns))) < 2:
+                if small and len(self._read_one(name, columns, next(iter(columns)))) < 2:
                     raise InputError("one row of numbers is no log")
                 self.found[name] = columns
             except InputError as error:
@@ -266,7 +272,7 @@ class _Logs:
             trials = [trial for trial, has in zip(trials, shared, strict=True) if best <= has]
             if trials and (axes or self._completeness(self._labels(trials[0])) == _WHOLE):
                 self._leave_out([p for t in trials for p in (t.file, *(x.file for x in t.parts))])
-                self.remarks += [_describe_join(trials)]
+                self.remarks += [_describe_join(trials[0])]
                 return trials, [c for c in self._labels(trials[0]) if c in best]
             if not whole:
                 self._refuse_parted(names[0], reasons)
@@ -378,7 +384,7 @@ class _Logs:
         if trial.parts or not several or self.scanned > _MOST_SCANNED:
             return [trial]
         times = [c for c, u in columns.items() if _role(c, u) == "time" and u != "datetime"]
-        column = (times or [_first(columns)])[0]
+        column = (times or [next(iter(columns))])[0]
         raw = self._read_one(trial.file, columns, column)
         starts = starts_of(raw, column if times else "")
         if len(starts) == 1:
@@ -408,22 +414,11 @@ def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
     return complete if 2 * complete.sum() > len(complete) else np.ones_like(complete)
 
 
-def _first(columns: Mapping[str, str]) -> str:
-    return next(iter(columns))
-
-
-def _describe_join(trials: Sequence[TrialEntry]) -> str:
-    """What was joined, as of the first recording."""
-    first = trials[0]
-    how = {
-        "rows": "row by row",
-        "time": "by their times",
-        "start": "by their times, as if started together",
-    }
-    ways = dict.fromkeys(how[part.join] for part in first.parts)
-    names = [first.file, *(part.file for part in first.parts)]
-    listed = f"{', '.join(names[:-1])} and {names[-1]}"
-    return f"{listed} are taken as one recording, joined {' and '.join(ways)}"
+def _describe_join(first: TrialEntry) -> str:
+    """What was joined to make a recording."""
+    ways = join_names(dict.fromkeys(_JOINED[part.join] for part in first.parts))
+    files = join_names([first.file, *(part.file for part in first.parts)])
+    return f"{files} are taken as one recording, joined {ways}"
 
 
 def _by_looks(
@@ -440,7 +435,8 @@ def _by_looks(
     times = [c.values for c in columns if c.role == "time" and not c.is_constant]
     roles = find_roles({c.name: c.values for c in unnamed}, times[0] if times else None)
     if "position" not in roles.values():
-        if len(unnamed) < len(columns) or not all(_is_numbered(c.name) for c in columns):
+        numbered = (re.fullmatch(r"(.*:)?column_\d+", c.name) for c in columns)
+        if len(unnamed) < len(columns) or not all(numbered):
             return columns, []
         listed = ", ".join(describe(c.name, c.values) for c in columns[:12])
         raise InputError(
@@ -465,10 +461,6 @@ def _with_unit_beside(
     said = next((u for name, u in beside.items() if _role(name, u) == column.role), "")
     known = column.by_looks and column is first and unit(said) is not None
     return replace(column, unit=said, by_looks=False) if known else column
-
-
-def _is_numbered(name: str) -> bool:
-    return re.fullmatch(r"(.*:)?column_\d+", name) is not None
 
 
 def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:

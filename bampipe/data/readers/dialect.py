@@ -107,7 +107,7 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
         InputError: no header, a column missing, or a layout that can be read in two ways.
     """
     lines = _lines(head, name)
-    if not any(line.text.strip() for line in lines):
+    if not _filled(lines):
         raise InputError("the file holds no text", where=name)
     ended = _end_in_semicolons(lines)
     if ended:
@@ -119,7 +119,7 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     remarks = []
     if delimiter != "," and not dialect.delimiter:
         remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")
-    above = sum(bool(line.text.strip()) for line in lines[: max(index, 0)])
+    above = len(_filled(lines[: max(index, 0)]))
     if above:
         remarks.append(f"{above} lines above the header passed over")
     passed = index
@@ -217,9 +217,8 @@ def _header(
     """Place of the header among the lines (-1 where the session gives the names), and its cells."""
     if dialect.names:
         check_columns(dialect.names, columns, f"{name}: csv.names")
-        index, delimiter = _guess(lines, delimiters)[0]
-        above = [n for n, line in enumerate(lines[:index]) if line.text.strip()]
-        return (above[-1] if above else -1), delimiter, list(dialect.names)
+        first, delimiter = _guess(lines, delimiters)[0]
+        return max(_filled(lines[:first]), default=-1), delimiter, list(dialect.names)
     for index, line in enumerate(lines[:_SEARCHED]) if columns else ():
         for delimiter in delimiters:
             row = _names(line.text, delimiter, lines[index + 1 :])
@@ -236,8 +235,7 @@ def _header(
         first, delimiter = guesses[0]
         row = [f"{_NUMBERED}{n}" for n, _ in enumerate(cells(lines[first].text, delimiter), 1)]
         if set(columns) <= set(row):
-            above = [n for n, line in enumerate(lines[:first]) if line.text.strip()]
-            return (above[-1] if above else -1), delimiter, row
+            return max(_filled(lines[:first]), default=-1), delimiter, row
         raise InputError(
             "no header: the first line holds numbers",
             where=f"{name}, row {lines[0].number}",
@@ -250,6 +248,11 @@ def _header(
         row = next(iter(_otherwise(lines[index].text, width)), row)
     check_columns(row, columns, f"{name}, row {lines[index].number}")
     return index, delimiter, row
+
+
+def _filled(lines: list[_Line]) -> list[int]:
+    """Places of the lines that are not blank."""
+    return [n for n, line in enumerate(lines) if line.text.strip()]
 
 
 def _otherwise(text: str, width: int) -> list[list[str]]:
@@ -342,10 +345,9 @@ def _number_cells(row: list[str], delimiter: str) -> int:
 def _above(lines: list[_Line], first: int, delimiter: str) -> int:
     """Place of the header above the first sample, -1 where there is none."""
     if first >= len(lines):
-        return next((n for n, line in enumerate(lines) if line.text.strip()), -1)
-    width = len(cells(lines[first].text, delimiter))
-    above = [n for n in range(first) if lines[n].text.strip()]
-    rows = {n: cells(_REMARK.sub("", lines[n].text, count=1), delimiter) for n in above[-4:]}
+        return next(iter(_filled(lines)), -1)
+    width, above = len(cells(lines[first].text, delimiter)), _filled(lines[:first])[-4:]
+    rows = {n: cells(_REMARK.sub("", lines[n].text, count=1), delimiter) for n in above}
     for n, row in rows.items():
         if not width - 1 <= len(row) <= width:
             rows[n] = next(iter(_otherwise(lines[n].text, width)), row)
@@ -417,16 +419,12 @@ def _is_remark(text: str) -> bool:
 
 def _is_unit_row(row: list[str], header: list[str], columns: Sequence[str]) -> bool:
     """Whether a line below the header names units: no number in it, a unit for what is wanted."""
-    wanted = [
-        row[n] for n, name in enumerate(header) if n < len(row) and (name in columns or not columns)
-    ]
-    return bool(wanted) and len(row) == len(header) and _looks_like_units(wanted)
-
-
-def _looks_like_units(row: list[str]) -> bool:
-    said = [cell for cell in row if cell]
+    pairs = zip(header, row, strict=False)
+    wanted = [cell for name, cell in pairs if name in columns or not columns]
+    said = [cell for cell in wanted if cell]
     return (
-        2 * len(said) >= len(row)
+        len(row) == len(header)
+        and 2 * len(said) >= len(wanted)
         and bool(said)
         and all(_UNIT.match(cell) and cell not in NULLS for cell in said)
         and not any(_POINT.match(cell) and cell != "1" for cell in said)

@@ -21,7 +21,7 @@ import pyarrow.csv as pa_csv
 from bampipe.data.readers import dialect as dialects
 from bampipe.data.readers import moments
 from bampipe.data.readers.dialect import HEAD, NULLS, TableLayout
-from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, joined
+from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size
 from bampipe.errors import InputError
 
 BLOCK = 1 << 20
@@ -73,8 +73,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     Raises:
         InputError: binary data, a wrong layout, or a cell that is not a number; names the row.
     """
-    with opened(path, wanted.dialect, name) as (stream, said):
-        layout = _layout(stream, wanted, name)
+    with _opened(path, wanted.dialect, name) as (stream, said):
+        layout = dialects.find_layout(_head(stream, name), wanted.columns, wanted.dialect, name)
         end, notes = _sound_end(stream, layout)
         samples = _Samples(wanted)
         _read_samples(stream, layout, end, samples, name)
@@ -96,7 +96,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
 def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, str]:
     """Names and units of the columns of numbers, or of moments (unit "datetime")."""
     dialect = dialect or Dialect()
-    with opened(path, dialect, name) as (stream, _):
+    with _opened(path, dialect, name) as (stream, _):
         head = _head(stream, name)
     layout = dialects.find_layout(head, (), dialect, name)
     return {
@@ -106,7 +106,7 @@ def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, 
 
 
 @contextmanager
-def opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO, tuple[str, ...]]]:
+def _opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO, tuple[str, ...]]]:
     """The file as UTF-8, itself or a copy of it in memory; and what to say of it.
 
     Raises:
@@ -165,10 +165,6 @@ def _head(stream: BinaryIO, name: str) -> bytes:
     return head
 
 
-def _layout(stream: BinaryIO, wanted: Wanted, name: str) -> TableLayout:
-    return dialects.find_layout(_head(stream, name), wanted.columns, wanted.dialect, name)
-
-
 @dataclass
 class _Samples:
     """What has been read of a file: the wanted columns in parts, and how many rows.
@@ -204,8 +200,8 @@ class _Samples:
             del held[parts:]
 
     def values(self) -> dict[str, np.ndarray]:
-        values = joined({column: self.parts[column] for column in self.wanted.columns})
-        self.parts.clear()
+        # Parts are let go of column by column, so that only one column is held twice.
+        values = {column: np.concatenate(self.parts.pop(column)) for column in self.wanted.columns}
         for column in self.wanted.datetimes:
             known = values[column][values[column] != np.iinfo(np.int64).min]
             self.since |= {column: int(known[0])} if len(known) else {}
@@ -234,11 +230,7 @@ def _read_samples(
             if line is None or not (again or layout.is_chatter(line.text)):
                 raise _fault(str(error), layout, line, name) from error
             samples.cut(rows, parts)
-            try:
-                _read_stretch(stream, layout, line.start, samples, name)
-            except pa.ArrowInvalid as empty:
-                if "Empty CSV file" not in str(empty):
-                    raise _fault(str(empty), layout, None, name) from empty
+            _read_samples(stream, layout, line.start, samples, name)
             if again:
                 samples.begun += [samples.rows] if samples.rows else []
             elif len(samples.notes) == _MOST_CHATTER:

@@ -165,15 +165,6 @@ def interpolated(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.nd
     return np.asarray(np.interp(at, times[order], values[order], left=np.nan, right=np.nan))
 
 
-def joined(parts: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
-    """Concatenate column by column, letting go of the parts, so that only one column is double."""
-    columns = {}
-    for column in list(parts):
-        chunks = parts.pop(column)
-        columns[column] = np.concatenate(chunks) if chunks else np.empty(0)
-    return columns
-
-
 def need(module: str, extra: str, name: str) -> ModuleType:
     """The module, which belongs to an optional extra of bampipe.
 
