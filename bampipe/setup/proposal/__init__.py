@@ -106,13 +106,14 @@ def propose(
         _check_robot(chosen, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
+    left = [column.name for column in found.columns if column.name not in match.used]
     lines = [
         *_head(folder, chosen.name, clock.rate),
         *_names(names),
         *clock.lines,
         *encoders,
         *inputs,
-        *_not_used(match),
+        *([f"# not used: {', '.join(left)}", ""] if left else []),
         *_trials_tables(chosen.device, axes, match, notes),
     ]
     return ProposedSession(
@@ -231,11 +232,6 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
         notes.check.append(
             f"no mass is drawn on {join_names(robot.undrawn)}: put it in where there is a body"
         )
-
-
-def _not_used(match: Matcher) -> list[str]:
-    left = [column.name for column in match.found.columns if column.name not in match.used]
-    return [f"# not used: {', '.join(left)}", ""] if left else []
 
 
 def _trials_tables(

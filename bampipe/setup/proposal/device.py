@@ -21,7 +21,6 @@ from bampipe.lists import join_names
 from bampipe.physics import registry
 from bampipe.physics.device import KINDS, Device
 from bampipe.setup.hypotheses import MOST_TRAVEL
-from bampipe.setup.proposal.encoders import measured_position
 from bampipe.setup.proposal.joints import chain_logged
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import Notes
@@ -207,7 +206,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         InputError: no column looks like a position.
     """
     found = match.found
-    position = measured_position("", 1, match, notes)
+    position = match.position("", 1, notes)
     if position is None:
         raise InputError(
             "no column looks like a position",

@@ -7,14 +7,12 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.survey import SurveyedColumn, words
 from bampipe.data.units import bare, spelled, unit
-from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
 from bampipe.setup.proposal.positions import in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
-_MANY = 6
 _SURE = 2.0
 """Standard errors within which a power of two, as most encoders count, is what a turn counts."""
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
@@ -27,7 +25,7 @@ def encoders_table(
     lines = ["[encoders]"]
     axes: dict[str, SurveyedColumn] = {}
     for axis in device.coordinates:
-        column = measured_position(axis.name, len(device.coordinates), match, notes)
+        column = match.position(axis.name, len(device.coordinates), notes)
         if column is None:
             note = notes.ask_column(axis.name, axis.unit, "position")
             lines.append(f"{axis.name} = {entry(UNKNOWN, axis.unit)}{note}")
@@ -42,22 +40,6 @@ def encoders_table(
             notes.check.append(f"{column.name} is {register.words}")
         lines.append(f"{axis.name} = {table}")
     return [*lines, ""], axes
-
-
-def measured_position(axis: str, axes: int, match: Matcher, notes: Notes) -> SurveyedColumn | None:
-    """The column of the position of an axis; a guess is noted where it was one of several.
-
-    Args:
-        axis: name of the axis, "" for any.
-        axes: how many axes there are.
-        match: the columns.
-        notes: where a guess is noted.
-    """
-    column, candidates = match.position(axis, axes)
-    if column is not None and candidates:
-        listed = join_names(candidates, _MANY)
-        notes.guess(f"of {listed}, {column.name} is the measured position")
-    return column
 
 
 def _encoder(
