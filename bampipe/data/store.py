@@ -189,6 +189,7 @@ def _table(frame: Frame) -> pa.Table:
 
 
 def _writer(stream: BinaryIO, schema: pa.Schema) -> pq.ParquetWriter:
+    text = (pa.types.is_string, pa.types.is_large_string, pa.types.is_dictionary)
     return pq.ParquetWriter(
         stream,
         schema,
@@ -196,16 +197,11 @@ def _writer(stream: BinaryIO, schema: pa.Schema) -> pq.ParquetWriter:
         data_page_version="1.0",
         compression="zstd",
         compression_level=3,
-        use_dictionary=[field.name for field in schema if _is_text(field.type)],
+        use_dictionary=[f.name for f in schema if any(check(f.type) for check in text)],
         # Those that find a trial: others would make most of a footer with thousands of row groups.
         write_statistics=["trial_id"] if "trial_id" in schema.names else False,
         store_schema=False,
     )
-
-
-def _is_text(kind: pa.DataType) -> bool:
-    text = (pa.types.is_string, pa.types.is_large_string, pa.types.is_dictionary)
-    return any(check(kind) for check in text)
 
 
 def _trial_bounds(table: pa.Table) -> list[int]:

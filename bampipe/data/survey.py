@@ -112,6 +112,16 @@ class SurveyedColumn:
         return unit(self.unit) if self.unit else None
 
     @property
+    def si(self) -> str | None:
+        """SI unit of its quantity; None where that is not known."""
+        return self.conversion.si if self.conversion is not None else None
+
+    @property
+    def scale(self) -> float:
+        """What makes SI of its values, 1 where that is not known."""
+        return self.conversion.scale if self.conversion is not None else 1.0
+
+    @property
     def is_integer(self) -> bool:
         """Whether all values are integers, as counts are."""
         known = self.values[np.isfinite(self.values)]
@@ -481,11 +491,9 @@ def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:
 
 def _role_apart(column: SurveyedColumn) -> str:
     """The role that the unit or the rest of the name gives to a reference."""
-    known = unit(column.stated)
-    if known is not None and known.si in _BY_UNIT:
-        return _BY_UNIT[known.si]
     said = set(words(column.name)) - REFERENCE_WORDS
-    return next((role for role in DRIVERS if said & set(_WORDS[role].split())), "")
+    named = (role for role in DRIVERS if said & set(_WORDS[role].split()))
+    return _role_by_unit(column.stated) or next(named, "")
 
 
 def words(name: str) -> list[str]:
@@ -493,11 +501,6 @@ def words(name: str) -> list[str]:
     bare = re.sub(r"[\[(].*?[\])]", " ", name)
     parts = re.split(r"[^A-Za-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare))
     return [part.lower() for part in parts if part]
-
-
-def _singular(said: Sequence[str]) -> set[str]:
-    """Words, and those in the plural without their s."""
-    return {*said, *(word.removesuffix("s") for word in said if len(word) > 3)}
 
 
 def _role(name: str, stated: str) -> str:
@@ -509,13 +512,13 @@ def _role(name: str, stated: str) -> str:
         return (vague and _role(part, "")) or alone
     if stated == "datetime" or name.strip().lower() in _UNIT_WORDS["time"]:
         return "time"
-    said = _singular(words(name))
+    said = set(words(name))
+    said |= {word.removesuffix("s") for word in said if len(word) > 3}
     first = [role for role in ("reference", "brake") if said & set(_WORDS[role].split())]
     if first:
         return first[0]
-    known = unit(stated)
-    if known is not None and known.si in _BY_UNIT:
-        return _BY_UNIT[known.si]
+    if role := _role_by_unit(stated):
+        return role
     if said & _PLAIN_POSITIONS and said & _PRESENT:
         said -= _PRESENT  # the position that is current, and no current
     roles = [role for role, text in _WORDS.items() if said & set(text.split())]
@@ -525,11 +528,15 @@ def _role(name: str, stated: str) -> str:
     return named or lerobot.role_of(name) or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
 
 
+def _role_by_unit(text: str) -> str:
+    known = unit(text)
+    return _BY_UNIT.get(known.si, "") if known is not None else ""
+
+
 def _role_by_suffix(suffix: str) -> str:
     """The role by a unit at the end of a name that says nothing else."""
     long = len(suffix) > _LONGEST_WORD and suffix.lower() not in _PLAIN_WORDS
-    known = unit(suffix) if long or suffix in _SHORT_UNITS else None
-    role = _BY_UNIT.get(known.si, "") if known is not None else ""
+    role = _role_by_unit(suffix) if long or suffix in _SHORT_UNITS else ""
     return role if role != "time" else ""
 
 
@@ -546,5 +553,4 @@ def _unit(name: str, stated: str, role: str) -> str:
     matches = [u for u in _UNIT_WORDS.get(role, ()) if u.lower() == suffix.lower()]
     if matches or role == "time" or len(suffix) <= _LONGEST_WORD:
         return next(iter(matches), "")
-    known = unit(suffix)
-    return suffix if known is not None and _BY_UNIT.get(known.si) == role else ""
+    return suffix if role and _role_by_unit(suffix) == role else ""

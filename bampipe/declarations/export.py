@@ -159,7 +159,11 @@ def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
     before = read_tree(file)
     after = put_bodies(before, robot.base, robot.tip, bodies, limits)
     notes = []
-    emptied = [link for link in before.bodies if _lost(before.bodies[link], after.bodies[link])]
+    emptied = [
+        link
+        for link, body in after.bodies.items()
+        if before.bodies[link].mass != 0.0 and body.mass == 0.0 and not body.inertia.any()
+    ]
     if emptied:
         notes.append(
             f"the mass of what is fixed to a link is in that link, not in {join_names(emptied)}"
@@ -175,11 +179,6 @@ def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
     urdf = file if read_xml(file).tag == "robot" else None
     flat = hold_beside(after, robot.base, robot.tip)
     return _Drawn(urdf, before, after, flat, robot.base, tuple(notes))
-
-
-def _lost(before: Body, after: Body) -> bool:
-    """Whether a body is there no more."""
-    return before.mass != 0.0 and after.mass == 0.0 and not after.inertia.any()
 
 
 def _overdrawn(identified: Mapping[str, Body], after: Tree) -> list[str]:

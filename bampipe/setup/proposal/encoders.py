@@ -50,8 +50,8 @@ def _encoder(
     if in_counts(column):
         return _counted(axis, column, match, notes)
     worth = match.turning.get(column.name)
-    if worth is not None and column.conversion is not None:
-        turns, sd = (column.conversion.scale * part for part in (worth.size, worth.sd))
+    if worth is not None and column.si is not None:
+        turns, sd = (column.scale * part for part in (worth.size, worth.sd))
         said = spelled(column.unit, _POSITION_UNITS)
         fields = f", gear_ratio = {turns:.4g}, zero_counts = {worth.zero:.4g}"
         return entry(column.name, said, fields) + notes.guess(
@@ -59,8 +59,7 @@ def _encoder(
             f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
             " the angle; put in the ratio of the gear"
         )
-    known, geared = column.conversion, axis.name in match.robot.gears
-    right = known is not None and known.si == axis.unit
+    right, geared = column.si == axis.unit, axis.name in match.robot.gears
     if column.by_looks and not right:
         note = notes.ask(
             f"the unit of {column.name}, which looks like the position of {axis.name}",
@@ -105,9 +104,8 @@ def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -
 
 
 def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
-    known = column.conversion
     si = f"{axis.unit}/s"
-    said = spelled(column.unit, _SPEED_UNITS) if known is not None and known.si == si else ""
+    said = spelled(column.unit, _SPEED_UNITS) if column.si == si else ""
     return entry(column.name, said or si) + notes.guess(
         f"no position was recorded: that of {axis.name} is the integral of {column.name}"
     )
@@ -145,8 +143,7 @@ def _rounded(sd: float) -> str:
 def _velocity_beside(axis: Coordinate, alone: bool, match: Matcher, notes: Notes) -> str:
     """The field of a recorded velocity, against which the position is checked; "" without one."""
     for column in match.found.of("velocity"):
-        known = column.conversion
-        fits = known is not None and known.si == f"{axis.unit}/s" and not column.is_constant
+        fits = column.si == f"{axis.unit}/s" and not column.is_constant
         if fits and (alone or axis.name in words(column.name)):
             match.used.add(column.name)
             notes.check.append(f"{column.name} is used to check the position only")

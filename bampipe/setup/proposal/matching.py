@@ -142,9 +142,7 @@ class Matcher:
     def supply(self, driver: SurveyedColumn | None) -> SurveyedColumn | None:
         """The supply voltage beside a duty cycle: in volts or of no unit, and never negative."""
         for column in self.found.of("voltage"):
-            known = column.conversion
-            volts = known is None or known.si == "V"
-            if column is not driver and volts and np.nanmin(column.values) > 0.0:
+            if column is not driver and _compatible(column, "V") and np.nanmin(column.values) > 0.0:
                 return column
         return None
 
@@ -156,8 +154,7 @@ class Matcher:
             if not free or column.is_constant or column is position:
                 continue
             values = np.nan_to_num(column.values)
-            known = column.conversion
-            if known is not None and known.si in ("rad", "m"):  # of another axis
+            if column.si in ("rad", "m"):  # of another axis
                 continue
             if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
                 continue
@@ -181,5 +178,4 @@ def _numbers(name: str) -> list[str]:
 
 def _compatible(column: SurveyedColumn, si: str) -> bool:
     """Whether nothing that the column says of its unit contradicts ``si``."""
-    known = column.conversion
-    return known is None or known.si == si
+    return column.si in (None, si)

@@ -132,12 +132,11 @@ def weight_of(
 
 def _may_carry(position: SurveyedColumn, found: Survey) -> bool:
     """Whether an axis whose drive shows no weight is a joint all the same."""
-    said, known = set(words(position.name)), position.conversion
-    torque = any(c.conversion is not None and c.conversion.si == "N.m" for c in found.of("force"))
-    is_angle = (known is not None and known.si == "rad") or bool(said & _ANGLES) or torque
+    said, turns = set(words(position.name)), position.si == "rad"
+    is_angle = turns or said & _ANGLES or any(c.si == "N.m" for c in found.of("force"))
     if not is_angle or said & _UPRIGHT:
         return False
-    scale = known.scale if known is not None and known.si == "rad" else 1.0
+    scale = position.scale if turns else 1.0
     return in_counts(position) or float(np.ptp(position.values)) * scale <= MOST_TRAVEL
 
 
