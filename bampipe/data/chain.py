@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bampipe.arrays import Array
 from bampipe.data.mjcf import mjcf_tree
 from bampipe.data.rigid_body import Body
 from bampipe.data.robot_tree import (
@@ -27,8 +27,6 @@ from bampipe.data.robot_xml import DEEPEST, read_xml
 from bampipe.data.urdf import urdf_tree
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names
-
-Array = NDArray[np.float64]
 
 _MANY = 8
 """Most names that a message lists."""

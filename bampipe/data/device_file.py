@@ -12,16 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bampipe.arrays import Array
 from bampipe.data.chain import read_chain
 from bampipe.data.rigid_body import Body, symmetric
 from bampipe.data.robot_tree import DriveLimits, Tree, fixed_joint, tree_of_tables
 from bampipe.errors import InputError
 from bampipe.files import read_toml
-
-Array = NDArray[np.float64]
 
 _UNITS = {"revolute": ("rad", "N.m", "kg.m2"), "prismatic": ("m", "N", "kg")}
 _FRICTION_SHARE = 0.1

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data import guesses
 from bampipe.data.session import SECONDS
-
-Array = NDArray[np.float64]
 
 _MOST_ROWS = 20_000
 _DERIVATIVE = 0.98

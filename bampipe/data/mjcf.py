@@ -12,16 +12,14 @@ from dataclasses import dataclass, field
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bampipe.arrays import Array
 from bampipe.data.rigid_body import Body, symmetric
 from bampipe.data.robot_tree import DriveLimits, Tree, TreeJoint
 from bampipe.data.robot_xml import document, number_list, numbers
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names
-
-Array = NDArray[np.float64]
 
 Attributes = dict[str, str]
 STEP_S = 5e-4

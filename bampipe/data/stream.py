@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data.session import Session
 from bampipe.errors import InputError
-
-Array = NDArray[np.float64]
 
 PORTION = 1 << 16
 """Bytes read at once: what memory is bounded by, with `LONGEST_LINE`."""

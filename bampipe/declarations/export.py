@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data.chain import read_tree
 from bampipe.data.device_file import tree_of_robot
 from bampipe.data.mjcf import mjcf_text
@@ -37,7 +37,6 @@ from bampipe.physics.portable import portable_source
 from bampipe.physics.robot import INERTIAL_NAMES, Robot
 from bampipe.results.identify import IdentifyResult
 
-Array = NDArray[np.float64]
 Form = Literal["json", "urdf", "mjcf", "python", "c"]
 FORMS: tuple[Form, ...] = get_args(Form)
 

@@ -11,13 +11,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.physics.robot import Robot
 from bampipe.setup.mounting import Mounting
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Bounds = tuple[float, float]
 
 WIDE: Bounds = (-np.inf, np.inf)

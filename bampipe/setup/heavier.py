@@ -6,14 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from bampipe.arrays import Array
 from bampipe.physics.robot import Robot
 from bampipe.setup.drawn_bodies import Comparison
 from bampipe.setup.mounting import Mounting
-
-Array = NDArray[np.float64]
 
 _FAR = 2.0
 """Factor from which a mass is no longer what a drawing is wrong by."""

@@ -8,8 +8,8 @@ from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
 from bampipe.physics.robot import Robot
@@ -31,8 +31,6 @@ from bampipe.setup.search import (
 )
 from bampipe.trials.residuals import standstill_of
 from bampipe.trials.signals import Change
-
-Array = NDArray[np.float64]
 
 DRAWN_SAMPLES = 4_000
 """Of all trials together, that the bodies as drawn are held against."""

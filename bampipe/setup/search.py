@@ -9,8 +9,8 @@ from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.setup import hypotheses
@@ -34,8 +34,6 @@ from bampipe.setup.plausibility import Plausibility, axes_without_pose, judge_se
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
-
-Array = NDArray[np.float64]
 
 SUSPICIOUS_PRIORS = 5.0
 """Sum of objections from which other set-ups are tried: two parameters beyond

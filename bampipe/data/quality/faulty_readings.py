@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Flags
 from bampipe.data.angle_torque import least_squares
 from bampipe.data.quality.channels import fill_missing, take_out
 from bampipe.data.quality.table import TrialTable, find_runs, longest_run
 from bampipe.data.smoothing import SmoothedMotion
 from bampipe.results.ingest import DeadStretch
-
-Flags = NDArray[np.bool_]
 
 POSITION, INPUT = (0.95, 20.0), (0.5, 40.0)
 """A reading is wild this many times farther from its neighbours than so large a share of the

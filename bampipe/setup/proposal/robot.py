@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data.chain import frame_of_tip, read_tree
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
@@ -20,8 +20,6 @@ from bampipe.setup.proposal.gears import BEYOND, DOUBTED, MOST_ROWS, Gears, Logg
 from bampipe.setup.proposal.joints import Group, pair_joints
 from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import scale_to
-
-Array = NDArray[np.float64]
 
 LEAST_AT_JOINT = 1.0 / 3.0
 """Share of what the drawing requires below which a torque is that of a motor."""
