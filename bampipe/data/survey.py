@@ -174,12 +174,10 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     sound = []
     for trial in trials:
         try:
-            if not read:
-                several = logs.recordings(trial)
-                read = logs.read(several[0], common)
-            else:
+            if read:
                 logs.compare(trial, common)
-                several = logs.recordings(trial)
+            several = logs.recordings(trial)
+            read = read or logs.read(several[0], common)
             sound += several
         except InputError as error:
             logs.passed.append((trial.file, str(error)))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -30,19 +29,6 @@ _MANY = 8
 """Most names that a message lists."""
 
 
-@dataclass(frozen=True)
-class Placeholder:
-    """A scale that stands at exactly 1.
-
-    Attributes:
-        signals: whose readings it scales.
-        sentence: what stands where, without a full stop.
-    """
-
-    signals: tuple[str, ...]
-    sentence: str
-
-
 def inspect_setup(
     system: System, session: IngestResult, motions: Sequence[Motion], band: Band, folds: Folds
 ) -> SetupResult:
@@ -64,7 +50,7 @@ def inspect_setup(
     held = search.judge(())
     if is_drawn(system):
         search = DrawnSearch(system, shorten(short, DRAWN_SAMPLES), band, folds, signals)
-    findings = search.find_mistakes(tuple(n for p in placeholders for n in p.signals))
+    findings = search.find_mistakes(tuple(n for names in placeholders.values() for n in names))
     mistakes = tuple(_record(system, session, found, placeholders) for found in findings)
     axes = {
         axis: _axis(place, axis, held, mistakes) for place, axis in enumerate(system.coordinates)
@@ -83,9 +69,9 @@ def inspect_setup(
         warnings += describe_lack(system, held, search.over_position)
     named = " ".join(mistake.sentence for mistake in mistakes)
     warnings += [
-        f"{p.sentence}: the scale of all estimates rests on it"
-        for p in placeholders
-        if p.sentence not in named
+        f"{sentence}: the scale of all estimates rests on it"
+        for sentence in placeholders
+        if sentence not in named
     ]
     return SetupResult(
         headline="; ".join(mistake.sentence for mistake in mistakes),
@@ -124,13 +110,13 @@ def _axis(
 
 
 def _record(
-    system: System, session: IngestResult, found: Finding, placeholders: Sequence[Placeholder]
+    system: System, session: IngestResult, found: Finding, placeholders: Mapping[str, Sequence[str]]
 ) -> SetupMistake:
     correction, axes = found.correction, spoilt_axes(found)
     sentence = describe_correction(correction, session)
-    left = [p for p in placeholders if set(correction.signals) <= set(p.signals)]
+    left = [s for s, names in placeholders.items() if set(correction.signals) <= set(names)]
     if correction.kind == "scale" and left:
-        sentence = f"{left[0].sentence}, a placeholder: {describe_size(correction)}"
+        sentence = f"{left[0]}, a placeholder: {describe_size(correction)}"
 
     def errors(of: Plausibility) -> dict[str, float]:
         return dict(zip(system.coordinates, 100.0 * of.error, strict=True))
@@ -179,13 +165,16 @@ def _require_scale(system: System, motions: Sequence[Motion]) -> None:
     )
 
 
-def _find_placeholders(system: System, session: IngestResult) -> tuple[Placeholder, ...]:
-    """Return scales of exactly 1: counts of an encoder, calibrations, constants of the input."""
-    found = [
-        Placeholder((axis,), f"counts_per_unit of {axis} is 1")
+def _find_placeholders(system: System, session: IngestResult) -> dict[str, tuple[str, ...]]:
+    """Scales of exactly 1 that nobody has filled in, in words, and the signals that they scale.
+
+    Counts of an encoder, calibrations, and constants that the input goes through.
+    """
+    found: dict[str, tuple[str, ...]] = {
+        f"counts_per_unit of {axis} is 1": (axis,)
         for axis, encoder in session.axes.items()
         if encoder.counts_per_unit is not None and abs(encoder.counts_per_unit) == 1.0
-    ]
+    }
     force = session.force
     if force.raw_unit == "V":
         ones = tuple(
@@ -194,17 +183,12 @@ def _find_placeholders(system: System, session: IngestResult) -> tuple[Placehold
             if sorted(map(abs, row)) == [0.0] * (len(row) - 1) + [1.0]
         )
         if ones:
-            found.append(Placeholder(ones, f"calibration_n_per_v of {', '.join(ones)} is 1"))
+            found[f"calibration_n_per_v of {', '.join(ones)} is 1"] = ones
     device = system.model.device
-    used = {
-        node.id
-        for tree in device.applied.values()
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Name)
-    }
+    nodes = (node for tree in device.applied.values() for node in ast.walk(tree))
+    used = {node.id for node in nodes if isinstance(node, ast.Name)}
     for name, constant in device.constants.items():
         if name in used and constant.value == 1.0 and constant.unit:
             source = f", source {constant.source!r}" if constant.source else ""
-            sentence = f"{name} of the device file is 1 {constant.unit}{source}"
-            found.append(Placeholder(tuple(device.forces), sentence))
-    return tuple(found)
+            found[f"{name} of the device file is 1 {constant.unit}{source}"] = device.forces
+    return found

@@ -81,8 +81,11 @@ class TableLayout:
 
 
 @dataclass(frozen=True)
-class _Line:
+class Line:
+    """A line of a file: its number, its bytes in the file, and its text without the line end."""
+
     number: int
+    start: int
     end: int
     text: str
 
@@ -185,9 +188,9 @@ def _mark(head: bytes) -> int:
     return 3 if head.startswith(b"\xef\xbb\xbf") else 0
 
 
-def _lines(head: bytes, name: str) -> list[_Line]:
+def _lines(head: bytes, name: str) -> list[Line]:
     """The whole lines of ``head``, and the last one where it is all there is."""
-    found: list[_Line] = []
+    found: list[Line] = []
     start = _mark(head)
     for number, match in enumerate(re.finditer(rb"[^\r\n]*(\r\n|\n|\r|\Z)", head[start:]), 1):
         end = start + match.end()
@@ -203,12 +206,12 @@ def _lines(head: bytes, name: str) -> list[_Line]:
                     remedy='save it as UTF-8, or say encoding = "latin-1" under [csv]',
                 ) from error
             text = match[0].decode("utf-8", "replace")
-        found.append(_Line(number, end, text.rstrip("\r\n")))
+        found.append(Line(number, start + match.start(), end, text.rstrip("\r\n")))
     return found
 
 
 def _header(
-    lines: list[_Line],
+    lines: list[Line],
     columns: Sequence[str],
     dialect: Dialect,
     delimiters: list[str],
@@ -250,7 +253,7 @@ def _header(
     return index, delimiter, row
 
 
-def _filled(lines: list[_Line]) -> list[int]:
+def _filled(lines: list[Line]) -> list[int]:
     """Places of the lines that are not blank."""
     return [n for n, line in enumerate(lines) if line.text.strip()]
 
@@ -261,7 +264,7 @@ def _otherwise(text: str, width: int) -> list[list[str]]:
     return [row for row in split if len(row) == width > 1]
 
 
-def _names(text: str, delimiter: str, below: list[_Line]) -> list[str]:
+def _names(text: str, delimiter: str, below: list[Line]) -> list[str]:
     """Names in a header, which may be written as a remark: ``# t x`` has two names or three."""
     plain, bare = (cells(t, delimiter) for t in (text, _REMARK.sub("", text, count=1)))
     rows = [line.text for line in below if line.text.strip() and not _is_remark(line.text)]
@@ -293,7 +296,7 @@ def _named_items(header: list[str], rows: list[list[str]]) -> list[str]:
     return named
 
 
-def _guess(lines: list[_Line], delimiters: list[str]) -> list[tuple[int, str]]:
+def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
     """Where the samples start and what separates their columns; several where that is equal."""
     ranked: list[tuple[float, int, int, str]] = []
     tried = [line for line in lines[-_TRIED:] if line.text.strip()]
@@ -329,7 +332,7 @@ def _is_sparse(row: list[str], width: int) -> bool:
     )
 
 
-def _end_in_semicolons(lines: list[_Line]) -> bool:
+def _end_in_semicolons(lines: list[Line]) -> bool:
     """Whether lines end with a semicolon, and have other delimiters in them."""
     tried = [line.text for line in lines[-_TRIED:] if line.text.strip()]
     ended = [text for text in tried if text.endswith(";") and text.count(";") == 1]
@@ -342,7 +345,7 @@ def _number_cells(row: list[str], delimiter: str) -> int:
     return sum(any(sign.match(cell) for sign in signs) for cell in row)
 
 
-def _above(lines: list[_Line], first: int, delimiter: str) -> int:
+def _above(lines: list[Line], first: int, delimiter: str) -> int:
     """Place of the header above the first sample, -1 where there is none."""
     if first >= len(lines):
         return next(iter(_filled(lines)), -1)
@@ -357,7 +360,7 @@ def _above(lines: list[_Line], first: int, delimiter: str) -> int:
     return fitting[-1] if fitting else -1
 
 
-def _padded(header: list[str], body: list[_Line], delimiter: str) -> list[str]:
+def _padded(header: list[str], body: list[Line], delimiter: str) -> list[str]:
     """The header with one more, nameless column where every line ends with a delimiter."""
     rows = [cells(line.text, delimiter) for line in body[:_TRIED] if line.text.strip()]
     longer = rows and all(len(row) == len(header) + 1 and not row[-1] for row in rows)
@@ -365,7 +368,7 @@ def _padded(header: list[str], body: list[_Line], delimiter: str) -> list[str]:
 
 
 def _decimal(
-    body: list[_Line], header: list[str], columns: Sequence[str], delimiter: str, name: str
+    body: list[Line], header: list[str], columns: Sequence[str], delimiter: str, name: str
 ) -> str:
     """Decimal sign of the first lines.
 

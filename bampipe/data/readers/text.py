@@ -20,7 +20,7 @@ import pyarrow.csv as pa_csv
 
 from bampipe.data.readers import dialect as dialects
 from bampipe.data.readers import moments
-from bampipe.data.readers.dialect import HEAD, NULLS, TableLayout
+from bampipe.data.readers.dialect import HEAD, NULLS, Line, TableLayout
 from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size
 from bampipe.errors import InputError
 
@@ -306,21 +306,11 @@ def _split(line: bytes, layout: TableLayout) -> list[bytes]:
     return line.split() if layout.delimiter == " " else line.split(layout.delimiter.encode())
 
 
-@dataclass(frozen=True)
-class _FaultyLine:
-    """A line at which reading stopped: its number, its bytes in the file and its text."""
-
-    number: int
-    start: int
-    end: int
-    text: str
-
-
 _TORN = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+): (.*?)(?: \.\.\.)?$", re.DOTALL)
 _CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*invalid value '(.*)'", re.DOTALL)
 
 
-def _faulty_line(stream: BinaryIO, message: str, layout: TableLayout) -> _FaultyLine | None:
+def _faulty_line(stream: BinaryIO, message: str, layout: TableLayout) -> Line | None:
     """The line that Arrow complains about, which does not count blank lines; None for none."""
     found = _TORN.search(message) or _CELL.search(message)
     row = int(found[1] if found.re is _TORN else found[2] or 0) if found else 0
@@ -332,12 +322,12 @@ def _faulty_line(stream: BinaryIO, message: str, layout: TableLayout) -> _Faulty
         full += bool(line.strip(b"\r\n"))
         if full == row:
             text = line.decode("utf-8", "replace").strip("\r\n")
-            return _FaultyLine(number, at, at + len(line), text)
+            return Line(number, at, at + len(line), text)
         at += len(line)
     return None
 
 
-def _fault(message: str, layout: TableLayout, line: _FaultyLine | None, name: str) -> InputError:
+def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> InputError:
     """The plain form of what Arrow says about a text file."""
     at = f", row {line.number}" if line is not None else ""
     torn = _TORN.search(message)
