@@ -67,17 +67,6 @@ class Chain:
     gravity_note: str = ""
 
 
-def read_chain(
-    path: Path, base: str = "", tip: str = "", payload: Mapping[str, Any] | None = None
-) -> Chain:
-    """Read the chain of joints from ``base`` to ``tip``; arguments are those of `select_chain`.
-
-    Raises:
-        InputError: neither URDF nor MJCF, or none from which there is such a chain.
-    """
-    return select_chain(read_tree(path), base, tip, payload, str(path))
-
-
 def read_tree(path: Path) -> Tree:
     """Read the links and joints of a robot's file.
 
@@ -95,34 +84,34 @@ def read_tree(path: Path) -> Tree:
     )
 
 
-def select_chain(
-    tree: Tree, base: str, tip: str, payload: Mapping[str, Any] | None, where: str
+def read_chain(
+    path: Path, base: str = "", tip: str = "", payload: Mapping[str, Any] | None = None
 ) -> Chain:
-    """The chain of joints from ``base`` to ``tip``.
+    """Read the chain of joints from ``base`` to ``tip``.
 
     Args:
-        tree: what a file has.
+        path: of a URDF or MJCF.
         base: link that stands still; the root of the tree where empty.
         tip: last link; where empty, the only end of the tree.
         payload: ``mass``, ``center`` and ``inertia`` of a body held at the tip, in its frame.
-        where: the file.
 
     Raises:
-        InputError: a joint or link that is wrong, or no single chain between the links.
+        InputError: another file, a wrong joint or link, or no single chain between the links.
     """
+    tree, where = read_tree(path), str(path)
     _refuse_broken(tree, where)
     base = _link(base, tree, where) if base else _only_root(tree, where)
     tip = _link(tip, tree, where) if tip else _only_end(tree, base, where)
     tree, held_alone = _hold_followers(tree, tree.path(base, tip, where))
-    path = tree.path(base, tip, where)
+    joints = tree.path(base, tip, where)
     if payload is not None:
         held = tree.bodies[tip].joined(Body.of_table(payload))
         tree = replace(tree, bodies={**tree.bodies, tip: held})
-    moving = [joint for joint in path if joint.kind != "fixed"]
+    moving = [joint for joint in joints if joint.kind != "fixed"]
     if not moving:
         raise InputError(f"no joint moves between {base!r} and {tip!r}", where=where)
     lumped = LumpedBodies(tree, moving)
-    tables = _tables(path, lumped, where)
+    tables = _tables(joints, lumped, where)
     limits = {identifier(joint.name): joint.limits for joint in moving}
     held_still = [*held_alone] + [
         joint.name for start in moving for joint in lumped.held_on(start.child)
