@@ -72,21 +72,17 @@ def find_robot_columns(
         found: the log; t: (T,) time, s.
         notes: what is guessed is noted, and how sure it is.
     """
-    pairing = pair_joints(device, found)
-    positions = next(iter(pairing.positions), None)
-    drives = next(iter(pairing.drives), None)
-    for what, chosen, others in (
-        ("positions", positions, pairing.positions[1:]),
-        ("drives", drives, pairing.drives[1:]),
-    ):
-        if chosen is not None and others:
-            listed = "; ".join(str(other) for other in others)
-            notes.check.append(f"of several {what}, {chosen} are taken, not {listed}")
+    by_position, by_drive, some_drives = pair_joints(device, found)
+    for what, groups in (("positions", by_position), ("drives", by_drive)):
+        if len(groups) > 1:
+            listed = "; ".join(map(str, groups[1:]))
+            notes.check.append(f"of several {what}, {groups[0]} are taken, not {listed}")
+    positions, drives = next(iter(by_position), None), next(iter(by_drive), None)
     turns, logged, joints = _turns(device, robot), Logged(device, robot, t), _joints(device)
     if positions is None or drives is None:
         columns = dict(zip(joints, positions.columns, strict=True)) if positions else {}
         columns |= dict(zip(device.forces, drives.columns, strict=True)) if drives else {}
-        return RobotColumns(joints, {**columns, **pairing.some_drives})
+        return RobotColumns(joints, {**columns, **some_drives})
 
     def pair(positions: Group, drives: Group) -> dict[str, SurveyedColumn]:
         found = (*positions.columns, *drives.columns)
