@@ -377,7 +377,7 @@ def _decimal(
     """
     indices = [n for n, column in enumerate(header) if column in columns or not columns]
     seen: dict[str, tuple[str, int]] = {}
-    grouped = plain = 0
+    plain = False
     for line in body[:_TRIED]:
         row = cells(line.text, delimiter)
         for index in indices:
@@ -391,8 +391,7 @@ def _decimal(
                 )
             if _COMMA.match(cell):
                 seen.setdefault(",", (cell, line.number))
-                grouped += bool(_THOUSANDS.match(cell))
-                plain += not _THOUSANDS.match(cell)
+                plain = plain or not _THOUSANDS.match(cell)
             elif _POINT.match(cell) and "." in cell:
                 seen.setdefault(".", (cell, line.number))
     if "," not in seen or (delimiter == "," and "." in seen):
