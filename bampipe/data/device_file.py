@@ -224,11 +224,10 @@ def _filled(
         for joint, ratio in ratios.items():
             applied[joint].append(f"{ratio}*{torque}")
         # At the joint, inertia of a joint that slides is a mass.
-        direct = not given
-        unit = _UNITS[kinds[last]][2] if direct else "kg.m2"
+        unit = "kg.m2" if given else _UNITS[kinds[last]][2]
         rotor = f"rotor_inertia_{name}"
         parameters[rotor] = _rotor_parameter(motor, name, limits[last], turns, unit)
-        kinetic.append(f"0.5*{rotor}*qd_{last}**2" if direct else f"0.5*{rotor}*({speed})**2")
+        kinetic.append(f"0.5*{rotor}*({speed})**2" if given else f"0.5*{rotor}*qd_{last}**2")
         if len(ratios) > 1:
             effort, velocity = (value / turns for value in _scale(limits[last]))
             velocity *= turns * turns

@@ -166,12 +166,7 @@ class Search:
         ]
 
     def _refine(
-        self,
-        chosen: tuple[Correction, ...],
-        family: Family,
-        best: float,
-        least: float,
-        step: float,
+        self, chosen: Corrections, family: Family, best: float, least: float, step: float
     ) -> Correction:
         """The best correction of a family near ``best``, where it scores ``least``."""
         for _ in range(_HALVINGS):
@@ -182,11 +177,9 @@ class Search:
                     best, least = x, score
         return family(best)
 
-    def _shortlist(
-        self, chosen: tuple[Correction, ...], corrections: Iterable[Correction]
-    ) -> list[Correction]:
+    def _shortlist(self, chosen: Corrections, tried: Iterable[Correction]) -> list[Correction]:
         """The corrections that do best on the small part of the trials."""
-        screened = [(self.screen(chosen, correction), correction) for correction in corrections]
+        screened = [(self.screen(chosen, correction), correction) for correction in tried]
         screened.sort(key=lambda one: one[0])
         return [one for score, one in screened[:_SHORTLIST] if math.isfinite(score)]
 
