@@ -186,8 +186,6 @@ def wrap(t):
     t["enc_yaw"][:] = np.mod(moved + 2.0**15, 2.0**16) - 2.0**15
 
 
-SQUARE = [[1.0, 2.0, 3.0]] * 3
-
 # name: (damage, what the one line must say)
 REFUSED: dict[str, tuple[Damage, str]] = {
     "no session file": (
@@ -236,12 +234,6 @@ REFUSED: dict[str, tuple[Damage, str]] = {
         "column 'enc_pitch' is used for 2 channels",
     ),
     "calibration missing": (drop("force.calibration_n_per_v"), "'calibration_n_per_v' is missing"),
-    "calibration of the wrong shape": (
-        put("force.calibration_n_per_v", [[1.0, 0.0], [0.0, 1.0]]),
-        "found 2 rows of 2 numbers, expected 3 rows of 3",
-    ),
-    "calibration singular": (put("force.calibration_n_per_v", SQUARE), "singular"),
-    "zero_v of the wrong length": (put("force.zero_v", [0.0]), "zero_v: found 1, expected 3"),
     "calibration for a channel in N": (put("force.unit", "N"), "needs no calibration"),
     "force without its columns": (drop("force.columns"), "'columns' is missing"),
     "an input of the device missing": (drop("force"), "no channel for input 'force_x'"),

@@ -189,25 +189,19 @@ def _in_alphabetical_order(device: Device, group: Group) -> Group:
 
 def _in_unit_of_range(logged: Logged, group: Group) -> Group | None:
     """The positions in degrees or millimetres where they state no unit and only these fit."""
-    device, found = logged.device, []
-    for c, column, width in zip(device.coordinates, group.columns, logged.ranges, strict=True):
-        name, scale = _OTHER_UNITS[c.unit]
-        most = BEYOND * width
-        span = float(np.ptp(np.nan_to_num(column.values)))
-        if column.unit or span <= most or span * scale > most:
-            found.append(column)
-        else:
-            found.append(replace(column, unit=name))
+    coordinates, others = logged.device.coordinates, set()
+    for c, column, width in zip(coordinates, group.columns, logged.ranges, strict=True):
+        span, most = float(np.ptp(np.nan_to_num(column.values))), BEYOND * width
+        if not column.unit and span > most >= span * _OTHER_UNITS[c.unit][1]:
+            others.add(c.unit)
+    if not others:
+        return None
     # One controller gives all angles alike: what is so for one is so for all.
-    angles = {c.unit for c in device.coordinates}
-    for si in angles:
-        name, _ = _OTHER_UNITS[si]
-        own = [k for k, c in enumerate(device.coordinates) if c.unit == si]
-        if any(found[k].unit == name and not group.columns[k].unit for k in own):
-            for k in own:
-                found[k] = replace(found[k], unit=found[k].unit or name)
-    changed = any(new is not old for new, old in zip(found, group.columns, strict=True))
-    return replace(group, columns=tuple(found)) if changed else None
+    columns = [
+        replace(column, unit=column.unit or _OTHER_UNITS[c.unit][0]) if c.unit in others else column
+        for c, column in zip(coordinates, group.columns, strict=True)
+    ]
+    return replace(group, columns=tuple(columns))
 
 
 def _beyond_range(logged: Logged, positions: Group, of_joint: bool) -> list[str]:
