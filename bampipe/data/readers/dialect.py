@@ -298,7 +298,7 @@ def _named_items(header: list[str], rows: list[list[str]]) -> list[str]:
 
 def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
     """Where the samples start and what separates their columns; several where that is equal."""
-    ranked: list[tuple[float, int, int, str]] = []
+    ranked: list[tuple[float, int, str]] = []
     tried = [line for line in lines[-_TRIED:] if line.text.strip()]
     for delimiter in delimiters:
         rows = [cells(line.text, delimiter) for line in tried]
@@ -306,18 +306,15 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
         alike = [row for row in rows if len(row) == width]
         numbers = sum(_number_cells(row, delimiter) for row in alike)
         share = numbers / (width * len(rows)) if width else 0.0
-        ranked.append((share * width if width > 1 else 0.0, -len(ranked), width, delimiter))
+        ranked.append((share * width if width > 1 else 0.0, width, delimiter))
     found = []
-    best = max(ranked)[0]
-    for score, _, width, delimiter in sorted(ranked, reverse=True):
-        if score < best:
-            break
-        first = len(lines)
-        for index, line in enumerate(lines):
-            row = cells(line.text, delimiter)
-            if len(row) == width and _number_cells(row, delimiter) > 0.5 * width:
-                first = index
-                break
+    best = max(score for score, _, _ in ranked)
+    for _, width, delimiter in (each for each in ranked if each[0] == best):
+        split = (cells(line.text, delimiter) for line in lines)
+        numeric = (
+            len(row) == width and _number_cells(row, delimiter) > 0.5 * width for row in split
+        )
+        first = next((n for n, is_sample in enumerate(numeric) if is_sample), len(lines))
         # What was logged before all sensors had answered are samples with empty cells.
         while 0 < first < len(lines) and _is_sparse(cells(lines[first - 1].text, delimiter), width):
             first -= 1

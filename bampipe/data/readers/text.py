@@ -154,14 +154,12 @@ def _encoding(head: bytes) -> str:
 def _head(stream: BinaryIO, name: str) -> bytes:
     """The first 64 kB, if they can be lines of a table."""
     head = stream.read(HEAD)
-    if b"\0" in head:
-        raise InputError("binary data, not text", where=name, remedy="export the log as CSV")
     line = re.split(rb"[\r\n]", head, maxsplit=1)[0]
+    text = line.decode("utf-8", "ignore").removeprefix("\ufeff")
+    if b"\0" in head or not (text.isprintable() or "\t" in text):
+        raise InputError("binary data, not text", where=name, remedy="export the log as CSV")
     if len(line) == HEAD:
         raise InputError("no line end in the first 64 kB: not a table", where=name)
-    text = line.decode("utf-8", "ignore").removeprefix("\ufeff")
-    if not text.isprintable() and "\t" not in text:
-        raise InputError("binary data, not text", where=name, remedy="export the log as CSV")
     return head
 
 
