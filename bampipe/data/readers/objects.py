@@ -32,7 +32,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     """
     samples, constants, notes = _samples(path, name)
     if isinstance(samples, dict):
-        alone = {key: np.array([as_number(x, name)]) for key, x in constants.items()}
+        fixed = [column for column in wanted.columns if column in constants]
+        alone = {c: np.array([as_number(constants[c], f"{name}, '{c}'")]) for c in fixed}
         return replace(read_arrays(alone | samples, wanted, name, "array"), notes=notes)
     first, values = samples[0], {}
     beside = [column for column in wanted.columns if find(first, column) is MISSING]

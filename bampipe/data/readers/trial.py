@@ -142,8 +142,8 @@ def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np
     Raises:
         InputError: a column is of another length.
     """
-    first = max(values, key=lambda column: len(values[column]) > 1)
-    count = len(values[first])
+    first = max(values, key=lambda column: len(values[column]) > 1, default="")
+    count = len(values[first]) if values else 0
     for column, value in values.items():
         if len(value) not in (1, count):
             raise InputError(
