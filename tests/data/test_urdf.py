@@ -312,8 +312,7 @@ def test_gravity_is_that_of_the_root_above_the_base(
 
 
 def test_a_session_depends_on_its_urdf(tmp_path: Path) -> None:
-    write(tmp_path, *ARM)
-    (tmp_path / "device.toml").write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\n')
+    device_of(tmp_path)
     (tmp_path / "session.toml").write_text('device = "device.toml"\n')
     before = digest_session(tmp_path)
     write(tmp_path, *ARM, link("weight", 3.0), joint("grip", "tool", "weight", "fixed"))
@@ -343,10 +342,7 @@ def following(entry: str, other: str, ratio: float, zero: float) -> str:
 
 def system_of(folder: Path, *parts: str) -> System:
     folder.mkdir()
-    write(folder, *parts)
-    path = folder / "device.toml"
-    path.write_text('name = "a"\n[robot]\nurdf = "arm.urdf"\ngravity = [3.0, -5.0, -7.0]\n')
-    return compile_model(Model(device_from(read_device_file(path), str(path))))
+    return compile_model(Model(device_of(folder, "gravity = [3.0, -5.0, -7.0]\n", parts)))
 
 
 def test_a_joint_that_follows_another_moves_with_it(tmp_path: Path) -> None:
