@@ -177,20 +177,17 @@ class SampleStream:
                 continue
             self._delimiter = max(DELIMITERS, key=line.count)
             found = [cell.strip().strip("\"'") for cell in line.split(self._delimiter)]
-            for layout in self.layouts:
-                if set(layout.columns) <= set(found):
-                    self._layout = layout
-                    self._width = len(found)
-                    self._indices = tuple(found.index(name) for name in layout.columns)
-                    self._last_good = self._line
-                    break
-            else:
-                missing = [name for name in self.layouts[0].columns if name not in found]
+            fitting = [layout for layout in self.layouts if set(layout.columns) <= set(found)]
+            if not fitting:
+                wanted = self.layouts[0].columns
+                missing = next(name for name in wanted if name not in found)
                 raise InputError(
-                    f"no column {missing[0]!r} in the header",
+                    f"no column {missing!r} in the header",
                     where=f"{self.name}: line {self._line}",
-                    remedy=f"the columns must be {', '.join(self.layouts[0].columns)}",
+                    remedy=f"the columns must be {', '.join(wanted)}",
                 )
+            self._layout, self._width, self._last_good = fitting[0], len(found), self._line
+            self._indices = tuple(found.index(name) for name in fitting[0].columns)
         return lines
 
     def _samples(self, lines: list[str], layout: StreamLayout) -> Array:

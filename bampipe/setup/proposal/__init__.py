@@ -109,7 +109,7 @@ def propose(
     left = [column.name for column in found.columns if column.name not in match.used]
     lines = [
         *_head(folder, chosen.name, clock.rate),
-        *_names(names),
+        *(["[csv]", f"names = [{', '.join(map(quoted, names))}]", ""] if names else []),
         *clock.lines,
         *encoders,
         *inputs,
@@ -161,11 +161,6 @@ def _head(folder: Path, device: str, rate: str) -> list[str]:
         rate,
         "",
     ]
-
-
-def _names(names: Sequence[str]) -> list[str]:
-    listed = ", ".join(quoted(name) for name in names)
-    return ["[csv]", f"names = [{listed}]", ""] if names else []
 
 
 def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColumns) -> ChosenDevice:
