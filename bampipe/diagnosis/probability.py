@@ -132,9 +132,10 @@ def weigh_sets(
             sets = with_unknown
     far = np.sqrt(_squares(search, ()) / np.maximum(search.p.count, 1)) > criteria.doubt
     unknown[far] = 1.0
-    for effect in own if far.any() else ():
+    doubtful = unknown >= criteria.probability
+    for effect in own if doubtful.any() else ():
         # In doubt is not absent: the model keeps it, and the report mentions it.
-        most = max(_share_explained(search, effect, far), 1.0 - criteria.probability)
+        most = max(_share_explained(search, effect, doubtful), 1.0 - criteria.probability)
         effects[effect] = min(effects[effect], most)
     return Weighed(sets, effects, unknown, tuple(functions), drops)
 
