@@ -184,11 +184,10 @@ def _write_summaries(
     """Write the verdicts of the gates as JUnit XML, and add a summary in Markdown, where asked."""
     from bampipe.run.markdown import summary
 
-    suites = [junit_xml.Suite(one.root.name, one.verdicts, one.error) for one in outcomes]
     for path, mode in ((junit, "wb"), (markdown, "ab")):
         if path is None:
             continue
-        content = junit_xml.junit(suites) if path is junit else summary(outcomes).encode()
+        content = junit_xml.junit(outcomes) if path is junit else summary(outcomes).encode()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open(mode) as stream:

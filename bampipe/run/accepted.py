@@ -55,10 +55,7 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     """Keep the values of ``model`` in the run ``root`` as those to hold later sessions against.
 
     Args:
-        root: the run folder.
-        model: name of the model.
-        folder: the folder of accepted values.
-        force: even if a gate failed.
+        folder: of accepted values; force: even if a gate failed.
 
     Returns:
         The file written.
@@ -90,7 +87,7 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     results: dict[str, dict[str, dict[str, dict[str, object]]]] = {
         IdentifyResult.FILE: {
             "parameters": {
-                name: {"estimate": found.estimate, "sd": found.sd, "unit": found.unit}
+                name: found.model_dump(include={"estimate", "sd", "unit"})
                 for name, found in run.read(IdentifyResult, model).parameters.items()
             }
         }
@@ -98,7 +95,7 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     if run.exists(StiffnessResult.FILE):
         results[StiffnessResult.FILE] = {
             "axes": {
-                axis: {"stiffness": found.stiffness, "sd": found.sd, "unit": found.unit}
+                axis: found.model_dump(include={"stiffness", "sd", "unit"})
                 for axis, found in run.read(StiffnessResult).axes.items()
             }
         }

@@ -80,10 +80,8 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
     """Write the base model: the device that the pipeline or else the session names.
 
     Args:
-        root: the run folder; ``ingest/session.json`` must be there where ``device`` is "".
-        device: the pipeline's device, or "".
-        effects: the pipeline's effects of the base model; without any, those that the device file
-            gives it.
+        device: the pipeline's device; "" takes that of ``ingest/session.json``.
+        effects: the pipeline's; without any, those that the device file gives the base model.
     """
     from bampipe.declarations.model import ModelFile
     from bampipe.results.ingest import IngestResult

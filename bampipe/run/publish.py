@@ -42,10 +42,9 @@ CURRENT = "current.json"
 def publish(root: Path, url: str) -> str:
     """Publish the run folder ``root`` below ``url``.
 
-    A version that is there already, whole, is not sent again.
+    Nobody may be at work in it. A version that is there already, whole, is not sent again.
 
     Args:
-        root: the run folder; nobody may be at work in it.
         url: a folder as fsspec names it, such as ``s3://bucket/runs`` or ``file:///mnt/runs``.
 
     Returns:
@@ -102,9 +101,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
     """Fetch the published run of ``session`` into ``runs``, every file held against its hash.
 
     Args:
-        url: as for :func:`publish`.
-        session: its id.
-        runs: folder of run folders.
+        url: as for :func:`publish`; runs: folder of run folders.
         force: replace a run folder that says something else.
 
     Returns:
@@ -182,7 +179,8 @@ def _driver(what: str, url: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"{what}: {_first_line(error)}", where=url) from error
+        first_line = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(f"{what}: {first_line}", where=url) from error
 
 
 def _current(system: Any, here: str) -> Published | None:
@@ -212,7 +210,3 @@ def _is_same(root: Path, files: dict[str, str]) -> bool:
         (root / name).is_file() and digest_file(root / name) == known
         for name, known in files.items()
     )
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]

@@ -145,13 +145,6 @@ def _as_stored(summary: dict[str, object], step: Step) -> dict[str, object]:
 def run_session(request: Request, listen: Listener = unheard) -> Outcome:
     """Run the selected stages of one session.
 
-    Args:
-        request: what to run, where.
-        listen: called with every event.
-
-    Returns:
-        What came of it.
-
     Raises:
         InputError: bad input; results of earlier runs stay as they were.
     """

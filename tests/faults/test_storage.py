@@ -198,13 +198,6 @@ def test_a_commit_cannot_remove_what_is_outside(toy: Toy) -> None:
     assert outside.read_text() == "mine"
 
 
-@pytest.mark.parametrize("notes", ["[]", '{"x": 3}', "{", "\x00", '{"x": [1, 2, "0"]}'])
-def test_damaged_notes_on_hashes_change_nothing(toy: Toy, notes: str) -> None:
-    toy.run()
-    (toy.root / ".bampipe" / "hashes.json").write_text(notes)
-    assert {step.state for step in toy.run().steps} == {"unchanged"}
-
-
 # Extending
 
 
