@@ -225,18 +225,7 @@ def _maps(evidence: Evidence) -> dict[str, dict[str, ResidualMap]]:
     maps: dict[str, dict[str, ResidualMap]] = {}
     for i, axis in enumerate(evidence.system.coordinates):
         drawn = [residual_map(evidence, i, v) for v in variables(evidence, i)]
-        maps[axis] = {
-            m.variable: ResidualMap(
-                unit=m.unit,
-                center=tuple(m.center),
-                mean=tuple(m.mean),
-                low=tuple(m.low),
-                high=tuple(m.high),
-                count=tuple(m.count),
-                variance_share=m.share,
-            )
-            for m in drawn
-        }
+        maps[axis] = {m.variable: ResidualMap.of(m, variance_share=m.share) for m in drawn}
     return maps
 
 

@@ -159,23 +159,21 @@ def _effect(term: Term, file: str) -> DraftedEffect:
         for name, c in constants.items()
     )
     is_curve = form.shape.name == "curve"
-    return DraftedEffect(
+    return DraftedEffect.of(
+        form,
         file=file,
         axis=form.axis.name,
-        expression=form.expression,
         acts_as=form.factor,
         constants=constants,
-        summary=form.summary,
-        looks_like=form.looks_like,
         sentence=f"{form.summary}." if is_curve else f"{form.summary}: {numbers}.",
-        curve=DraftCurve(
+        curve=DraftCurve.of(
             variable=form.coordinate.words,
             variable_unit=form.coordinate.unit,
             unit=unit,
-            at=tuple(at),
-            mean=tuple(mean),
-            low=tuple(mean - 1.96 * sd),
-            high=tuple(mean + 1.96 * sd),
+            at=at,
+            mean=mean,
+            low=mean - 1.96 * sd,
+            high=mean + 1.96 * sd,
             beside={quantity.words: span.high for quantity, span in form.beside},
         ),
     )
@@ -200,12 +198,7 @@ def _axis(
         effects=tuple(effects),
         chance=found.chance,
         options=tuple(
-            DraftOption(
-                effects=tuple(form.name for form in option.terms),
-                constants=option.constants,
-                held_out_rmse=option.held_out_rmse,
-                log_evidence=option.log_evidence,
-            )
+            DraftOption.of(option, effects=tuple(form.name for form in option.terms))
             for option in found.options
         ),
         rmse_before=before,

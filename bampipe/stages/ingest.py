@@ -224,48 +224,34 @@ def _description(
     encoders, forces = channels.encoders(), channels.forces()
     counted = channels.count_warnings()
     own = session.device_file is not None
-    return IngestResult(
-        session_id=session.session_id,
+    return IngestResult.of(
+        session,
         device=device.name,
         device_file=session.device if own else None,
         placeholders=tuple(placeholders(device.declaration)) if own else (),
         device_digest=digest_content(device.declaration) if own else "",
         driven=bool(device.drive),
         default_effects=device.default_effects,
-        recorded_at=session.recorded_at,
-        operator=session.operator,
-        device_serial=session.device_serial,
-        notes=session.notes,
-        simulated=session.simulated,
         sample_rate_hz=rate,
         announced_rate_hz=session.sample_rate,
         kept_every=every,
         axes={
-            encoder.axis: EncoderChannel(
-                unit=encoder.unit,
-                resolution=encoders[encoder.axis].resolution,
+            encoder.axis: EncoderChannel.of(
+                encoders[encoder.axis],
+                encoder,
                 resolution_stated=encoders[encoder.axis].stated,
                 resolution_measured=encoders[encoder.axis].measured,
-                noise_sd=encoders[encoder.axis].noise_sd,
-                scale=encoder.scale,
-                zero=encoder.zero,
-                counts_per_unit=encoder.counts_per_unit,
                 raw_unit=encoder.stated_unit,
-                scale_sd=encoder.scale_sd,
             )
             for encoder in session.encoders
         },
-        force=ForceChannels(
+        force=ForceChannels.of(
+            force,
             columns=force.names if force else (),
             unit=device.force_unit,
             noise_sd={name: found.noise_sd for name, found in forces.items()},
             noise_sd_stated=force.noise_sd if force else None,
             noise_sd_measured={name: found.measured for name, found in forces.items()},
-            calibration=force.calibration if force else (),
-            zero=force.zero if force else (),
-            raw_unit=force.raw_unit if force else "",
-            gain_sd=force.gain_sd if force else 0.0,
-            crosstalk_sd=force.crosstalk_sd if force else 0.0,
             look_like_counts=tuple(counted),
         ),
         sensor_warnings=(
@@ -276,17 +262,7 @@ def _description(
         brakes={
             f"brake_{brake.axis}": RecordedChannel(unit=brake.unit) for brake in session.brakes
         },
-        channels={
-            channel.name: RecordedChannel(
-                unit=channel.unit,
-                scale=channel.scale,
-                offset=channel.offset,
-                raw_unit=channel.raw_unit,
-                scale_sd=channel.scale_sd,
-                second_encoder_of=channel.second_encoder_of,
-            )
-            for channel in session.channels
-        },
+        channels={channel.name: RecordedChannel.of(channel) for channel in session.channels},
         dead={row["trial_id"]: row["dead"] for row in rows if row["dead"]},
     )
 

@@ -67,12 +67,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     return PerformanceResult(
         model=config.model,
         headline=_headline(handle, device.prescribed) if handle else "No handle on this device.",
-        constants={
-            name: DeviceConstant(
-                value=item.value, unit=item.unit, source=item.source, description=item.description
-            )
-            for name, item in device.constants.items()
-        },
+        constants={name: DeviceConstant.of(item) for name, item in device.constants.items()},
         range={
             axis: Range(lower=low, upper=high, unit=unit)
             for axis, unit, (low, high) in zip(

@@ -18,7 +18,7 @@ from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.gear_windup import Windup, find_windup
-from bampipe.estimate.hysteresis import Branch, Cycle, Hysteresis, hysteresis
+from bampipe.estimate.hysteresis import Cycle, Hysteresis, hysteresis
 from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.ingest import IngestResult
@@ -134,10 +134,8 @@ def _gears(
             continue
         q = frame[[f"q_{name}" for name in system.coordinates]].to_numpy(dtype=np.float64)
         u = np.column_stack([frame.get(name, 0.0 * frame["t"]) for name in system.inputs])
-        still, p = np.zeros_like(q), system.prior
         t = frame["t"].to_numpy(dtype=np.float64)
-        z = system.memory(q, still, still, u, p, t)
-        load = system.applied(q, still, still, z, u, p)
+        load = _applied(system, q, u, t)
         for axis, channel in second.items():
             number = system.coordinates.index(axis)
             rate = np.gradient(q[:, number], t)
@@ -176,17 +174,14 @@ def _gear(
     sure = size > _SURE * windup.compliance_sd
     if not sure:
         notes.append(f"{axis}: its two encoders do not move apart with the load.")
-    return GearStiffness(
+    return GearStiffness.of(
+        windup,
         stiffness=1.0 / size if sure else None,
         sd=windup.compliance_sd / size**2 if sure else None,
         unit=f"{system.torque_units[number]}/{unit}",
         play=None if windup.play is None else windup.play * np.sign(windup.compliance),
-        play_sd=windup.play_sd,
         play_unit=unit,
-        late_s=windup.late_s,
-        late_sd=windup.late_sd,
         side="motor" if windup.compliance > 0.0 else "load",
-        explained=windup.explained,
         channel=channel,
     )
 
@@ -218,11 +213,8 @@ def _loops_of(
         )
     q = np.stack([held[f"q_{name}"] for name in system.coordinates], axis=1)
     u = np.stack([held[name] for name in system.inputs], axis=1)
-    still = np.zeros_like(q)
-    p = system.prior
-    z = system.memory(q, still, still, u, p, grid.t)
-    number = system.coordinates.index(axis)
-    torque = np.ascontiguousarray(system.applied(q, still, still, z, u, p)[:, number])
+    number, still = system.coordinates.index(axis), np.zeros_like(q)
+    torque = np.ascontiguousarray(_applied(system, q, u, grid.t)[:, number])
     deflection = np.ascontiguousarray(q[:, number])
     try:
         found = hysteresis(torque, deflection, rate)
@@ -244,16 +236,20 @@ def _calibration(
     deflection: Array,
 ) -> dict[str, float]:
     """Share of the stiffness of axis ``number`` that one standard uncertainty of each source is."""
-    signals, p = Signals.of_session(system, session), system.prior
+    signals = Signals.of_session(system, session)
     found = {}
     for name, change in calibration_changes(signals):
         moved = change.of_motion(motion, signals)
-        u, still = moved.inputs(system.inputs), moved.qd
-        z = system.memory(moved.q, still, still, u, p, moved.t)
-        theirs = system.applied(moved.q, still, still, z, u, p)[:, number]
+        theirs = _applied(system, moved.q, moved.inputs(system.inputs), moved.t)[:, number]
         torques, deflections = _slope(theirs, torque), _slope(moved.q[:, number], deflection)
         found[name] = torques / deflections - 1.0
     return found
+
+
+def _applied(system: System, q: Array, u: Array, t: Array) -> Array:
+    """Generalised force (T, n_q) of inputs u (T, n_u) on a device at rest in poses q (T, n_q)."""
+    still, p = np.zeros_like(q), system.prior
+    return system.applied(q, still, still, system.memory(q, still, still, u, p, t), u, p)
 
 
 def _slope(values: Array, against: Array) -> float:
@@ -322,14 +318,7 @@ def _axis(
         yielded=all(trial.found.yielded for trial in trials),
         cycles=tuple(_cycle(trial, cycle) for trial, cycle in cycles),
         trials={
-            trial.trial_id: LockedTrial(
-                stiffness=trial.found.stiffness,
-                standard_error=trial.found.standard_error,
-                transition=trial.found.transition,
-                slope_change=trial.found.slope_change,
-                drift=_drift(trial),
-            )
-            for trial in trials
+            trial.trial_id: LockedTrial.of(trial.found, drift=_drift(trial)) for trial in trials
         },
     )
 
@@ -343,15 +332,12 @@ def _drift(trial: _Loops) -> float:
 
 def _cycle(trial: _Loops, cycle: Cycle) -> LoopCycle:
     """Return what is stored of one cycle."""
-    return LoopCycle(
+    return LoopCycle.of(
+        cycle,
         trial_id=trial.trial_id,
         duration_s=(cycle.stop - cycle.start) / trial.rate,
-        stiffness=cycle.stiffness,
         loop_width=cycle.width_torque,
         loop_width_deflection=cycle.width_deflection,
-        energy=cycle.energy,
-        amplitude=cycle.amplitude,
-        centre=cycle.centre,
     )
 
 
@@ -410,7 +396,7 @@ def _loop_rows(axis: str, trial: _Loops) -> pd.DataFrame:
                     "trial_id": trial.trial_id,
                     "axis": axis,
                     "cycle": np.int64(number // 2),
-                    "branch": _side(branch),
+                    "branch": "rising" if branch.direction > 0 else "falling",
                     "t": rows / trial.rate,
                     "torque": torque,
                     "deflection": trial.deflection[rows],
@@ -420,11 +406,6 @@ def _loop_rows(axis: str, trial: _Loops) -> pd.DataFrame:
             )
         )
     return pd.concat(parts, ignore_index=True)
-
-
-def _side(branch: Branch) -> str:
-    """Return the name of the branch."""
-    return "rising" if branch.direction > 0 else "falling"
 
 
 def _describe_axes(axes: Mapping[str, AxisStiffness]) -> list[str]:

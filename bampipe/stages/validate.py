@@ -238,8 +238,8 @@ def _judged(
 ) -> JudgedError:
     """Hold the error of one axis against its noise floor ``level``, which scatters so much."""
     refused = found.published_rmse > REFUSAL_RATIO * expected_ratio * found.held_out_rmse
-    return JudgedError(
-        **vars(found),
+    return JudgedError.of(
+        found,
         noise_floor=level,
         noise_floor_sd=scatter,
         standing=compare_with_floor(found.held_out_rmse, level, scatter),
@@ -313,9 +313,8 @@ def _table(system: System, trial_id: str, c: ComparedTrial) -> pd.DataFrame:
         measured = c.measured[:, i]
         columns[f"torque_measured_{axis}"] = measured
         columns[f"torque_predicted_{axis}"] = measured - c.residual_held_out[:, i]
-        columns[f"torque_predicted_without_friction_{axis}"] = (
-            measured - c.residual_without_friction[:, i]
-        )
+        without = measured - c.residual_without_friction[:, i]
+        columns[f"torque_predicted_without_friction_{axis}"] = without
         columns[f"residual_{axis}"] = c.residual_held_out[:, i]
         columns[f"moving_{axis}"] = c.used[:, i]
     for j, name in enumerate(system.model.device.forces):
