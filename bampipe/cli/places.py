@@ -12,7 +12,7 @@ from bampipe.run import record
 from bampipe.run.session_name import session_folder, session_id
 
 
-def known_runs(runs: Path) -> list[Path]:
+def _known_runs(runs: Path) -> list[Path]:
     """Return the run folders in ``runs``, the most recent first."""
     found = [path.parent for path in runs.glob(f"*/{record.FILE}")]
     return sorted(found, key=lambda root: (root / record.FILE).stat().st_mtime_ns, reverse=True)
@@ -42,27 +42,27 @@ def find_run(argument: str | None, runs: Path) -> Path:
     Raises:
         InputError: there is no such run, or it holds a link.
     """
-    if argument is None:
-        known = known_runs(runs)
-        if not known:
-            raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
-        refuse_links(known[0])
-        return known[0]
-    if (root := _run_folder(argument, runs)) is not None:
-        refuse_links(root)
-        return root
-    argument = str(session_folder(argument))
-    if (Path(argument) / "session.toml").is_file():
-        root = runs / session_id(Path(argument))
-        if (root / record.FILE).is_file():
-            refuse_links(root)
-            return root
-        raise InputError(
-            "this session has not been run", where=argument, remedy=f"`bampipe run {argument}`"
-        )
-    names = [root.name for root in known_runs(runs)]
-    remedy = choose_from(argument, names) or "start with `bampipe run SESSION`"
-    raise InputError(f"no run {argument!r}", where=str(runs), remedy=remedy)
+    known = _known_runs(runs)
+    if argument is None and not known:
+        raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
+    root = known[0] if argument is None else _run_folder(argument, runs)
+    if argument is not None and root is None:
+        folder = session_folder(argument)
+        if not (folder / "session.toml").is_file():
+            remedy = choose_from(argument, [root.name for root in known])
+            raise InputError(
+                f"no run {argument!r}",
+                where=str(runs),
+                remedy=remedy or "start with `bampipe run SESSION`",
+            )
+        root = runs / session_id(folder)
+        if not (root / record.FILE).is_file():
+            raise InputError(
+                "this session has not been run", where=str(folder), remedy=f"`bampipe run {folder}`"
+            )
+    assert root is not None
+    refuse_links(root)
+    return root
 
 
 def find_sessions(arguments: Sequence[str]) -> list[Path]:
