@@ -15,7 +15,7 @@ import stat
 import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import date, datetime, time
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -79,11 +79,7 @@ def read_json_table(path: Path) -> dict[str, Any]:
 
 
 def parse_json(data: bytes, where: str) -> Any:
-    """The value that the text ``data`` of a JSON file stands for.
-
-    Args:
-        data: the bytes of the file.
-        where: the file, for messages.
+    """The value that the bytes ``data`` of the JSON file ``where`` stand for.
 
     Raises:
         InputError: not JSON, nested too deeply, or a number that nothing can hold.
@@ -189,8 +185,10 @@ def require_regular(path: Path) -> os.stat_result:
         status = os.stat(path)
     except FileNotFoundError as error:
         raise InputError("no such file", where=str(path)) from error
-    except (OSError, ValueError) as error:
-        raise _unreadable(path, error) from error
+    except OSError as error:
+        raise cannot("read", path, error) from error
+    except ValueError as error:
+        raise InputError("no path of a file", where=str(path)) from error
     if stat.S_ISDIR(status.st_mode):
         raise InputError("a folder, where a file is expected", where=str(path))
     if not stat.S_ISREG(status.st_mode):
@@ -203,7 +201,6 @@ def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[BinaryIO]:
     """A binary file that takes the place of ``path`` only when the block ends without error.
 
     Args:
-        path: the file.
         durable: survive a loss of power; not needed for what can be made again.
 
     Raises:
@@ -220,11 +217,10 @@ def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[BinaryIO]:
                 os.fsync(stream.fileno())
         partial.replace(path)
     except OSError as error:
-        _discard(partial)
         raise cannot("write", path, error) from error
-    except BaseException:
-        _discard(partial)
-        raise
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -324,21 +320,13 @@ def digest_input(path: Path) -> str:
     TOML counts by its bytes: the stage that reads it says what is wrong with it.
     """
     if path.suffix == ".toml":
-        try:
+        with suppress(InputError):
             return digest_content(read_toml(path))
-        except InputError:
-            return digest_file(path)
     return digest_file(path)
 
 
 def cannot(verb: str, path: Path, error: OSError) -> InputError:
-    """Return what to tell the user of a file that cannot be read or written.
-
-    Args:
-        verb: "read" or "write".
-        path: the file.
-        error: what the operating system said.
-    """
+    """Return what to tell the user of a file that cannot be read or written (``verb``)."""
     reason = STORAGE_FAULTS.get(error.errno or 0) or (error.strerror or str(error)).lower()
     return InputError(
         f"cannot {verb}: {reason}", where=str(path), remedy=_REMEDIES.get(error.errno or 0, "")
@@ -360,12 +348,6 @@ def read_bytes(path: Path, limit: int) -> bytes:
         raise cannot("read", path, error) from error
 
 
-def _unreadable(path: Path, error: OSError | ValueError) -> InputError:
-    if isinstance(error, OSError):
-        return cannot("read", path, error)
-    return InputError("no path of a file", where=str(path))
-
-
 def _whole_number(text: str) -> int:
     if len(text) > MOST_DIGITS:
         raise ValueError(f"a whole number of {len(text)} digits")
@@ -379,11 +361,6 @@ def _refuse_deep(value: object, where: str, depth: int = DEEPEST) -> None:
         raise InputError("nested too deeply", where=where)
     for item in value.values() if isinstance(value, Mapping) else value:
         _refuse_deep(item, where, depth - 1)
-
-
-def _discard(partial: Path) -> None:
-    if partial.exists():
-        partial.unlink()
 
 
 def _plain(value: object) -> object:
