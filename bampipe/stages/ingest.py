@@ -76,9 +76,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     every = thinning_factor(session.sample_rate, config.fastest_hz)
     with ParquetAppender(out / "ingest/samples.parquet") as samples:
         rows = _ingest_trials(session, config, every, channels, samples, progress)
-    trials = _trials_table(rows)
+    text = ("trial_id", "file", "kind", "locked_axis", "status", "reason", "repairs")
+    trials = pd.DataFrame(rows).drop(columns="dead").astype(dict.fromkeys(text, "string"))
     write_parquet(out / "ingest/trials.parquet", trials)
-    rate = _rate(session.sample_rate / every, trials)
+    # The announced rate, or the median of the trials where the time stamps say otherwise.
+    rate, measured = session.sample_rate / every, float(trials["sample_rate_hz"].median())
+    if abs(measured - rate) > RATE_TOLERANCE * rate:
+        rate = measured
     description = _description(session, device, rate, every, channels, rows)
     description.write(out)
     if session.device_file is not None:
@@ -131,7 +135,10 @@ def _ingest_trials(
         if noise:
             channels.measure_noise(trial)
         rows.append(_row(entry, trial, ""))
-        _append(samples, entry, trial)
+        ids = pa.DictionaryArray.from_arrays(
+            np.zeros(len(trial.t), dtype=np.int32), pa.array([entry.trial_id])
+        )
+        samples.append({"trial_id": ids, "t": trial.t, **trial.columns})
     if all(row["status"] == "set_aside" for row in rows):
         first, *others = _reasons(rows, str(session.root))
         raise InputError(
@@ -171,13 +178,6 @@ def _reasons(rows: list[dict[str, Any]], where: str) -> list[InputError]:
     ]
 
 
-def _append(samples: ParquetAppender, entry: TrialEntry, trial: CleanTrial) -> None:
-    ids = pa.DictionaryArray.from_arrays(
-        np.zeros(len(trial.t), dtype=np.int32), pa.array([entry.trial_id])
-    )
-    samples.append({"trial_id": ids, "t": trial.t, **trial.columns})
-
-
 def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, Any]:
     status = "set_aside"
     if trial is not None:
@@ -197,18 +197,6 @@ def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, 
         "repairs": "" if trial is None else "; ".join([*trial.repairs, *trial.notes]),
         "dead": () if trial is None else tuple(trial.dead),
     }
-
-
-def _trials_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    table = pd.DataFrame(rows).drop(columns="dead")
-    text = ("trial_id", "file", "kind", "locked_axis", "status", "reason", "repairs")
-    return table.astype(dict.fromkeys(text, "string"))
-
-
-def _rate(announced: float, trials: pd.DataFrame) -> float:
-    """The ``announced`` rate, or the median of the trials where the time stamps say otherwise."""
-    measured = float(trials["sample_rate_hz"].median())
-    return announced if abs(measured - announced) <= RATE_TOLERANCE * announced else measured
 
 
 def _description(

@@ -18,7 +18,7 @@ from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.gear_windup import Windup, find_windup
-from bampipe.estimate.hysteresis import Cycle, Hysteresis, hysteresis
+from bampipe.estimate.hysteresis import Hysteresis, hysteresis
 from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.ingest import IngestResult
@@ -45,6 +45,12 @@ _SMOOTHED_S = 0.05
 """Over which the velocity is averaged, whose sign the drive's friction follows."""
 _SURE = 3.0
 """Standard uncertainties from which on compliance and play are more than nothing."""
+
+_COLUMNS = {
+    "trial_id": "str", "axis": "str", "cycle": "int64", "branch": "str",
+    "t": "float64", "torque": "float64", "deflection": "float64", "post_yield": "bool",
+}  # fmt: skip
+"""Of loops.parquet, and their types."""
 
 Array = NDArray[np.float64]
 
@@ -111,8 +117,18 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         for axis in system.coordinates
         if axis in loops
     }
-    _write_loops(out / "stiffness/loops.parquet", loops)
-    headline = "; ".join([*_describe_axes(axes), *_describe_gears(gears)]) or notes[-1]
+    with ParquetAppender(out / "stiffness/loops.parquet") as file:
+        for axis, found in loops.items():
+            for trial in found:
+                file.append(_loop_rows(axis, trial))
+        if not loops:
+            file.append(pd.DataFrame({n: pd.Series(dtype=kind) for n, kind in _COLUMNS.items()}))
+    said = [
+        f"{axis} {round_with_sd(entry.stiffness, entry.sd)} {entry.unit} "
+        f"({entry.bandwidth_rad_s:.3g} rad/s, {entry.bandwidth_hz:.3g} Hz)"
+        for axis, entry in axes.items()
+    ]
+    headline = "; ".join([*said, *_describe_gears(gears)]) or notes[-1]
     return StiffnessResult(axes=axes, notes=tuple(notes), headline=headline, gears=gears).write(out)
 
 
@@ -291,7 +307,11 @@ def _axis(
                 "brake slips."
             )
     poses = _poses(system, trials[0].pose)
-    bandwidths = {name: _bandwidth(system, number, stiffness, pose) for name, pose in poses.items()}
+    bandwidths = {}
+    for name, pose in poses.items():
+        inertia = float(system.mass_matrix(pose[None, :], system.prior)[0, number, number])
+        speed = float(np.sqrt(stiffness / inertia))
+        bandwidths[name] = Bandwidth(rad_s=speed, hz=speed / (2.0 * np.pi), inertia=inertia)
     stated = "maximum_extension" if "maximum_extension" in bandwidths else "recorded"
     return AxisStiffness(
         stiffness=stiffness,
@@ -316,7 +336,16 @@ def _axis(
         energy_per_cycle=float(np.mean([cycle.energy for _, cycle in cycles])),
         energy_unit="J",
         yielded=all(trial.found.yielded for trial in trials),
-        cycles=tuple(_cycle(trial, cycle) for trial, cycle in cycles),
+        cycles=tuple(
+            LoopCycle.of(
+                cycle,
+                trial_id=trial.trial_id,
+                duration_s=(cycle.stop - cycle.start) / trial.rate,
+                loop_width=cycle.width_torque,
+                loop_width_deflection=cycle.width_deflection,
+            )
+            for trial, cycle in cycles
+        ),
         trials={
             trial.trial_id: LockedTrial.of(trial.found, drift=_drift(trial)) for trial in trials
         },
@@ -328,17 +357,6 @@ def _drift(trial: _Loops) -> float:
     cycles = trial.found.cycles
     reach = 2.0 * max(cycle.amplitude for cycle in cycles) / trial.found.stiffness
     return (cycles[-1].centre - cycles[0].centre) / reach
-
-
-def _cycle(trial: _Loops, cycle: Cycle) -> LoopCycle:
-    """Return what is stored of one cycle."""
-    return LoopCycle.of(
-        cycle,
-        trial_id=trial.trial_id,
-        duration_s=(cycle.stop - cycle.start) / trial.rate,
-        loop_width=cycle.width_torque,
-        loop_width_deflection=cycle.width_deflection,
-    )
 
 
 def _poses(system: System, recorded: Array) -> dict[str, Array]:
@@ -356,32 +374,6 @@ def _poses(system: System, recorded: Array) -> dict[str, Array]:
             [device.limits[c.name][1] if c.name in linear else 0.0 for c in device.coordinates]
         )
     return poses
-
-
-def _bandwidth(system: System, number: int, stiffness: float, pose: Array) -> Bandwidth:
-    """Return sqrt(K / M_ii) at ``pose`` in both units, and M_ii."""
-    inertia = float(system.mass_matrix(pose[None, :], system.prior)[0, number, number])
-    speed = float(np.sqrt(stiffness / inertia))
-    return Bandwidth(rad_s=speed, hz=speed / (2.0 * np.pi), inertia=inertia)
-
-
-def _write_loops(path: Path, loops: Mapping[str, list[_Loops]]) -> None:
-    """Write every sample of the whole cycles; an empty table where there are none."""
-    with ParquetAppender(path) as file:
-        for axis, trials in loops.items():
-            for trial in trials:
-                file.append(_loop_rows(axis, trial))
-        if not loops:
-            file.append(_no_rows())
-
-
-def _no_rows() -> pd.DataFrame:
-    """Return the table without rows."""
-    kinds = {
-        "trial_id": "str", "axis": "str", "cycle": "int64", "branch": "str",
-        "t": "float64", "torque": "float64", "deflection": "float64", "post_yield": "bool",
-    }  # fmt: skip
-    return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in kinds.items()})
 
 
 def _loop_rows(axis: str, trial: _Loops) -> pd.DataFrame:
@@ -406,15 +398,6 @@ def _loop_rows(axis: str, trial: _Loops) -> pd.DataFrame:
             )
         )
     return pd.concat(parts, ignore_index=True)
-
-
-def _describe_axes(axes: Mapping[str, AxisStiffness]) -> list[str]:
-    """The stiffness of every axis that was locked."""
-    return [
-        f"{axis} {round_with_sd(entry.stiffness, entry.sd)} {entry.unit} "
-        f"({entry.bandwidth_rad_s:.3g} rad/s, {entry.bandwidth_hz:.3g} Hz)"
-        for axis, entry in axes.items()
-    ]
 
 
 def _describe_gears(gears: Mapping[str, GearStiffness]) -> list[str]:
