@@ -8,7 +8,7 @@ import typer
 
 from bampipe.cli import places, show
 from bampipe.cli.next_step import after_loop, print_forecasts
-from bampipe.cli.one_stage import advise, run_stage, stage_command, whole_pipeline
+from bampipe.cli.one_stage import advise, run_stage, stage_command
 from bampipe.cli.options import (
     DEFAULTS,
     RUNS,
@@ -24,6 +24,7 @@ from bampipe.cli.options import (
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import batch, models
+from bampipe.run import pipeline as pipelines
 
 
 @stage_command("diagnose")
@@ -121,7 +122,7 @@ def extend(
     if not auto and not effects:
         raise InputError("no effect named", remedy="`bampipe effects` lists them; or use --auto")
     root = places.find_run(first, runs)
-    pipeline = whole_pipeline(root, "")
+    pipeline = pipelines.whole(root)
     parent = models.choose_model(root, model)
     with show.Watcher(quiet or json) as watcher:
         options = loop.LoopOptions(root, pipeline, force, not no_wait, watcher)

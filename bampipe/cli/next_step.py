@@ -11,30 +11,23 @@ from bampipe.data.run_folder import RunFolder
 def after_run(root: Path, model: str) -> str:
     """Return the next step after a run; ``model``: that counts."""
     from bampipe.results.diagnose import DiagnoseResult
+    from bampipe.results.identify import IdentifyResult
     from bampipe.results.setup import SetupResult
 
     run = RunFolder(root)
     setup, found = run.find(SetupResult), run.find(DiagnoseResult, model)
     if setup is not None and setup.mistakes:
         return "correct the session file as the first line says, and run it again"
-    if _has_new_trials(run, model) or (found is None and _is_above_floor(run, model)):
+    identified = run.find(IdentifyResult, model)
+    fitted, diagnosed = (set(one.trials) if one else set() for one in (identified, found))
+    has_new_trials = bool(diagnosed and fitted - diagnosed)
+    if has_new_trials or (found is None and _is_above_floor(run, model)):
         return f"bampipe diagnose RUN{run.model_option(model)}"
     if found is not None and found.lacking:
         return _after_diagnosis(run, model, found.next)
     if run.exists("report/report.pdf"):
         return f"open {root / 'report' / 'report.pdf'}"
     return "bampipe status RUN"
-
-
-def _has_new_trials(run: RunFolder, model: str) -> bool:
-    """Whether the model is fitted to trials that the last diagnosis did not have."""
-    from bampipe.results.diagnose import DiagnoseResult
-    from bampipe.results.identify import IdentifyResult
-
-    diagnosed, identified = run.find(DiagnoseResult, model), run.find(IdentifyResult, model)
-    if diagnosed is None or identified is None or not diagnosed.trials:
-        return False
-    return not set(identified.trials) <= set(diagnosed.trials)
 
 
 def _is_above_floor(run: RunFolder, model: str) -> bool:

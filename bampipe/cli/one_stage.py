@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 
 from bampipe.cli import places, show
 from bampipe.cli.options import StageOptions
-from bampipe.run import batch, record
+from bampipe.run import batch
 from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome, Request
 from bampipe.run.runner import run_session
@@ -74,12 +74,6 @@ def _print_settings(stage: str) -> None:
     show.say(f"\ndefaults: {module.Config()}")
 
 
-def whole_pipeline(root: Path, name: str) -> Pipeline:
-    """Return the pipeline whose settings count for single stages, with every stage in it."""
-    chosen = pipelines.load(name) if name else pipelines.recorded(record.read(root))
-    return chosen.with_every_stage()
-
-
 def run_stage(
     stage: str,
     root: Path,
@@ -101,7 +95,7 @@ def run_stage(
     settings |= {name: value for name, value in (more or {}).items() if value}
     request = Request(
         root=root,
-        pipeline=whole_pipeline(root, options.pipeline),
+        pipeline=pipelines.whole(root, options.pipeline),
         session=session,
         settings={stage: settings} if settings else {},
         first=stage,

@@ -22,9 +22,6 @@ def read_forecasts(root: Path, model: str) -> tuple[NextResult, ...]:
 
     A forecast that another version of bampipe made in other terms cannot be compared and is left
     out: a new proposal replaces it.
-
-    Args:
-        root: the run folder; model: the model of the proposals.
     """
     last, folder = root / NextResult.file(model), root / NextResult.EARLIER.format(model=model)
     paths = [*([last] if last.is_file() else []), *sorted(folder.glob("*.json"))]

@@ -92,11 +92,11 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
             }
         }
     }
-    if run.exists(StiffnessResult.FILE):
+    if stiffness := run.find(StiffnessResult):
         results[StiffnessResult.FILE] = {
             "axes": {
                 axis: found.model_dump(include={"stiffness", "sd", "unit"})
-                for axis, found in run.read(StiffnessResult).axes.items()
+                for axis, found in stiffness.axes.items()
             }
         }
     path = file_of(folder, session.device)
@@ -116,9 +116,9 @@ def doubts(run: RunFolder, model: str) -> list[str]:
     from bampipe.phrases.results import STANDINGS
     from bampipe.results.validate import ValidateResult
 
-    if not run.exists(ValidateResult.file(model)):
+    found = run.find(ValidateResult, model)
+    if found is None:
         return [f"model {model} has not been validated: `bampipe validate {run.root}`"]
-    found = run.read(ValidateResult, model)
     lines = list(found.failed_checks)
     for axis, error in found.axes.items():
         if error.standing == "above_floor" and error.noise_floor:

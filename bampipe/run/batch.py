@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import traceback
 from collections.abc import Sequence
+from functools import partial
 
 from bampipe.errors import InputError
 from bampipe.run import record
@@ -58,10 +59,6 @@ def guarded(request: Request, listen: Listener) -> Outcome:
         return Outcome(request.root, "crashed", error=text, traceback=traceback.format_exc())
 
 
-def _guarded_in_worker(request: Request) -> Outcome:
-    return guarded(request, send_to_parent)
-
-
 def run_sessions(requests: Sequence[Request], jobs: int, listen: Listener) -> list[Outcome]:
     """Run several sessions, no two of which share a run folder; return their outcomes in order.
 
@@ -75,4 +72,4 @@ def run_sessions(requests: Sequence[Request], jobs: int, listen: Listener) -> li
         return Outcome(request.root, "crashed", error=error.what)
 
     with process_pool(min(jobs, len(requests)), os.getpid, nested=True, hear=listen) as pool:
-        return list(pool.map(_guarded_in_worker, requests, crash))
+        return list(pool.map(partial(guarded, listen=send_to_parent), requests, crash))

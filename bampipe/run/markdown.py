@@ -67,12 +67,11 @@ def _errors(run: RunFolder, model: str) -> str:
     """Return held-out error over floor, axis by axis."""
     from bampipe.results.validate import ValidateResult
 
-    if not model or not run.exists(ValidateResult.file(model)):
-        return ""
     try:
-        axes = run.read(ValidateResult, model).axes
+        found = run.find(ValidateResult, model) if model else None
     except InputError:
         return "not readable"
+    axes = found.axes if found else {}
     return ", ".join(
         f"{axis} {error.held_out_rmse / error.noise_floor:.2f}"
         for axis, error in axes.items()
