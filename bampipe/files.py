@@ -1,7 +1,8 @@
 """Files of text: read with mistakes named, written whole or not at all, and hashed.
 
-Nothing heavy is imported. A file that cannot be read or written raises
-:class:`bampipe.errors.InputError` naming it.
+Nothing heavy is imported. A file that is not there, cannot be read or written, is no regular file,
+too large, or not what is asked for (JSON, TOML) raises :class:`bampipe.errors.InputError`, which
+names it, and the line.
 """
 
 from __future__ import annotations
@@ -54,20 +55,12 @@ _REMEDIES = {
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file.
-
-    Raises:
-        InputError: no such file, or not JSON (file and line are named).
-    """
+    """The value in a JSON file."""
     return parse_json(read_bytes(path, LARGEST_JSON_BYTES), str(path))
 
 
 def read_json_table(path: Path) -> dict[str, Any]:
-    """The table in a JSON file that bampipe wrote.
-
-    Raises:
-        InputError: as :func:`read_json`, or it holds something else than a table.
-    """
+    """The table in a JSON file that bampipe wrote."""
     try:
         content = read_json(path)
         if isinstance(content, dict):
@@ -79,11 +72,7 @@ def read_json_table(path: Path) -> dict[str, Any]:
 
 
 def parse_json(data: bytes, where: str) -> Any:
-    """The value that the bytes ``data`` of the JSON file ``where`` stand for.
-
-    Raises:
-        InputError: not JSON, nested too deeply, or a number that nothing can hold.
-    """
+    """The value that the bytes ``data`` of the JSON file ``where`` stand for."""
     try:
         value = json.loads(data, parse_int=_whole_number)
     except json.JSONDecodeError as error:
@@ -99,11 +88,7 @@ def parse_json(data: bytes, where: str) -> Any:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The table in a TOML file.
-
-    Raises:
-        InputError: no such file, not UTF-8, or not TOML (file and line are named).
-    """
+    """The table in a TOML file."""
     data = read_bytes(path, LARGEST_TOML_BYTES)
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(
@@ -177,9 +162,7 @@ def refuse_links(folder: Path) -> None:
 def require_regular(path: Path) -> os.stat_result:
     """Return the status of ``path``, which is to be read.
 
-    Raises:
-        InputError: no such file, or no regular one: a pipe could be waited for without end, and
-            a device has none.
+    A pipe could be waited for without end, and a device has none.
     """
     try:
         status = os.stat(path)
@@ -202,9 +185,6 @@ def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[BinaryIO]:
 
     Args:
         durable: survive a loss of power; not needed for what can be made again.
-
-    Raises:
-        InputError: the folder is read-only, the disk is full, or the like.
     """
     path = Path(path)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -294,11 +274,7 @@ def digest_bytes(content: bytes) -> str:
 
 
 def digest_file(path: Path) -> str:
-    """Return the SHA-256 of the bytes of ``path`` in hexadecimal, read in pieces.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
+    """Return the SHA-256 of the bytes of ``path`` in hexadecimal, read in pieces."""
     require_regular(path)
     try:
         with path.open("rb") as stream:
@@ -334,11 +310,7 @@ def cannot(verb: str, path: Path, error: OSError) -> InputError:
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """The content of a regular file of at most ``limit`` bytes.
-
-    Raises:
-        InputError: no such file, a larger one, or one that cannot be read.
-    """
+    """The content of a regular file of at most ``limit`` bytes."""
     path = Path(path)
     if require_regular(path).st_size > limit:
         raise InputError(f"larger than {limit // 1_000_000} MB", where=str(path))

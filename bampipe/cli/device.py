@@ -114,11 +114,7 @@ def check(
 
 
 def _draw(declaration: Mapping[str, Any], where: str, path: Path) -> None:
-    """Write the picture of a robot.
-
-    Raises:
-        InputError: the device is no robot, or the file is not to be written.
-    """
+    """Write the picture of a robot, the only kind of device that has one."""
     from bampipe.declarations.robot_picture import draw_robot
     from bampipe.files import write_text
     from bampipe.physics import registry

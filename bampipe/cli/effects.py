@@ -32,11 +32,7 @@ def list_all(json: bool) -> None:
 
 
 def show_one(text: str, device_name: str, json: bool) -> None:
-    """Print the effect ``text``, ``name[:target]`` or ``file.toml[:target]``, in full.
-
-    Raises:
-        InputError: no such effect, device or target.
-    """
+    """Print the effect ``text``, ``name[:target]`` or ``file.toml[:target]``, in full."""
     from bampipe.declarations.files import read_device, read_effect
     from bampipe.physics import registry
 

@@ -83,11 +83,7 @@ def print_json(content: object) -> None:
 
 
 def page(path: Path) -> None:
-    """Open a page in the user's browser.
-
-    Raises:
-        InputError: no browser can be started.
-    """
+    """Open a page in the user's browser; InputError where none can be started."""
     import webbrowser
 
     if not webbrowser.open(path.resolve().as_uri()):

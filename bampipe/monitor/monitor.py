@@ -40,11 +40,9 @@ class Monitor:
         options: MonitorOptions,
         complain: Callable[[str], None],
     ) -> None:
-        """Wait for the first sample.
+        """Begin at ``start``; where that is None, from the first `FIRST_LOOK` samples.
 
-        Args:
-            system: the model; start: None to begin from the first `FIRST_LOOK` samples.
-            options: of the alarm; complain: called for the first few new starts of the motion.
+        ``complain`` is called for the first few new starts of the motion.
         """
         self.system, self.options, self._complain = system, options, complain
         self.alarm, self.alarms, self.restarts, self.samples = False, 0, 0, 0

@@ -53,11 +53,7 @@ def find_open(forecasts: Sequence[NextResult], proposed: NextResult) -> tuple[Ne
 def compare_forecasts(
     forecasts: Sequence[NextResult], identified: IdentifyResult, diagnosed: DiagnoseResult | None
 ) -> tuple[str, ...]:
-    """Compare each forecast that a new trial has followed with its outcome.
-
-    Args:
-        forecasts: from `read_forecasts`; the others as for `compare_forecast`.
-    """
+    """Compare each forecast that a new trial has followed with its outcome."""
     said: list[str] = []
     for one in forecasts:
         about = f"{one.parameter or one.purpose}, {one.proposals[0].seconds:g} s: "

@@ -47,11 +47,7 @@ class Report:
 
 
 def build(results: Results, progress: Callable[[float, str], None]) -> Report:
-    """Return the report of ``results``; ``progress``: called with the share done.
-
-    Raises:
-        InputError: ingest has not run, or a result is damaged.
-    """
+    """Return the report of ``results``; ``progress``: called with the share done."""
     sections = []
     for number, name in enumerate(SECTIONS):
         progress(0.7 * number / len(SECTIONS), name)

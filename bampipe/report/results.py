@@ -26,18 +26,18 @@ T = TypeVar("T")
 
 @dataclass
 class Results:
-    """The results of one session; ``detail_model`` is shown in detail, "" for the best one."""
+    """The results of one session; ``detail_model`` is shown in detail, "" for the best one.
+
+    Raises:
+        InputError: from all that reads, where a file that must be there is not, or is damaged.
+    """
 
     root: Path
     detail_model: str = ""
     _results: dict[str, Result | None] = field(default_factory=dict, repr=False)
 
     def read(self, kind: type[R], model: str = "") -> R | None:
-        """Return the result ``kind`` of ``model`` (default: the one in detail), None without it.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """Return the result ``kind`` of ``model`` (default: the one in detail), None without it."""
         relative = kind.file(model or (self.model if "{model}" in kind.FILE else ""))
         if relative not in self._results:
             path = self.root / relative
@@ -47,11 +47,7 @@ class Results:
     def table(
         self, relative: str, columns: Sequence[str] | None = None, trial: str | None = None
     ) -> pd.DataFrame | None:
-        """Return a Parquet file, or the rows of one trial; None where there is no such file.
-
-        Raises:
-            InputError: the file is damaged, or lacks one of ``columns``.
-        """
+        """Return a Parquet file, or the rows of one trial; None where there is no such file."""
         path = self.root / relative
         if not path.is_file():
             return None
@@ -93,20 +89,12 @@ class Results:
 
     @cached_property
     def session(self) -> IngestResult:
-        """The result of ingest.
-
-        Raises:
-            InputError: ingest has not run.
-        """
+        """The result of ingest."""
         return self._require(self.read(IngestResult), IngestResult.FILE)
 
     @cached_property
     def trials(self) -> pd.DataFrame:
-        """One row a trial.
-
-        Raises:
-            InputError: ingest has not run.
-        """
+        """One row a trial."""
         return self._require(self.table("ingest/trials.parquet"), "ingest/trials.parquet")
 
     def _require(self, found: T | None, relative: str) -> T:
@@ -164,11 +152,7 @@ class Results:
 
     @cached_property
     def model(self) -> str:
-        """The model shown in detail.
-
-        Raises:
-            InputError: the model asked for has no results.
-        """
+        """The model shown in detail."""
         if self.detail_model:
             return self.require_model(self.detail_model)
         compared = self.read(CompareResult)
@@ -196,11 +180,7 @@ class Results:
         return f"bampipe diagnose {self.root.name}{option}"
 
     def require_model(self, name: str) -> str:
-        """Return ``name`` of a model with results.
-
-        Raises:
-            InputError: that model has no results.
-        """
+        """Return ``name`` of a model with results."""
         if name in self.models:
             return name
         raise MissingResultError(

@@ -33,11 +33,7 @@ def file_of(folder: Path, device: str) -> Path:
 
 
 def read(folder: Path, device: str) -> Accepted | None:
-    """Return what was accepted for ``device``; None where nothing was.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """Return what was accepted for ``device``; None where nothing was."""
     path = file_of(folder, device)
     if not path.is_file():
         return None
@@ -54,11 +50,10 @@ def read(folder: Path, device: str) -> Accepted | None:
 def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     """Keep the values of ``model`` in the run ``root`` as those to hold later sessions against.
 
+    Returns the file written.
+
     Args:
         folder: of accepted values; force: even if a gate failed.
-
-    Returns:
-        The file written.
 
     Raises:
         InputError: the model is not identified, a gate failed, or a result was changed by hand.

@@ -34,11 +34,7 @@ def limit_threads(jobs: int) -> None:
 
 
 def run_and_publish(request: Request, listen: Listener) -> Outcome:
-    """Run one session and, where asked, publish its run folder.
-
-    Raises:
-        InputError: bad input, or it could not be published.
-    """
+    """Run one session and, where asked, publish its run folder."""
     if request.publish:
         check_address(request.publish)
     outcome = run_session(request, listen)

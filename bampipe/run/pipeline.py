@@ -1,4 +1,7 @@
-"""Pipelines: which stages run, with which settings, and which results are good enough."""
+"""Pipelines: which stages run, with which settings, and which results are good enough.
+
+One that is not there or says something impossible raises `InputError`.
+"""
 
 from __future__ import annotations
 
@@ -49,11 +52,7 @@ def names() -> tuple[str, ...]:
 
 
 def find(name: str) -> Path:
-    """Return the file of the pipeline ``name``: a shipped one, or a path to a lab's own.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return the file of the pipeline ``name``: a shipped one, or a path to a lab's own."""
     if name.endswith(".toml"):
         path = Path(name)
         if path.is_file():
@@ -65,11 +64,7 @@ def find(name: str) -> Path:
 
 
 def load(name: str = "default") -> Pipeline:
-    """Read and check the pipeline ``name`` (see :func:`find`).
-
-    Raises:
-        InputError: there is none, it is not TOML, or it says something impossible.
-    """
+    """Read and check the pipeline ``name`` (see :func:`find`)."""
     from bampipe.declarations.pipeline import Pipeline
     from bampipe.schema import read
 

@@ -9,6 +9,9 @@ or shared folder and published whole:
 ``current.json`` is written last, in one piece. Whoever reads it first sees the old version or the
 new one, never a mixture; an upload that was cut short is not seen at all, and the next one
 completes it. Versions that no longer count are left: somebody may be reading them.
+
+What fsspec, the driver of a file system or the place itself refuses is an `InputError`; and a run
+folder that holds a link.
 """
 
 from __future__ import annotations
@@ -40,19 +43,12 @@ CURRENT = "current.json"
 
 
 def publish(root: Path, url: str) -> str:
-    """Publish the run folder ``root`` below ``url``.
+    """Publish the run folder ``root`` below ``url``; return the version.
 
     Nobody may be at work in it. A version that is there already, whole, is not sent again.
 
     Args:
         url: a folder as fsspec names it, such as ``s3://bucket/runs`` or ``file:///mnt/runs``.
-
-    Returns:
-        The version.
-
-    Raises:
-        InputError: fsspec or the driver of that file system is not installed, or it refuses; or
-            the run folder holds a link.
     """
     refuse_links(root)
     files = {
@@ -81,11 +77,7 @@ def publish(root: Path, url: str) -> str:
 
 
 def published(url: str) -> list[str]:
-    """Return the sessions published below ``url``, sorted.
-
-    Raises:
-        InputError: as :func:`publish`.
-    """
+    """Return the sessions published below ``url``, sorted."""
     system, base = _open(url)
     with _driver("cannot be read", url):
         if not system.exists(base):
@@ -150,11 +142,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
 
 
 def check_address(url: str) -> None:
-    """Refuse an address at which nothing can be published, before hours of work.
-
-    Raises:
-        InputError: no such file system, or fsspec or its driver is not installed.
-    """
+    """Refuse an address at which nothing can be published, before hours of work."""
     _open(url)
 
 

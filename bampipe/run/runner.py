@@ -134,11 +134,7 @@ class _Runner:
 
 
 def run_session(request: Request, listen: Listener = unheard) -> Outcome:
-    """Run the selected stages of one session.
-
-    Raises:
-        InputError: bad input; results of earlier runs stay as they were.
-    """
+    """Run the selected stages of one session; bad input leaves earlier results as they were."""
     selected(request)
     fresh = not request.root.exists()
     with record.lock(request.root, request.wait, listen):

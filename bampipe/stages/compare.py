@@ -36,11 +36,7 @@ class Config:
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Put the validated models of a run side by side, parents before children.
-
-    Raises:
-        InputError: no model has been validated, or the parent of one is missing.
-    """
+    """Put the validated models of a run side by side, parents before children."""
     models: dict[str, ModelFile] = {}
     for path in run.glob("models/*/model.toml"):
         name = Path(path).parent.name

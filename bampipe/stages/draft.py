@@ -66,11 +66,7 @@ class Config(Criteria):
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Draft formulas for one model; write them and what they rest on.
-
-    Raises:
-        InputError: there is no diagnosis of the model, or nothing is left by it without a name.
-    """
+    """Draft formulas for one model; write them and what they rest on."""
     diagnosis = run.read(DiagnoseResult, config.model)
     if not diagnosis.unnamed_axes:
         raise NothingToDoError(

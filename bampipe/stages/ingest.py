@@ -59,11 +59,7 @@ class Config(CleaningLimits):
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Write the sound trials of a session and what became of each.
-
-    Raises:
-        InputError: a mistake in the session file, or no trial is sound.
-    """
+    """Write the sound trials of a session and what became of each."""
     if not config.session:
         raise InputError("no session folder given", remedy="bampipe ingest SESSION")
     session = read_session(Path(config.session))
@@ -110,11 +106,7 @@ def _ingest_trials(
     samples: ParquetAppender,
     progress: Progress,
 ) -> list[dict[str, Any]]:
-    """Write the samples of the sound trials, and return what became of each.
-
-    Raises:
-        InputError: none is sound.
-    """
+    """Write the samples of the sound trials, and return what became of each; refuse if none is."""
     rows: list[dict[str, Any]] = []
     copies = find_copies(session)
     encoders = {each.name for each in session.channels if each.second_encoder_of}

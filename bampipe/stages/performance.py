@@ -50,11 +50,7 @@ class Config:
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Map joint stiffness, friction and inertia to the handle over the poses of the session.
-
-    Raises:
-        InputError: a setting out of range, or a handle that no pose lets move every way.
-    """
+    """Map joint stiffness, friction and inertia to the handle over the poses of the session."""
     system = compile_model(load_model(run, config.model))
     device = system.model.device
     p = identified(run, config.model, system)

@@ -68,14 +68,9 @@ class _Version:
 
 
 def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
-    """Return everything that the page shows; channels as blocks of ``packer``.
+    """Return everything that the page shows of sessions of one device; ``packer`` packs channels.
 
-    Args:
-        sessions: of one device; trials and models of the second stand behind those of the first.
-        packer: what packs their channels.
-
-    Raises:
-        InputError: the sessions have other axes.
+    Trials and models of a second session stand behind those of the first.
     """
     results = sessions[0]
     for other in sessions[1:]:
