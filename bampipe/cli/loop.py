@@ -116,7 +116,7 @@ def extend(
         raise InputError("--draft goes with --auto", remedy="or use `bampipe draft RUN`")
     if auto and effects:
         raise InputError("--auto chooses the effects itself", remedy=f"leave out {effects[0]!r}")
-    names_run = first is None or auto or places.is_run(first, runs)
+    names_run = first is None or auto or bool(places.run_folder_of(first, runs))
     if first is not None and not names_run and (not effects or _is_effect(first)):
         effects, first = [first, *effects], None
     if not auto and not effects:

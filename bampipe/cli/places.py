@@ -18,12 +18,7 @@ def _known_runs(runs: Path) -> list[Path]:
     return sorted(found, key=lambda root: (root / record.FILE).stat().st_mtime_ns, reverse=True)
 
 
-def is_run(argument: str, runs: Path) -> bool:
-    """Return whether ``argument`` is a run folder, or the name of one in ``runs``."""
-    return _run_folder(argument, runs) is not None
-
-
-def _run_folder(argument: str, runs: Path) -> Path | None:
+def run_folder_of(argument: str, runs: Path) -> Path | None:
     """Return the run folder: a bare name is first of all one in ``runs``, anything else a path."""
     is_name = argument == Path(argument).name
     places = (runs / argument, Path(argument)) if is_name else (Path(argument), runs / argument)
@@ -45,7 +40,7 @@ def find_run(argument: str | None, runs: Path) -> Path:
     known = _known_runs(runs)
     if argument is None and not known:
         raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
-    root = known[0] if argument is None else _run_folder(argument, runs)
+    root = known[0] if argument is None else run_folder_of(argument, runs)
     if argument is not None and root is None:
         folder = session_folder(argument)
         if not (folder / "session.toml").is_file():

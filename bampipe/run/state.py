@@ -58,12 +58,6 @@ class RunState:
             settings["model"] = step.model
         return settings
 
-    def digest_record(self, step: Step) -> str:
-        """Hash of what ``run.json`` says of the other steps, times and places left out."""
-        return digest_content(
-            {name: made.key for name, made in self.records.items() if name != step.name}
-        )
-
     def session_folder(self) -> Path:
         if self.session is None:
             place = self.written.place.session
@@ -96,7 +90,9 @@ class RunState:
                 raise self.missing(pattern)
             for name in names:
                 if name == record.FILE:
-                    found[name] = self.digest_record(step)
+                    # What it says of the other steps, times and places left out.
+                    others = {k: made.key for k, made in self.records.items() if k != step.name}
+                    found[name] = digest_content(others)
                     continue
                 self.check_untouched(name)
                 is_text = name.endswith(".toml")

@@ -98,13 +98,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     for one in found:
         axis = system.coordinates[one.axis]
         drafted: dict[str, DraftedEffect] = {}
-        if _beats_named_effects(one, diagnosis.axes[axis]):
+        named = diagnosis.axes[axis]
+        if not named.effects or one.chosen.held_out_rmse < named.rmse_after:
             for term in one.terms:
                 file = f"models/{config.model}/drafts/{term.form.name}.toml"
                 write_text(out / file, write_toml(declare(term, source)))
                 drafted[term.form.canonical] = _effect(term, file)
         rows = [row for row in diagnosis.ranking if row.axis == axis]
-        entries[axis] = _axis(axis, one, drafted, diagnosis.axes[axis], rows)
+        entries[axis] = _axis(axis, one, drafted, named, rows)
         effects |= drafted
     selected = tuple(effects)
     advice = (
@@ -129,11 +130,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         },
         "selected": selected,
     }
-
-
-def _beats_named_effects(found: FoundDraft, diagnosed: AxisVerdict) -> bool:
-    """Whether the terms found leave less than the effects that the diagnosis names there."""
-    return not diagnosed.effects or found.chosen.held_out_rmse < diagnosed.rmse_after
 
 
 def _effect(term: Term, file: str) -> DraftedEffect:
