@@ -202,8 +202,7 @@ def _drive(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
         one["gain"] -= getattr(v, "error", 0.0)
         one["offset"] -= getattr(v, "bias", 0.0)
         one["delay"] += getattr(v, "delay", 0.0)
-        # As the effect's own formula rounds it off.
-        one["lag"] += 0.5 * (late + math.sqrt(late**2 + 4e-6)) if late else 0.0
+        one["lag"] += late
     return True
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.trials.evidence import Evidence
+from bampipe.trials.likelihood import NOTHING
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
 
@@ -26,7 +27,12 @@ def added_columns(
     """
     e, system = evidence, item.system
     count = len(system.parameters) - len(item.parameters)
-    p = np.concatenate([e.p[:count], [q.prior for q in item.parameters]])
+    p = np.array([q.prior for q in system.parameters])
+    beside_others = item.is_joint or _moves(item)
+    for k, q in enumerate(system.parameters[:count]):
+        # Where the fit took a parameter away, an effect of it would be none: its prior stands in.
+        if beside_others or k not in e.free or e.p[k] - q.lower > NOTHING * q.sd:
+            p[k] = e.p[k]
     p[[count + i for i in item.searched_indices]] = searched
     p[[count + i for i in item.linear_indices]] = 0.0
     axes = list(range(len(system.coordinates)) if system.moves_sensors else system.touched)

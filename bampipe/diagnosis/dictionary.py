@@ -14,8 +14,10 @@ from scipy.signal import csd
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_columns
 from bampipe.diagnosis.ranges import MachineScale, SearchRange
+from bampipe.physics.system import System
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import Samples, take_samples
+from bampipe.trials.motion import Motion
 
 Array = NDArray[np.float64]
 
@@ -29,6 +31,8 @@ _MOST, _MOST_OF_THREE, _MOST_OF_STATES = 60, 120, 300
 happen, not only how large they are; three of them at most, or more."""
 _DIVERGED = 1e30
 """An internal state that is too stiff to be integrated at the sampling rate ends above this."""
+_PASSES = 1e-3
+"""Slope by a constant force up to which a candidate passes it as it is."""
 _SEGMENT = 128
 """Thinned samples of a segment from which the gain of a filter is found."""
 
@@ -45,13 +49,13 @@ class Atom:
         slopes: derivative of what it adds by each measured force, by axis, (n, n_forces, m), for
             each of its strengths at one; empty where what it adds does not depend on the force of
             that moment.
-        log_gain: mean over the band of the logarithm of its gain where it filters the measured
-            force, by axis, (n_q,); else zero.
+        gain: share of the variance of white noise of the measured force that it leaves in the
+            band where it filters that force, by axis, (n_q,); else one.
     """
 
     columns: Mapping[int, Array]
     slopes: Mapping[int, Array]
-    log_gain: Array
+    gain: Array
 
     @property
     def width(self) -> int:
@@ -88,7 +92,9 @@ class Dictionary:
         """The shapes of a candidate at which its columns are made to begin with."""
         ranges = self.ranges[name]
         each = _ALONE if len(ranges) == 1 else _SEVERAL
-        counts = [each + _MORE * (r.by_ratio and r.high / r.low > _WIDE) for r in ranges]
+        counts = [
+            max(each + _MORE * (r.by_ratio and r.high / r.low > _WIDE), r.fewest) for r in ranges
+        ]
         states = self.candidates[name].system.model.effects[-1].effect.states
         most = _MOST_OF_STATES if len(ranges) > 3 else _MOST_OF_THREE
         while np.prod(counts) > (most if states else _MOST):
@@ -138,20 +144,35 @@ class Dictionary:
             for k in range(next(iter(found.values())).shape[1])
         ):
             return None
-        system, nothing = item.system, np.zeros(len(self.samples))
-        filters = not item.linear_indices and system.model.effects[-1].effect.kind == "input"
-        if system.driven:
-            return Atom(found, self._slopes(item, values), nothing)
-        if filters:
-            p = self._parameters(item, values, np.zeros(0))
-            return Atom(found, {}, self._log_gain(item, p))
-        return Atom(found, {}, nothing)
+        slopes = self._slopes(item, values)
+        gain = self._gain(item, self._parameters(item, values), slopes)
+        return Atom(found, slopes, gain)
+
+    def scale_left(
+        self, name: str, parameters: Mapping[str, float]
+    ) -> tuple[dict[int, Array], Array]:
+        """What a candidate changes of how the residual depends on the measured forces.
+
+        Args:
+            name: of the candidate; parameters: values of its own, by name.
+
+        Returns:
+            Slopes of what it adds by each force, by axis, each (n, n_forces), and its `gain`.
+        """
+        item = self.candidates[name]
+        count = len(item.system.parameters) - len(item.parameters)
+        own = [parameters[q.name] for q in item.parameters]
+        p = np.concatenate([self.evidence.p[:count], own])
+        slopes = self._slopes_at(item, p)
+        return slopes, self._gain(item, p, slopes)
 
     def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
         """`make` each."""
         return [(key, self.make(key)) for key in keys]
 
-    def _parameters(self, item: Candidate, searched: Array, strengths: Array) -> Array:
+    def _parameters(
+        self, item: Candidate, searched: Array, strengths: Array | float = 0.0
+    ) -> Array:
         count = len(item.system.parameters) - len(item.parameters)
         p = np.concatenate([self.evidence.p[:count], [q.prior for q in item.parameters]])
         p[[count + i for i in item.searched_indices]] = searched
@@ -161,43 +182,46 @@ class Dictionary:
     def _slopes(self, item: Candidate, searched: Array) -> dict[int, Array]:
         one_each = np.eye(len(item.linear_indices)) if item.linear_indices else np.zeros((1, 0))
         each = [self._slopes_at(item, self._parameters(item, searched, b)) for b in one_each]
+        nothing = {axis: np.zeros_like(slope) for slopes in each for axis, slope in slopes.items()}
         return {
-            axis: values
-            for axis in range(len(self.samples))
-            if (values := np.stack([slopes[axis] for slopes in each], axis=2)).any()
+            axis: np.stack([slopes.get(axis, zero) for slopes in each], axis=2)
+            for axis, zero in nothing.items()
         }
 
-    def _slopes_at(self, item: Candidate, p: Array) -> list[Array]:
-        """The same at given parameters, (n_p,), by axis, each (n, n_forces)."""
+    def _slopes_at(self, item: Candidate, p: Array) -> dict[int, Array]:
+        """The same at given parameters, (n_p,), each (n, n_forces)."""
         e, system, rows = self.evidence, item.system, []
+        if not system.driven:
+            return {}
         for motion in e.motions:
-            kept, u = e.band.thinned_rows(len(motion.t)), motion.inputs(system.inputs)
-            motion = motion.of_mechanism(system, u, p)
-            z = system.memory(*motion.kinematics, u, p, motion.t)
-            at = motion.q[kept], motion.qd[kept], motion.qdd[kept], z[kept]
-            here = system.contribution(*at, u[kept], p)
-            slope = np.zeros((*here.shape, len(system.model.device.forces)))
-            for j, force in enumerate(system.model.device.forces):
-                moved, column = u[kept].copy(), system.inputs.index(force)
-                step = 1e-6 * max(float(np.abs(moved[:, column]).max()), 1e-6)
-                moved[:, column] += step
-                slope[:, :, j] = (system.contribution(*at, moved, p) - here) / step
+            kept = e.band.thinned_rows(len(motion.t))
+            slope = _slope_by_force(system, motion, kept, p)
+            if item.is_joint:
+                slope = slope - _slope_by_force(e.system, motion, kept, e.p)
             rows.append(slope)
-        return [take_samples(rows, here, a) for a, here in enumerate(self.samples)]
+        found = [take_samples(rows, here, a) for a, here in enumerate(self.samples)]
+        return {axis: slope for axis, slope in enumerate(found) if (np.abs(slope) > _PASSES).any()}
 
-    def _log_gain(self, item: Candidate, p: Array) -> Array:
-        """Kolmogorov: what a filter takes off the innovations of all that goes through it."""
+    def _gain(self, item: Candidate, p: Array, slopes: Mapping[int, Array]) -> Array:
+        """What a candidate leaves of the noise of the forces, `Atom.gain`.
+
+        Args:
+            item: the candidate; p: parameters of its system, (n_p,).
+            slopes: what it changes of a constant force; a filter passes that.
+        """
         e, system, through = self.evidence, item.system, []
+        if slopes or item.linear_indices or system.model.effects[-1].effect.kind != "input":
+            return np.ones(len(self.samples))
         for motion in e.motions:
             u = motion.inputs(system.inputs)
             z = system.memory(*motion.kinematics, u, p, motion.t)
             through.append(e.band.thin(system.applied(*motion.kinematics, z, u, p)))
-        found = np.zeros(len(self.samples))
+        found, band = np.ones(len(self.samples)), e.band.passed_power(_SEGMENT // 2)
         for axis, auto in enumerate(self._power):
             pairs = [(x[:, axis], y[:, axis]) for x, y in zip(self._plain, through, strict=True)]
             if any(not np.array_equal(x, y) for x, y in pairs):
                 gain = np.abs(sum(_spectrum(x, y) for x, y in pairs)) / np.maximum(auto, 1e-300)
-                found[axis] = min(float(np.mean(np.log(np.clip(gain[1:], 1e-2, 1e2)))), 0.0)
+                found[axis] = np.average(np.clip(gain, 1e-2, 1.0) ** 2, weights=band[:, axis])
         return found
 
     @cached_property
@@ -210,6 +234,28 @@ class Dictionary:
         """Its power spectrum, by axis."""
         columns = ([x[:, a] for x in self._plain] for a in range(len(self.samples)))
         return [np.abs(sum(_spectrum(x, x) for x in each)) for each in columns]
+
+
+def _slope_by_force(system: System, motion: Motion, kept: NDArray[np.int64], p: Array) -> Array:
+    """Derivative of what the effects of a model add by each measured force, (K, n_q, n_forces).
+
+    By a force that is more all the time, so that internal states which follow it have come to rest.
+    """
+    u, forces = motion.inputs(system.inputs), system.model.device.forces
+    motion = motion.of_mechanism(system, u, p)
+    at = motion.q[kept], motion.qd[kept], motion.qdd[kept]
+
+    def added(inputs: Array) -> Array:
+        z = system.memory(*motion.kinematics, inputs, p, motion.t)
+        return system.contribution(*at, z[kept], inputs[kept], p)
+
+    here, slopes = added(u), []
+    for force in forces:
+        moved, column = u.copy(), system.inputs.index(force)
+        step = 1e-6 * max(float(np.abs(moved[:, column]).max()), 1e-6)
+        moved[:, column] += step
+        slopes.append((added(moved) - here) / step)
+    return np.stack(slopes, axis=2)
 
 
 def _spectrum(x: Array, y: Array) -> NDArray[np.complex128]:

@@ -79,20 +79,26 @@ def weigh_sets(
 
     Args:
         by_noise: the search over sets beside the most probable model; fit: that model.
-        pool: sets near it; given: effects of the model diagnosed, which are not in question.
+        pool: sets near it, with costs by the noise.
+        given: effects of the model diagnosed, which are not in question.
         seed: of the bootstrap.
     """
     search = by_noise.with_independent(fit.count_independent(criteria))
-    pool = {n: (search.cost(k), k) for n, (_, k) in pool.items()}
+    # What a set fell short by when it was fitted.
+    short = {k: c - by_noise.cost(k) for c, k in pool.values()}
+    pool = {n: (search.cost(k) + short[k], k) for n, (_, k) in pool.items()}
     none, evidence = search.cost(()), search.dictionary.evidence
     own = [e for e in search.p.absence if e not in given]
     near = sorted((c, k) for c, k in pool.values() if c < none + _NEAR and k)[:_MOST]
     absent = [((f"-{e}", ()),) for e in own]
     named = [
-        _Listed(keys, None, none - search.cost(keys), _by_block(search, keys, None))
+        _Listed(
+            keys, None, none - search.cost(keys) - short.get(keys, 0.0),
+            _by_block(search, keys, None, short.get(keys, 0.0)),
+        )
         for keys in dict.fromkeys([(), *(k for _, k in near), *absent])
         if np.isfinite(search.cost(keys))
-    ]
+    ]  # fmt: skip
     sets = _share(search, named, given, seed)
     effects, drops = _by_effect(sets), _losses(sets)
     unknown, functions = np.zeros(len(search.p.y)), []
@@ -245,8 +251,10 @@ def _effects(search: Search, keys: Sequence[Key], given: Sequence[str]) -> tuple
     return (*kept, *(name for name, _ in added(keys)))
 
 
-def _by_block(search: Search, keys: tuple[Key, ...], unknown: Unknown | None) -> Array:
-    """Log likelihood of a set over that of none, nats, by block of time, (n_blocks,)."""
+def _by_block(
+    search: Search, keys: tuple[Key, ...], unknown: Unknown | None, short: float = 0.0
+) -> Array:
+    """Log likelihood of a set over that of none, less ``short``, nats, by block of time, (n,)."""
     p = search.p
     before = search.residual_rows(())
     after = list(unknown.residual) if unknown else search.residual_rows(keys)
@@ -254,7 +262,7 @@ def _by_block(search: Search, keys: tuple[Key, ...], unknown: Unknown | None) ->
     w_after = unknown.weight if unknown else search.solve(keys).weight
     volume = search.volume_rows(keys)
     count = 1 + max((int(s.block.max()) for s in p.likelihood.samples if len(s.block)), default=0)
-    found = np.zeros(count)
+    found = np.full(count, -short / count)
     for axis, here in enumerate(p.likelihood.samples):
         if not len(here.rows):
             continue

@@ -23,6 +23,9 @@ _SPEED = (1e-3, 1.0)
 """Of the highest speed."""
 _WAVES = (2.0, 30.0)
 """Waves on the travel."""
+_WAVES_APART = 0.6
+"""Waves on the travel between two values that are tried: two that differ by one have nothing in
+common."""
 _GIVE = (1e-4, 0.1)
 """Of the travel, at the highest load: less cannot be distinguished from what happens between two
 samples where friction changes its sign."""
@@ -54,6 +57,8 @@ class SearchRange:
         around: middle of the travel for a position outside of it. Then ``low`` and ``high`` are
             reciprocals of its distance from there, through 0 from one side to the other.
         farthest: the farthest such distance.
+        apart: values may be no farther apart where they are tried one by one, in the unit; such a
+            range is even.
     """
 
     low: float
@@ -61,6 +66,12 @@ class SearchRange:
     by_ratio: bool
     around: float | None = None
     farthest: float = np.inf
+    apart: float = np.inf
+
+    @property
+    def fewest(self) -> int:
+        """Values of a grid that lie near enough."""
+        return 1 + int(np.ceil((self.high - self.low) / self.apart))
 
     @property
     def extent(self) -> float:
@@ -84,6 +95,8 @@ class SearchRange:
 
     def within(self, share: float) -> float:
         """The value that lies a share of the way from the lower to the upper end."""
+        if np.isfinite(self.apart):
+            return self.low + share * (self.high - self.low)
         return between(self.low, self.high, share)
 
 
@@ -162,7 +175,12 @@ class MachineScale:
         low, high = max(low, lower), min(high, upper)
         if not low < high:
             low, high = lower or 0.02 * reach, min(upper, reach)
-        return SearchRange(low, high if np.isfinite(high) else parameter.prior + reach, True)
+        high = high if np.isfinite(high) else parameter.prior + reach
+        if item.axes and parameter.unit == f"1/{self.coordinates[item.axes[0]][0]}":
+            i = list(self.coordinates).index(item.axes[0])
+            travel = max(float(self.highest[i] - self.lowest[i]), 1e-300)
+            return SearchRange(low, high, True, apart=2.0 * np.pi * _WAVES_APART / travel)
+        return SearchRange(low, high, True)
 
     def _sizes(self, item: BoundEffect, parameter: Parameter) -> dict[str, tuple[float, float]]:
         """Ranges of lengths, speeds and the like at the target of an effect, by unit."""

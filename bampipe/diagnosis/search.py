@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
+from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import (
     NOTHING,
     Problem,
@@ -221,10 +222,10 @@ class Search:
         if any(solved.held[h].all() for h in held):
             return Solution(np.inf)
         strengths = tuple(b[nb:][h] for h in held)
-        volume = self._volume(keys, strengths)
+        scale = solved.left / p.count
+        volume = self._volume(self._log_slopes(keys, strengths, scale))
         if volume is None:
             return Solution(np.inf)
-        scale = solved.left / p.count
         sizes: tuple[float, ...] = ()
         # What an effect of the model costs is not in the cost of the model as it is.
         penalty = self.penalty_of(all_keys)
@@ -298,24 +299,47 @@ class Search:
             for axis, square in self._squares[key].items()
         )
 
-    def _volume(self, keys: Sequence[Key], strengths: Sequence[Array]) -> Array | None:
+    def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
+        """`Solution.volume` of a set with the parameters of a model that was fitted with it."""
+        known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
+        each = [self.dictionary.scale_left(name, known) for name, _ in added(keys)]
+        return self._volume(self._log_of_slopes(each, self.solve(keys).scale))
+
+    def _volume(self, rows: Sequence[Array]) -> Array | None:
         """By axis, independent samples times the mean log of what is left of what was measured.
 
         None where so little is left of the force that the equation has no scale.
         """
-        rows = self._log_slopes(keys, strengths)
         means = np.array([float(r.mean()) if len(r) else 0.0 for r in rows])
         return None if (means < np.log(_LEAST_SLOPE)).any() else self.p.independent * means
 
-    def _log_slopes(self, keys: Sequence[Key], strengths: Sequence[Array]) -> list[Array]:
+    def _log_slopes(
+        self, keys: Sequence[Key], strengths: Sequence[Array], scale: Array
+    ) -> list[Array]:
         """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
+        atoms = [self._atom(key) for key in keys]
+        each = [
+            ({axis: slope @ b for axis, slope in atom.slopes.items()}, atom.gain)
+            for atom, b in zip(atoms, strengths, strict=True)
+        ]
+        return self._log_of_slopes(each, scale)
+
+    def _log_of_slopes(
+        self, each: Sequence[tuple[Mapping[int, Array], Array]], scale: Array
+    ) -> list[Array]:
+        """The same of slopes, by axis, (n, n_forces), and gains of each effect."""
         found = [np.zeros(len(y)) for y in self.p.y]
         moved: dict[int, Array] = {}
-        for key, b in zip(keys, strengths, strict=True):
-            atom = self._atom(key)
-            found = [f + g if g else f for f, g in zip(found, atom.log_gain, strict=True)]
-            for axis, slope in atom.slopes.items():
-                moved[axis] = moved.get(axis, 0.0) + slope @ b
+        gains = np.ones(self.n_q)
+        for slopes, gain in each:
+            for axis, slope in slopes.items():
+                moved[axis] = moved.get(axis, 0.0) + slope
+            gains *= gain
+        # A filter takes off the noise of the forces, and what is beyond that of replays; that of
+        # the motion stays.
+        for axis in map(int, np.flatnonzero(gains < 1.0)):
+            kept = (1.0 - self.p.likelihood.force_share[axis]) / max(float(scale[axis]), 1.0)
+            found[axis] = found[axis] + 0.5 * np.log(kept + (1.0 - kept) * gains[axis])
         for axis, slope in moved.items():
             plain = self.p.likelihood.slopes[axis]
             bare = np.linalg.norm(plain, axis=1)
@@ -359,7 +383,9 @@ class Search:
 
     def volume_rows(self, keys: Sequence[Key]) -> list[Array]:
         """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
-        return self._log_slopes(added(tuple(sorted(keys))), self.solve(keys).strengths)
+        return self._log_slopes(
+            added(tuple(sorted(keys))), self.solve(keys).strengths, self.solve(keys).scale
+        )
 
     def cost(self, keys: Sequence[Key]) -> float:
         """Negative log evidence of a set, nats."""
@@ -427,7 +453,7 @@ class Search:
         only = np.flatnonzero(self.widths == 1)
         square, moment = block[only, 0, 0], mom[only, 0]
         x = np.clip(moment / np.maximum(square, 1e-300), low[only, 0], high[only, 0])
-        held = np.where(square > 1e-6 * own[only, 0], (moment - 0.5 * square * x) * x, 0.0)
+        held = np.where(square > least[only, 0], (moment - 0.5 * square * x) * x, 0.0)
         gain[only] = np.maximum(held, 0.0)
         return gain
 
@@ -440,7 +466,7 @@ class Search:
         # Close to those of this set: most weights are found in two passes from there.
         self._weight = self.solve(keys).weight
         gains, have = self.gains(keys), {name.removeprefix("-") for name, _ in keys}
-        tried: dict[str, float] = {}
+        tried: dict[str, int] = {}
         best: dict[str, tuple[float, Key]] = {}
         for k in np.argsort(-gains):
             key = self.places[k]
@@ -454,8 +480,7 @@ class Search:
             ):
                 continue
             cost = self.cost((*keys, key))
-            # A shape that its bounds rule out says nothing yet of the others.
-            tried[name] = tried.get(name, 0.0) + (1.0 if np.isfinite(cost) else 0.5)
+            tried[name] = tried.get(name, 0) + 1
             if np.isfinite(cost) and cost < best.get(name, (np.inf,))[0]:
                 best[name] = cost, key
         return sorted(best.values())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
 from bampipe.diagnosis.probability import Weighed, weigh_sets
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.search import Pool, Search, Solution, added, gone, names
+from bampipe.diagnosis.search import Pool, Search, added, gone, names
 from bampipe.diagnosis.session import (
     Fit,
     Session,
@@ -160,6 +160,7 @@ def select_effects(
             last |= number == _MOST_ROUNDS - 1
             better = [(c, k) for c, k in sorted(pool.values()) if c < none - _WORTH]
             broken: list[set[Key]] = []
+            kept: dict[tuple[str, ...], float] = {}
             for _, keys in [] if last else better:
                 if len(broken) == _TRIED:
                     break
@@ -172,17 +173,23 @@ def select_effects(
                     progress(0.15 + 0.1 * number, f"fitting {', '.join(names(keys))}")
                     fits[members] = session.try_fit(wider, start_of(search, keys, wider))
                 moved = fits[members]
-                if moved is not None and is_better(current, moved, search.solve(keys)):
-                    # By its own noise a set fitted before is not the better one: it is the last.
-                    last |= not fresh
-                    break
+                if moved is not None:
+                    kept[names(keys)] = gain_when_fitted(current, moved, search, keys)
+                    if kept[names(keys)] > _WORTH:
+                        # By its own noise a set fitted before is not the better one: the last.
+                        last |= not fresh
+                        break
                 broken.append({*keys})
                 moved = None
                 if fresh:
                     fits[members] = None
             if moved is None:
-                # What promised more by its linear problem did not keep that when it was fitted.
-                pool = {n: (c, k) for n, (c, k) in pool.items() if c >= none - _WORTH}
+                # What promised more by its linear problem counts by what it kept when fitted.
+                pool = {
+                    n: (max(c, none - kept[n]) if n in kept else c, k)
+                    for n, (c, k) in pool.items()
+                    if n in kept or c >= none - _WORTH
+                }
                 progress(0.9, "holding the model against chance")
                 replays = range(session.criteria.replicates)
                 chance = tuple(search.of_replay(k).largest_gain()[0] for k in replays)
@@ -217,14 +224,14 @@ def _leave_out(session: Session, fit: Fit, weighed: Weighed, given: Collection[s
     return session.try_fit(less, np.array([known[q.name] for q in system_of(less).parameters]))
 
 
-def is_better(before: Fit, after: Fit, promised: Solution) -> bool:
-    """Whether a fitted set is more probable, by the weights of the model without it.
+def gain_when_fitted(before: Fit, after: Fit, search: Search, keys: Sequence[Key]) -> float:
+    """Log evidence that a fitted set gains by the weights of the model without it, nats.
 
     Args:
-        before, after: the model without and with it; promised: its linear problem solved.
+        before, after: the model without and with it; search: beside the former; keys: the set.
     """
     if any(len(a) != len(b) for a, b in zip(before.problem.y, after.problem.y, strict=True)):
-        return True
+        return np.inf
     gained = 0.0
     for axis, root in enumerate(before.likelihood.root):
         if len(root):
@@ -233,10 +240,10 @@ def is_better(before: Fit, after: Fit, promised: Solution) -> bool:
             ]
             ratio = max(squares[1], 1e-300) / max(squares[0], 1e-300)
             gained -= 0.5 * before.problem.independent[axis] * float(np.log(ratio))
+    promised, taken = search.solve(keys), search.volume_where_fitted(keys, after.evidence)
     # What a fit ends at may take more off the measured quantity than its linear problem promised.
-    taken = before.problem.independent * (after.log_slope - before.log_slope)
-    volume = float(np.minimum(promised.volume, taken).sum())
-    return gained + volume - promised.penalty > _WORTH
+    volume = -np.inf if taken is None else float(np.minimum(promised.volume, taken).sum())
+    return gained + volume - promised.penalty
 
 
 def _explore(search: Search, room: int, deep: int) -> Pool:

@@ -192,6 +192,26 @@ class Session:
             return nothing
         return residuals_of(evidence, replays)
 
+    def weight_samples(
+        self, recipe: Recipe, evidence: Evidence, noise: Noise | None = None
+    ) -> Likelihood:
+        """The likelihood of the trials of ``evidence``, with noise by replays of its model.
+
+        Args:
+            recipe: the model; evidence: linearised; noise: by replays of another one instead.
+
+        Raises:
+            Runaway: the simulated motion grows without bounds.
+        """
+        c = self.criteria
+        samples = lay_out_samples(evidence, c.block_s)
+        if noise is None:
+            replays = self.replay(evidence, evidence.p, c.replicates)
+            stopping = self.replay_stopping(recipe, evidence)
+            noise = describe_noise(replays, stopping, evidence, samples)
+        force_sd = self.trials.sensors.force_sd
+        return Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy, force_sd)
+
     def fit(
         self, recipe: Recipe, start: Array, noise: Noise | None = None, lacking: float = np.inf
     ) -> Fit:
@@ -205,14 +225,8 @@ class Session:
         Raises:
             Runaway: the simulated motion grows without bounds.
         """
-        evidence = self.linearise(recipe, start)
-        c = self.criteria
-        samples = lay_out_samples(evidence, c.block_s)
-        if noise is None:
-            replays = self.replay(evidence, evidence.p, c.replicates)
-            stopping = self.replay_stopping(recipe, evidence)
-            noise = describe_noise(replays, stopping, evidence, samples)
-        likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
+        evidence, c = self.linearise(recipe, start), self.criteria
+        likelihood = self.weight_samples(recipe, evidence, noise)
         evidence, problem = self._descend(recipe, evidence, likelihood)
         log_likelihood = problem.log_likelihood()
         likelihood = likelihood.with_heavy_tails(problem, c.tails)
@@ -259,13 +273,9 @@ class Session:
         Raises:
             Runaway: the simulated motion grows without bounds.
         """
-        evidence, c = self.linearise(recipe, p, judged=True), self.criteria
-        samples = lay_out_samples(evidence, c.block_s)
-        replays = self.replay(evidence, p, c.replicates)
-        stopping = self.replay_stopping(recipe, evidence)
-        noise = describe_noise(replays, stopping, evidence, samples)
-        likelihood = Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy)
-        return Fit(recipe, evidence, likelihood, likelihood.pose(evidence))
+        evidence = self.linearise(recipe, p, judged=True)
+        likelihood = self.weight_samples(recipe, evidence)
+        return Fit(recipe, evidence, likelihood, likelihood.pose(evidence), given=True)
 
     def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
         """Fit a model with noise that is the same for all samples of an axis, without replays."""
@@ -273,7 +283,7 @@ class Session:
         samples = lay_out_samples(evidence, self.criteria.block_s)
         nothing = [np.zeros_like(r) for r in evidence.residual]
         noise = describe_noise([nothing, nothing], nothing, evidence, samples)
-        flat = Likelihood.of(evidence, samples, noise, 0.0, 0.0)
+        flat = Likelihood.of(evidence, samples, noise, 0.0, 0.0, self.trials.sensors.force_sd)
         evidence, problem = self._descend(recipe, evidence, flat)
         return Fit(recipe, evidence, flat, problem)
 
@@ -301,6 +311,7 @@ class Fit:
         likelihood: noise and weights; problem: the weighted linear problem.
         log_likelihood: under the normal noise of its replays, nats, to rank fits whose noise comes
             from different replays; nan where the model was not fitted with such noise.
+        given: whether its parameters are given, so that nuisance parameters alone are fitted.
     """
 
     recipe: Recipe
@@ -308,34 +319,14 @@ class Fit:
     likelihood: Likelihood
     problem: Problem
     log_likelihood: float = float("nan")
+    given: bool = False
 
     @cached_property
     def solved(self) -> Solved:
         """The solution of its linear problem, next to zero but for the nuisance parameters."""
+        if self.given:
+            return self.problem.solve_nuisance(len(self.evidence.free))
         return self.problem.solve()
-
-    @cached_property
-    def log_slope(self) -> Array:
-        """Mean log of the slope of the residual by the measured forces, by axis, (n_q,).
-
-        Where it falls, both sides of the equation are made small.
-        """
-        e, system, rows = self.evidence, self.evidence.system, []
-        for motion in e.motions:
-            kept, u = e.band.thinned_rows(len(motion.t)), motion.inputs(system.inputs)
-            moved = motion.of_mechanism(system, u, e.p)
-            z = system.memory(*moved.kinematics, u, e.p, motion.t)
-            z, u = z[kept], u[kept]
-            at = (moved.q[kept], moved.qd[kept], moved.qdd[kept])
-            here = system.residual(*at, z, u, e.p)
-            square = np.zeros_like(here)
-            for column in map(system.inputs.index, system.model.device.forces):
-                more, step = u.copy(), 1e-6 * max(float(np.abs(u[:, column]).max()), 1e-6)
-                more[:, column] += step
-                square += ((system.residual(*at, z, more, e.p) - here) / step) ** 2
-            rows.append(0.5 * np.log(np.maximum(square, 1e-300)))
-        taken = [take_samples(rows, here, a) for a, here in enumerate(self.likelihood.samples)]
-        return np.array([float(each.mean()) if each.size else 0.0 for each in taken])
 
     @cached_property
     def bias(self) -> tuple[Array, ...]:
@@ -356,12 +347,12 @@ class Fit:
         like, levels = self.likelihood, []
         parts = zip(
             like.noise.residuals, like.noise.bias, self.bias, like.bias_variance,
-            self.problem.y, like.root, strict=True,
+            self.rows_beyond_bias, strict=True,
         )  # fmt: skip
-        for of_replays, b, bias, variance, y, root in parts:
+        for of_replays, b, bias, variance, left in parts:
             rows = of_replays - b + bias
             square = np.mean(rows**2, axis=1) if b.size else np.zeros(len(rows))
-            off = rms(y / root) ** 2 - float(np.median(square))
+            off = rms(left + bias) ** 2 - float(np.median(square))
             more = float(variance.mean()) if b.size else 0.0
             levels.append(np.sqrt(square + np.clip(off, 0.0, more)))
         return NoiseFloor.of_errors([*np.array(levels).T])

@@ -128,6 +128,15 @@ class Band:
         spacing = self.step * 2.0 * np.array(self.cutoff_hz) / self.rate_hz
         return np.minimum(1.0, spacing)
 
+    def passed_power(self, count: int) -> Array:
+        """Share of the power that is left at ``count`` frequencies, (count, n_q).
+
+        They are evenly spaced below half the rate of the thinned samples.
+        """
+        at = np.tan(0.5 * np.pi / self.step * (np.arange(count) + 0.5) / count)[:, None]
+        edge = np.tan(np.pi * np.array(self.cutoff_hz) / self.rate_hz)
+        return np.asarray((1.0 + (at / edge) ** 4) ** -2.0)
+
     def thinned_rows(self, count: int) -> NDArray[np.int64]:
         """Indices of the samples that thinning keeps of ``count``."""
         margin = int(self.margin_s * self.rate_hz)

@@ -174,7 +174,8 @@ class Comparison:
             classes.append(numbers[at])
         nothing = tuple(np.zeros_like(b) for b in bias)
         noise = Noise(tuple(bias), tuple(variance), nothing, (), tuple(classes))
-        return seen, Likelihood.of(seen, samples, noise, c.bias_error, c.discrepancy)
+        force_sd = self.session.trials.sensors.force_sd
+        return seen, Likelihood.of(seen, samples, noise, c.bias_error, c.discrepancy, force_sd)
 
     @cached_property
     def _noise_by_speed(self) -> list[tuple[Array, Array, NDArray[np.int64]]]:

@@ -43,6 +43,8 @@ _SLOW = 3.0
 """Sign widths: slow motion, in which dry friction is as large as it gets."""
 _MOST_STOPPING = 1.5
 """Largest factor of the residual of a replay that truly stops."""
+_FREQUENCIES = 256
+"""At which the share of white noise that a low-pass leaves is summed."""
 _RIDGE = 1e-10
 _PASSES, _REWEIGHTS = 8, 5
 _STEADY = 0.02
@@ -173,6 +175,8 @@ class Likelihood:
         bias_variance: how far the bias may be off where the machine turns, by axis, each (n,).
         applied: the applied force, by axis, each (n,), N.m or N.
         slopes: its derivative by each measured force, by axis, each (n, n_forces).
+        force_share: share of the noise of each sample that is that of the measured forces, by axis,
+            each (n,).
         factors: of what is measured where the weights are those of the residual; see `Evidence`.
     """
 
@@ -182,6 +186,7 @@ class Likelihood:
     bias_variance: tuple[Array, ...]
     applied: tuple[Array, ...]
     slopes: tuple[Array, ...]
+    force_share: tuple[Array, ...]
     factors: tuple[float, ...] = ()
 
     @classmethod
@@ -192,8 +197,13 @@ class Likelihood:
         noise: Noise,
         bias_error: float,
         discrepancy: float,
+        force_sd: Array,
     ) -> Likelihood:
-        """Weight samples by the noise of replays, the error of their bias and any model's."""
+        """Weight samples by the noise of replays, the error of their bias and any model's.
+
+        Args:
+            force_sd: noise of each measured force, (n_forces,), in its unit.
+        """
         e, system = evidence, evidence.system
         axes = range(len(samples))
         applied = e.band.thin_trials([fitted.applied for fitted in e.fitted], axes)
@@ -205,7 +215,8 @@ class Likelihood:
         turning = [np.zeros_like(r) for r in e.residual]
         if bias_error:
             turning = e.band.thin_trials(_error_of_turning(e), axes)
-        root, force, bias_variance = [], [], []
+        white = e.band.passed_power(_FREQUENCIES).mean(axis=0) / e.band.step
+        root, force, bias_variance, force_share = [], [], [], []
         for axis, here in enumerate(samples):
             f, y = take_samples(applied, here, axis), take_samples(e.residual, here, axis)
             of_bias = bias_error**2 * noise.variance_of_bias(axis, y)
@@ -216,10 +227,13 @@ class Likelihood:
             root.append(1.0 / np.sqrt(np.maximum(variance, least)) if least else np.ones(len(f)))
             force.append(f)
             bias_variance.append(of_bias)
+            slope = take_samples(plain, here, axis)
+            of_force = np.sum((slope * force_sd) ** 2, axis=1) * white[axis]
+            force_share.append(np.minimum(of_force / np.maximum(variance, 1e-300), 1.0))
         return cls(
             samples, noise, tuple(root), tuple(bias_variance), tuple(force),
             tuple(take_samples(plain, here, axis) for axis, here in enumerate(samples)),
-            e.factors,
+            tuple(force_share), e.factors,
         )  # fmt: skip
 
     def with_equal_weights(self, problem: Problem, lacking: float) -> Likelihood:
@@ -546,6 +560,8 @@ def solve_bounded(
 ) -> Solved:
     """Minimise the negative log likelihood: weights of the axes and bounds found in turn.
 
+    An unknown that leaves its bounds is held at the one it left by.
+
     Args:
         problem: the model's own columns, which are the first of all.
         xx, xy, yy: sums of products by axis, (n_q, n, n), (n_q, n), (n_q,).
@@ -560,10 +576,11 @@ def solve_bounded(
     precision, moment = np.zeros((n, n)), np.zeros(n)
     precision[:nb, :nb], moment[:nb] = p.precision, p.moment
     fixed_at = dict(absent or {})
-    held = np.zeros(n - nb, dtype=bool)
+    held, bound = np.zeros(n - nb, dtype=bool), np.zeros(n - nb)
     weight = independent / np.maximum(yy, 1e-300) if weight is None else weight
     for _ in range(_PASSES):
         fixed, free = p.hold(fixed_at, n)
+        fixed[nb:] = bound
         chosen = free[:, np.append(np.ones(free.shape[1] - n + nb, dtype=bool), ~held)]
         for _ in range(_REWEIGHTS):
             normal = np.tensordot(weight, xx, 1) + precision
@@ -582,11 +599,12 @@ def solve_bounded(
         if not out.any() and not fresh:
             break
         held |= out
+        bound[out] = np.clip(b[nb:], low, high)[out]
         fixed_at |= {k: float(p.lower[k] if below[k] else p.upper[k]) for k in fresh}
     cost = float(independent @ (0.5 * np.log(left / p.count)))
     off = b[:nb]
     cost += p.prior_cost + 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
-    return Solved(b, held, left, weight, cost)
+    return Solved(b, held & (bound == 0.0), left, weight, cost)
 
 
 def solve_scaled(normal: Array, right: Array) -> Array:

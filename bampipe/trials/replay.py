@@ -40,7 +40,7 @@ from bampipe.trials.motion import (
     n_samples,
     trial_sizes,
 )
-from bampipe.trials.residuals import ModelOnTrial, standstill_of
+from bampipe.trials.residuals import ModelOnTrial, residual_and_memory, standstill_of
 from bampipe.trials.sensors import Sensors
 
 Array = NDArray[np.float64]
@@ -61,6 +61,10 @@ _LATEST = 8
 """Samples by which a drive may act after its log says so, or be read after it acts: its jumps then
 stand in the log before or behind those of friction."""
 _FEW_REVERSALS = 5
+_CORRECTIONS, _CANCELLED = 8, 1e-3
+"""Newton steps to the force that a motion needs, and the part of the residual that may remain."""
+_SMALL, _LEAST_SLOPE = 1e-3, 0.05
+"""Part of such a step from which slopes are taken, and the least of these that is one."""
 _PROBED, _FEW = 300, 50
 """Samples of a trial at which the steps of integration are counted; to tell ten from one, a few."""
 LONGEST_STEP_S = 2.5e-4
@@ -292,10 +296,33 @@ def _required_force(fitted: ModelOnTrial, u: Array, rate_hz: float) -> Array:
         if late.any():
             moved = _moved_on(motion, system.model.device.forces, samples)
             at = ModelOnTrial(system, _without_delays(system, fitted.p), [moved])
-        inputs = at.motion.inputs(system.inputs)
-        excess = system.least_force(at.motion.q, at.residual, inputs, at.p)
-        found[:, late == samples] -= excess[:, late == samples]
+        found[:, late == samples] = _cancel_residual(at)[:, late == samples]
     return found
+
+
+def _cancel_residual(fitted: ModelOnTrial) -> Array:
+    """The measured force changed by Newton steps until the model leaves nothing, (T, n_f).
+
+    An effect that takes a part of the force needs more of it. What a force does through a state of
+    its own, such as a lag, has no slope by the force of the moment; that is taken to be one.
+    """
+    system, motion, p = fitted.system, fitted.motion, fitted.p
+    columns = [system.inputs.index(name) for name in system.model.device.forces]
+    u, first = motion.inputs(system.inputs).copy(), 0.0
+    for number in range(_CORRECTIONS):
+        left, z = residual_and_memory(system, motion, u, p)
+        size = float(np.sqrt(np.mean(left**2)))
+        first = first or size
+        if number and size <= _CANCELLED * first:
+            break
+        moved = u.copy()
+        moved[:, columns] -= _SMALL * system.least_force(motion.q, left, u, p)
+        at = motion.of_mechanism(system, u, p).kinematics
+        slope = (left - system.residual(*at, z, moved, p)) / _SMALL
+        steep = np.abs(slope) > _LEAST_SLOPE * np.abs(left)
+        share = np.divide(left, slope, out=np.ones_like(left), where=steep)
+        u[:, columns] -= system.least_force(motion.q, share * left, u, p)
+    return u[:, columns]
 
 
 def _without_delays(system: System, p: Array) -> Array:

@@ -229,12 +229,16 @@ def test_a_form_that_cancels_the_drive_gains_nothing(clean):
     reach = search.forms.candidates[name].fixed()["reach"][0]
     key = search.forms.key(name, {"place": 0.0})
     search.ensure([key])
+
+    def volume(forms, place, strengths):
+        return forms._volume(forms._log_slopes((place,), [strengths], np.ones(forms.n_q)))
+
     # A rise of this height from load zero is the load itself, against the motion.
-    assert search._volume((key,), [np.array([-0.2 * reach])])[0] < -0.05 * search.p.independent[0]
-    assert search._volume((key,), [np.array([-reach])]) is None
+    assert volume(search, key, np.array([-0.2 * reach]))[0] < -0.05 * search.p.independent[0]
+    assert volume(search, key, np.array([-reach])) is None
     own = open_forms(session, fit, 0, "slope_by_extension")
     at = own.places[0]
-    assert own._volume((at,), [np.ones(own.atoms[at].width)]) == pytest.approx(0.0)
+    assert volume(own, at, np.ones(own.atoms[at].width)) == pytest.approx(0.0)
 
 
 def test_hysteresis_of_a_force_sensor_is_found(tmp_path):

@@ -61,7 +61,14 @@ def test_a_replay_has_unit_variance_in_units_of_its_noise(fitted):
 def test_what_a_model_may_be_wrong_by_weighs_less_where_the_force_is_large(fitted):
     _, fit = fitted
     like = fit.likelihood
-    loose = Likelihood.of(fit.evidence, like.samples, like.noise, 1e-9, 0.05)
+    loose = Likelihood.of(
+        fit.evidence,
+        like.samples,
+        like.noise,
+        1e-9,
+        0.05,
+        np.zeros(len(fit.evidence.system.model.device.forces)),
+    )
     for force, root in zip(loose.applied, loose.root, strict=True):
         large, small = np.abs(force) > np.quantile(np.abs(force), [[0.9], [0.1]])
         assert root[large].mean() < 0.6 * root[~small].mean()
@@ -96,9 +103,9 @@ def problem_of(y, base, *, independent=None, lower=-np.inf, upper=np.inf, absenc
     nothing, place = np.zeros(rows), np.zeros(rows, dtype=np.int64)
     samples = Samples(np.arange(rows), place, place, independent or float(rows))
     noise = Noise((nothing,), (nothing + 1.0,), (nothing,), (nothing[None],), (place,))
-    like = Likelihood(
-        (samples,), noise, (nothing + 1.0,), (nothing,), (nothing + 1.0,), (np.ones((rows, 1)),)
-    )
+    ones = nothing + 1.0
+    slopes = (np.ones((rows, 1)),)
+    like = Likelihood((samples,), noise, (ones,), (nothing,), (ones,), slopes, (nothing,))
     bounds = np.broadcast_to(lower, n), np.broadcast_to(upper, n)
     precision = 1e-4 * np.eye(n)
     return Problem(like, (y,), (base,), precision, np.zeros(n), np.eye(n), *bounds, absence or {})

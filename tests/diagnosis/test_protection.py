@@ -9,6 +9,7 @@ import pytest
 from sessions import bam, diagnose_trials, take_timing_off
 
 from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.select import open_search
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.physics import registry
 
@@ -66,8 +67,9 @@ def test_one_event_decides_nothing(record, seconds):
     assert verdicts(found) != ["missing"]
 
 
+@pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("seed", [8, *(pytest.param(k, marks=pytest.mark.long) for k in (9, 10))])
-def test_a_lag_gains_nothing_by_averaging_noise(record, seed):
+def test_a_lag_gains_nothing_by_averaging_noise(record, seed, known):
     trials, recipe = record("joint", 4)
     rng = np.random.default_rng(seed)
     sd = 0.5 * trials.motions[0].channels["current"].std()
@@ -75,11 +77,31 @@ def test_a_lag_gains_nothing_by_averaging_noise(record, seed):
     def noisy(_, motion):
         return {"current": motion.channels["current"] + sd * rng.normal(size=motion.t.size)}
 
-    sensors = replace(trials.sensors, force_sd=np.hypot(trials.sensors.force_sd, sd))
+    sensors = replace(trials.sensors, force_sd=np.hypot(trials.sensors.force_sd, known * sd))
     shaken = replace(moved(trials, noisy), sensors=sensors)
     _, found = diagnose_trials(shaken, recipe)
     named = probabilities(found)
     assert not [n for n in named if n.partition(":")[0] in ("actuator_lag", "actuator_delay")]
+
+
+def test_a_lag_of_two_samples_is_neither_a_delay_nor_a_flexible_load(record):
+    """It leaves less of the noise of the drive as well, which alone speaks for nothing."""
+    trials, recipe = record("joint", 6, "actuator_lag:current", creep=True, rate_hz=100.0)
+    selection, found = diagnose_trials(trials, recipe)
+    assert selection.effects == ("actuator_lag:current",)
+    assert verdicts(found) == ["missing"]
+
+
+def test_friction_by_load_beside_a_lag_does_not_halve_both_sides(record):
+    trials, recipe = record("joint", 6, "actuator_lag:current", creep=True, rate_hz=100.0)
+    session, name = Session(trials, Criteria()), "load_dependent_presliding:joint"
+    lagging = replace(recipe, effects=("actuator_lag:current",))
+    fit = session.fit_plainly(lagging, system_of(lagging).prior)
+    with open_search(session, fit, only=(name,)) as search:
+        atom = search.make([(name, (0.0,))])[0][1]
+    torque_by_current = 10.0
+    largest = np.abs(atom.slopes[0][:, 0, :]).max(axis=0)
+    assert largest == pytest.approx(np.full(2, torque_by_current), rel=0.1)
 
 
 def test_a_trial_that_alone_holds_a_parameter_condemns_no_model(record):

@@ -149,6 +149,37 @@ def test_a_replay_of_a_late_motor_leaves_what_the_measurement_leaves(machine, tm
 
 
 @pytest.mark.parametrize(
+    ("effect", "values"),
+    [
+        ("force_gain:current", {"error": 0.5}),
+        ("drive_sag:joint", {"sag": 0.01}),
+        ("load_dependent_friction:joint", {"coefficient": 0.4, "side_coefficient": 0.0}),
+        ("actuator_lag:current", {"time_constant": 0.004}),
+    ],
+)
+def test_the_force_that_a_motion_needs_leaves_no_residual(fitted, effect, values) -> None:
+    """Whatever part of the force an effect takes: else the bias of replays holds the misfit."""
+    trials, evidence = fitted
+    system = compile_model(Model(evidence.system.model.device, [effect]))
+    head = effect.replace(":", ".")
+    p = np.append(
+        evidence.p,
+        [values[q.name.removeprefix(f"{head}.")] for q in system.parameters[len(evidence.p) :]],
+    )
+    motion = trials.motions[0]
+    u = motion.inputs(system.inputs)
+    measured = ModelOnTrial(system, p, [motion])
+    force = replay._required_force(measured, u, trials.sensors.rate_hz)
+    named = dict(zip(system.model.device.forces, force.T, strict=True))
+    needed = ModelOnTrial(system, p, [motion.with_channels(named)])
+    before, after = (
+        np.sqrt(np.mean(trials.band.thin(on_trial.residual) ** 2))
+        for on_trial in (measured, needed)
+    )
+    assert after < 0.01 * before
+
+
+@pytest.mark.parametrize(
     ("effect", "late"),
     [("force_delay", -0.006), ("actuator_delay", 0.006), ("actuator_lag:current", 0.0)],
 )

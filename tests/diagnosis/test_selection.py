@@ -105,7 +105,7 @@ def test_what_makes_both_sides_of_the_equation_small_gains_nothing(search):
     base = best_set(search, 3)
     plain, small = search.solve(base), search.solve((*base, *gains))
     assert not small.cost < plain.cost
-    half = search._log_slopes([gains[2]], [np.array([0.5])])[2]
+    half = search._log_slopes([gains[2]], [np.array([0.5])], np.ones(3))[2]
     assert half == pytest.approx(np.full(half.shape, np.log(0.5)), abs=1e-6)
 
 

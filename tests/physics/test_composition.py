@@ -122,7 +122,7 @@ def test_the_coil_of_a_damper_saturates_with_the_current_that_has_come(order):
     }
     at = motion(system, current=current)
     _, needed = forces(system, p, at)
-    coil = lagged(current, 0.04, 0.002)
+    coil = lagged(current, 0.04, 0.0002)
     field = coil / np.sqrt(1.0 + (0.5 * coil) ** 2)
     speed = at[2][:, 0]
     expected = field * (400.0 * speed + 250.0 * np.tanh(speed / 2e-3))
@@ -144,7 +144,7 @@ def test_a_reading_is_corrected_before_it_lags_and_the_gears_carry_what_is_deliv
     }
     at = motion(system, force_motor=asked / 0.9 + 12.0)
     applied, needed = forces(system, p, at)
-    torque = lagged(asked, 0.03, 0.001)
+    torque = lagged(asked, 0.03, 0.0001)
     np.testing.assert_allclose(applied, torque, atol=0.01)
     delivered = torque / (1.0 + 0.002 * np.abs(torque))
     sign = np.tanh(at[2][:, 0] / system.model.device.coordinates[0].sign_width)

@@ -152,7 +152,7 @@ class FormDictionary:
         by_force = {
             axis: np.concatenate(s)[self.samples[axis].rows] for axis, s in slopes.items() if s
         }
-        return Atom(found, by_force, np.zeros(len(self.samples)))
+        return Atom(found, by_force, np.ones(len(self.samples)))
 
     def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
         """`make` each."""
