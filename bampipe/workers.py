@@ -62,7 +62,6 @@ def process_pool(
     """A pool of worker processes for the length of the block; what they are at then is given up.
 
     Args:
-        jobs: number of processes.
         initialize: called in each process before its first task, with ``arguments``.
         nested: whether tasks start processes of their own; the workers then begin afresh.
         hear: called with every message of `send_to_parent`.

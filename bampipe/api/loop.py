@@ -119,11 +119,7 @@ def _find_effect(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | Non
 
 
 def adopt_effect(file: Path, runs: Path) -> Path:
-    """Copy an effect file to where every run of the folder ``runs`` finds it; return the copy.
-
-    Raises:
-        InputError: it is no effect file, or its name is that of a built-in effect.
-    """
+    """Copy an effect file to where every run of the folder ``runs`` finds it; return the copy."""
     from bampipe.declarations.files import read_effect
     from bampipe.physics import registry
 
@@ -185,9 +181,6 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
 
     Args:
         named: ``name[:target]`` of each effect, and where it comes from if it is a lab's own.
-
-    Raises:
-        InputError: the parent has an effect already, or the device cannot have it.
     """
     from bampipe.declarations.model import ModelFile
     from bampipe.declarations.model_file import load_model

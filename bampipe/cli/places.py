@@ -63,10 +63,7 @@ def find_run(argument: str | None, runs: Path) -> Path:
 def find_sessions(arguments: Sequence[str]) -> list[Path]:
     """Return the session folders that ``arguments`` mean, patterns expanded, each once.
 
-    A folder that a pattern finds counts only if it holds a session.
-
-    Raises:
-        InputError: a pattern finds no session.
+    A folder that a pattern finds counts only if it holds a session; a pattern without is refused.
     """
     found: list[Path] = []
     for argument in (str(session_folder(name)) for name in arguments):

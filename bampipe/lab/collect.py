@@ -46,7 +46,6 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
     comes last.
 
     Args:
-        runs: folder of run folders; folder: the lab's.
         report: whether to write report.pdf and report.html too.
 
     Raises:

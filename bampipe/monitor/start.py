@@ -147,9 +147,6 @@ def open_stream(
     Args:
         samples: path, or ``-``; system: the model; session: folder whose raw columns may come.
         strict: raise at a bad line; complain: called for the first ones that are skipped.
-
-    Raises:
-        InputError: there is no such file, or the session file is wrong.
     """
     known = layouts(system, read_session(session) if session is not None else None)
     if samples == "-":

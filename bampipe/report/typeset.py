@@ -39,7 +39,6 @@ def pdf(document: Document, recorded: int) -> bytes:
     """Return ``document`` as PDF: the same document gives the same bytes.
 
     Args:
-        document: what to print.
         recorded: seconds since 1970, the date in the file; ``SOURCE_DATE_EPOCH`` replaces it.
 
     Raises:

@@ -66,9 +66,6 @@ def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[Gate
     Args:
         gate: against accepted values it judges the model that was accepted, not ``model``.
         baseline: folder of the values last accepted.
-
-    Raises:
-        InputError: the result or the file of accepted values is damaged.
     """
     if gate.against == accepted.ACCEPTED:
         model, found = _judge_change(gate, root, model, baseline)
