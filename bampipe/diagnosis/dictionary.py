@@ -191,7 +191,7 @@ class Dictionary:
     def _slopes_at(self, item: Candidate, p: Array) -> dict[int, Array]:
         """The same at given parameters, (n_p,), each (n, n_forces)."""
         e, system, rows = self.evidence, item.system, []
-        if not system.driven:
+        if not (system.driven or system.force_fed):
             return {}
         for motion in e.motions:
             kept = e.band.thinned_rows(len(motion.t))
@@ -210,7 +210,7 @@ class Dictionary:
             slopes: what it changes of a constant force; a filter passes that.
         """
         e, system, through = self.evidence, item.system, []
-        if slopes or item.linear_indices or system.model.effects[-1].effect.kind != "input":
+        if slopes or item.linear_indices or not system.force_fed:
             return np.ones(len(self.samples))
         for motion in e.motions:
             u = motion.inputs(system.inputs)
@@ -244,17 +244,15 @@ def _slope_by_force(system: System, motion: Motion, kept: NDArray[np.int64], p: 
     u, forces = motion.inputs(system.inputs), system.model.device.forces
     motion = motion.of_mechanism(system, u, p)
     at = motion.q[kept], motion.qd[kept], motion.qdd[kept]
-
-    def added(inputs: Array) -> Array:
-        z = system.memory(*motion.kinematics, inputs, p, motion.t)
-        return system.contribution(*at, z[kept], inputs[kept], p)
-
-    here, slopes = added(u), []
+    z = system.memory(*motion.kinematics, u, p, motion.t)
+    here, slopes = system.contribution(*at, z[kept], u[kept], p), []
     for force in forces:
-        moved, column = u.copy(), system.inputs.index(force)
-        step = 1e-6 * max(float(np.abs(moved[:, column]).max()), 1e-6)
-        moved[:, column] += step
-        slopes.append((added(moved) - here) / step)
+        more, column = u.copy(), system.inputs.index(force)
+        step = 1e-6 * max(float(np.abs(more[:, column]).max()), 1e-6)
+        more[:, column] += step
+        if system.force_fed:
+            z = system.memory(*motion.kinematics, more, p, motion.t)
+        slopes.append((system.contribution(*at, z[kept], more[kept], p) - here) / step)
     return np.stack(slopes, axis=2)
 
 

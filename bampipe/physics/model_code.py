@@ -49,7 +49,8 @@ def effects_code(model: Model) -> Generation:
         "moved_by": [
             i for i, p in enumerate(equations.p) if any(e.has(p) for e in equations.offset)
         ],
-        "driven": any(e.has(*forces) for e in (*added, *equations.rates)),
+        "driven": any(e.has(*forces) for e in added),
+        "force_fed": any(e.has(*forces) for e in equations.rates),
         "moved_first": moved_first(equations, forces),
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
         "delays": equations.delays,

@@ -43,7 +43,7 @@ class System:
         moves_sensors: whether an effect of kind ``measurement`` is present.
         moved_by: numbers of the parameters of its `offset`.
         driven: whether what the effects add to the residual depends on the measured force of
-            the same moment.
+            the same moment; force_fed: whether the rate of an internal state does.
         moved_first: by axis, the places among `states` of the position and rate that a force there
             acts on first, (n_q, 2).
         compensated: axes on which the device has something against gravity; see `compensation`.
@@ -76,6 +76,7 @@ class System:
         self.moves_sensors: bool = meta["moves_sensors"]
         self.moved_by: tuple[int, ...] = tuple(meta["moved_by"])
         self.driven: bool = meta["driven"]
+        self.force_fed: bool = meta["force_fed"]
         self.moved_first: NDArray[np.int64] = np.array(meta["moved_first"], dtype=np.int64)
         self.compensated: tuple[int, ...] = tuple(meta["compensated"])
         self.delays: tuple[str, ...] = tuple(meta["delays"])
