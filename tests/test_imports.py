@@ -23,7 +23,8 @@ HEAVY = (
 
 def law(libraries: str, rooms: str) -> set[str]:
     """What a layer may import: libraries by name, rooms and single files of bampipe by theirs."""
-    return {*libraries.split(), *(f"bampipe.{room}" for room in rooms.split())}
+    own = [*rooms.split(), *(["arrays"] if "numpy" in libraries else [])]
+    return {*libraries.split(), *(f"bampipe.{room}" for room in own)}
 
 
 # What each layer may import beside the standard library and itself.

@@ -9,19 +9,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bampipe.data.lumping import LumpedBodies
+from bampipe.arrays import Array
 from bampipe.data.mjcf import mjcf_tree
 from bampipe.data.rigid_body import Body
-from bampipe.data.robot_tree import MOVING, DriveLimits, Tree, TreeJoint, gravity_at, identifier
+from bampipe.data.robot_tree import (
+    MOVING,
+    DriveLimits,
+    LumpedBodies,
+    Tree,
+    TreeJoint,
+    gravity_at,
+    identifier,
+)
 from bampipe.data.robot_xml import DEEPEST, read_xml
 from bampipe.data.urdf import urdf_tree
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names
-
-Array = NDArray[np.float64]
 
 _MANY = 8
 """Most names that a message lists."""
@@ -36,19 +41,8 @@ class Branches(InputError):
             behind each.
     """
 
-    def __init__(
-        self,
-        what: str,
-        *,
-        where: str = "",
-        remedy: str = "",
-        others: Sequence[InputError] = (),
-        stem: str = "",
-        chains: Mapping[str, Sequence[tuple[str, str]]] | None = None,
-    ) -> None:
-        super().__init__(what, where=where, remedy=remedy, others=others)
-        self.stem = stem
-        self.chains = chains or {}
+    stem: str = ""
+    chains: Mapping[str, Sequence[tuple[str, str]]] = {}
 
 
 @dataclass(frozen=True)
@@ -73,17 +67,6 @@ class Chain:
     gravity_note: str = ""
 
 
-def read_chain(
-    path: Path, base: str = "", tip: str = "", payload: Mapping[str, Any] | None = None
-) -> Chain:
-    """Read the chain of joints from ``base`` to ``tip``; arguments are those of `select_chain`.
-
-    Raises:
-        InputError: neither URDF nor MJCF, or none from which there is such a chain.
-    """
-    return select_chain(read_tree(path), base, tip, payload, str(path))
-
-
 def read_tree(path: Path) -> Tree:
     """Read the links and joints of a robot's file.
 
@@ -101,34 +84,34 @@ def read_tree(path: Path) -> Tree:
     )
 
 
-def select_chain(
-    tree: Tree, base: str, tip: str, payload: Mapping[str, Any] | None, where: str
+def read_chain(
+    path: Path, base: str = "", tip: str = "", payload: Mapping[str, Any] | None = None
 ) -> Chain:
-    """The chain of joints from ``base`` to ``tip``.
+    """Read the chain of joints from ``base`` to ``tip``.
 
     Args:
-        tree: what a file has.
+        path: of a URDF or MJCF.
         base: link that stands still; the root of the tree where empty.
         tip: last link; where empty, the only end of the tree.
         payload: ``mass``, ``center`` and ``inertia`` of a body held at the tip, in its frame.
-        where: the file.
 
     Raises:
-        InputError: a joint or link that is wrong, or no single chain between the links.
+        InputError: another file, a wrong joint or link, or no single chain between the links.
     """
+    tree, where = read_tree(path), str(path)
     _refuse_broken(tree, where)
     base = _link(base, tree, where) if base else _only_root(tree, where)
     tip = _link(tip, tree, where) if tip else _only_end(tree, base, where)
     tree, held_alone = _hold_followers(tree, tree.path(base, tip, where))
-    path = tree.path(base, tip, where)
+    joints = tree.path(base, tip, where)
     if payload is not None:
         held = tree.bodies[tip].joined(Body.of_table(payload))
         tree = replace(tree, bodies={**tree.bodies, tip: held})
-    moving = [joint for joint in path if joint.kind != "fixed"]
+    moving = [joint for joint in joints if joint.kind != "fixed"]
     if not moving:
         raise InputError(f"no joint moves between {base!r} and {tip!r}", where=where)
     lumped = LumpedBodies(tree, moving)
-    tables = _tables(path, lumped, where)
+    tables = _tables(joints, lumped, where)
     limits = {identifier(joint.name): joint.limits for joint in moving}
     held_still = [*held_alone] + [
         joint.name for start in moving for joint in lumped.held_on(start.child)
@@ -239,22 +222,16 @@ def _link(name: str, tree: Tree, where: str) -> str:
 
 def _refuse_loops(above: Mapping[str, TreeJoint], where: str) -> None:
     """Refuse links that hang on themselves, or too many one behind another."""
-    depth: dict[str, int] = {}
+    deepest = 0
     for first in above:
-        path = [first]
-        while path[-1] in above and path[-1] not in depth:
-            parent = above[path[-1]].parent
-            if parent in path:
-                raise InputError(f"the joints above {parent!r} form a loop", where=where)
-            if len(path) > DEEPEST:
-                raise InputError(f"more than {DEEPEST} links one behind another", where=where)
-            path.append(parent)
-        reached = depth.get(path.pop(), 0)
-        for link in reversed(path):
-            reached += 1
-            depth[link] = reached
-        if reached > DEEPEST:
-            raise InputError(f"more than {DEEPEST} links one behind another", where=where)
+        link, depth = first, 0
+        while link in above and depth <= DEEPEST:
+            link, depth = above[link].parent, depth + 1
+            if link == first:
+                raise InputError(f"the joints above {first!r} form a loop", where=where)
+        deepest = max(deepest, depth)
+    if deepest > DEEPEST:
+        raise InputError(f"more than {DEEPEST} links one behind another", where=where)
 
 
 def _only_root(tree: Tree, where: str) -> str:
@@ -297,12 +274,13 @@ def _only_end(tree: Tree, base: str, where: str) -> str:
         common = [level[0] for level in takewhile(lambda level: len(set(level)) == 1, levels)]
         stem = next((j.child for j in tree.joints if common and j.name == common[-1]), "")
         behind = {joint.name: joint.child for joint in tree.joints}
-        raise Branches(
+        error = Branches(
             f"the joints branch; chains end at {join_names(others, _MANY)}",
             where=where,
             remedy='choose one: base = "..." and tip = "..." in [robot] of a device file'
             + (f'; tip = "{stem}" ends before they branch' if stem else ""),
-            stem=stem,
-            chains={end: [(name, behind[name]) for name in chains[end]] for end in others},
         )
+        error.stem = stem
+        error.chains = {end: [(name, behind[name]) for name in chains[end]] for end in others}
+        raise error
     return longest

@@ -12,16 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bampipe.arrays import Array
 from bampipe.data.chain import read_chain
 from bampipe.data.rigid_body import Body, symmetric
 from bampipe.data.robot_tree import DriveLimits, Tree, fixed_joint, tree_of_tables
 from bampipe.errors import InputError
 from bampipe.files import read_toml
-
-Array = NDArray[np.float64]
 
 _UNITS = {"revolute": ("rad", "N.m", "kg.m2"), "prismatic": ("m", "N", "kg")}
 _FRICTION_SHARE = 0.1
@@ -226,11 +224,10 @@ def _filled(
         for joint, ratio in ratios.items():
             applied[joint].append(f"{ratio}*{torque}")
         # At the joint, inertia of a joint that slides is a mass.
-        direct = not given
-        unit = _UNITS[kinds[last]][2] if direct else "kg.m2"
+        unit = "kg.m2" if given else _UNITS[kinds[last]][2]
         rotor = f"rotor_inertia_{name}"
         parameters[rotor] = _rotor_parameter(motor, name, limits[last], turns, unit)
-        kinetic.append(f"0.5*{rotor}*qd_{last}**2" if direct else f"0.5*{rotor}*({speed})**2")
+        kinetic.append(f"0.5*{rotor}*({speed})**2" if given else f"0.5*{rotor}*qd_{last}**2")
         if len(ratios) > 1:
             effort, velocity = (value / turns for value in _scale(limits[last]))
             velocity *= turns * turns
@@ -238,13 +235,8 @@ def _filled(
                 ("viscous", _FRICTION_SHARE * effort / velocity, "N.m.s/rad"),
                 ("coulomb", _FRICTION_SHARE * effort, "N.m"),
             ):
-                parameters[f"{term}_{name}"] = {
-                    "unit": unit,
-                    "prior": 0.0,
-                    "sd": size,
-                    "lower": 0.0,
-                    "description": f"friction of motor {name}, at the motor",
-                }
+                about = f"friction of motor {name}, at the motor"
+                parameters[f"{term}_{name}"] = _positive(unit, 0.0, size, description=about)
             for joint, ratio in ratios.items():
                 losses[joint].append(
                     f"{ratio}*(viscous_{name}*({speed}) + coulomb_{name}*sgn({speed}))"
@@ -297,17 +289,12 @@ def _rotor_parameter(
     about = f"inertia of the rotor of {name}, seen from where its torque is"
     if "rotor_inertia" in motor:
         value = float(motor["rotor_inertia"])
-        return {
-            "unit": unit, "prior": value, "sd": _DATA_SHEET * value, "lower": 0.0,
-            "weighed": True, "description": about,
-        }  # fmt: skip
-    guess = _rotor(limits) / turns**2
+        return _positive(unit, value, _DATA_SHEET * value, weighed=True, description=about)
+    effort, velocity = _scale(limits)
+    guess = _ACCELERATING_S * effort / velocity / turns**2
     # Many a file has an armature that only steadies its simulation: a start, not weighed as data.
     prior = max(limits.armature, 0.0) / turns**2 or guess
-    return {
-        "unit": unit, "prior": prior, "sd": 5.0 * max(prior, guess), "lower": 0.0,
-        "description": about,
-    }  # fmt: skip
+    return _positive(unit, prior, 5.0 * max(prior, guess), description=about)
 
 
 def _friction(kind: str, limits: DriveLimits) -> dict[str, Any]:
@@ -315,25 +302,14 @@ def _friction(kind: str, limits: DriveLimits) -> dict[str, Any]:
     length, torque, _ = _UNITS[kind]
     size = _FRICTION_SHARE * effort
     return {
-        "viscous": {
-            "unit": f"{torque}.s/{length}",
-            "prior": max(limits.damping, 0.0),
-            "sd": size / velocity,
-            "lower": 0.0,
-        },
-        "coulomb": {
-            "unit": torque,
-            "prior": max(limits.friction, 0.0),
-            "sd": size,
-            "lower": 0.0,
-        },
+        "viscous": _positive(f"{torque}.s/{length}", max(limits.damping, 0.0), size / velocity),
+        "coulomb": _positive(torque, max(limits.friction, 0.0), size),
     }
 
 
-def _rotor(limits: DriveLimits) -> float:
-    """Inertia of a drive as seen from its joint, before any data."""
-    effort, velocity = _scale(limits)
-    return _ACCELERATING_S * effort / velocity
+def _positive(unit: str, prior: float, sd: float, **more: object) -> dict[str, Any]:
+    """The table of a parameter that is not below zero."""
+    return {"unit": unit, "prior": prior, "sd": sd, "lower": 0.0, **more}
 
 
 def _scale(limits: DriveLimits) -> tuple[float, float]:

@@ -8,7 +8,7 @@ is written whole or not at all; the same rows give the same bytes.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from urllib.parse import quote
@@ -87,7 +87,10 @@ def write(folder: Path, rows: Mapping[str, Sequence[Row]]) -> dict[str, int]:
             kept.add(part)
             here = [row for row in rows.get(name, ()) if row["device"] == device]
             with store.ParquetAppender(folder / name / part / "data.parquet") as file:
-                file.append(_columns(here, columns))
+                arrays = (
+                    (c, pa.array([row.get(c) for row in here], k)) for c, k in columns.items()
+                )
+                file.append(dict(arrays))
         for old in sorted((folder / name).glob("device=*")):
             if old.name not in kept:
                 shutil.rmtree(old)
@@ -116,11 +119,3 @@ def moment(text: str | None) -> datetime | None:
         return None
     when = datetime.fromisoformat(text)
     return when.replace(tzinfo=UTC) if when.tzinfo is None else when.astimezone(UTC)
-
-
-def _columns(rows: Iterable[Row], columns: Mapping[str, pa.DataType]) -> dict[str, pa.Array]:
-    found = list(rows)
-    return {
-        name: pa.array([row.get(name) for row in found], type=kind)
-        for name, kind in columns.items()
-    }

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data import guesses
 from bampipe.data.session import SECONDS
-
-Array = NDArray[np.float64]
 
 _MOST_ROWS = 20_000
 _DERIVATIVE = 0.98
@@ -54,9 +52,10 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
     positions = [k for k in derivative if k not in rates]
     left = [k for k, name in enumerate(names) if name not in found]
     if len(positions) == 1:
-        q = matrix[:, positions[0]]
+        q, unit = matrix[:, positions[0]], guesses.time_unit(t, "")
+        seconds = (t - t[0]) * SECONDS.get(unit, 1.0)
         share = {
-            k: guesses.driven(_seconds(t), q, matrix[:, k]).share
+            k: guesses.driven(seconds, q, matrix[:, k]).share
             for k in left
             if abs(float(np.corrcoef(q, matrix[:, k])[0, 1])) < _DERIVATIVE
         }
@@ -80,12 +79,6 @@ def _is_time(values: Array) -> bool:
     steps = np.diff(values)
     rises = len(steps) > 3 and bool(np.all(steps > 0))
     return rises and float(steps.max()) < _STEADY * float(np.median(steps))
-
-
-def _seconds(t: Array) -> Array:
-    """Time from 0, in s by the rate that it gives."""
-    unit = guesses.time_unit(t, "")
-    return np.asarray((t - t[0]) * SECONDS.get(unit, 1.0))
 
 
 def _derivatives(matrix: Array, t: Array) -> dict[int, int]:

@@ -12,16 +12,14 @@ from dataclasses import dataclass, field
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bampipe.arrays import Array
 from bampipe.data.rigid_body import Body, symmetric
-from bampipe.data.robot_tree import DriveLimits, Tree, TreeJoint
+from bampipe.data.robot_tree import DriveLimits, Tree, TreeJoint, fixed_joint
 from bampipe.data.robot_xml import document, number_list, numbers
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names
-
-Array = NDArray[np.float64]
 
 Attributes = dict[str, str]
 STEP_S = 5e-4
@@ -157,21 +155,18 @@ class _Reader:
                 raise InputError(f"a <{tag}>, which MuJoCo expands", where=where, remedy=_FLAT)
         self.defaults: dict[str, dict[str, str]] = {"": {}, "main": {}}
         for entry in root.iterfind("default"):
-            self._read_defaults(entry, {}, is_main=True)
+            self._read_defaults(entry, {})
+            self.defaults[""] = self.defaults[entry.get("class", "")]
         self.efforts: dict[str, float] = {}
         for motor in root.iterfind("actuator/*"):
             self._read_motor(motor)
         self.bodies = {_WORLD: Body()}
         self.joints: list[TreeJoint] = []
 
-    def _read_defaults(
-        self, entry: ElementTree.Element, outer: Mapping[str, str], is_main: bool = False
-    ) -> None:
+    def _read_defaults(self, entry: ElementTree.Element, outer: Mapping[str, str]) -> None:
         joint = entry.find("joint")
         own = {**outer, **({} if joint is None else joint.attrib)}
         self.defaults[entry.get("class", "")] = own
-        if is_main:
-            self.defaults[""] = own
         for inner in entry.iterfind("default"):
             self._read_defaults(inner, own)
 
@@ -207,7 +202,11 @@ class _Reader:
         joints = [*body.iterfind("freejoint"), *body.iterfind("joint")]
         center = np.zeros(3)
         for k, entry in enumerate(joints):
-            known = {**self.default(entry.get("class", given), place), **entry.attrib}
+            usual = entry.get("class", given)
+            if usual not in self.defaults:
+                near = did_you_mean(usual, self.defaults)
+                raise InputError(f"no <default> of class {usual!r}{near}", where=place)
+            known = {**self.defaults[usual], **entry.attrib}
             joint = known.get("name") or f"{name}_joint{k or ''}"
             own = ElementTree.Element("joint", known)
             spot = f"{self.where}: joint {joint!r}"
@@ -223,43 +222,18 @@ class _Reader:
                 turn = turn @ Rotation.from_rotvec(-self.angle(start) * along).as_matrix()
             elif kind == "prismatic":
                 offset = offset - turn @ along * start
-            self.joints.append(self.joint(joint, kind, (parent, child), turn, offset, axis, own))
+            roll, pitch, yaw = Rotation.from_matrix(turn).as_euler("xyz")
+            limits = self.limits(own, joint, kind, spot)
+            frame = turn, offset, (roll, pitch, yaw)
+            self.joints.append(TreeJoint(joint, kind, parent, child, *frame, axis, limits))
             if child != name:
                 self.bodies[child] = Body()
             parent, turn, offset, center, moves = child, np.eye(3), np.zeros(3), at, True
         if not joints:
-            bare = ElementTree.Element("joint")
-            self.joints.append(
-                self.joint(
-                    f"{name}_fixed", "fixed", (parent, name), turn, offset, [0.0, 0.0, 1.0], bare
-                )
-            )
+            self.joints.append(fixed_joint(f"{name}_fixed", parent, name, turn, offset))
         self.bodies[name] = self.body(body, moves, place).moved(np.eye(3), -center)
         for inner in body.iterfind("body"):
             self.walk(inner, name, -center, given, moves)
-
-    def default(self, name: str, place: str) -> dict[str, str]:
-        """What a class gives a joint."""
-        if name not in self.defaults:
-            raise InputError(
-                f"no <default> of class {name!r}{did_you_mean(name, self.defaults)}", where=place
-            )
-        return self.defaults[name]
-
-    def joint(
-        self,
-        name: str,
-        kind: str,
-        ends: tuple[str, str],
-        turn: Array,
-        offset: Array,
-        axis: list[float],
-        own: ElementTree.Element,
-    ) -> TreeJoint:
-        """A joint, its limits and losses those of the element ``own``."""
-        roll, pitch, yaw = Rotation.from_matrix(turn).as_euler("xyz")
-        limits = self.limits(own, name, kind, f"{self.where}: joint {name!r}")
-        return TreeJoint(name, kind, *ends, turn, offset, (roll, pitch, yaw), axis, limits)
 
     def angle(self, value: float) -> float:
         return value if self.radian else math.radians(value)

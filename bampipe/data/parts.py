@@ -159,7 +159,9 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
     rows = counts[1] - counts[0] <= max(1, MOST_APART * counts[1])
     join: Literal["rows", "time", "start", ""] = "rows" if rows else ""
     if first.t is not None and second.t is not None:
-        same = rows and _same_stamps(first.t, second.t)
+        length, step = min(len(first.t), len(second.t)), float(np.median(np.diff(first.t)))
+        apart = float(np.max(np.abs(first.t[:length] - second.t[:length])))
+        same = rows and apart <= _SAME_STAMP * step
         ends = (first.start + first.t[-1], second.start + second.t[-1])
         overlap = min(ends) - max(first.start, second.start)
         spans = sorted((float(first.t[-1]), float(second.t[-1])))
@@ -180,12 +182,6 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
         time=second.column if timed and second.column != first.column else "",
         time_unit=cast(TimeUnit, second.unit) if timed and second.unit != first.unit else "",
     )
-
-
-def _same_stamps(t: np.ndarray, u: np.ndarray) -> bool:
-    length = min(len(t), len(u))
-    step = float(np.median(np.diff(t)))
-    return bool(np.max(np.abs(t[:length] - u[:length])) <= _SAME_STAMP * step)
 
 
 def _read_clock(

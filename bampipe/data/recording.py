@@ -130,19 +130,13 @@ def _by_rows(
             where=part.file,
             remedy='files of different rates are joined by their times: join = "time" or "start"',
         )
-    remarks = [f"{part.file} joined to {entry.file} row by row"]
+    remark = f"{part.file} joined to {entry.file} row by row"
     if most > least:
         longer = entry.file if counts[0] == most else part.file
-        remarks[0] += f"; the last {most - least} of {longer} left out"
+        remark += f"; the last {most - least} of {longer} left out"
     columns = {name: values[:least] for name, values in raw.columns.items()}
     columns |= {name: other.columns[name][:least] for name in kept}
-    return replace(
-        raw,
-        columns=columns,
-        units={**raw.units, **other.units},
-        notes=(*raw.notes, *other.notes),
-        remarks=(*raw.remarks, *remarks),
-    )
+    return _with_columns(raw, other, columns, remark)
 
 
 def _by_time(
@@ -168,18 +162,24 @@ def _by_time(
             where=part.file,
             remedy='join = "start" where both clocks count from the same moment',
         )
-    columns = dict(raw.columns)
-    columns |= {name: interpolated(at, stamps, other.columns[name]) for name in kept}
-    said = f"{part.file} interpolated linearly at the times of {file}"
+    found = {name: interpolated(at, stamps, other.columns[name]) for name in kept}
+    remark = f"{part.file} interpolated linearly at the times of {file}"
+    remark += f" (at most {np.nanmax(np.diff(stamps)):.3g} s apart)"
     within = np.flatnonzero((at >= np.nanmin(stamps)) & (at <= np.nanmax(stamps)))
-    joined = replace(
+    joined = _with_columns(raw, other, {**raw.columns, **found}, remark)
+    return joined.between(int(within[0]), int(within[-1]) + 1)
+
+
+def _with_columns(
+    raw: RawTrial, other: RawTrial, columns: dict[str, np.ndarray], remark: str
+) -> RawTrial:
+    return replace(
         raw,
         columns=columns,
         units={**raw.units, **other.units},
         notes=(*raw.notes, *other.notes),
-        remarks=(*raw.remarks, f"{said} (at most {np.nanmax(np.diff(stamps)):.3g} s apart)"),
+        remarks=(*raw.remarks, remark),
     )
-    return joined.between(int(within[0]), int(within[-1]) + 1)
 
 
 def _one_of(raw: RawTrial, entry: TrialEntry, clock: Clock) -> RawTrial:

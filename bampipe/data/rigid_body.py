@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array
 
 _ROUNDING = 1e-6
 """Share of the largest second moment of mass by which one may be below zero."""

@@ -42,8 +42,10 @@ def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
             where=f"{where}, line {line}",
             remedy=_MEND,
         ) from error
-    if to_write:
-        _keep_prefixes(text)
+    if to_write:  # namespaces have the prefixes that they have in the text
+        for _, (prefix, name) in ElementTree.iterparse(BytesIO(text), events=("start-ns",)):
+            with suppress(ValueError):  # ns1 and the like, which are given anew
+                ElementTree.register_namespace(prefix, name)
     level, depth = [root], 0
     while level := [inner for element in level for inner in element]:
         depth += 1
@@ -51,13 +53,6 @@ def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
             what = f"elements are nested more than {DEEPEST} deep"
             raise InputError(what, where=where, remedy=_MEND)
     return root
-
-
-def _keep_prefixes(text: bytes) -> None:
-    """Have the namespaces of a text written with the prefixes that they have there."""
-    for _, (prefix, name) in ElementTree.iterparse(BytesIO(text), events=("start-ns",)):
-        with suppress(ValueError):  # ns1 and the like, which are given anew
-            ElementTree.register_namespace(prefix, name)
 
 
 def numbers(

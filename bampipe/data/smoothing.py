@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import oaconvolve
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array
 
 _SMOOTHED_S = 0.06
 """Length of the window over which motion and input are smoothed before they are compared, s."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -121,10 +120,10 @@ def read_arrays(path: Path, columns: Sequence[str], trial: str) -> dict[str, np.
 
 def _read_table(path: Path, columns: Sequence[str] | None, trial: str | None) -> pa.Table:
     path = Path(path)
-    footer = _footer(path)
+    metadata, by_trial = _footer(path)
     with (
         _damage_named(path),
-        pq.ParquetFile(path, metadata=footer.metadata, memory_map=False) as file,
+        pq.ParquetFile(path, metadata=metadata, memory_map=False) as file,
     ):
         names = file.schema_arrow.names
         wanted = list(columns) if columns is not None else names
@@ -135,10 +134,11 @@ def _read_table(path: Path, columns: Sequence[str] | None, trial: str | None) ->
                 )
         if trial is None:
             return file.read(columns=wanted).select(wanted)
-        if trial not in footer.groups:
+        if trial not in by_trial:
             raise InputError(f"no trial '{trial}'", where=str(path))
-        groups = footer.groups[trial]
-        return file.read_row_groups(groups, columns=wanted, use_threads=False).select(wanted)
+        return file.read_row_groups(by_trial[trial], columns=wanted, use_threads=False).select(
+            wanted
+        )
 
 
 def column_names(path: Path) -> tuple[str, ...]:
@@ -147,7 +147,7 @@ def column_names(path: Path) -> tuple[str, ...]:
     Raises:
         InputError: no such file, or not a sound Parquet file.
     """
-    return tuple(_footer(Path(path)).metadata.schema.names)
+    return tuple(_footer(Path(path))[0].schema.names)
 
 
 def trial_ids(path: Path) -> frozenset[str]:
@@ -156,10 +156,10 @@ def trial_ids(path: Path) -> frozenset[str]:
     Raises:
         InputError: no such file, or not a sound Parquet file with ``trial_id``.
     """
-    footer = _footer(Path(path))
-    if "trial_id" not in footer.metadata.schema.names:
+    metadata, by_trial = _footer(Path(path))
+    if "trial_id" not in metadata.schema.names:
         raise InputError("no column 'trial_id'", where=str(path))
-    return frozenset(footer.groups)
+    return frozenset(by_trial)
 
 
 def row_count(path: Path, trials: Collection[str]) -> int:
@@ -168,9 +168,9 @@ def row_count(path: Path, trials: Collection[str]) -> int:
     Raises:
         InputError: no such file, or not a sound Parquet file.
     """
-    footer = _footer(Path(path))
-    groups = {group for name in trials for group in footer.groups.get(name, ())}
-    return sum(footer.metadata.row_group(group).num_rows for group in groups)
+    metadata, by_trial = _footer(Path(path))
+    groups = {group for name in trials for group in by_trial.get(name, ())}
+    return sum(metadata.row_group(group).num_rows for group in groups)
 
 
 def _table(frame: Frame) -> pa.Table:
@@ -189,6 +189,7 @@ def _table(frame: Frame) -> pa.Table:
 
 
 def _writer(stream: BinaryIO, schema: pa.Schema) -> pq.ParquetWriter:
+    text = (pa.types.is_string, pa.types.is_large_string, pa.types.is_dictionary)
     return pq.ParquetWriter(
         stream,
         schema,
@@ -196,16 +197,11 @@ def _writer(stream: BinaryIO, schema: pa.Schema) -> pq.ParquetWriter:
         data_page_version="1.0",
         compression="zstd",
         compression_level=3,
-        use_dictionary=[field.name for field in schema if _is_text(field.type)],
+        use_dictionary=[f.name for f in schema if any(check(f.type) for check in text)],
         # Those that find a trial: others would make most of a footer with thousands of row groups.
         write_statistics=["trial_id"] if "trial_id" in schema.names else False,
         store_schema=False,
     )
-
-
-def _is_text(kind: pa.DataType) -> bool:
-    text = (pa.types.is_string, pa.types.is_large_string, pa.types.is_dictionary)
-    return any(check(kind) for check in text)
 
 
 def _trial_bounds(table: pa.Table) -> list[int]:
@@ -215,16 +211,8 @@ def _trial_bounds(table: pa.Table) -> list[int]:
     return [0, *(np.flatnonzero(ids[1:] != ids[:-1]) + 1).tolist(), table.num_rows]
 
 
-@dataclass(frozen=True)
-class _Footer:
-    """What is known of a Parquet file before its data: metadata, and row groups by their trial."""
-
-    metadata: pq.FileMetaData
-    groups: Mapping[str, Sequence[int]]
-
-
-def _footer(path: Path) -> _Footer:
-    """The footer of a file, read once as long as it is the same file.
+def _footer(path: Path) -> tuple[pq.FileMetaData, Mapping[str, Sequence[int]]]:
+    """Metadata of a file and its row groups by their trial, read once while it is the same file.
 
     Reading it takes time in proportion to the number of trials: once a trial would be too often.
 
@@ -239,7 +227,9 @@ def _footer(path: Path) -> _Footer:
 
 
 @lru_cache(maxsize=8)
-def _read_footer(path: Path, inode: int, size: int, changed_ns: int) -> _Footer:
+def _read_footer(
+    path: Path, inode: int, size: int, changed_ns: int
+) -> tuple[pq.FileMetaData, Mapping[str, Sequence[int]]]:
     metadata = pq.read_metadata(path, memory_map=False)
     groups: dict[str, list[int]] = {}
     if "trial_id" in metadata.schema.names:
@@ -250,7 +240,7 @@ def _read_footer(path: Path, inode: int, size: int, changed_ns: int) -> _Footer:
                 if limits.min != limits.max:
                     raise pa.ArrowInvalid(f"row group {group} has rows of several trials")
                 groups.setdefault(str(limits.min), []).append(group)
-    return _Footer(metadata, groups)
+    return metadata, groups
 
 
 @contextmanager

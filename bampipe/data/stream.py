@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data.session import Session
 from bampipe.errors import InputError
-
-Array = NDArray[np.float64]
 
 PORTION = 1 << 16
 """Bytes read at once: what memory is bounded by, with `LONGEST_LINE`."""
@@ -80,21 +79,19 @@ class StreamLayout:
                 remedy="log it as a signed number",
             )
         force = session.force
-        columns = [session.clock.column, *(e.column for e in session.encoders)]
+        columns = [clock.column, *(e.column for e in session.encoders)]
         columns += [*(b.column for b in session.brakes), *(c.column for c in session.channels)]
         columns += list(force.columns) if force else []
         names = ["t", *(f"q_{e.axis}" for e in session.encoders)]
         names += [*(f"brake_{b.axis}" for b in session.brakes), *(c.name for c in session.channels)]
         names += list(force.names) if force else []
         gain, offset = np.zeros((len(columns), len(names))), np.zeros(len(names))
-        gain[0, 0] = session.tick
-        at = 1
-        scales = [(e.scale, -e.zero * e.scale) for e in session.encoders]
+        scales = [(session.tick, 0.0), *((e.scale, -e.zero * e.scale) for e in session.encoders)]
         scales += [(1.0, 0.0) for _ in session.brakes]
         scales += [(c.scale, c.offset) for c in session.channels]
-        for scale, shift in scales:
-            gain[at, at], offset[at] = scale, shift
-            at += 1
+        at = len(scales)
+        np.fill_diagonal(gain[:at, :at], [scale for scale, _ in scales])
+        offset[:at] = [shift for _, shift in scales]
         if force:
             matrix = np.array(force.calibration).T
             gain[at:, at:] = matrix
@@ -180,43 +177,30 @@ class SampleStream:
                 continue
             self._delimiter = max(DELIMITERS, key=line.count)
             found = [cell.strip().strip("\"'") for cell in line.split(self._delimiter)]
-            for layout in self.layouts:
-                if set(layout.columns) <= set(found):
-                    self._layout = layout
-                    self._width = len(found)
-                    self._indices = tuple(found.index(name) for name in layout.columns)
-                    self._last_good = self._line
-                    break
-            else:
-                missing = [name for name in self.layouts[0].columns if name not in found]
+            fitting = [layout for layout in self.layouts if set(layout.columns) <= set(found)]
+            if not fitting:
+                wanted = self.layouts[0].columns
+                missing = next(name for name in wanted if name not in found)
                 raise InputError(
-                    f"no column {missing[0]!r} in the header",
+                    f"no column {missing!r} in the header",
                     where=f"{self.name}: line {self._line}",
-                    remedy=f"the columns must be {', '.join(self.layouts[0].columns)}",
+                    remedy=f"the columns must be {', '.join(wanted)}",
                 )
+            self._layout, self._width, self._last_good = fitting[0], len(found), self._line
+            self._indices = tuple(found.index(name) for name in fitting[0].columns)
         return lines
 
     def _samples(self, lines: list[str], layout: StreamLayout) -> Array:
         rows: list[list[float]] = []
         numbers: list[int] = []
-        indices, width, delimiter = self._indices, self._width, self._delimiter
         for line in lines:
             self._line += 1
-            cells = line.split(delimiter)
-            try:
-                # float() also reads 1_0 and the digits of other scripts, which no logger writes.
-                if len(cells) != width or "_" in line or not line.isascii():
-                    raise ValueError
-                row = [float(cells[index]) for index in indices]
-            except ValueError:
-                if not line.strip() or line.startswith("#"):
-                    continue
-                careful = self._carefully(cells, layout)
-                if careful is None:
-                    continue
-                row = careful
-            rows.append(row)
-            numbers.append(self._line)
+            if not line.strip() or line.startswith("#"):
+                continue
+            row = self._row(line.split(self._delimiter), layout)
+            if row is not None:
+                rows.append(row)
+                numbers.append(self._line)
         if not rows:
             return np.empty((0, len(layout.names)))
         raw = np.array(rows)
@@ -249,8 +233,8 @@ class SampleStream:
             self._last_good = numbers[int(np.flatnonzero(keep)[-1])]
         return np.asarray(values[keep])
 
-    def _carefully(self, cells: list[str], layout: StreamLayout) -> list[float] | None:
-        """Read a line that is not plain numbers; None where it is bad."""
+    def _row(self, cells: list[str], layout: StreamLayout) -> list[float] | None:
+        """The numbers of a line; None where it is bad, which is said."""
         if len(cells) != self._width:
             self._skip(self._line, "", f"{len(cells)} cells where the header has {self._width}")
             return None
@@ -260,6 +244,7 @@ class SampleStream:
         ):
             text = cells[index].strip().strip("\"'")
             try:
+                # float() also reads 1_0 and the digits of other scripts, which no logger writes.
                 if "_" in text or not text.isascii():
                     raise ValueError
                 row.append(np.nan if may_lack and not text else float(text))

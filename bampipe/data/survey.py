@@ -24,9 +24,10 @@ from bampipe.data.readers.trial import Dialect
 from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
 from bampipe.data.session.channels import CLOCK_UNITS
-from bampipe.data.session.places import lexically_inside
+from bampipe.data.session.file import lexically_inside
 from bampipe.data.units import RecordedUnit, spelled, unit
 from bampipe.errors import InputError
+from bampipe.lists import join_names
 
 MOST_FILES = 500
 _SMALL = 1 << 16
@@ -69,6 +70,11 @@ _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
 _PRESENT = frozenset(["current", "curr", "cur"])
 _LONGEST_WORD = 2
 """Letters at the end of a name that are a word rather than a unit, such as the in of pos_in."""
+_JOINED = {
+    "rows": "row by row",
+    "time": "by their times",
+    "start": "by their times, as if started together",
+}
 _UNIT_WORDS = {
     "time": ("us", "ms", "ns", "s"),
     "position": ("rad", "deg", "mm", "cm", "m"),
@@ -104,6 +110,16 @@ class SurveyedColumn:
     def conversion(self) -> RecordedUnit | None:
         """How its unit becomes SI; None where it has none, or none that is known."""
         return unit(self.unit) if self.unit else None
+
+    @property
+    def si(self) -> str | None:
+        """SI unit of its quantity; None where that is not known."""
+        return self.conversion.si if self.conversion is not None else None
+
+    @property
+    def scale(self) -> float:
+        """What makes SI of its values, 1 where that is not known."""
+        return self.conversion.scale if self.conversion is not None else 1.0
 
     @property
     def is_integer(self) -> bool:
@@ -158,12 +174,10 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     sound = []
     for trial in trials:
         try:
-            if not read:
-                several = logs.recordings(trial)
-                read = logs.read(several[0], common)
-            else:
+            if read:
                 logs.compare(trial, common)
-                several = logs.recordings(trial)
+            several = logs.recordings(trial)
+            read = read or logs.read(several[0], common)
             sound += several
         except InputError as error:
             logs.passed.append((trial.file, str(error)))
@@ -226,7 +240,7 @@ class _Logs:
                 if not columns:
                     raise InputError("no column of numbers in it")
                 small = path.stat().st_size < _SMALL and path.suffix.lower() in TEXTS
-                if small and len(self._read_one(name, columns, _first(columns))) < 2:
+                if small and len(self._read_one(name, columns, next(iter(columns)))) < 2:
                     raise InputError("one row of numbers is no log")
                 self.found[name] = columns
             except InputError as error:
@@ -266,7 +280,7 @@ class _Logs:
             trials = [trial for trial, has in zip(trials, shared, strict=True) if best <= has]
             if trials and (axes or self._completeness(self._labels(trials[0])) == _WHOLE):
                 self._leave_out([p for t in trials for p in (t.file, *(x.file for x in t.parts))])
-                self.remarks += [_describe_join(trials)]
+                self.remarks += [_describe_join(trials[0])]
                 return trials, [c for c in self._labels(trials[0]) if c in best]
             if not whole:
                 self._refuse_parted(names[0], reasons)
@@ -378,7 +392,7 @@ class _Logs:
         if trial.parts or not several or self.scanned > _MOST_SCANNED:
             return [trial]
         times = [c for c, u in columns.items() if _role(c, u) == "time" and u != "datetime"]
-        column = (times or [_first(columns)])[0]
+        column = (times or [next(iter(columns))])[0]
         raw = self._read_one(trial.file, columns, column)
         starts = starts_of(raw, column if times else "")
         if len(starts) == 1:
@@ -408,22 +422,11 @@ def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
     return complete if 2 * complete.sum() > len(complete) else np.ones_like(complete)
 
 
-def _first(columns: Mapping[str, str]) -> str:
-    return next(iter(columns))
-
-
-def _describe_join(trials: Sequence[TrialEntry]) -> str:
-    """What was joined, as of the first recording."""
-    first = trials[0]
-    how = {
-        "rows": "row by row",
-        "time": "by their times",
-        "start": "by their times, as if started together",
-    }
-    ways = dict.fromkeys(how[part.join] for part in first.parts)
-    names = [first.file, *(part.file for part in first.parts)]
-    listed = f"{', '.join(names[:-1])} and {names[-1]}"
-    return f"{listed} are taken as one recording, joined {' and '.join(ways)}"
+def _describe_join(first: TrialEntry) -> str:
+    """What was joined to make a recording."""
+    ways = join_names(dict.fromkeys(_JOINED[part.join] for part in first.parts))
+    files = join_names([first.file, *(part.file for part in first.parts)])
+    return f"{files} are taken as one recording, joined {ways}"
 
 
 def _by_looks(
@@ -440,7 +443,8 @@ def _by_looks(
     times = [c.values for c in columns if c.role == "time" and not c.is_constant]
     roles = find_roles({c.name: c.values for c in unnamed}, times[0] if times else None)
     if "position" not in roles.values():
-        if len(unnamed) < len(columns) or not all(_is_numbered(c.name) for c in columns):
+        numbered = (re.fullmatch(r"(.*:)?column_\d+", c.name) for c in columns)
+        if len(unnamed) < len(columns) or not all(numbered):
             return columns, []
         listed = ", ".join(describe(c.name, c.values) for c in columns[:12])
         raise InputError(
@@ -467,10 +471,6 @@ def _with_unit_beside(
     return replace(column, unit=said, by_looks=False) if known else column
 
 
-def _is_numbered(name: str) -> bool:
-    return re.fullmatch(r"(.*:)?column_\d+", name) is not None
-
-
 def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:
     """The columns, with commanded forces, currents or voltages for inputs if none was measured.
 
@@ -489,11 +489,9 @@ def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:
 
 def _role_apart(column: SurveyedColumn) -> str:
     """The role that the unit or the rest of the name gives to a reference."""
-    known = unit(column.stated)
-    if known is not None and known.si in _BY_UNIT:
-        return _BY_UNIT[known.si]
     said = set(words(column.name)) - REFERENCE_WORDS
-    return next((role for role in DRIVERS if said & set(_WORDS[role].split())), "")
+    named = (role for role in DRIVERS if said & set(_WORDS[role].split()))
+    return _role_by_unit(column.stated) or next(named, "")
 
 
 def words(name: str) -> list[str]:
@@ -501,11 +499,6 @@ def words(name: str) -> list[str]:
     bare = re.sub(r"[\[(].*?[\])]", " ", name)
     parts = re.split(r"[^A-Za-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare))
     return [part.lower() for part in parts if part]
-
-
-def _singular(said: Sequence[str]) -> set[str]:
-    """Words, and those in the plural without their s."""
-    return {*said, *(word.removesuffix("s") for word in said if len(word) > 3)}
 
 
 def _role(name: str, stated: str) -> str:
@@ -517,13 +510,13 @@ def _role(name: str, stated: str) -> str:
         return (vague and _role(part, "")) or alone
     if stated == "datetime" or name.strip().lower() in _UNIT_WORDS["time"]:
         return "time"
-    said = _singular(words(name))
+    said = set(words(name))
+    said |= {word.removesuffix("s") for word in said if len(word) > 3}
     first = [role for role in ("reference", "brake") if said & set(_WORDS[role].split())]
     if first:
         return first[0]
-    known = unit(stated)
-    if known is not None and known.si in _BY_UNIT:
-        return _BY_UNIT[known.si]
+    if role := _role_by_unit(stated):
+        return role
     if said & _PLAIN_POSITIONS and said & _PRESENT:
         said -= _PRESENT  # the position that is current, and no current
     roles = [role for role, text in _WORDS.items() if said & set(text.split())]
@@ -533,11 +526,15 @@ def _role(name: str, stated: str) -> str:
     return named or lerobot.role_of(name) or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
 
 
+def _role_by_unit(text: str) -> str:
+    known = unit(text)
+    return _BY_UNIT.get(known.si, "") if known is not None else ""
+
+
 def _role_by_suffix(suffix: str) -> str:
     """The role by a unit at the end of a name that says nothing else."""
     long = len(suffix) > _LONGEST_WORD and suffix.lower() not in _PLAIN_WORDS
-    known = unit(suffix) if long or suffix in _SHORT_UNITS else None
-    role = _BY_UNIT.get(known.si, "") if known is not None else ""
+    role = _role_by_unit(suffix) if long or suffix in _SHORT_UNITS else ""
     return role if role != "time" else ""
 
 
@@ -554,5 +551,4 @@ def _unit(name: str, stated: str, role: str) -> str:
     matches = [u for u in _UNIT_WORDS.get(role, ()) if u.lower() == suffix.lower()]
     if matches or role == "time" or len(suffix) <= _LONGEST_WORD:
         return next(iter(matches), "")
-    known = unit(suffix)
-    return suffix if known is not None and _BY_UNIT.get(known.si) == role else ""
+    return suffix if role and _role_by_unit(suffix) == role else ""

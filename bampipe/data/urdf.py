@@ -6,15 +6,13 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bampipe.arrays import Array
 from bampipe.data.rigid_body import Body, symmetric
 from bampipe.data.robot_tree import DriveLimits, Tree, TreeJoint
 from bampipe.data.robot_xml import document, number_list, numbers, read_xml
 from bampipe.errors import InputError
-
-Array = NDArray[np.float64]
 
 _XACRO = ("{http://www.ros.org/wiki/xacro", "{http://ros.org/wiki/xacro", "{http://ros.org/xacro")
 _UNLIMITED = 1e6

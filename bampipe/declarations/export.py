@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data.chain import read_tree
 from bampipe.data.device_file import tree_of_robot
-from bampipe.data.lumping import put_bodies
 from bampipe.data.mjcf import mjcf_text
 from bampipe.data.rigid_body import Body, symmetric
 from bampipe.data.robot_tree import (
@@ -22,6 +21,7 @@ from bampipe.data.robot_tree import (
     gravity_at,
     hold_beside,
     identifier,
+    put_bodies,
 )
 from bampipe.data.robot_xml import number_list, read_xml
 from bampipe.data.run_folder import RunFolder
@@ -37,7 +37,6 @@ from bampipe.physics.portable import portable_source
 from bampipe.physics.robot import INERTIAL_NAMES, Robot
 from bampipe.results.identify import IdentifyResult
 
-Array = NDArray[np.float64]
 Form = Literal["json", "urdf", "mjcf", "python", "c"]
 FORMS: tuple[Form, ...] = get_args(Form)
 
@@ -91,14 +90,13 @@ def _urdf(run: RunFolder, system: System, p: Array) -> str:
         f"{joint} {own:.6g}" for joint, own in zip(system.coordinates, np.diag(drives), strict=True)
     )
     lacks = [f"drives' inertia at their joints, kg.m2 or kg ({shown})"] if drives.any() else []
-    given_back = drawn.file is not None and drawn.is_urdf
-    said = gravity_at(drawn.before, drawn.base)[0] if given_back else None
+    said = gravity_at(drawn.before, drawn.base)[0] if drawn.urdf is not None else None
     if not np.allclose(robot.gravity, said or UPRIGHT):
         lacks.append(f"gravity in the frame of {drawn.base} ({number_list(robot.gravity)})")
     lacks += [*_coupled(robot, drives), *(item.name for item in system.model.effects)]
     comment = _head(drawn, lacks)
-    if drawn.file is not None and drawn.is_urdf:
-        return changed_urdf(drawn.file, drawn.before, drawn.after, comment)
+    if drawn.urdf is not None:
+        return changed_urdf(drawn.urdf, drawn.before, drawn.after, comment)
     return urdf_text(system.model.device.name, drawn.flat, comment)
 
 
@@ -131,16 +129,14 @@ class _Drawn:
     """A robot's links and joints as they were drawn, and as they were identified.
 
     Attributes:
-        file: copy of the drawing in the run folder, None where the device file has the joints.
-        is_urdf: whether that is a URDF.
+        urdf: copy of the drawing in the run folder; None where there is none, or another.
         before, after: all links and joints, as drawn and with what was identified.
         flat: of ``after``, what the model has: the part on the base, joints beside the chain fixed.
         base: link that stands still.
         notes: what is where other than in the drawing, one clause each.
     """
 
-    file: Path | None
-    is_urdf: bool
+    urdf: Path | None
     before: Tree
     after: Tree
     flat: Tree
@@ -157,12 +153,16 @@ def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
         links = {f"{joint}_link": body for joint, body in bodies.items()}
         joints = [replace(j, limits=limits.get(j.name, j.limits)) for j in before.joints]
         after = replace(before, bodies={**before.bodies, **links}, joints=joints)
-        return _Drawn(None, False, before, after, after, "base", ())
+        return _Drawn(None, before, after, after, "base", ())
     file = run.path(DRAWING)
     before = read_tree(file)
     after = put_bodies(before, robot.base, robot.tip, bodies, limits)
     notes = []
-    emptied = [link for link in before.bodies if _lost(before.bodies[link], after.bodies[link])]
+    emptied = [
+        link
+        for link, body in after.bodies.items()
+        if before.bodies[link].mass != 0.0 and body.mass == 0.0 and not body.inertia.any()
+    ]
     if emptied:
         notes.append(
             f"the mass of what is fixed to a link is in that link, not in {join_names(emptied)}"
@@ -175,20 +175,9 @@ def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
             f"no body has what is left for {join_names(overdrawn)}: what hangs there beside the"
             " chain is drawn too heavy"
         )
-    return _Drawn(
-        file=file,
-        is_urdf=read_xml(file).tag == "robot",
-        before=before,
-        after=after,
-        flat=hold_beside(after, robot.base, robot.tip),
-        base=robot.base,
-        notes=tuple(notes),
-    )
-
-
-def _lost(before: Body, after: Body) -> bool:
-    """Whether a body is there no more."""
-    return before.mass != 0.0 and after.mass == 0.0 and not after.inertia.any()
+    urdf = file if read_xml(file).tag == "robot" else None
+    flat = hold_beside(after, robot.base, robot.tip)
+    return _Drawn(urdf, before, after, flat, robot.base, tuple(notes))
 
 
 def _overdrawn(identified: Mapping[str, Body], after: Tree) -> list[str]:

@@ -8,15 +8,13 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data.mjcf import STEP_S, Additions
 from bampipe.data.robot_xml import number_list
 from bampipe.physics import System, registry
 from bampipe.physics.effect import BoundEffect
 from bampipe.physics.robot import Robot
-
-Array = NDArray[np.float64]
 
 _FAR = 1e6
 """Where a spring on one side ends on the other, rad or m."""

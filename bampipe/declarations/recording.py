@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bampipe.arrays import Array
 from bampipe.data.chain import read_tree
 from bampipe.data.robot_tree import MOVING, Tree, identifier
 from bampipe.data.run_folder import RunFolder
@@ -20,8 +20,6 @@ from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.ingest import IngestResult
-
-Array = NDArray[np.float64]
 
 DRAWING = "ingest/robot.xml"
 """The URDF or MJCF that a session brought."""

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bampipe.arrays import Array
 from bampipe.data.readers.trial import need
-from bampipe.declarations.recording import Array, Recording
+from bampipe.declarations.recording import Recording
 
 
 def pack_recording(recording: Recording) -> bytes:

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.physics.robot import Joint, Robot, rotation_matrix
-
-Array = NDArray[np.float64]
 
 _SIDE, _MARGIN, _TOP = 420.0, 60.0, 34.0
 _INK, _FAINT, _BODY, _WRONG = "#1c2024", "#b4b8bd", "#56b4e9", "#d55e00"

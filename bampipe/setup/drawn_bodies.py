@@ -11,13 +11,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.physics.robot import Robot
 from bampipe.setup.mounting import Mounting
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Bounds = tuple[float, float]
 
 WIDE: Bounds = (-np.inf, np.inf)
@@ -165,34 +163,34 @@ class Comparison:
 
     def by_body(self, mounting: Mounting) -> list[Array]:
         """By joint, what losses leave of the drive that each drawn body asks for, (K, bodies)."""
-        n, bodies = len(self.ratio), range(len(self.robot.joints))
-        found: list[list[Array]] = []
-        for motion in self.motions:
-            moved = motion.scaled(mounting.direction)
-            at = moved.position + mounting.zero, moved.rate, moved.change
-            found.append(
-                [
-                    self.robot.drawn_forces(*at, mounting.gravity, only=b) / self.ratio
-                    for b in bodies
-                ]
-            )
-        return [
-            loss.without(
-                self._thinned([np.column_stack([f[:, k] for f in trial]) for trial in found], k).T
-            ).T
-            for k, loss in zip(range(n), self.losses, strict=True)
-        ]
+
+        def forces(q: Array, qd: Array, qdd: Array) -> list[Array]:
+            bodies, down = range(len(self.robot.joints)), mounting.gravity
+            each = [self.robot.drawn_forces(q, qd, qdd, down, only=b) for b in bodies]
+            return [np.column_stack([one[:, k] for one in each]) for k, _ in enumerate(self.ratio)]
+
+        return self._left_of(mounting, forces)
 
     def by_number(self, mounting: Mounting, place: int) -> list[Array]:
         """By joint, what losses leave of one of each inertial number of a body, (K, 10)."""
         under = self.robot.model_copy(update={"gravity": tuple(mounting.gravity)})
+
+        def numbers(q: Array, qd: Array, qdd: Array) -> list[Array]:
+            rows = (row[place] for row in under.columns(q, qd, qdd))
+            return [np.column_stack([np.broadcast_to(c, len(q)) for c in row]) for row in rows]
+
+        return self._left_of(mounting, numbers)
+
+    def _left_of(
+        self, mounting: Mounting, columns: Callable[[Array, Array, Array], list[Array]]
+    ) -> list[Array]:
+        """By joint, what losses leave of columns (K, m): of forces (T, m) along each motion."""
         found: list[list[Array]] = [[] for _ in self.ratio]
         for motion in self.motions:
             moved = motion.scaled(mounting.direction)
-            columns = under.columns(moved.position + mounting.zero, moved.rate, moved.change)
-            for parts, row, ratio in zip(found, columns, self.ratio, strict=True):
-                numbers = [np.broadcast_to(c, len(moved.rate)) for c in row[place]]
-                parts.append(np.column_stack(numbers) / ratio)
+            by_joint = columns(moved.position + mounting.zero, moved.rate, moved.change)
+            for parts, one, ratio in zip(found, by_joint, self.ratio, strict=True):
+                parts.append(one / ratio)
         return [
             loss.without(self._thinned(parts, k).T).T
             for k, (parts, loss) in enumerate(zip(found, self.losses, strict=True))

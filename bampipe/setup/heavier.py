@@ -6,14 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from bampipe.arrays import Array
 from bampipe.physics.robot import Robot
 from bampipe.setup.drawn_bodies import Comparison
 from bampipe.setup.mounting import Mounting
-
-Array = NDArray[np.float64]
 
 _FAR = 2.0
 """Factor from which a mass is no longer what a drawing is wrong by."""
@@ -113,7 +111,7 @@ def describe_heavy(
     compared: Comparison,
     mounting: Mounting,
     found: HeavierBody,
-    in_tip: Callable[[Array], Array] | None = None,
+    in_tip: Callable[[Array], Array],
 ) -> str:
     """Say which body is heavier than drawn; of the last one, with the payload that it suggests.
 
@@ -124,7 +122,7 @@ def describe_heavy(
     """
     robot = compared.robot
     said, joint = robot.describe_mass(found.place, found.factor), robot.joints[found.place]
-    if joint is not robot.joints[-1] or robot.payload is not None or in_tip is None:
+    if joint is not robot.joints[-1] or robot.payload is not None:
         return said
     pairs = zip(_signed_drives(compared, mounting), compared.by_body(mounting), strict=True)
     mass, center = _fit_point_mass(

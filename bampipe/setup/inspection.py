@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import ast
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, SetupResult
 from bampipe.setup.finding import Finding, spoilt_axes
-from bampipe.setup.placeholders import Placeholder, find_placeholders
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, drawn_robot, is_drawn
 from bampipe.setup.search import Search, shorten
@@ -45,12 +45,12 @@ def inspect_setup(
     short = shorten(motions)
     _require_scale(system, short)
     signals = Signals.of_session(system, session)
-    placeholders = find_placeholders(system, session)
+    placeholders = _find_placeholders(system, session)
     search = Search(system, short, band, folds, signals)
     held = search.judge(())
     if is_drawn(system):
         search = DrawnSearch(system, shorten(short, DRAWN_SAMPLES), band, folds, signals)
-    findings = search.find_mistakes(tuple(n for p in placeholders for n in p.signals))
+    findings = search.find_mistakes(tuple(n for names in placeholders.values() for n in names))
     mistakes = tuple(_record(system, session, found, placeholders) for found in findings)
     axes = {
         axis: _axis(place, axis, held, mistakes) for place, axis in enumerate(system.coordinates)
@@ -69,9 +69,9 @@ def inspect_setup(
         warnings += describe_lack(system, held, search.over_position)
     named = " ".join(mistake.sentence for mistake in mistakes)
     warnings += [
-        f"{p.sentence}: the scale of all estimates rests on it"
-        for p in placeholders
-        if p.sentence not in named
+        f"{sentence}: the scale of all estimates rests on it"
+        for sentence in placeholders
+        if sentence not in named
     ]
     return SetupResult(
         headline="; ".join(mistake.sentence for mistake in mistakes),
@@ -110,13 +110,13 @@ def _axis(
 
 
 def _record(
-    system: System, session: IngestResult, found: Finding, placeholders: Sequence[Placeholder]
+    system: System, session: IngestResult, found: Finding, placeholders: Mapping[str, Sequence[str]]
 ) -> SetupMistake:
     correction, axes = found.correction, spoilt_axes(found)
     sentence = describe_correction(correction, session)
-    left = [p for p in placeholders if set(correction.signals) <= set(p.signals)]
+    left = [s for s, names in placeholders.items() if set(correction.signals) <= set(names)]
     if correction.kind == "scale" and left:
-        sentence = f"{left[0].sentence}, a placeholder: {describe_size(correction)}"
+        sentence = f"{left[0]}, a placeholder: {describe_size(correction)}"
 
     def errors(of: Plausibility) -> dict[str, float]:
         return dict(zip(system.coordinates, 100.0 * of.error, strict=True))
@@ -163,3 +163,32 @@ def _require_scale(system: System, motions: Sequence[Motion]) -> None:
         where=f"device {system.model.device.name!r}",
         remedy="make a constant of one that is known, such as the gain of the input",
     )
+
+
+def _find_placeholders(system: System, session: IngestResult) -> dict[str, tuple[str, ...]]:
+    """Scales of exactly 1 that nobody has filled in, in words, and the signals that they scale.
+
+    Counts of an encoder, calibrations, and constants that the input goes through.
+    """
+    found: dict[str, tuple[str, ...]] = {
+        f"counts_per_unit of {axis} is 1": (axis,)
+        for axis, encoder in session.axes.items()
+        if encoder.counts_per_unit is not None and abs(encoder.counts_per_unit) == 1.0
+    }
+    force = session.force
+    if force.raw_unit == "V":
+        ones = tuple(
+            name
+            for name, row in zip(force.columns, force.calibration, strict=True)
+            if sorted(map(abs, row)) == [0.0] * (len(row) - 1) + [1.0]
+        )
+        if ones:
+            found[f"calibration_n_per_v of {', '.join(ones)} is 1"] = ones
+    device = system.model.device
+    nodes = (node for tree in device.applied.values() for node in ast.walk(tree))
+    used = {node.id for node in nodes if isinstance(node, ast.Name)}
+    for name, constant in device.constants.items():
+        if name in used and constant.value == 1.0 and constant.unit:
+            source = f", source {constant.source!r}" if constant.source else ""
+            found[f"{name} of the device file is 1 {constant.unit}{source}"] = device.forces
+    return found

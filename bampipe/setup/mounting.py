@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array
 
 _TURNS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
 _DOWN = tuple(np.array(v) for v in product((-1.0, 0.0, 1.0), repeat=3) if any(v))

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
@@ -18,8 +18,6 @@ from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import applied_rms
-
-Array = NDArray[np.float64]
 
 WEIGHT = 8.0
 """Of the logarithm of an axis' error: its third counts as much as a parameter that comes back from

@@ -8,27 +8,16 @@ from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
 from bampipe.physics.robot import Robot
+from bampipe.setup import hypotheses
 from bampipe.setup.drawn_bodies import Bounds, Comparison, Drive, JointMotion, keep
 from bampipe.setup.finding import LEAST_GAIN
 from bampipe.setup.heavier import find_heavy, with_heavier_body
-from bampipe.setup.hypotheses import (
-    Correction,
-    clock_corrections,
-    combine,
-    exchange_corrections,
-    quarter_turns,
-    resized,
-    shifted,
-    sign_corrections,
-    turned,
-    under_gravity,
-    unit_corrections,
-)
+from bampipe.setup.hypotheses import Correction
 from bampipe.setup.mounting import Mounting, find_mounting
 from bampipe.setup.plausibility import FARTHEST, WEIGHT, Plausibility
 from bampipe.setup.search import (
@@ -42,8 +31,6 @@ from bampipe.setup.search import (
 )
 from bampipe.trials.residuals import standstill_of
 from bampipe.trials.signals import Change
-
-Array = NDArray[np.float64]
 
 DRAWN_SAMPLES = 4_000
 """Of all trials together, that the bodies as drawn are held against."""
@@ -173,19 +160,21 @@ class DrawnSearch(Search):
     def rivals(self, tried: list[Correction]) -> list[Correction]:
         down = [-g for g in self.stated.robot.gravity]
         return [
-            *sign_corrections(self.signals),
-            *quarter_turns(self.signals),
-            under_gravity(self.signals, down, 1.0),
+            *hypotheses.sign_corrections(self.signals),
+            *hypotheses.quarter_turns(self.signals),
+            hypotheses.under_gravity(self.signals, down, 1.0),
         ]
 
     def discrete(self) -> Iterator[Correction]:
         coupled = {force for force in self.signals.forces if force not in self._alone}
-        yield from (one for one in sign_corrections(self.signals) if coupled & set(one.signals))
+        yield from (
+            one for one in hypotheses.sign_corrections(self.signals) if coupled & set(one.signals)
+        )
         axes = set(self.signals.axes)
         for correction in (
-            *exchange_corrections(self.signals),
-            *unit_corrections(self.signals),
-            *clock_corrections(self.signals),
+            *hypotheses.exchange_corrections(self.signals),
+            *hypotheses.unit_corrections(self.signals),
+            *hypotheses.clock_corrections(self.signals),
         ):
             # Of a drive in another unit, the share tells, unless it turns several joints.
             of_drive = correction.kind == "scale" and not (axes | coupled) & set(correction.signals)
@@ -205,7 +194,7 @@ class DrawnSearch(Search):
     def together(self, chosen: Corrections) -> Corrections:
         # What the best mounting and the drives' shares say is mistaken besides.
         found: list[Correction] = []
-        change = combine(self.signals, chosen)
+        change = hypotheses.combine(self.signals, chosen)
         compared, rough = (self._compare(change, one) for one in (self.stated, self.roughly))
         if compared is None or rough is None:
             return ()
@@ -215,12 +204,13 @@ class DrawnSearch(Search):
         for k, (axis, (direction, zero)) in enumerate(
             zip(self.signals.axes, mounting.by_joint, strict=True)
         ):
-            found += [turned(self.signals, [axis])] if direction < 0.0 else []
+            found += [hypotheses.turned(self.signals, [axis])] if direction < 0.0 else []
             if zero:
                 off = float(np.remainder(zero + np.pi, 2.0 * np.pi) - np.pi) or np.pi
-                found.append(shifted(self.signals, axis, off if compared.turning[k] else zero, 1.0))
+                off = off if compared.turning[k] else zero
+                found.append(hypotheses.shifted(self.signals, axis, off, 1.0))
         if mounting.hangs:
-            found.append(under_gravity(self.signals, mounting.gravity, 1.0))
+            found.append(hypotheses.under_gravity(self.signals, mounting.gravity, 1.0))
         drives = compared.hold(mounting)
         return (*found, *self._by_share(drives))
 
@@ -231,9 +221,9 @@ class DrawnSearch(Search):
         """Drives whose sign or size is not that of the bodies, each by itself or all alike."""
         signs = [name for name, k in self._alone.items() if drives[k].is_turned]
         if len(signs) == len(self.signals.forces) > 1:
-            yield turned(self.signals, signs, 1.0)
+            yield hypotheses.turned(self.signals, signs, 1.0)
         else:
-            yield from (turned(self.signals, [name]) for name in signs)
+            yield from (hypotheses.turned(self.signals, [name]) for name in signs)
         sizes = {
             name: float(np.log(abs(drives[k].share)))
             for name, k in self._alone.items()
@@ -243,11 +233,11 @@ class DrawnSearch(Search):
         middle = float(np.median(logs)) if len(logs) else 0.0
         alike = len(logs) > 2 and np.abs(logs - middle).max() < _ALIKE_SHARES
         if alike and abs(middle) > _FAR_SHARE:
-            yield resized(self.signals, self.signals.forces, np.exp(-middle))
+            yield hypotheses.resized(self.signals, self.signals.forces, np.exp(-middle))
             return
         for name, size in sizes.items():
             if abs(size) > np.log(_STATED[1]):
-                yield resized(self.signals, [name], np.exp(-size))
+                yield hypotheses.resized(self.signals, [name], np.exp(-size))
 
     def _compare(self, change: Change, stated: Comparison) -> Comparison | None:
         """The comparison ``stated`` with other readings and drives, zeros apart.
@@ -273,7 +263,7 @@ class DrawnSearch(Search):
         self, corrections: Sequence[Correction], stated: Comparison
     ) -> tuple[Comparison, Mounting, list[Drive]] | None:
         self.tested += 1
-        change = combine(self.signals, corrections)
+        change = hypotheses.combine(self.signals, corrections)
         compared = self._compare(change, stated)
         if compared is None:
             return None

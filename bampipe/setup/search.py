@@ -9,10 +9,11 @@ from functools import cached_property, partial
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
+from bampipe.setup import hypotheses
 from bampipe.setup.finding import (
     ALIKE,
     LEAST_GAIN,
@@ -28,26 +29,11 @@ from bampipe.setup.finding import (
     spoils_sound_axes,
 )
 from bampipe.setup.heavier import HeavierBody
-from bampipe.setup.hypotheses import (
-    JOINT_SPANS,
-    MOST_TRAVEL,
-    Correction,
-    clock_corrections,
-    combine,
-    exchange_corrections,
-    groups_of_like,
-    quarter_turns,
-    scaled,
-    shifted,
-    sign_corrections,
-    unit_corrections,
-)
+from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import Plausibility, axes_without_pose, judge_setup
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
-
-Array = NDArray[np.float64]
 
 SUSPICIOUS_PRIORS = 5.0
 """Sum of objections from which other set-ups are tried: two parameters beyond
@@ -180,12 +166,7 @@ class Search:
         ]
 
     def _refine(
-        self,
-        chosen: tuple[Correction, ...],
-        family: Family,
-        best: float,
-        least: float,
-        step: float,
+        self, chosen: Corrections, family: Family, best: float, least: float, step: float
     ) -> Correction:
         """The best correction of a family near ``best``, where it scores ``least``."""
         for _ in range(_HALVINGS):
@@ -196,11 +177,9 @@ class Search:
                     best, least = x, score
         return family(best)
 
-    def _shortlist(
-        self, chosen: tuple[Correction, ...], corrections: Iterable[Correction]
-    ) -> list[Correction]:
+    def _shortlist(self, chosen: Corrections, tried: Iterable[Correction]) -> list[Correction]:
         """The corrections that do best on the small part of the trials."""
-        screened = [(self.screen(chosen, correction), correction) for correction in corrections]
+        screened = [(self.screen(chosen, correction), correction) for correction in tried]
         screened.sort(key=lambda one: one[0])
         return [one for score, one in screened[:_SHORTLIST] if math.isfinite(score)]
 
@@ -236,7 +215,7 @@ class Search:
         steps: int,
         posed: Sequence[int] = (),
     ) -> Plausibility | None:
-        change = combine(self.signals, corrections)
+        change = hypotheses.combine(self.signals, corrections)
         with np.errstate(all="ignore"):
             changed = [change.of_motion(motion, self.signals) for motion in motions]
         return judge_setup(self.system, changed, change.of_band(self.band), folds, steps, posed)
@@ -276,22 +255,22 @@ class Search:
 
     def discrete(self) -> Iterator[Correction]:
         """Mistakes that are usual."""
-        yield from sign_corrections(self.signals)
-        yield from clock_corrections(self.signals)
-        for correction in unit_corrections(self.signals):
+        yield from hypotheses.sign_corrections(self.signals)
+        yield from hypotheses.clock_corrections(self.signals)
+        for correction in hypotheses.unit_corrections(self.signals):
             if self.has_few_axes or len(correction.signals) > 1:
                 yield correction
         if self.has_few_axes:
-            yield from exchange_corrections(self.signals)
-            yield from quarter_turns(self.signals)
+            yield from hypotheses.exchange_corrections(self.signals)
+            yield from hypotheses.quarter_turns(self.signals)
 
     def families(self, chosen: Corrections) -> Iterator[tuple[Family, Array]]:
         """Scales and zeros of any size, each with the sizes to begin with."""
         if not self.has_few_axes:
             return
-        for names in groups_of_like(self.signals):
+        for names in hypotheses.groups_of_like(self.signals):
             yield partial(scaled_by_power, self.signals, names), DECADES
-        change = combine(self.signals, chosen)
+        change = hypotheses.combine(self.signals, chosen)
         changed = [change.of_motion(motion, self.signals) for motion in self.screened[0]]
         for place, axis in enumerate(self.signals.axes):
             q = np.concatenate([motion.q[:, place] for motion in changed])
@@ -300,7 +279,7 @@ class Search:
                 yield from gears(self.signals, axis, float(np.ptp(q)))
             reach = 2.0 * max(float(np.ptp(q)), float(np.abs(np.median(q))))
             grid = (math.pi if turns else reach) * np.linspace(-1.0, 1.0, _STEPS)
-            yield partial(_shifted_by, self.signals, axis), grid
+            yield partial(hypotheses.shifted, self.signals, axis, cost=3.0), grid
 
 
 def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:
@@ -317,17 +296,13 @@ def spread(count: int) -> list[int]:
 
 
 def scaled_by_power(signals: Signals, names: tuple[str, ...], power: float) -> Correction:
-    return scaled(signals, names, 10.0**power, 3.0)
+    return hypotheses.scaled(signals, names, 10.0**power, 3.0)
 
 
 def gears(signals: Signals, axis: str, travel: float) -> Iterator[tuple[Family, Array]]:
     """What a motor turns for one of its joint, where a position travels that far, rad."""
-    if travel > MOST_TRAVEL:
-        yield partial(scaled_by_power, signals, (axis,)), np.log10(JOINT_SPANS / travel)
-
-
-def _shifted_by(signals: Signals, axis: str, offset: float) -> Correction:
-    return shifted(signals, axis, offset, 3.0)
+    if travel > hypotheses.MOST_TRAVEL:
+        yield partial(scaled_by_power, signals, (axis,)), np.log10(hypotheses.JOINT_SPANS / travel)
 
 
 def _is_gross(correction: Correction, motions: Sequence[Motion], signals: Signals) -> bool:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bampipe.data.quality.dead import find_equal_runs
-from bampipe.data.quality.spikes import INPUT, POSITION, find_spikes
+from bampipe.data.quality.faulty_readings import INPUT, POSITION, find_equal_runs, find_spikes
 
 T = np.arange(4000) / 500.0
 RNG = np.random.default_rng(3)

@@ -174,6 +174,8 @@ def test_readings_at_a_rail_are_left_out_and_a_command_at_its_limit_is_not():
                                 "sign_bit": 15}}},
             "holds its sign in one way only",
         ),
+        ({"channels": {"a": {"column": "a", "unit": "", "wrap_bits": 16}}}, "belong together"),
+        ({"channels": {"a": {"column": "a", "unit": "", "signed": True}}}, "belong together"),
     ],
 )  # fmt: skip
 def test_contradictions_are_refused(tables: dict[str, Any], said: str):

@@ -33,18 +33,18 @@ def test_json_has_no_number_that_is_not_finite(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("content", [b"[" * 100_000, b"9" * 5000, b"\xff", b""])
-def test_json_that_is_no_json_is_named(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        *((text, "(not JSON|nested too deeply)") for text in (b"[" * 100_000, b"9" * 5000)),
+        *((text, "not JSON") for text in (b"\xff", b"")),
+        (b'{"a": 1,\n oops}', "line 2"),
+    ],
+)
+def test_json_that_is_no_json_is_named(tmp_path, content, said):
     (tmp_path / "x.json").write_bytes(content)
-    with pytest.raises(InputError, match=r"x\.json.*: (not JSON|nested too deeply)"):
+    with pytest.raises(InputError, match=rf"x\.json.*{said}"):
         read_json(tmp_path / "x.json")
-
-
-def test_json_that_is_broken_is_named_with_its_line(tmp_path):
-    path = tmp_path / "x.json"
-    path.write_text('{"a": 1,\n oops}')
-    with pytest.raises(InputError, match=r"x\.json, line 2"):
-        read_json(path)
 
 
 @pytest.mark.parametrize(

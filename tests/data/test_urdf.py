@@ -12,6 +12,7 @@ from bampipe.data.chain import read_chain
 from bampipe.data.device_file import read_device_file
 from bampipe.errors import InputError
 from bampipe.physics import Model, System, compile_model
+from bampipe.physics.device import Device
 from bampipe.physics.registry import device_from
 from bampipe.physics.units import check_device
 from bampipe.run.hashing import digest_session
@@ -44,6 +45,14 @@ def write(folder: Path, *parts: str) -> Path:
     return path
 
 
+def device_of(folder: Path, tables: str = "", parts: tuple[str, ...] | None = None) -> Device:
+    """The device of an arm, with more tables in its file; of ``ARM`` by default."""
+    write(folder, *(ARM if parts is None else parts))
+    path = folder / "device.toml"
+    path.write_text(f'name = "arm"\n[robot]\nurdf = "arm.urdf"\n{tables}')
+    return device_from(read_device_file(path), str(path))
+
+
 ARM = (
     link("base"),
     link("upper", 2.0, x=0.25),
@@ -69,10 +78,7 @@ def test_a_chain_is_read_with_what_is_fixed_to_it(tmp_path: Path) -> None:
 
 
 def test_a_device_file_needs_no_more_than_the_urdf(tmp_path: Path) -> None:
-    write(tmp_path, *ARM)
-    path = tmp_path / "device.toml"
-    path.write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\n')
-    device = device_from(read_device_file(path), str(path))
+    device = device_of(tmp_path)
     assert [c.name for c in device.coordinates] == ["shoulder_pan", "elbow"]
     assert device.forces == ("torque_shoulder_pan", "torque_elbow")
     assert device.limits["elbow"] == (-1.0, 2.0)
@@ -166,20 +172,15 @@ def test_damaged_files_are_refused(text: str, what: str, tmp_path: Path) -> None
 def test_what_cannot_be_computed_is_one_line(
     parts: tuple[str, ...], what: str, tmp_path: Path
 ) -> None:
-    write(tmp_path, *parts)
-    file = tmp_path / "device.toml"
-    file.write_text('schema = "bampipe.device/1"\nname = "arm"\n[robot]\nurdf = "arm.urdf"\n')
     with pytest.raises(InputError, match=what) as caught:
-        check_device(device_from(read_device_file(file), str(file)))
+        check_device(device_of(tmp_path, parts=parts))
     assert not caught.value.others and "\n" not in str(caught.value)
 
 
 def test_a_limit_below_zero_is_one_that_is_not_known(tmp_path: Path) -> None:
     parts = (link("a"), link("b"), joint("j", "a", "b"))
-    write(tmp_path, *(part.replace('effort="40"', 'effort="-40"') for part in parts))
-    file = tmp_path / "device.toml"
-    file.write_text('schema = "bampipe.device/1"\nname = "arm"\n[robot]\nurdf = "arm.urdf"\n')
-    device = device_from(read_device_file(file), str(file))
+    parts = tuple(part.replace('effort="40"', 'effort="-40"') for part in parts)
+    device = device_of(tmp_path, parts=parts)
     assert {p.name: p.sd for p in device.parameters}["coulomb.j"] == 5.0
 
 
@@ -191,15 +192,12 @@ def test_a_urdf_outside_the_folder_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_motor_that_two_joints_turn_has_friction_and_inertia_of_their_sum(tmp_path: Path) -> None:
-    write(tmp_path, *ARM)
-    path = tmp_path / "device.toml"
-    path.write_text(
-        'name = "arm"\n[robot]\nurdf = "arm.urdf"\n'
+    device = device_of(
+        tmp_path,
         "[robot.motors.one]\nturns = { shoulder_pan = 50.0 }\n"
         "[robot.motors.two]\nturns = { shoulder_pan = -32.0, elbow = 32.0 }\n"
-        "rotor_inertia = 2e-4\n"
+        "rotor_inertia = 2e-4\n",
     )
-    device = device_from(read_device_file(path), str(path))
     assert check_device(device) == []
     assert device.forces == ("torque_one", "torque_two")
     system = compile_model(Model(device))
@@ -220,16 +218,9 @@ def test_a_motor_that_two_joints_turn_has_friction_and_inertia_of_their_sum(tmp_
 
 
 def test_motors_by_current_have_torque_constants(tmp_path: Path) -> None:
-    write(tmp_path, *ARM)
-    path = tmp_path / "device.toml"
     motor = "[robot.motors.{}]\nturns = {{ {} = 100.0 }}\ntorque_constant = 0.1\n"
-    path.write_text(
-        'name = "arm"\n[robot]\nurdf = "arm.urdf"\n'
-        + motor.format("one", "shoulder_pan")
-        + "torque_constant_sd = 0.01\n"
-        + motor.format("two", "elbow")
-    )
-    device = device_from(read_device_file(path), str(path))
+    first, second = motor.format("one", "shoulder_pan"), motor.format("two", "elbow")
+    device = device_of(tmp_path, f"{first}torque_constant_sd = 0.01\n{second}")
     assert check_device(device) == []
     assert device.force_unit == "A"
     parameters = {p.name: p for p in device.parameters}
@@ -257,11 +248,8 @@ def test_motors_by_current_have_torque_constants(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_motors_and_payloads_are_refused(tables: str, what: str, tmp_path: Path) -> None:
-    write(tmp_path, *ARM)
-    path = tmp_path / "device.toml"
-    path.write_text(f'name = "arm"\n[robot]\nurdf = "arm.urdf"\n{tables}')
     with pytest.raises(InputError, match=what):
-        device_from(read_device_file(path), str(path))
+        device_of(tmp_path, tables)
 
 
 def test_a_table_of_denavit_and_hartenberg_is_the_same_robot(tmp_path: Path) -> None:
@@ -314,21 +302,17 @@ def test_gravity_is_that_of_the_root_above_the_base(
     chain = read_chain(write(tmp_path, *ARM, '<link name="world"/>', mount), base="base")
     assert chain.gravity == (None if gravity is None else pytest.approx(gravity))
     assert said in chain.gravity_note and bool(said) == bool(chain.gravity_note)
-    head = 'name = "arm"\n[robot]\nurdf = "arm.urdf"\nbase = "base"\n'
-    path = tmp_path / "device.toml"
-    path.write_text(head)
-    device = device_from(read_device_file(path))
+    parts, base = (*ARM, '<link name="world"/>', mount), 'base = "base"\n'
+    device = device_of(tmp_path, base, parts)
     assert device.robot is not None and said in device.declaration["source"]
     assert device.robot.gravity == pytest.approx(gravity or (0.0, 0.0, -9.81))
-    path.write_text(head + "gravity = [0.0, 9.81, 0.0]\n")
-    given = device_from(read_device_file(path))
+    given = device_of(tmp_path, base + "gravity = [0.0, 9.81, 0.0]\n", parts)
     assert given.robot is not None and "gravity" not in given.declaration["source"]
     assert given.robot.gravity == (0.0, 9.81, 0.0)
 
 
 def test_a_session_depends_on_its_urdf(tmp_path: Path) -> None:
-    write(tmp_path, *ARM)
-    (tmp_path / "device.toml").write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\n')
+    device_of(tmp_path)
     (tmp_path / "session.toml").write_text('device = "device.toml"\n')
     before = digest_session(tmp_path)
     write(tmp_path, *ARM, link("weight", 3.0), joint("grip", "tool", "weight", "fixed"))
@@ -358,10 +342,7 @@ def following(entry: str, other: str, ratio: float, zero: float) -> str:
 
 def system_of(folder: Path, *parts: str) -> System:
     folder.mkdir()
-    write(folder, *parts)
-    path = folder / "device.toml"
-    path.write_text('name = "a"\n[robot]\nurdf = "arm.urdf"\ngravity = [3.0, -5.0, -7.0]\n')
-    return compile_model(Model(device_from(read_device_file(path), str(path))))
+    return compile_model(Model(device_of(folder, "gravity = [3.0, -5.0, -7.0]\n", parts)))
 
 
 def test_a_joint_that_follows_another_moves_with_it(tmp_path: Path) -> None:

@@ -6,16 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from exported_run import write_run
 from made_results import write_result
 
-from bampipe.data.device_file import read_device_file
-from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.export import DRAWING, export_model
-from bampipe.declarations.model import ModelFile
+from bampipe.declarations.export import export_model
 from bampipe.estimate.simulation import simulate
-from bampipe.files import toml_text, write_text
-from bampipe.physics import Model, System, compile_model
-from bampipe.physics.registry import device_from
 from bampipe.results.identify import IdentifyResult
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed: pip install mujoco")
@@ -65,9 +60,7 @@ class Case:
         folder.mkdir(exist_ok=True)
         (folder / "two.urdf").write_text(URDF)
         (folder / "device.toml").write_text(DEVICE + motors)
-        path = folder / "device.toml"
-        device = device_from(read_device_file(path), str(path))
-        self.system: System = compile_model(Model(device, tuple(effects)))
+        self.run, self.system = write_run(folder, tuple(effects))
         self.p = self.system.prior.copy()
         known = {
             f"{e.replace(':', '.')}.{k}": v for e, own in effects.items() for k, v in own.items()
@@ -79,11 +72,6 @@ class Case:
                 self.p[i] = 1e-4 if motors else 0.1
             elif item.name in ("viscous_m2", "coulomb_m2"):
                 self.p[i] = 0.002 if "viscous" in item.name else 0.02
-        self.run = RunFolder(folder / "run")
-        write_text(self.run.path("ingest/device.toml"), toml_text(device.declaration))
-        write_text(self.run.path(DRAWING), URDF)
-        text = ModelFile(name="base", device=device.name, effects=tuple(effects)).text()
-        write_text(self.run.path("models/base/model.toml"), text)
         values = zip(self.system.parameters, self.p, strict=True)
         write_result(
             self.run.root, IdentifyResult,

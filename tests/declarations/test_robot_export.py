@@ -8,15 +8,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from exported_run import write_run
 from made_results import write_result
 
-from bampipe.data.device_file import find_robot_file, read_device_file
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.export import DRAWING, Form, export_model
-from bampipe.declarations.model import ModelFile
-from bampipe.files import toml_text, write_text
-from bampipe.physics import Model, System, compile_model
-from bampipe.physics.registry import device_from
+from bampipe.declarations.export import Form, export_model
+from bampipe.physics import System
 from bampipe.physics.robot import INERTIAL_NAMES
 from bampipe.results.identify import IdentifyResult
 
@@ -136,16 +133,7 @@ def identify(folder: Path, files: dict[str, str]) -> Identified:
     """Write what ingest and identify leave: a ball more on every link, other losses and drives."""
     for name, text in files.items():
         (folder / name).write_text(text)
-    path = folder / "device.toml"
-    device = device_from(read_device_file(path), str(path))
-    system = compile_model(Model(device))
-    run = RunFolder(folder / "run")
-    write_text(run.path("ingest/device.toml"), toml_text(device.declaration))
-    drawing = find_robot_file(path)
-    if drawing is not None:
-        write_text(run.path(DRAWING), drawing.read_text())
-    text = ModelFile(name="base", device=device.name).text()
-    write_text(run.path("models/base/model.toml"), text)
+    run, system = write_run(folder)
     rng = np.random.default_rng(4)
     p = system.prior + 0.2 * rng.uniform(size=len(system.parameters))
     balls = {j: dict(zip(INERTIAL_NAMES, ball(rng), strict=True)) for j in system.coordinates}

@@ -126,14 +126,7 @@ def test_an_axis_that_hardly_moves_is_said(tmp_path: Path) -> None:
 
 def test_an_axis_that_moves_beyond_reason_is_said(tmp_path: Path) -> None:
     """A weightless joint in degrees: with all sizes free, nothing but the travel contradicts it."""
-
-    def in_degrees(folder: Path) -> None:
-        for file in folder.glob("trials/*.csv"):
-            frame = pd.read_csv(file)
-            frame["q"] = np.rad2deg(frame["q"])
-            frame.to_csv(file, index=False)
-
-    found = inspected(tmp_path, in_degrees)
+    found = inspected(tmp_path, mistakes.scale_column("q", 180.0 / np.pi))
     assert any(
         line.startswith("joint moves through") and line.endswith("is its position in degrees?")
         for line in list_setup_faults(found)

@@ -69,6 +69,12 @@ DAMPER_UNITS = {
 }  # fmt: skip
 
 
+def write_table(path: Path, table: dict[str, np.ndarray], form: str = "%.7g") -> None:
+    """Columns of numbers with a header, between commas."""
+    rows = np.column_stack(list(table.values()))
+    np.savetxt(path, rows, form, ",", header=",".join(table), comments="")
+
+
 def write_joint_logs(folder: Path, count: int = 3) -> None:
     """Plain text with a header and blanks between columns."""
     folder.mkdir(parents=True, exist_ok=True)

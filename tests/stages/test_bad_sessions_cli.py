@@ -1,4 +1,4 @@
-"""Some of the bad-input corpus as a user meets it: exit code, a line, nothing left behind."""
+"""The bad-input corpus as a user meets it: exit code, one line, nothing left behind."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from made_session import Made
 from test_bad_sessions import ASIDE, REFUSED, REPAIRED, T01, Damage
+
+from bampipe.data.store import read_parquet
 
 Command = Callable[..., tuple[int, str, str]]
 
@@ -23,20 +25,22 @@ def make(damage: Damage, session: Path) -> Path:
     return session
 
 
-@pytest.mark.parametrize("name", ["no session file", "unknown key", "axis missing"])
+@pytest.mark.parametrize("name", REFUSED)
 def test_a_session_is_refused_by_a_line_a_fault(
     name: str, tmp_path: Path, command: Command
 ) -> None:
-    session = make(REFUSED[name][0], tmp_path / "session")
+    damage, message = REFUSED[name]
+    session = make(damage, tmp_path / "session")
     code, out, err = command("ingest", session, "--runs", tmp_path / "runs")
     assert (code, out) == (2, "")
     lines = [line for line in err.splitlines() if line.startswith("bampipe: error: ")]
     assert lines and err.endswith("\n".join(lines) + "\n") and "Traceback" not in err, err
     assert all(str(session) in line for line in lines), "a line a fault"
+    assert re.search(message, err)
     assert not list((tmp_path / "runs").glob("*")), "a refused session leaves no run folder"
 
 
-@pytest.mark.parametrize("name", ["empty file", "text in a cell", "counter reset"])
+@pytest.mark.parametrize("name", ASIDE)
 def test_a_trial_is_set_aside_in_one_line(name: str, tmp_path: Path, command: Command) -> None:
     damage, message = ASIDE[name]
     session = make(damage, tmp_path / "session")
@@ -46,11 +50,12 @@ def test_a_trial_is_set_aside_in_one_line(name: str, tmp_path: Path, command: Co
     (line,) = [line for line in out.splitlines() if line.startswith("set aside: ")]
     assert line.startswith("set aside: t01: trials/t01.")
     assert re.search(message, line.removeprefix("set aside: t01: ")), line
+    (samples,) = (tmp_path / "runs").glob("*/ingest/samples.parquet")
+    assert set(read_parquet(samples).trial_id) == {"t02", "t03"}
 
 
-@pytest.mark.parametrize("name", ["last line cut off", "counter of 16 bits"])
-def test_a_repair_is_said_in_one_line(name: str, tmp_path: Path, command: Command) -> None:
-    damage, message = REPAIRED[name]
+def test_a_repair_is_said_in_one_line(tmp_path: Path, command: Command) -> None:
+    damage, message = REPAIRED["a few NaN"]
     session = make(damage, tmp_path / "session")
     code, out, err = command("ingest", session, "--runs", tmp_path / "runs", "--quiet")
     assert (code, err) == (0, "")

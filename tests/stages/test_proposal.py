@@ -22,6 +22,7 @@ from other_labs import (
     joint_log,
     write_damper_logs,
     write_joint_logs,
+    write_table,
 )
 
 from bampipe.data import guesses
@@ -99,12 +100,10 @@ def test_a_fine_encoder_allows_a_narrow_sign(tmp_path, step: float, width: float
     t = np.arange(4000) / 125.0
     angle = np.round(0.8 * np.sin(1.3 * t) / step) * step
     pushed = 2.0 * np.sign(np.cos(1.3 * t)) + np.cos(1.3 * t)
-    (tmp_path / "arm").mkdir()
-    columns = np.column_stack([t, angle, pushed])
-    names = "time_s,joint_angle_rad,torque_nm"
-    np.savetxt(tmp_path / "arm" / "run.csv", columns, "%.9g", ",", header=names, comments="")
-    proposed(tmp_path / "arm")
-    device = tomllib.loads((tmp_path / "arm" / "device.toml").read_text())
+    table = {"time_s": t, "joint_angle_rad": angle, "torque_nm": pushed}
+    write_table(tmp_path / "run.csv", table, "%.9g")
+    proposed(tmp_path)
+    device = tomllib.loads((tmp_path / "device.toml").read_text())
     (axis,) = device["coordinates"].values()
     assert axis.get("sign_width") == width
 
@@ -121,15 +120,7 @@ def test_a_fine_encoder_allows_a_narrow_sign(tmp_path, step: float, width: float
 def test_where_only_the_command_was_logged_it_is_the_input(tmp_path, column: str, role: str):
     log = joint_log(1)
     names = {"stamp": "time [s]", "joint_angle": "angle [deg]", "motor_current": column}
-    table = np.column_stack([log[name] for name in names])
-    np.savetxt(
-        tmp_path / "a.csv",
-        table,
-        fmt="%.6f",
-        delimiter=",",
-        header=",".join(names.values()),
-        comments="",
-    )
+    write_table(tmp_path / "a.csv", {called: log[name] for name, called in names.items()}, "%.6f")
     session, proposal = proposed(tmp_path)
     assert proposal.fill_in == [] and f"driven by a {role}" in proposal.device
     assert "drive = true" in proposal.device
@@ -140,8 +131,7 @@ def test_where_only_the_command_was_logged_it_is_the_input(tmp_path, column: str
 def test_a_measured_current_comes_before_the_one_commanded(tmp_path):
     log = joint_log(1)
     log["target_current"] = np.roll(log["motor_current"], -1)
-    table = np.column_stack(list(log.values()))
-    np.savetxt(tmp_path / "a.txt", table, fmt="%.6f", header=" ".join(log))
+    write_table(tmp_path / "a.csv", log, "%.6f")
     session, _ = proposed(tmp_path)
     assert session["channels"]["motor_current"]["column"] == "motor_current"
 
@@ -197,14 +187,11 @@ def test_joint_states_of_a_robot_that_wrap_at_half_a_turn(tmp_path):
 
 
 def test_duty_cycle_and_supply_make_a_motor(tmp_path):
-    (tmp_path / "arm").mkdir()
-    columns = arm_log()
-    rows = ["t,present_angle_deg,pwm_percent,vbat"]
-    for k, (t, q, torque) in enumerate(zip(*columns.values(), strict=True)):
-        stamp = t - columns["stamp"][0]
-        rows.append(f"{stamp:.4f},{np.rad2deg(q):.2f},{8 * torque:.2f},{12 + 0.01 * (k % 3):.2f}")
-    (tmp_path / "arm/a.csv").write_text("\n".join(rows) + "\n")
-    session, proposal = proposed(tmp_path / "arm")
+    t, q, torque = arm_log().values()
+    table = {"t": t - t[0], "present_angle_deg": np.rad2deg(q), "pwm_percent": 8 * torque}
+    table["vbat"] = 12 + 0.01 * (np.arange(len(t)) % 3)
+    write_table(tmp_path / "a.csv", table, "%.4f")
+    session, proposal = proposed(tmp_path)
     assert session["encoders"]["joint"] == {"column": "present_angle_deg", "unit": "deg"}
     duty, supply = session["channels"]["duty"], session["channels"]["supply"]
     assert duty == {"column": "pwm_percent", "unit": "percent"}
@@ -212,17 +199,15 @@ def test_duty_cycle_and_supply_make_a_motor(tmp_path):
     assert any(
         "torque_constant and resistance are not yours yet" in line for line in proposal.check
     )
-    device = registry.device_from(tomllib.loads((tmp_path / "arm/device.toml").read_text()))
+    device = registry.device_from(tomllib.loads((tmp_path / "device.toml").read_text()))
     assert check_device(device) == [] and device.force_unit == ""
 
 
 def test_a_damper_whose_velocity_alone_was_kept(tmp_path):
-    (tmp_path / "damper").mkdir()
-    columns = damper_log(1)
-    pairs = zip(columns["Velocity"] / 10, columns["Force"], strict=True)
-    rows = ["V,F,Ts"] + [f"{v:.6f},{f:.3f},0.001" for v, f in pairs]
-    (tmp_path / "damper/a.csv").write_text("\n".join(rows) + "\n")
-    session, proposal = proposed(tmp_path / "damper")
+    log = damper_log(1)
+    table = {"V": log["Velocity"] / 10, "F": log["Force"], "Ts": np.full_like(log["Force"], 1e-3)}
+    write_table(tmp_path / "a.csv", table)
+    session, proposal = proposed(tmp_path)
     assert session["time"] == {"unit": "samples"} and session["sample_rate_hz"] == 1000
     (axis,) = session["encoders"].values()
     assert axis["column"] == "V" and any("integral of V" in line for line in proposal.check)
@@ -318,8 +303,9 @@ def test_a_log_too_short_to_look_into_is_proposed_all_the_same(tmp_path):
 
 def test_a_clock_of_no_likely_unit_is_left_open_and_costs_no_time(tmp_path):
     t = np.arange(1000) * 1e-9
-    rows = "\n".join(f"{x:.12g},{np.sin(k / 50):.6f},{np.cos(k / 50):.6f}" for k, x in enumerate(t))
-    (tmp_path / "a.csv").write_text(f"time,angle_deg,torque_nm\n{rows}\n")
+    wave = np.arange(1000) / 50
+    table = {"time": t, "angle_deg": np.sin(wave), "torque_nm": np.cos(wave)}
+    write_table(tmp_path / "a.csv", table, "%.12g")
     proposal = propose(tmp_path)
     assert 'unit = "?"' in proposal.session and "from the time stamps" not in proposal.session
     assert any("unit of time" in line for line in proposal.fill_in)
@@ -340,9 +326,7 @@ def test_each_axis_is_checked_by_a_velocity_of_its_own(tmp_path):
         "force_y": np.cos(3 * t),
         "force_z": np.sin(5 * t),
     }
-    table = np.column_stack(list(columns.values()))
-    header = ",".join(columns)
-    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header=header, comments="")
+    write_table(tmp_path / "a.csv", columns)
     lines = propose(tmp_path, "bam").session.splitlines()
     with_velocity = [line.split(" = ")[0] for line in lines if ", velocity = " in line]
     assert with_velocity == ["pitch"]
@@ -360,10 +344,8 @@ def stage_log() -> dict[str, np.ndarray]:
 
 
 def write_stage_log(folder: Path, *columns: str) -> None:
-    log = stage_log()
-    rows = np.column_stack([log[name] for name in columns])
     folder.mkdir(parents=True)
-    np.savetxt(folder / "a.csv", rows, "%.6f", ",", header=",".join(columns), comments="")
+    write_table(folder / "a.csv", {name: stage_log()[name] for name in columns}, "%.6f")
 
 
 def test_a_rate_that_nobody_knows_is_refused_until_it_is_given(tmp_path):
@@ -385,9 +367,8 @@ def test_the_position_of_another_joint_is_no_force(tmp_path):
 def test_a_force_that_is_not_there_is_asked_for_where_it_is_read(tmp_path, command: Command):
     """A line under [channels] would be refused by the name of the device's own input."""
     t = 0.01 * np.arange(2000)
-    table = np.column_stack([t, np.sin(t), np.full_like(t, 1.25)])
-    header = "time [s],position [rad],current [A]"
-    np.savetxt(tmp_path / "a.csv", table, fmt="%.6f", delimiter=",", header=header, comments="")
+    table = {"time [s]": t, "position [rad]": np.sin(t), "current [A]": np.full_like(t, 1.25)}
+    write_table(tmp_path / "a.csv", table, "%.6f")
     session, proposal = proposed(tmp_path)
     assert proposal.fill_in == ["the column of force_drive in N.m: " + COLUMNS]
     assert session["force"] == {"columns": ["?"], "components": ["drive"], "unit": "N.m"}
@@ -430,18 +411,12 @@ def two_joints(columns: dict[str, str]) -> dict[str, np.ndarray]:
     return {columns.get(name, name): values[:samples] for name, values in held.items()}
 
 
-def write_table(path: Path, table: dict[str, np.ndarray]) -> None:
-    header = ",".join(table)
-    np.savetxt(path, np.column_stack(list(table.values())), "%.7g", ",", header=header, comments="")
-
-
 def test_of_two_joints_without_a_drawing_a_position_has_its_own_drive(tmp_path):
     table = two_joints({"q1": "pos_meas1", "q2": "pos_meas2"})
     # The drive of the other joint, and what was asked of this one, follow the motion better.
-    table["tau_con1"] = table["tau1"] - np.random.default_rng(0).normal(
-        0.0, 1e-3, len(table["tau1"])
-    )
-    table["tau1"] = table["tau1"] + np.random.default_rng(1).normal(0.0, 0.3, len(table["tau1"]))
+    rng, samples = np.random.default_rng(0), len(table["tau1"])
+    table["tau_con1"] = table["tau1"] - rng.normal(0.0, 1e-3, samples)
+    table["tau1"] = table["tau1"] + rng.normal(0.0, 0.3, samples)
     table["tau2"] = table["tau_con1"]
     write_table(tmp_path / "a.csv", table)
     session, proposal = proposed(tmp_path)
@@ -530,12 +505,8 @@ def test_units_at_the_end_of_names(tmp_path):
     write_table(tmp_path / "a.csv", table)
     session, proposal = proposed(tmp_path)
     assert session["time"] == {"column": "t_ms", "unit": "ms"}
-    velocity = {"column": "vel_deg_s", "unit": "deg/s"}
-    assert session["encoders"]["joint"] == {
-        "column": "pos_deg",
-        "unit": "deg",
-        "velocity": velocity,
-    }
+    velocity = {"velocity": {"column": "vel_deg_s", "unit": "deg/s"}}
+    assert session["encoders"]["joint"] == {"column": "pos_deg", "unit": "deg"} | velocity
     assert session["channels"]["motor_current"] == {"column": "cur_mA", "unit": "mA"}
     assert "driven by a current" in proposal.device
 

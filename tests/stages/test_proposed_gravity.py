@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from other_labs import write_table
 
 from bampipe.data import guesses
 from bampipe.physics import registry
@@ -90,9 +91,8 @@ def test_a_drive_that_wanders_does_not_tell_weight_from_a_spring() -> None:
 def test_the_device_file_says_how_sure_gravity_is(
     tmp_path: Path, torque: str, name: str, has_weight: bool, said: str
 ) -> None:
-    header = f"time [s],{name},torque [N.m]"
-    table = np.column_stack(joint(torque, 1.2))
-    np.savetxt(tmp_path / "a.csv", table, "%.6f", ",", header=header, comments="")
+    table = dict(zip(("time [s]", name, "torque [N.m]"), joint(torque, 1.2), strict=True))
+    write_table(tmp_path / "a.csv", table, "%.6f")
     proposal = propose(tmp_path)
     content = tomllib.loads(proposal.device)
     assert check_device(registry.device_from(content)) == []

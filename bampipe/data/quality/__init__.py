@@ -8,34 +8,7 @@ noticed is a sentence in ``notes``. Nothing is altered without one.
 
 from __future__ import annotations
 
-from bampipe.data.quality.channels import (
-    fill_missing,
-    refuse_frozen,
-    refuse_other_units,
-    to_si,
-    to_signed,
-)
-from bampipe.data.quality.clock import (
-    cut_stretch,
-    drop_backward_stamps,
-    keep_fresh_rows,
-    keep_longest_stretch,
-    note_clock,
-    rate_of,
-    refuse_length,
-    time_to_seconds,
-)
-from bampipe.data.quality.dead import note_dead_stretches
-from bampipe.data.quality.encoders import (
-    check_velocity,
-    integrate,
-    interpolate_jumps,
-    refuse_fractions,
-    unwrap,
-)
-from bampipe.data.quality.motion import refuse_wrong_brakes, refuse_wrong_motion
-from bampipe.data.quality.rails import leave_out_rails
-from bampipe.data.quality.spikes import interpolate_spikes
+from bampipe.data.quality import channels, clock, encoders, faulty_readings, motion
 from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable
 from bampipe.data.quality.thinning import thin, thinning_factor
 from bampipe.data.readers import RawTrial
@@ -59,34 +32,35 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
         InputError: the trial must be set aside; says why, and where in the file.
     """
     table = TrialTable(raw, session, entry, limits)
-    refuse_other_units(table, raw.units)
-    keep_fresh_rows(table)
-    time_to_seconds(table)
-    drop_backward_stamps(table)
-    cut_stretch(table)
-    keep_longest_stretch(table)
+    channels.refuse_other_units(table, raw.units)
+    clock.keep_fresh_rows(table)
+    clock.time_to_seconds(table)
+    clock.drop_backward_stamps(table)
+    clock.cut_stretch(table)
+    clock.keep_longest_stretch(table)
     for encoder in session.encoders:
-        refuse_fractions(table, encoder)
-        to_signed(table, encoder)
-        unwrap(table, encoder)
+        encoders.refuse_fractions(table, encoder)
+        channels.to_signed(table, encoder)
+        encoders.unwrap(table, encoder)
     for channel in session.channels:
-        to_signed(table, channel)
-    fill_missing(table)
-    interpolate_spikes(table)
+        channels.to_signed(table, channel)
+    channels.fill_missing(table)
+    faulty_readings.interpolate_spikes(table)
     for encoder in session.encoders:
-        integrate(table, encoder)
-        interpolate_jumps(table, encoder)
+        encoders.integrate(table, encoder)
+        encoders.interpolate_jumps(table, encoder)
     table.t -= table.t[0]
-    refuse_length(table)
-    note_clock(table)
+    clock.refuse_length(table)
+    clock.note_clock(table)
     for encoder in session.encoders:
-        check_velocity(table, encoder)
+        encoders.check_velocity(table, encoder)
     if session.force is not None and session.force.volts:
         for column in session.force.columns:
-            refuse_frozen(table, column)
-    note_dead_stretches(table)
-    leave_out_rails(table)
-    columns = to_si(table)
-    refuse_wrong_motion(table, columns)
-    refuse_wrong_brakes(table, columns)
-    return CleanTrial(table.t, columns, rate_of(table.t), table.repairs, table.notes, table.dead)
+            channels.refuse_frozen(table, column)
+    faulty_readings.note_dead_stretches(table)
+    faulty_readings.leave_out_rails(table)
+    columns = channels.to_si(table)
+    motion.refuse_wrong_motion(table, columns)
+    motion.refuse_wrong_brakes(table, columns)
+    rate = clock.rate_of(table.t)
+    return CleanTrial(table.t, columns, rate, table.repairs, table.notes, table.dead)

@@ -35,12 +35,11 @@ def keep_fresh_rows(table: TrialTable) -> None:
 
 def time_to_seconds(table: TrialTable) -> None:
     """Time stamps in s, whatever unit they are really in; rows without one are dropped."""
-    missing = ~np.isfinite(table.t)
     blank = np.logical_and.reduce([~np.isfinite(values) for values in table.columns.values()])
     if blank.any() and not blank.all():
         table.keep(~blank)
         table.repairs.append(f"{counted(int(blank.sum()), 'row')} that hold no number dropped")
-        missing = missing[~blank]
+    missing = ~np.isfinite(table.t)
     count = int(missing.sum())
     if count:
         if count > _few(table, len(table)):

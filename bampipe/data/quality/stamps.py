@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array
 
 COARSEST_STAMP = 0.05
 """Share of a step to which time stamps may be rounded: their scatter is a third of it."""

@@ -117,10 +117,9 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
     """
     path, name = Path(path), name or str(path)
     reader = _READERS[_checked_extension(path, name)]
+    more = (dialect,) if reader is text else ()
     with _safely(path, name):
-        if reader is text and dialect is not None:
-            return text.columns(path, name, dialect)
-        columns: dict[str, str] = reader.columns(path, name)
+        columns: dict[str, str] = reader.columns(path, name, *more)
     return columns
 
 

@@ -7,10 +7,69 @@ from collections.abc import Container, Mapping
 
 import numpy as np
 
+from bampipe.data.readers import moments
+from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
 from bampipe.errors import InputError
 
 LARGEST_WIDTH = 64
 _TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
+
+
+def read_arrays(
+    arrays: Mapping[str, np.ndarray | None], wanted: Wanted, name: str, what: str
+) -> RawTrial:
+    """The wanted columns of the arrays of a file, runs of one recording end to end.
+
+    Args:
+        arrays: by name, of numbers or of texts that are moments; None for what is neither.
+        wanted: columns.
+        name: what to call the file in messages; what: its arrays.
+
+    Raises:
+        InputError: an array is missing, not a vector of numbers, or not as long as the others.
+    """
+    joined, begun = _join_runs(arrays)
+    known, values = {**arrays, **joined}, {}
+    for column in wanted.columns:
+        variable, index = split_index(column, known)
+        check_columns(list(known), [variable], name)
+        array, where = known[variable], f"{name}, {what} '{column}'"
+        if array is None:
+            _refuse_kind(variable, known, where)
+        elif column in wanted.datetimes:
+            stamps = moments.nanoseconds(array.tolist(), wanted.datetimes[column], where)
+            values[column] = moments.seconds(stamps)
+        elif array.dtype == object:
+            raise InputError("found text, expected numbers", where=where)
+        else:
+            check_size(array.size, wanted, name)
+            # A copy: what stands in a file cannot be written to.
+            values[column] = np.array(pick(array, index, where), dtype=np.float64)
+    starts = next((begun[column] for column in wanted.columns if column in begun), ())
+    return RawTrial(aligned(values, name, what), first_row=1, begun=starts)
+
+
+def _refuse_kind(variable: str, known: Mapping[str, object], where: str) -> None:
+    inside = [other for other in known if other.startswith((f"{variable}.", f"{variable}[0]."))]
+    if inside:
+        raise InputError(
+            "a struct, expected a vector of numbers",
+            where=where,
+            remedy=f"name what is in it: {', '.join(inside[:8])}",
+        )
+    raise InputError(
+        "not numbers, expected a vector of real numbers",
+        where=where,
+        remedy="save it as a numeric array: cells, tables and objects are not",
+    )
+
+
+def columns_of_arrays(arrays: Mapping[str, np.ndarray | None]) -> dict[str, str]:
+    """Names of the columns that were recorded together; the unit of moments is "datetime"."""
+    joined = _join_runs(arrays)[0]
+    moment = {label for label, array in joined.items() if array.dtype == object}
+    found = recorded({label: array.shape for label, array in joined.items()})
+    return {column: "datetime" if column in moment else "" for column in found}
 
 
 def split_index(column: str, names: Container[str]) -> tuple[str, int | None]:
@@ -56,8 +115,8 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [f"{name}[{k}]" for k in range(min(sides))] if min(sides) <= LARGEST_WIDTH else []
 
 
-def join_runs(
-    arrays: Mapping[str, np.ndarray],
+def _join_runs(
+    arrays: Mapping[str, np.ndarray | None],
 ) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, ...]]]:
     """Vectors of one name in all structs of a list, end to end: ``runs[:].q`` of ``runs[0].q``.
 
@@ -66,15 +125,16 @@ def join_runs(
     Returns:
         All arrays, and by the name of each that was joined the samples before which one begins.
     """
+    found = {label: array for label, array in arrays.items() if array is not None}
+    begun: dict[str, tuple[int, ...]] = {}
     runs: dict[str, dict[int, str]] = {}
-    for label in arrays:
+    for label, array in found.items():
         match = re.fullmatch(r"(.+?)\[(\d+)\]\.([^\[\]]+)", label)
-        if match and len(labels("", arrays[label].shape)) == 1 < arrays[label].size:
+        if match and len(labels("", array.shape)) == 1 < array.size:
             runs.setdefault(f"{match[1]}[:].{match[3]}", {})[int(match[2])] = label
     timed = {name.partition("[")[0] for name in runs if _TIMES.search(name)}
-    found, begun = dict(arrays), {}
     for name, own in runs.items():
-        parts = [arrays[label].ravel() for label in own.values()]
+        parts = [found[label].ravel() for label in own.values()]
         alike = len({part.size for part in parts}) == 1 and name.partition("[")[0] not in timed
         if alike or len(own) < 2 or list(own) != list(range(len(own))):
             continue

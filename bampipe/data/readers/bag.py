@@ -16,7 +16,7 @@ empty, are a stream of their own, and a column is taken from that with most of w
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -64,19 +64,18 @@ class Field:
         return "[:]" in self.path or "::" in self.path
 
 
-@dataclass
+@dataclass(eq=False)
 class _Stream:
     """The messages of one kind on a topic.
 
     Attributes:
-        topic: name of the topic; kind: the names in the messages, and which lists are empty.
+        topic: name of the topic.
         recorded, stamped: times of the messages, ns.
         cells: numbers by column, for the columns that these messages have.
         counts: samples in each message.
     """
 
     topic: str
-    kind: tuple[Any, ...]
     recorded: list[int] = field(default_factory=list)
     stamped: list[int | None] = field(default_factory=list)
     cells: dict[str, list[float]] = field(default_factory=dict)
@@ -95,9 +94,18 @@ class _Stream:
             self.cells[column] += numbers * count if len(numbers) < count else numbers
         self.counts.append(count)
 
-    def spread(self, times: np.ndarray) -> np.ndarray:
-        """Times of all samples, ns, by those of the messages (T,)."""
-        counts = np.array(self.counts)
+    def times(self, clock: Field, leads: bool, name: str) -> np.ndarray:
+        """Times of all samples (T,), ns, by the clock that the time column names if it has that."""
+        known = [moment for moment in self.stamped if moment is not None]
+        lost = len(self.stamped) - len(known)
+        if lost and leads and clock.path == STAMP:
+            raise InputError(
+                f"{lost} messages have no {STAMP}",
+                where=f"{name}, topic {clock.topic}",
+                remedy=f"give {clock.topic}:{RECORDED} under [time]",
+            )
+        stamps = known if clock.path == STAMP and not lost else self.recorded
+        times, counts = np.array(stamps, dtype=np.int64), np.array(self.counts)
         if len(counts) < 2 or counts.max() == 1:
             return np.repeat(times, counts)
         step = float(np.median(np.diff(times))) / float(np.median(counts))
@@ -121,17 +129,16 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
             where=f"{name}, column '{clock_column}'",
             remedy=f"give {clock.topic}:{RECORDED} or {clock.topic}:{STAMP} under [time]",
         )
-    of = _chosen(streams, fields, name)
+    # The stream that has most of the columns, then most messages, comes first.
+    ranked = sorted(streams, key=lambda s: (-len(s.cells), -len(s.recorded)))
+    of = {c: next(s for s in ranked if c in s.cells) for c, f in fields.items() if not f.is_time}
     # The stream of most columns on the topic of the time gives the samples.
     here = [of[c] for c, f in fields.items() if f.topic == clock.topic and not f.is_time]
     alike = [stream for stream in streams if stream.topic == clock.topic]
     leading = max(here or alike, key=lambda s: (here.count(s), len(s.recorded)))
     of |= {column: leading for column, field in fields.items() if field.is_time}
-    used = list({id(stream): stream for stream in of.values()}.values())
-    times = {
-        id(s): s.spread(_times(clock, s.recorded, s.stamped, s is leading, name)) for s in used
-    }
-    base = times[id(leading)]
+    times = {s: s.times(clock, s is leading, name) for s in dict.fromkeys(of.values())}
+    base = times[leading]
     values = {}
     for column, each in fields.items():
         stream = of[column]
@@ -140,13 +147,13 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         elif stream is leading:
             values[column] = np.array(stream.cells[column], dtype=np.float64)
         else:
-            at, since = ((x - base[0]) / moments.NANOSECONDS for x in (base, times[id(stream)]))
+            at, since = ((x - base[0]) / moments.NANOSECONDS for x in (base, times[stream]))
             cells = np.array(stream.cells[column], dtype=np.float64)
             values[column] = interpolated(at, since, cells)
-    remarks = [_left_out(topic, streams, used) for topic in {s.topic for s in used}]
-    for stream in used:
+    remarks = [_left_out(topic, streams, times) for topic in {s.topic for s in times}]
+    for stream in times:
         if stream is not leading:
-            gap = float(np.max(np.diff(times[id(stream)]), initial=0)) / moments.NANOSECONDS
+            gap = float(np.max(np.diff(times[stream]), initial=0)) / moments.NANOSECONDS
             remarks.append(
                 f"{stream.topic} interpolated linearly at the times of {clock.topic}"
                 f" (at most {gap:.3g} s between its messages)"
@@ -165,7 +172,7 @@ def _read_streams(
         kind = _kind(message)
         stream = streams.get((topic, kind))
         if stream is None:
-            stream = streams[topic, kind] = _Stream(topic, kind)
+            stream = streams[topic, kind] = _Stream(topic)
             asked = [c for c, f in fields.items() if f.topic == topic and not f.is_time]
             there = {c: items(message, fields[c].path) for c in asked}
             stream.cells = {c: [] for c, v in there.items() if v and v[0] is not MISSING}
@@ -191,22 +198,10 @@ def _kind(message: Any) -> tuple[Any, ...]:
     return (*sorted(names), "", *empty)
 
 
-def _chosen(streams: list[_Stream], fields: Mapping[str, Field], name: str) -> dict[str, _Stream]:
-    """The stream that each column is taken from: that which has most of the columns, then most
-    messages.
-    """
-    ranked = sorted(streams, key=lambda s: (-len(s.cells), -len(s.recorded)))
-    return {
-        column: next(stream for stream in ranked if column in stream.cells)
-        for column, field in fields.items()
-        if not field.is_time
-    }
-
-
-def _left_out(topic: str, streams: list[_Stream], used: list[_Stream]) -> str:
+def _left_out(topic: str, streams: list[_Stream], used: Collection[_Stream]) -> str:
     """What to say of the messages on a topic that are not used."""
     here = [stream for stream in streams if stream.topic == topic]
-    unused = [stream for stream in here if not any(stream is other for other in used)]
+    unused = [stream for stream in here if stream not in used]
     count, total = (sum(len(s.recorded) for s in part) for part in (unused, here))
     if not count:
         return ""
@@ -217,11 +212,7 @@ def _left_out(topic: str, streams: list[_Stream], used: list[_Stream]) -> str:
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names of the numbers in the first message of each kind; times have the unit s.
-
-    Raises:
-        InputError: as :func:`read`.
-    """
+    """Names of the numbers in the first message of each kind; times have the unit s."""
     found: dict[str, str] = {}
     seen: set[tuple[Any, ...]] = set()
     for topic, _, message in _messages(path, (), name):
@@ -261,39 +252,25 @@ def _field(column: str, name: str) -> Field:
     return Field(topic, path)
 
 
-def _times(
-    clock: Field,
-    recorded: Sequence[int],
-    stamped: Sequence[int | None],
-    leads: bool,
-    name: str,
-) -> np.ndarray:
-    """Times of a topic's messages, ns, by the clock that the time column names if it has that."""
-    known = [moment for moment in stamped if moment is not None]
-    if clock.path != STAMP or (not leads and len(known) < len(stamped)):
-        return np.array(recorded, dtype=np.int64)
-    if len(known) < len(stamped):
-        raise InputError(
-            f"{len(stamped) - len(known)} messages have no {STAMP}",
-            where=f"{name}, topic {clock.topic}",
-            remedy=f"give {clock.topic}:{RECORDED} under [time]",
-        )
-    return np.array(known, dtype=np.int64)
-
-
 def _messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of recording (ns) and message, in the order of recording; all if no topics.
 
     Raises:
         InputError: not installed, damaged, or a topic is missing.
     """
-    need("rosbags.highlevel", "ros", name)
-    in_json = path.suffix.lower() == ".mcap" and _holds_json(path, name)
-    yield from (_json_messages if in_json else _ros_messages)(path, topics, name)
-
-
-def _ros_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
     highlevel = need("rosbags.highlevel", "ros", name)
+    if path.suffix.lower() == ".mcap":
+        with path.open("rb") as stream:
+            source = need("mcap.reader", "ros", name).make_reader(stream)
+            summary = source.get_summary()
+            channels = summary.channels.values() if summary else ()
+            in_json = {c.topic for c in channels if c.message_encoding == "json"}
+            if in_json:
+                check_columns(sorted(in_json), topics, name)
+                for _, channel, message in source.iter_messages(topics=list(topics) or None):
+                    if channel.topic in in_json:
+                        yield channel.topic, message.log_time, json.loads(message.data)
+                return
     with highlevel.AnyReader([path]) as reader:
         check_columns(sorted(reader.topics), topics, name)
         chosen = [c for c in reader.connections if not topics or c.topic in topics]
@@ -301,25 +278,3 @@ def _ros_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tupl
             raise InputError("holds no messages", where=name)
         for connection, moment, raw in reader.messages(connections=chosen):
             yield connection.topic, moment, reader.deserialize(raw, connection.msgtype)
-
-
-def _holds_json(path: Path, name: str) -> bool:
-    """Whether an MCAP file holds JSON messages rather than those of ROS."""
-    with path.open("rb") as stream:
-        summary = need("mcap.reader", "ros", name).make_reader(stream).get_summary()
-    channels = summary.channels.values() if summary else ()
-    return any(channel.message_encoding == "json" for channel in channels)
-
-
-def _json_messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
-    with path.open("rb") as stream:
-        source = need("mcap.reader", "ros", name).make_reader(stream)
-        known = {
-            channel.topic
-            for channel in source.get_summary().channels.values()
-            if channel.message_encoding == "json"
-        }
-        check_columns(sorted(known), topics, name)
-        for _, channel, message in source.iter_messages(topics=list(topics) or None):
-            if channel.topic in known:
-                yield channel.topic, message.log_time, json.loads(message.data)

@@ -81,8 +81,11 @@ class TableLayout:
 
 
 @dataclass(frozen=True)
-class _Line:
+class Line:
+    """A line of a file: its number, its bytes in the file, and its text without the line end."""
+
     number: int
+    start: int
     end: int
     text: str
 
@@ -107,7 +110,7 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
         InputError: no header, a column missing, or a layout that can be read in two ways.
     """
     lines = _lines(head, name)
-    if not any(line.text.strip() for line in lines):
+    if not _filled(lines):
         raise InputError("the file holds no text", where=name)
     ended = _end_in_semicolons(lines)
     if ended:
@@ -119,7 +122,7 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     remarks = []
     if delimiter != "," and not dialect.delimiter:
         remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")
-    above = sum(bool(line.text.strip()) for line in lines[: max(index, 0)])
+    above = len(_filled(lines[: max(index, 0)]))
     if above:
         remarks.append(f"{above} lines above the header passed over")
     passed = index
@@ -185,9 +188,9 @@ def _mark(head: bytes) -> int:
     return 3 if head.startswith(b"\xef\xbb\xbf") else 0
 
 
-def _lines(head: bytes, name: str) -> list[_Line]:
+def _lines(head: bytes, name: str) -> list[Line]:
     """The whole lines of ``head``, and the last one where it is all there is."""
-    found: list[_Line] = []
+    found: list[Line] = []
     start = _mark(head)
     for number, match in enumerate(re.finditer(rb"[^\r\n]*(\r\n|\n|\r|\Z)", head[start:]), 1):
         end = start + match.end()
@@ -203,12 +206,12 @@ def _lines(head: bytes, name: str) -> list[_Line]:
                     remedy='save it as UTF-8, or say encoding = "latin-1" under [csv]',
                 ) from error
             text = match[0].decode("utf-8", "replace")
-        found.append(_Line(number, end, text.rstrip("\r\n")))
+        found.append(Line(number, start + match.start(), end, text.rstrip("\r\n")))
     return found
 
 
 def _header(
-    lines: list[_Line],
+    lines: list[Line],
     columns: Sequence[str],
     dialect: Dialect,
     delimiters: list[str],
@@ -217,9 +220,8 @@ def _header(
     """Place of the header among the lines (-1 where the session gives the names), and its cells."""
     if dialect.names:
         check_columns(dialect.names, columns, f"{name}: csv.names")
-        index, delimiter = _guess(lines, delimiters)[0]
-        above = [n for n, line in enumerate(lines[:index]) if line.text.strip()]
-        return (above[-1] if above else -1), delimiter, list(dialect.names)
+        first, delimiter = _guess(lines, delimiters)[0]
+        return max(_filled(lines[:first]), default=-1), delimiter, list(dialect.names)
     for index, line in enumerate(lines[:_SEARCHED]) if columns else ():
         for delimiter in delimiters:
             row = _names(line.text, delimiter, lines[index + 1 :])
@@ -236,8 +238,7 @@ def _header(
         first, delimiter = guesses[0]
         row = [f"{_NUMBERED}{n}" for n, _ in enumerate(cells(lines[first].text, delimiter), 1)]
         if set(columns) <= set(row):
-            above = [n for n, line in enumerate(lines[:first]) if line.text.strip()]
-            return (above[-1] if above else -1), delimiter, row
+            return max(_filled(lines[:first]), default=-1), delimiter, row
         raise InputError(
             "no header: the first line holds numbers",
             where=f"{name}, row {lines[0].number}",
@@ -252,13 +253,18 @@ def _header(
     return index, delimiter, row
 
 
+def _filled(lines: list[Line]) -> list[int]:
+    """Places of the lines that are not blank."""
+    return [n for n, line in enumerate(lines) if line.text.strip()]
+
+
 def _otherwise(text: str, width: int) -> list[list[str]]:
     """The names in a header of ``width`` cells, by each delimiter that separates so many."""
     split = [cells(_REMARK.sub("", text, count=1), delimiter) for delimiter in DELIMITERS]
     return [row for row in split if len(row) == width > 1]
 
 
-def _names(text: str, delimiter: str, below: list[_Line]) -> list[str]:
+def _names(text: str, delimiter: str, below: list[Line]) -> list[str]:
     """Names in a header, which may be written as a remark: ``# t x`` has two names or three."""
     plain, bare = (cells(t, delimiter) for t in (text, _REMARK.sub("", text, count=1)))
     rows = [line.text for line in below if line.text.strip() and not _is_remark(line.text)]
@@ -290,9 +296,9 @@ def _named_items(header: list[str], rows: list[list[str]]) -> list[str]:
     return named
 
 
-def _guess(lines: list[_Line], delimiters: list[str]) -> list[tuple[int, str]]:
+def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
     """Where the samples start and what separates their columns; several where that is equal."""
-    ranked: list[tuple[float, int, int, str]] = []
+    ranked: list[tuple[float, int, str]] = []
     tried = [line for line in lines[-_TRIED:] if line.text.strip()]
     for delimiter in delimiters:
         rows = [cells(line.text, delimiter) for line in tried]
@@ -300,18 +306,15 @@ def _guess(lines: list[_Line], delimiters: list[str]) -> list[tuple[int, str]]:
         alike = [row for row in rows if len(row) == width]
         numbers = sum(_number_cells(row, delimiter) for row in alike)
         share = numbers / (width * len(rows)) if width else 0.0
-        ranked.append((share * width if width > 1 else 0.0, -len(ranked), width, delimiter))
+        ranked.append((share * width if width > 1 else 0.0, width, delimiter))
     found = []
-    best = max(ranked)[0]
-    for score, _, width, delimiter in sorted(ranked, reverse=True):
-        if score < best:
-            break
-        first = len(lines)
-        for index, line in enumerate(lines):
-            row = cells(line.text, delimiter)
-            if len(row) == width and _number_cells(row, delimiter) > 0.5 * width:
-                first = index
-                break
+    best = max(score for score, _, _ in ranked)
+    for _, width, delimiter in (each for each in ranked if each[0] == best):
+        split = (cells(line.text, delimiter) for line in lines)
+        numeric = (
+            len(row) == width and _number_cells(row, delimiter) > 0.5 * width for row in split
+        )
+        first = next((n for n, is_sample in enumerate(numeric) if is_sample), len(lines))
         # What was logged before all sensors had answered are samples with empty cells.
         while 0 < first < len(lines) and _is_sparse(cells(lines[first - 1].text, delimiter), width):
             first -= 1
@@ -326,7 +329,7 @@ def _is_sparse(row: list[str], width: int) -> bool:
     )
 
 
-def _end_in_semicolons(lines: list[_Line]) -> bool:
+def _end_in_semicolons(lines: list[Line]) -> bool:
     """Whether lines end with a semicolon, and have other delimiters in them."""
     tried = [line.text for line in lines[-_TRIED:] if line.text.strip()]
     ended = [text for text in tried if text.endswith(";") and text.count(";") == 1]
@@ -339,13 +342,12 @@ def _number_cells(row: list[str], delimiter: str) -> int:
     return sum(any(sign.match(cell) for sign in signs) for cell in row)
 
 
-def _above(lines: list[_Line], first: int, delimiter: str) -> int:
+def _above(lines: list[Line], first: int, delimiter: str) -> int:
     """Place of the header above the first sample, -1 where there is none."""
     if first >= len(lines):
-        return next((n for n, line in enumerate(lines) if line.text.strip()), -1)
-    width = len(cells(lines[first].text, delimiter))
-    above = [n for n in range(first) if lines[n].text.strip()]
-    rows = {n: cells(_REMARK.sub("", lines[n].text, count=1), delimiter) for n in above[-4:]}
+        return next(iter(_filled(lines)), -1)
+    width, above = len(cells(lines[first].text, delimiter)), _filled(lines[:first])[-4:]
+    rows = {n: cells(_REMARK.sub("", lines[n].text, count=1), delimiter) for n in above}
     for n, row in rows.items():
         if not width - 1 <= len(row) <= width:
             rows[n] = next(iter(_otherwise(lines[n].text, width)), row)
@@ -355,7 +357,7 @@ def _above(lines: list[_Line], first: int, delimiter: str) -> int:
     return fitting[-1] if fitting else -1
 
 
-def _padded(header: list[str], body: list[_Line], delimiter: str) -> list[str]:
+def _padded(header: list[str], body: list[Line], delimiter: str) -> list[str]:
     """The header with one more, nameless column where every line ends with a delimiter."""
     rows = [cells(line.text, delimiter) for line in body[:_TRIED] if line.text.strip()]
     longer = rows and all(len(row) == len(header) + 1 and not row[-1] for row in rows)
@@ -363,7 +365,7 @@ def _padded(header: list[str], body: list[_Line], delimiter: str) -> list[str]:
 
 
 def _decimal(
-    body: list[_Line], header: list[str], columns: Sequence[str], delimiter: str, name: str
+    body: list[Line], header: list[str], columns: Sequence[str], delimiter: str, name: str
 ) -> str:
     """Decimal sign of the first lines.
 
@@ -372,7 +374,7 @@ def _decimal(
     """
     indices = [n for n, column in enumerate(header) if column in columns or not columns]
     seen: dict[str, tuple[str, int]] = {}
-    grouped = plain = 0
+    plain = False
     for line in body[:_TRIED]:
         row = cells(line.text, delimiter)
         for index in indices:
@@ -386,8 +388,7 @@ def _decimal(
                 )
             if _COMMA.match(cell):
                 seen.setdefault(",", (cell, line.number))
-                grouped += bool(_THOUSANDS.match(cell))
-                plain += not _THOUSANDS.match(cell)
+                plain = plain or not _THOUSANDS.match(cell)
             elif _POINT.match(cell) and "." in cell:
                 seen.setdefault(".", (cell, line.number))
     if "," not in seen or (delimiter == "," and "." in seen):
@@ -417,16 +418,12 @@ def _is_remark(text: str) -> bool:
 
 def _is_unit_row(row: list[str], header: list[str], columns: Sequence[str]) -> bool:
     """Whether a line below the header names units: no number in it, a unit for what is wanted."""
-    wanted = [
-        row[n] for n, name in enumerate(header) if n < len(row) and (name in columns or not columns)
-    ]
-    return bool(wanted) and len(row) == len(header) and _looks_like_units(wanted)
-
-
-def _looks_like_units(row: list[str]) -> bool:
-    said = [cell for cell in row if cell]
+    pairs = zip(header, row, strict=False)
+    wanted = [cell for name, cell in pairs if name in columns or not columns]
+    said = [cell for cell in wanted if cell]
     return (
-        2 * len(said) >= len(row)
+        len(row) == len(header)
+        and 2 * len(said) >= len(wanted)
         and bool(said)
         and all(_UNIT.match(cell) and cell not in NULLS for cell in said)
         and not any(_POINT.match(cell) and cell != "1" for cell in said)

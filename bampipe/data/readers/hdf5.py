@@ -24,13 +24,7 @@ _BLOCK_ROWS = 1 << 14
 
 
 def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTrial:
-    """The wanted columns of an HDF5 file.
-
-    Args:
-        path: the file.
-        wanted: columns.
-        name: what to call the file in messages.
-        what: what its parts are called in messages.
+    """The wanted columns of an HDF5 file, whose parts are called ``what`` in messages.
 
     Raises:
         InputError: damaged, a column missing, not a vector, or not of numbers.
@@ -61,11 +55,7 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names and units of the vectors of numbers that were recorded together.
-
-    Raises:
-        InputError: not a sound HDF5 file.
-    """
+    """Names and units of the vectors of numbers that were recorded together."""
     import h5py  # heavy: only for these files
 
     shapes: dict[str, tuple[int, ...]] = {}

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import hdf5
-from bampipe.data.readers.arrays import join_runs, pick, recorded, split_index
-from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
+from bampipe.data.readers.arrays import columns_of_arrays, read_arrays
+from bampipe.data.readers.trial import RawTrial, Wanted
 from bampipe.errors import InputError
 
 _HEADER = 128
@@ -39,44 +39,14 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         )
     if not _is_level_5(path, name):
         return hdf5.read(path, wanted, name, "variable")
-    known = _arrays(path, name)
-    joined, begun = join_runs({label: a for label, a in known.items() if a is not None})
-    known |= {label: joined[label] for label in begun}
-    values = {}
-    for column in wanted.columns:
-        variable, index = split_index(column, known)
-        check_columns(list(known), [variable], name)
-        array, where = known[variable], f"{name}, variable '{column}'"
-        inside = [other for other in known if other.startswith((f"{variable}.", f"{variable}[0]."))]
-        if inside:
-            raise InputError(
-                "a struct, expected a vector of numbers",
-                where=where,
-                remedy=f"name what is in it: {', '.join(inside[:8])}",
-            )
-        if array is None:
-            raise InputError(
-                "not numbers, expected a vector of real numbers",
-                where=where,
-                remedy="save it as a numeric array: cells, tables and objects are not",
-            )
-        check_size(array.size, wanted, name)
-        # A copy: what stands in the file cannot be written to.
-        values[column] = np.array(pick(array, index, where), dtype=np.float64)
-    starts = next((begun[column] for column in wanted.columns if column in begun), ())
-    return RawTrial(aligned(values, name, "variable"), first_row=1, begun=starts)
+    return read_arrays(_arrays(path, name), wanted, name, "variable")
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names of the vectors of numbers that were recorded together, or of columns; no units.
-
-    Raises:
-        InputError: as :func:`read`.
-    """
+    """Names of the vectors of numbers that were recorded together, or of columns; no units."""
     if not _is_level_5(path, name):
         return hdf5.columns(path, name)
-    arrays = {label: a for label, a in _arrays(path, name).items() if a is not None}
-    return dict.fromkeys(recorded({x: a.shape for x, a in join_runs(arrays)[0].items()}), "")
+    return columns_of_arrays(_arrays(path, name))
 
 
 def _is_level_5(path: Path, name: str) -> bool:

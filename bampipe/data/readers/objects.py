@@ -10,12 +10,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import join_runs, pick, recorded, split_index
+from bampipe.data.readers.arrays import columns_of_arrays, read_arrays
 from bampipe.data.readers.nested import MISSING, as_number, find, leaves
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns
 from bampipe.errors import InputError
@@ -31,48 +32,35 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     """
     samples, constants, notes = _samples(path, name)
     if isinstance(samples, dict):
-        return _from_arrays(samples, constants, wanted, notes, name)
-    first = _first(samples, name)
-    fixed = {column for column in wanted.columns if find(first, column) is MISSING}
-    for column in fixed - set(constants):
-        check_columns([path for path, _ in leaves(first)] + list(constants), [column], name)
-    values: dict[str, np.ndarray] = {c: np.empty(len(samples)) for c in wanted.columns}
-    texts: dict[str, list[str | None]] = {column: [] for column in wanted.datetimes}
-    for count, sample in enumerate(samples, 1):
-        if not isinstance(sample, dict):
-            raise InputError("not an object with named values", where=f"{name}, sample {count}")
-        for column in wanted.columns:
-            cell = constants[column] if column in fixed else find(sample, column)
-            cell = None if cell is MISSING else cell
-            where = f"{name}, sample {count}, '{column}'"
-            if column in texts:
+        fixed = [column for column in wanted.columns if column in constants]
+        alone = {c: np.array([as_number(constants[c], f"{name}, '{c}'")]) for c in fixed}
+        return replace(read_arrays(alone | samples, wanted, name, "array"), notes=notes)
+    first, values = samples[0], {}
+    beside = [column for column in wanted.columns if find(first, column) is MISSING]
+    unknown = [column for column in beside if column not in constants]
+    check_columns([path for path, _ in leaves(first)] + list(constants), unknown, name)
+    for column in wanted.columns:
+        parts = [constants] if column in beside else samples
+        cells = [None if (c := find(part, column)) is MISSING else c for part in parts]
+        places = (f"{name}, sample {n}, '{column}'" for n, _ in enumerate(cells, 1))
+        if column in wanted.datetimes:
+            for cell, where in zip(cells, places, strict=True):
                 if not isinstance(cell, str | None):
                     raise InputError(f"found {cell!r:.40}, expected a date and time", where=where)
-                texts[column].append(cell)
-            else:
-                values[column][count - 1] = as_number(cell, where)
-    for column, cells in texts.items():
-        where = f"{name}, '{column}'"
-        stamps = moments.nanoseconds(cells, wanted.datetimes[column], where)
-        values[column] = moments.seconds(stamps)
-    return RawTrial(values, first_row=1, notes=notes)
+            stamps = moments.nanoseconds(cells, wanted.datetimes[column], f"{name}, '{column}'")
+            values[column] = moments.seconds(stamps)
+        else:
+            values[column] = np.fromiter(map(as_number, cells, places), float, len(cells))
+    return RawTrial(aligned(values, name, "value"), first_row=1, notes=notes)
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names of the values that are numbers, or moments (unit "datetime"), in the first sample.
-
-    Raises:
-        InputError: as :func:`read`.
-    """
+    """Names of the values that are numbers, or moments (unit "datetime"), in the first sample."""
     samples, constants, _ = _samples(path, name)
     if isinstance(samples, dict):
-        joined = join_runs(samples)[0]
-        shapes = {column: values.shape for column, values in joined.items()}
-        moment = {column for column, values in joined.items() if values.dtype == object}
-        kept = {column: "datetime" if column in moment else "" for column in recorded(shapes)}
-        return kept | dict.fromkeys(constants, "")
+        return columns_of_arrays(samples) | dict.fromkeys(constants, "")
     found = {}
-    for column, cell in leaves(_first(samples, name)):
+    for column, cell in leaves(samples[0]):
         if isinstance(cell, int | float):
             found[column] = ""
         elif isinstance(cell, str) and moments.is_moment(cell):
@@ -86,40 +74,6 @@ def stated_units(path: Path, name: str) -> dict[str, str]:
     items = content.items() if isinstance(content, dict) else ()
     parts = [(re.split(r"[ _]units?$", str(key), flags=re.I), value) for key, value in items]
     return {key[0]: value for key, value in parts if len(key) > 1 and isinstance(value, str)}
-
-
-def _first(samples: list[object], name: str) -> dict[str, object]:
-    if not isinstance(samples[0], dict):
-        raise InputError("not an object with named values", where=f"{name}, sample 1")
-    return samples[0]
-
-
-def _from_arrays(
-    arrays: Mapping[str, np.ndarray],
-    constants: Mapping[str, object],
-    wanted: Wanted,
-    notes: tuple[str, ...],
-    name: str,
-) -> RawTrial:
-    """The wanted columns of arrays."""
-    values = {}
-    arrays, begun = join_runs(arrays)
-    for column in wanted.columns:
-        where = f"{name}, '{column}'"
-        if column in constants:
-            values[column] = np.array([as_number(constants[column], where)])
-            continue
-        label, index = split_index(column, arrays)
-        check_columns([*arrays, *constants], [label], name)
-        if column in wanted.datetimes:
-            stamps = moments.nanoseconds(arrays[label].tolist(), wanted.datetimes[column], where)
-            values[column] = moments.seconds(stamps)
-        elif arrays[label].dtype == object:
-            raise InputError("found text, expected numbers", where=where)
-        else:
-            values[column] = pick(arrays[label], index, where)
-    starts = next((begun[column] for column in wanted.columns if column in begun), ())
-    return RawTrial(aligned(values, name, "array"), first_row=1, notes=notes, begun=starts)
 
 
 def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
@@ -169,29 +123,38 @@ def _samples(
     except UnicodeDecodeError as error:
         raise InputError("not UTF-8 text", where=name, remedy="save it as UTF-8") from error
     del data
-    constants: Mapping[str, object] = {}
     notes: tuple[str, ...] = ()
+    content: object = None
     if path.suffix.lower() in (".jsonl", ".ndjson"):
         lines = [line for line in text.splitlines() if line.strip()]
-        samples = [_parsed(x, f"{name}, sample {n}") for n, x in enumerate(lines[:-1], 1)]
+        content = parsed = [_parsed(x, f"{name}, sample {n}") for n, x in enumerate(lines[:-1], 1)]
         try:
-            samples += [_parsed(x, f"{name}, sample {len(lines)}") for x in lines[-1:]]
+            parsed += [_parsed(x, f"{name}, sample {len(lines)}") for x in lines[-1:]]
         except InputError:
             if text.endswith("\n"):
                 raise
             notes = ("last line is cut off: 1 row dropped",)
-        content: object = samples
     else:
         content = _parsed(text, name)
     lists = _lists_of_samples(content)
     single = all(_is_sample(items[0]) for items in lists.values())
     if not (lists and single) and (arrays := dict(_arrays(content))):
         return arrays, _numbers(content), notes
-    if path.suffix.lower() not in (".jsonl", ".ndjson"):
-        samples, constants = _list_of_samples(content, lists, name), _numbers(content)
+    if not isinstance(content, list) and len(lists) != 1:
+        raise InputError(
+            f"{len(lists)} lists of samples: {', '.join(lists)}"
+            if lists
+            else "no list of samples, that is of objects with named values, and no array",
+            where=name,
+            remedy="leave one list in the file, or export the log as CSV",
+        )
+    samples = content if isinstance(content, list) else next(iter(lists.values()))
     if not samples:
         raise InputError("a header but no samples", where=name)
-    return samples, constants, notes
+    for count, sample in enumerate(samples, 1):
+        if not isinstance(sample, dict):
+            raise InputError("not an object with named values", where=f"{name}, sample {count}")
+    return samples, _numbers(content), notes
 
 
 def _parsed(text: str, where: str) -> object:
@@ -223,22 +186,3 @@ def _numbers(content: object) -> dict[str, object]:
     """The numbers beside the samples of a parsed file."""
     items = content.items() if isinstance(content, dict) else ()
     return {str(key): value for key, value in items if isinstance(value, int | float)}
-
-
-def _list_of_samples(content: object, lists: Mapping[str, list[object]], name: str) -> list[object]:
-    """Samples of a parsed file.
-
-    Raises:
-        InputError: no list can be them, or several.
-    """
-    if isinstance(content, list):
-        return content
-    if len(lists) != 1:
-        raise InputError(
-            f"{len(lists)} lists of samples: {', '.join(lists)}"
-            if lists
-            else "no list of samples, that is of objects with named values, and no array",
-            where=name,
-            remedy="leave one list in the file, or export the log as CSV",
-        )
-    return next(iter(lists.values()))

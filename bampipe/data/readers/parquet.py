@@ -32,10 +32,11 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         schema = file.schema_arrow
         vectors = lerobot.vector_columns(path, schema)
         check_columns([*schema.names, *vectors], wanted.columns, name)
-        plain = [column for column in wanted.columns if column not in vectors]
-        for column in plain:
-            _check_kind(schema.field(column).type, column in wanted.datetimes, name, column)
-        stored = dict.fromkeys([*plain, *(vectors[c][0] for c in wanted.columns if c in vectors)])
+        places = {column: vectors.get(column, (column, None)) for column in wanted.columns}
+        for column, (_, place) in places.items():
+            if place is None:
+                _check_kind(schema.field(column).type, column in wanted.datetimes, name, column)
+        stored = list(dict.fromkeys(where for where, _ in places.values()))
         rows = file.metadata.num_rows
         check_size(rows, wanted, name)
         values = {
@@ -43,9 +44,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
             for column in wanted.columns
         }
         done = 0
-        for batch in file.iter_batches(BATCH_ROWS, columns=list(stored), use_threads=False):
-            for column in wanted.columns:
-                where, place = vectors.get(column, (column, None))
+        for batch in file.iter_batches(BATCH_ROWS, columns=stored, use_threads=False):
+            for column, (where, place) in places.items():
                 cells = batch.column(where)
                 if place is not None:
                     cells = pc.list_element(cells, place)
@@ -61,11 +61,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names of the columns that hold numbers or moments; the unit is "datetime" for these.
-
-    Raises:
-        InputError: not a sound Parquet file.
-    """
+    """Names of the columns that hold numbers or moments; the unit is "datetime" for these."""
     schema = pq.read_schema(path)
     found = dict.fromkeys(lerobot.vector_columns(path, schema), "")
     for field in schema:

@@ -7,8 +7,9 @@ properties give it, for files without a time channel.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -27,12 +28,9 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         InputError: npTDMS is not installed, the file is damaged, a channel is missing, not of
             numbers, or not as long as the others.
     """
-    library = _library(name)
     values: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
-    # A stream: by its path, npTDMS would take an index file beside it for the truth.
-    with path.open("rb") as stream, library.TdmsFile.open(stream) as file:
-        known = _channels(file)
+    with _channels(path, name) as known:
         timed = [label + TIME for label, channel in known.items() if _increment(channel)]
         check_columns([*known, *timed], wanted.columns, name)
         for column in wanted.columns:
@@ -48,16 +46,10 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
-    """Names and units of the channels of numbers, moments (unit "datetime") and waveform times.
-
-    Raises:
-        InputError: as :func:`read`.
-    """
-    library = _library(name)
+    """Names and units of the channels of numbers, moments (unit "datetime") and waveform times."""
     found = {}
-    # A stream: by its path, npTDMS would take an index file beside it for the truth.
-    with path.open("rb") as stream, library.TdmsFile.open(stream) as file:
-        for label, channel in _channels(file).items():
+    with _channels(path, name) as known:
+        for label, channel in known.items():
             if channel.dtype.kind == "M":
                 found[label] = "datetime"
             elif channel.dtype.kind in "iufb" and len(channel):
@@ -67,15 +59,14 @@ def columns(path: Path, name: str) -> dict[str, str]:
     return found
 
 
-def _library(name: str) -> ModuleType:
-    """npTDMS, quiet: it would print pages about a damaged file."""
+@contextmanager
+def _channels(path: Path, name: str) -> Iterator[dict[str, Any]]:
+    """The channels of a file, by npTDMS, which would print pages about a damaged one."""
     library = need("nptdms", "tdms", name)
     need("nptdms.log", "tdms", name).log_manager.set_level(logging.CRITICAL)
-    return library
-
-
-def _channels(file: Any) -> dict[str, Any]:
-    return {f"{g.name}/{c.name}": c for g in file.groups() for c in g.channels()}
+    # A stream: by its path, npTDMS would take an index file beside it for the truth.
+    with path.open("rb") as stream, library.TdmsFile.open(stream) as file:
+        yield {f"{g.name}/{c.name}": c for g in file.groups() for c in g.channels()}
 
 
 def _increment(channel: Any) -> bool:

@@ -20,8 +20,8 @@ import pyarrow.csv as pa_csv
 
 from bampipe.data.readers import dialect as dialects
 from bampipe.data.readers import moments
-from bampipe.data.readers.dialect import HEAD, NULLS, TableLayout
-from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, joined
+from bampipe.data.readers.dialect import HEAD, NULLS, Line, TableLayout
+from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size
 from bampipe.errors import InputError
 
 BLOCK = 1 << 20
@@ -73,8 +73,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     Raises:
         InputError: binary data, a wrong layout, or a cell that is not a number; names the row.
     """
-    with opened(path, wanted.dialect, name) as (stream, said):
-        layout = _layout(stream, wanted, name)
+    with _opened(path, wanted.dialect, name) as (stream, said):
+        layout = dialects.find_layout(_head(stream, name), wanted.columns, wanted.dialect, name)
         end, notes = _sound_end(stream, layout)
         samples = _Samples(wanted)
         _read_samples(stream, layout, end, samples, name)
@@ -94,13 +94,9 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
 
 
 def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, str]:
-    """Names and units of the columns of numbers, or of moments (unit "datetime").
-
-    Raises:
-        InputError: as :func:`read`.
-    """
+    """Names and units of the columns of numbers, or of moments (unit "datetime")."""
     dialect = dialect or Dialect()
-    with opened(path, dialect, name) as (stream, _):
+    with _opened(path, dialect, name) as (stream, _):
         head = _head(stream, name)
     layout = dialects.find_layout(head, (), dialect, name)
     return {
@@ -110,7 +106,7 @@ def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, 
 
 
 @contextmanager
-def opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO, tuple[str, ...]]]:
+def _opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO, tuple[str, ...]]]:
     """The file as UTF-8, itself or a copy of it in memory; and what to say of it.
 
     Raises:
@@ -158,19 +154,13 @@ def _encoding(head: bytes) -> str:
 def _head(stream: BinaryIO, name: str) -> bytes:
     """The first 64 kB, if they can be lines of a table."""
     head = stream.read(HEAD)
-    if b"\0" in head:
-        raise InputError("binary data, not text", where=name, remedy="export the log as CSV")
     line = re.split(rb"[\r\n]", head, maxsplit=1)[0]
+    text = line.decode("utf-8", "ignore").removeprefix("\ufeff")
+    if b"\0" in head or not (text.isprintable() or "\t" in text):
+        raise InputError("binary data, not text", where=name, remedy="export the log as CSV")
     if len(line) == HEAD:
         raise InputError("no line end in the first 64 kB: not a table", where=name)
-    text = line.decode("utf-8", "ignore").removeprefix("\ufeff")
-    if not text.isprintable() and "\t" not in text:
-        raise InputError("binary data, not text", where=name, remedy="export the log as CSV")
     return head
-
-
-def _layout(stream: BinaryIO, wanted: Wanted, name: str) -> TableLayout:
-    return dialects.find_layout(_head(stream, name), wanted.columns, wanted.dialect, name)
 
 
 @dataclass
@@ -208,8 +198,8 @@ class _Samples:
             del held[parts:]
 
     def values(self) -> dict[str, np.ndarray]:
-        values = joined({column: self.parts[column] for column in self.wanted.columns})
-        self.parts.clear()
+        # Parts are let go of column by column, so that only one column is held twice.
+        values = {column: np.concatenate(self.parts.pop(column)) for column in self.wanted.columns}
         for column in self.wanted.datetimes:
             known = values[column][values[column] != np.iinfo(np.int64).min]
             self.since |= {column: int(known[0])} if len(known) else {}
@@ -238,11 +228,7 @@ def _read_samples(
             if line is None or not (again or layout.is_chatter(line.text)):
                 raise _fault(str(error), layout, line, name) from error
             samples.cut(rows, parts)
-            try:
-                _read_stretch(stream, layout, line.start, samples, name)
-            except pa.ArrowInvalid as empty:
-                if "Empty CSV file" not in str(empty):
-                    raise _fault(str(empty), layout, None, name) from empty
+            _read_samples(stream, layout, line.start, samples, name)
             if again:
                 samples.begun += [samples.rows] if samples.rows else []
             elif len(samples.notes) == _MOST_CHATTER:
@@ -318,21 +304,11 @@ def _split(line: bytes, layout: TableLayout) -> list[bytes]:
     return line.split() if layout.delimiter == " " else line.split(layout.delimiter.encode())
 
 
-@dataclass(frozen=True)
-class _FaultyLine:
-    """A line at which reading stopped: its number, its bytes in the file and its text."""
-
-    number: int
-    start: int
-    end: int
-    text: str
-
-
 _TORN = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+): (.*?)(?: \.\.\.)?$", re.DOTALL)
 _CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*invalid value '(.*)'", re.DOTALL)
 
 
-def _faulty_line(stream: BinaryIO, message: str, layout: TableLayout) -> _FaultyLine | None:
+def _faulty_line(stream: BinaryIO, message: str, layout: TableLayout) -> Line | None:
     """The line that Arrow complains about, which does not count blank lines; None for none."""
     found = _TORN.search(message) or _CELL.search(message)
     row = int(found[1] if found.re is _TORN else found[2] or 0) if found else 0
@@ -344,12 +320,12 @@ def _faulty_line(stream: BinaryIO, message: str, layout: TableLayout) -> _Faulty
         full += bool(line.strip(b"\r\n"))
         if full == row:
             text = line.decode("utf-8", "replace").strip("\r\n")
-            return _FaultyLine(number, at, at + len(line), text)
+            return Line(number, at, at + len(line), text)
         at += len(line)
     return None
 
 
-def _fault(message: str, layout: TableLayout, line: _FaultyLine | None, name: str) -> InputError:
+def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> InputError:
     """The plain form of what Arrow says about a text file."""
     at = f", row {line.number}" if line is not None else ""
     torn = _TORN.search(message)

@@ -142,8 +142,8 @@ def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np
     Raises:
         InputError: a column is of another length.
     """
-    first = max(values, key=lambda column: len(values[column]) > 1)
-    count = len(values[first])
+    first = max(values, key=lambda column: len(values[column]) > 1, default="")
+    count = len(values[first]) if values else 0
     for column, value in values.items():
         if len(value) not in (1, count):
             raise InputError(
@@ -163,15 +163,6 @@ def interpolated(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.nd
         return np.full(len(at), np.nan)
     order = known[np.argsort(times[known], kind="stable")]
     return np.asarray(np.interp(at, times[order], values[order], left=np.nan, right=np.nan))
-
-
-def joined(parts: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:
-    """Concatenate column by column, letting go of the parts, so that only one column is double."""
-    columns = {}
-    for column in list(parts):
-        chunks = parts.pop(column)
-        columns[column] = np.concatenate(chunks) if chunks else np.empty(0)
-    return columns
 
 
 def need(module: str, extra: str, name: str) -> ModuleType:

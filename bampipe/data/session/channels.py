@@ -319,7 +319,9 @@ class Force(Declaration):
     @property
     def components(self) -> tuple[str, ...]:
         """Names of the components, as given or as the columns say."""
-        return self.given_components or tuple(map(_component, self.columns))
+        # x for the columns force_x_v, force_x and x.
+        bare = (re.sub(r"(?i)(?<=.)_(nm|v|n)\Z", "", column) for column in self.columns)
+        return self.given_components or tuple(name.removeprefix("force_") for name in bare)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -412,11 +414,6 @@ class Force(Declaration):
                     where="calibration_n_per_v",
                     remedy="check for equal or zero rows",
                 )
-
-
-def _component(column: str) -> str:
-    """``x`` for the columns ``force_x_v``, ``force_x`` and ``x``."""
-    return re.sub(r"(?i)(?<=.)_(nm|v|n)\Z", "", column).removeprefix("force_")
 
 
 class Brake(NamedTuple):

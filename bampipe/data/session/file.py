@@ -6,9 +6,9 @@ import datetime
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, StringConstraints
@@ -25,9 +25,8 @@ from bampipe.data.session.channels import (
     Force,
     TimeUnit,
 )
-from bampipe.data.session.places import inside, is_device_path, lexically_inside
 from bampipe.errors import InputError, did_you_mean
-from bampipe.files import read_toml
+from bampipe.files import is_inside, read_toml
 from bampipe.schema import (
     ByName,
     Declaration,
@@ -44,13 +43,63 @@ from bampipe.schema import (
 FILE_NAME = "session.toml"
 
 
+def _is_device_path(device: str) -> bool:
+    """Whether ``device`` is the path of a device file rather than a built-in name."""
+    return device.endswith(".toml") or "/" in device or "\\" in device
+
+
+def lexically_inside(path: str, where: str) -> None:
+    """Refuse a path that by its text alone leaves the session folder.
+
+    Raises:
+        InputError: the path is absolute, has "..", a drive, a backslash or a NUL character.
+    """
+    remedy = "give a path relative to the session folder, with / between folders"
+    if PurePosixPath(path).is_absolute() or PureWindowsPath(path).drive:
+        raise InputError(f"absolute path '{path}'", where=where, remedy=remedy)
+    if ".." in PurePosixPath(path).parts or ".." in PureWindowsPath(path).parts:
+        raise InputError(f"path '{path}' leaves the session folder", where=where, remedy=remedy)
+    if "\\" in path or not path.isprintable():
+        shown = path.encode("unicode_escape").decode()
+        raise InputError(f"path '{shown}' is not portable", where=where, remedy=remedy)
+
+
+def inside(root: Path, path: str, where: str) -> Path:
+    """The existing file ``path`` of the session folder ``root``.
+
+    Raises:
+        InputError: it is no regular file, or it leaves the folder, also by a symbolic link.
+    """
+    lexically_inside(path, where)
+    full = Path(root) / path
+    try:
+        exists, regular = full.exists(), full.is_file()
+    except (OSError, ValueError) as error:
+        raise InputError(f"path '{path}' cannot be used", where=where) from error
+    if exists and not is_inside(Path(root), PurePosixPath(path).as_posix()):
+        raise InputError(
+            f"'{path}' is a link to a place outside the session folder",
+            where=where,
+            remedy="copy the file into the session folder",
+        )
+    if not exists:
+        stem = full.stem.lower()
+        near = [other for other in full.parent.glob("*") if other.stem.lower() == stem != ""]
+        names = [other.relative_to(root).as_posix() for other in near if other != full]
+        remedy = f"there is '{min(names)}'" if names else ""
+        raise InputError(f"no such file '{path}'", where=where, remedy=remedy)
+    if not regular:
+        raise InputError(f"'{path}' is not a file", where=where)
+    return full
+
+
 def _inside(path: str) -> str:
     lexically_inside(path, where="")
     return PurePosixPath(path).as_posix()
 
 
 def _device(text: str) -> str:
-    return _inside(text) if is_device_path(text) else text
+    return _inside(text) if _is_device_path(text) else text
 
 
 def _moment(value: Any) -> Any:
@@ -172,6 +221,13 @@ def _with_ids(trials: tuple[TrialEntry, ...]) -> tuple[TrialEntry, ...]:
     return trials
 
 
+def _no_axis(name: str, axes: Sequence[str], where: str, what: str = "") -> InputError:
+    remedy = f"the axes are {', '.join(axes)}"
+    return InputError(
+        f"no {what}axis '{name}'{did_you_mean(name, axes)}", where=where, remedy=remedy
+    )
+
+
 class Session(Declaration):
     """session.toml: one recording session, its channels and its trials."""
 
@@ -269,7 +325,7 @@ class Session(Declaration):
         Raises:
             InputError: there is no such file, or it is outside the session folder.
         """
-        if not is_device_path(self.device):
+        if not _is_device_path(self.device):
             return None
         return inside(self.root, self.device, where=f"{self.root / FILE_NAME}: device")
 
@@ -291,20 +347,12 @@ class Session(Declaration):
         for encoder in self.encoders:
             for other in encoder.also_reads:
                 if other not in axes or other == encoder.axis:
-                    yield InputError(
-                        f"no other axis '{other}'{did_you_mean(other, axes)}",
-                        where=f"encoders.{encoder.axis}.also_reads",
-                        remedy=f"the axes are {', '.join(axes)}",
-                    )
+                    yield _no_axis(other, axes, f"encoders.{encoder.axis}.also_reads", "other ")
         units = {encoder.axis: encoder.unit for encoder in self.encoders}
         for channel in self.channels:
             axis = channel.second_encoder_of
             if axis and axis not in axes:
-                yield InputError(
-                    f"no axis '{axis}'{did_you_mean(axis, axes)}",
-                    where=f"channels.{channel.name}.second_encoder_of",
-                    remedy=f"the axes are {', '.join(axes)}",
-                )
+                yield _no_axis(axis, axes, f"channels.{channel.name}.second_encoder_of")
             elif axis and channel.unit != units[axis]:
                 yield InputError(
                     f"a unit of {channel.unit or 'a pure number'}, expected one of {units[axis]}",
@@ -324,11 +372,7 @@ class Session(Declaration):
         for number, trial in enumerate(self.trials):
             place = f"trials[{number}]"
             if trial.locked_axis is not None and trial.locked_axis not in axes:
-                yield InputError(
-                    f"no axis '{trial.locked_axis}'{did_you_mean(trial.locked_axis, axes)}",
-                    where=f"{place}.locked_axis",
-                    remedy=f"the axes are {', '.join(axes)}",
-                )
+                yield _no_axis(trial.locked_axis, axes, f"{place}.locked_axis")
             for other in self.trials[:number]:
                 # The same file twice without stretches is left to ingest, which uses it once.
                 stretches = {(t.start_s, t.end_s) for t in (trial, other)}

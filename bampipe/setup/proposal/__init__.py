@@ -7,17 +7,20 @@ a radian, is left at a value that the session reader refuses with a line saying 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from bampipe.data import guesses
 from bampipe.data.readers import lerobot
-from bampipe.data.survey import DRIVERS, Survey, survey
+from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, survey, words
 from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.lists import join_names
+from bampipe.physics.device import Device
 from bampipe.setup.mounting import Mounting
 from bampipe.setup.proposal.clock import clock_of
 from bampipe.setup.proposal.device import (
@@ -34,7 +37,6 @@ from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import Notes, quoted
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
 from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
-from bampipe.setup.proposal.trials import trials_tables
 
 SESSION = "session.toml"
 
@@ -104,14 +106,15 @@ def propose(
         _check_robot(chosen, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
+    left = [column.name for column in found.columns if column.name not in match.used]
     lines = [
         *_head(folder, chosen.name, clock.rate),
-        *_names(names),
+        *(["[csv]", f"names = [{', '.join(map(quoted, names))}]", ""] if names else []),
         *clock.lines,
         *encoders,
         *inputs,
-        *_not_used(match),
-        *trials_tables(chosen.device, axes, match, notes),
+        *([f"# not used: {', '.join(left)}", ""] if left else []),
+        *_trials_tables(chosen.device, axes, match, notes),
     ]
     return ProposedSession(
         session="\n".join(lines) + "\n",
@@ -158,11 +161,6 @@ def _head(folder: Path, device: str, rate: str) -> list[str]:
         rate,
         "",
     ]
-
-
-def _names(names: Sequence[str]) -> list[str]:
-    listed = ", ".join(quoted(name) for name in names)
-    return ["[csv]", f"names = [{listed}]", ""] if names else []
 
 
 def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColumns) -> ChosenDevice:
@@ -231,9 +229,57 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
         )
 
 
-def _not_used(match: Matcher) -> list[str]:
-    left = [column.name for column in match.found.columns if column.name not in match.used]
-    return [f"# not used: {', '.join(left)}", ""] if left else []
+def _trials_tables(
+    device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes
+) -> list[str]:
+    """Propose the trials and their kinds; a single long record is cut at rests of its first axis.
+
+    Args:
+        device: whose axes a locked trial may name.
+        axes: columns of the positions.
+        match: the logs and their time.
+        notes: where guesses and what is left open are noted.
+    """
+    trials = match.found.trials
+    cuts: list[float] = []
+    if len(trials) == 1 and axes:
+        cuts = guesses.stretches(match.t, next(iter(axes.values())).values)
+    lines = []
+    if cuts:
+        note = notes.guess("one record, cut at rests, so that each part can be held out")
+        lines.append(note.strip())
+    for trial in trials:
+        for start_s, end_s in pairwise([None, *cuts, None]):
+            lines += ["[[trials]]", f"file = {quoted(trial.file)}"]
+            lines += _trial_kind(trial.file, device, notes)
+            lines += [f"recording = {trial.recording}"] if trial.recording else []
+            lines += [f"start_s = {start_s}"] if start_s is not None else []
+            lines += [f"end_s = {end_s}"] if end_s is not None else []
+            lines += [f"part = {quoted(trial.part)}"] if trial.part else []
+            for part in trial.parts:
+                if not any(name.startswith(f"{part.name}:") for name in match.used):
+                    continue
+                lines += ["", "[[trials.parts]]"]
+                given = ("file", "name", "join", "time", "time_unit")
+                told = {key: getattr(part, key) for key in given}
+                lines += [f"{key} = {quoted(value)}" for key, value in told.items() if value]
+            lines.append("")
+    return lines
+
+
+def _trial_kind(file: str, device: Device, notes: Notes) -> list[str]:
+    said = set(words(Path(file).stem))
+    axis = next((c.name for c in device.coordinates if c.name in said), "")
+    if "locked" in said and axis:
+        note = notes.guess(f"{file} is a locked trial, by its name")
+        return [f'kind = "locked"{note}', f'locked_axis = "{axis}"']
+    if "viscous" in said:
+        return [
+            'kind = "viscous"' + notes.guess(f"{file} is a viscous trial, by its name"),
+            "viscous_n_s_per_m = 0.0"
+            + notes.ask("viscous_n_s_per_m, the damping", "the commands of the brakes' controller"),
+        ]
+    return ['kind = "free"']
 
 
 def write_proposal(folder: Path, proposal: ProposedSession) -> list[Path]:

@@ -21,13 +21,11 @@ from bampipe.lists import join_names
 from bampipe.physics import registry
 from bampipe.physics.device import KINDS, Device
 from bampipe.setup.hypotheses import MOST_TRAVEL
-from bampipe.setup.proposal.encoders import measured_position
-from bampipe.setup.proposal.gravity import weight_of
 from bampipe.setup.proposal.joints import chain_logged
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import SLIDING, in_counts, position_in_si, scale_to, slides
-from bampipe.setup.proposal.starter import Drive, starter_device
+from bampipe.setup.proposal.starter import Drive, starter_device, weight_of
 
 DEVICE = "device.toml"
 _SCHEMA = "bampipe.device/1"
@@ -208,7 +206,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         InputError: no column looks like a position.
     """
     found = match.found
-    position = measured_position("", 1, match, notes)
+    position = match.position("", 1, notes)
     if position is None:
         raise InputError(
             "no column looks like a position",
@@ -233,7 +231,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
             ' gear before the unit, as in unit = "70mN.m"'
         )
     kind = "linear" if linear else "rotary"
-    doubt = "" if position.conversion is not None else _MAY_SLIDE
+    doubt = "" if position.si is not None else _MAY_SLIDE
     if doubt and linear:
         doubt = "" if set(words(position.name)) & SLIDING else _MAY_TURN.format(position.name)
     what = "torque" if role == "force" and not linear else role
@@ -281,13 +279,9 @@ def _at_joint(
     position: SurveyedColumn, driver: SurveyedColumn | None, match: Matcher
 ) -> SurveyedColumn:
     """The angle of the joint, where counts or a motor's angle are read and the weight shows it."""
-    known, counted = position.conversion, in_counts(position)
-    turns = known is not None and known.si == "rad"
-    scale = known.scale if known is not None else 1.0
-    if driver is None or not counted:
-        far = turns and float(np.ptp(position.values)) * scale > MOST_TRAVEL
-        if driver is None or not far:
-            return position
+    far = position.si == "rad" and np.ptp(position.values) * position.scale > MOST_TRAVEL
+    if driver is None or not (far or in_counts(position)):
+        return position
     values = np.nan_to_num(driver.values)
     worth = guesses.find_turning(match.t, np.nan_to_num(position.values), values)
     if worth is None:

@@ -7,14 +7,12 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.survey import SurveyedColumn, words
 from bampipe.data.units import bare, spelled, unit
-from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
 from bampipe.setup.proposal.positions import in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
-_MANY = 6
 _SURE = 2.0
 """Standard errors within which a power of two, as most encoders count, is what a turn counts."""
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
@@ -27,7 +25,7 @@ def encoders_table(
     lines = ["[encoders]"]
     axes: dict[str, SurveyedColumn] = {}
     for axis in device.coordinates:
-        column = measured_position(axis.name, len(device.coordinates), match, notes)
+        column = match.position(axis.name, len(device.coordinates), notes)
         if column is None:
             note = notes.ask_column(axis.name, axis.unit, "position")
             lines.append(f"{axis.name} = {entry(UNKNOWN, axis.unit)}{note}")
@@ -44,22 +42,6 @@ def encoders_table(
     return [*lines, ""], axes
 
 
-def measured_position(axis: str, axes: int, match: Matcher, notes: Notes) -> SurveyedColumn | None:
-    """The column of the position of an axis; a guess is noted where it was one of several.
-
-    Args:
-        axis: name of the axis, "" for any.
-        axes: how many axes there are.
-        match: the columns.
-        notes: where a guess is noted.
-    """
-    column, candidates = match.position(axis, axes)
-    if column is not None and candidates:
-        listed = join_names(candidates, _MANY)
-        notes.guess(f"of {listed}, {column.name} is the measured position")
-    return column
-
-
 def _encoder(
     axis: Coordinate, alone: bool, column: SurveyedColumn, match: Matcher, notes: Notes
 ) -> str:
@@ -68,8 +50,8 @@ def _encoder(
     if in_counts(column):
         return _counted(axis, column, match, notes)
     worth = match.turning.get(column.name)
-    if worth is not None and column.conversion is not None:
-        turns, sd = (column.conversion.scale * part for part in (worth.size, worth.sd))
+    if worth is not None and column.si is not None:
+        turns, sd = (column.scale * part for part in (worth.size, worth.sd))
         said = spelled(column.unit, _POSITION_UNITS)
         fields = f", gear_ratio = {turns:.4g}, zero_counts = {worth.zero:.4g}"
         return entry(column.name, said, fields) + notes.guess(
@@ -77,8 +59,7 @@ def _encoder(
             f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
             " the angle; put in the ratio of the gear"
         )
-    known, geared = column.conversion, axis.name in match.robot.gears
-    right = known is not None and known.si == axis.unit
+    right, geared = column.si == axis.unit, axis.name in match.robot.gears
     if column.by_looks and not right:
         note = notes.ask(
             f"the unit of {column.name}, which looks like the position of {axis.name}",
@@ -123,9 +104,8 @@ def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -
 
 
 def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
-    known = column.conversion
     si = f"{axis.unit}/s"
-    said = spelled(column.unit, _SPEED_UNITS) if known is not None and known.si == si else ""
+    said = spelled(column.unit, _SPEED_UNITS) if column.si == si else ""
     return entry(column.name, said or si) + notes.guess(
         f"no position was recorded: that of {axis.name} is the integral of {column.name}"
     )
@@ -163,8 +143,7 @@ def _rounded(sd: float) -> str:
 def _velocity_beside(axis: Coordinate, alone: bool, match: Matcher, notes: Notes) -> str:
     """The field of a recorded velocity, against which the position is checked; "" without one."""
     for column in match.found.of("velocity"):
-        known = column.conversion
-        fits = known is not None and known.si == f"{axis.unit}/s" and not column.is_constant
+        fits = column.si == f"{axis.unit}/s" and not column.is_constant
         if fits and (alone or axis.name in words(column.name)):
             match.used.add(column.name)
             notes.check.append(f"{column.name} is used to check the position only")

@@ -5,18 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import savgol_filter
 
+from bampipe.arrays import Array
 from bampipe.physics.device import Device
 from bampipe.physics.robot import Robot
 from bampipe.setup.drawn_bodies import Comparison, Drive, JointMotion, fits, mean_left
 from bampipe.setup.mounting import Mounting, find_mounting
 from bampipe.setup.proposal.joints import Group
 from bampipe.setup.proposal.positions import position_in_si, scale_to
-
-Array = NDArray[np.float64]
 
 BEYOND = 1.5
 """Times its range that a joint must travel for the position to be another's."""

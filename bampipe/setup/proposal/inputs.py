@@ -117,9 +117,9 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
 
 def _is_force(column: SurveyedColumn) -> bool:
     """Whether the column of a drive is a force rather than a torque, by its unit or its name."""
-    known, said = column.conversion, set(words(column.name))
-    if known is not None:
-        return known.si == "N"
+    said = set(words(column.name))
+    if column.si is not None:
+        return column.si == "N"
     return bool(said & _FORCES) and not said & _TORQUES
 
 
@@ -168,9 +168,8 @@ def _channel(
     register = match.registers.get(column.name)
     fields = register.fields if register else ""
     fields += ", scale = -1.0" if name in match.robot.turned else ""
-    known = column.conversion
-    slides = known is not None and (known.si, si) == ("N", "N.m")  # the drive of a sliding joint
-    if known is not None and (known.si == si or slides):
+    slides = (column.si, si) == ("N", "N.m")  # the drive of a sliding joint
+    if column.si == si or slides:
         table = entry(column.name, bare(column.unit), fields)
         if column.stated and not why and register is None:
             return table

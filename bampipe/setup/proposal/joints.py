@@ -37,22 +37,15 @@ class Group:
         return f"{self.columns[0].name} to {self.columns[-1].name}"
 
 
-@dataclass(frozen=True)
-class Pairing:
-    """The columns of a robot.
+def pair_joints(
+    device: Device, found: Survey
+) -> tuple[list[Group], list[Group], dict[str, SurveyedColumn]]:
+    """Find the groups of columns that stand for a robot's joints and its drives.
 
-    Attributes:
-        positions, drives: groups that fit, the likeliest first; of drives one a motor.
-        some_drives: where no group has all drives, by input those of the group with the most.
+    Returns:
+        Groups of positions and of drives, one a motor, the likeliest first; where no group has all
+        drives, those of the group with the most by their input.
     """
-
-    positions: tuple[Group, ...]
-    drives: tuple[Group, ...]
-    some_drives: Mapping[str, SurveyedColumn]
-
-
-def pair_joints(device: Device, found: Survey) -> Pairing:
-    """Find the groups of columns that stand for a robot's joints and its drives."""
     joints = [c.name for c in device.coordinates]
     motors = [re.sub(r"^(torque|current)_", "", name) for name in device.forces]
     roles = ("current", "force") if device.force_unit == "A" else ("force", "current")
@@ -65,7 +58,7 @@ def pair_joints(device: Device, found: Survey) -> Pairing:
         ]
         most = max(incomplete, key=len, default={})
         some = {name: most[m] for name, m in zip(device.forces, motors, strict=True) if m in most}
-    return Pairing(tuple(positions), tuple(drives), some)
+    return positions, drives, some
 
 
 def chain_logged(chains: Mapping[str, Sequence[tuple[str, str]]], found: Survey) -> str:

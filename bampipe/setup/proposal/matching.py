@@ -10,12 +10,15 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
+from bampipe.lists import join_names
+from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import travelled
 from bampipe.setup.proposal.robot import RobotColumns
 
 _DRIVEN = 0.5
 """Share of a column that the motion must explain for it to pass as what drives it."""
 
+_MANY = 6
 _NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
 _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
 Match = tuple[SurveyedColumn | None, str]
@@ -56,16 +59,17 @@ class Matcher:
                 return column
         return None
 
-    def position(self, axis: str, axes: int) -> tuple[SurveyedColumn | None, list[str]]:
-        """The measured position of an axis; and all that it was chosen from, if several.
+    def position(self, axis: str, axes: int, notes: Notes) -> SurveyedColumn | None:
+        """The measured position of an axis; a guess is noted where it was one of several.
 
         Args:
             axis: name of the axis, "" for any.
             axes: how many axes there are: of several, only the name tells which is which.
+            notes: where a guess is noted.
         """
         named = self.named(axis, "position") if axis else None
         if named is not None or axes > 1:
-            return named, []
+            return named
         moving = [c for c in self.found.columns if not c.is_constant]
         found = [c for c in moving if c.role == "position"]
         found = found or [c for c in moving if not c.role and re.match(r"q\w?\Z", c.name.lower())]
@@ -73,12 +77,14 @@ class Matcher:
         found = found or [c for c in moving if c.role == "velocity"]
         found = found or [c for c in moving if c.name in ("v", "V")]
         if len(found) < 2:
-            return (found[0] if found else None), []
+            return found[0] if found else None
         best = found[0]
         for other in found[1:]:
             alike = abs(float(np.corrcoef(best.values, other.values)[0, 1])) > 0.9
             best = other if alike and guesses.follows(best.values, other.values) else best
-        return best, [c.name for c in found]
+        listed = join_names((c.name for c in found), _MANY)
+        notes.guess(f"of {listed}, {best.name} is the measured position")
+        return best
 
     def inputs(
         self, wanted: Mapping[str, str], axes: tuple[SurveyedColumn, ...]
@@ -136,9 +142,7 @@ class Matcher:
     def supply(self, driver: SurveyedColumn | None) -> SurveyedColumn | None:
         """The supply voltage beside a duty cycle: in volts or of no unit, and never negative."""
         for column in self.found.of("voltage"):
-            known = column.conversion
-            volts = known is None or known.si == "V"
-            if column is not driver and volts and np.nanmin(column.values) > 0.0:
+            if column is not driver and _compatible(column, "V") and np.nanmin(column.values) > 0.0:
                 return column
         return None
 
@@ -150,8 +154,7 @@ class Matcher:
             if not free or column.is_constant or column is position:
                 continue
             values = np.nan_to_num(column.values)
-            known = column.conversion
-            if known is not None and known.si in ("rad", "m"):  # of another axis
+            if column.si in ("rad", "m"):  # of another axis
                 continue
             if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
                 continue
@@ -175,5 +178,4 @@ def _numbers(name: str) -> list[str]:
 
 def _compatible(column: SurveyedColumn, si: str) -> bool:
     """Whether nothing that the column says of its unit contradicts ``si``."""
-    known = column.conversion
-    return known is None or known.si == si
+    return column.si in (None, si)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.quality.encoders import integral
 from bampipe.data.quality.stamps import find_fresh_rows
 from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
 from bampipe.data.units import unit
-from bampipe.data.velocity import integral
 from bampipe.setup.proposal.notes import Notes
 
 SLIDING = frozenset(["stroke", "displacement", "disp", "dist", "weg", "hub", "carriage", "piston"])
@@ -24,22 +24,14 @@ def is_velocity(column: SurveyedColumn) -> bool:
 
 def in_counts(column: SurveyedColumn) -> bool:
     """Whether a position is in whole counts of no known unit."""
-    return (
-        column.conversion is None
-        and column.is_integer
-        and bool(np.ptp(column.values) > _FEWEST_COUNTS)
-    )
+    return column.si is None and column.is_integer and bool(np.ptp(column.values) > _FEWEST_COUNTS)
 
 
 def slides(column: SurveyedColumn, found: Survey) -> bool:
     """Whether an axis slides rather than turns: by its unit, its name, or a force in newtons."""
-    known = column.conversion
-    if known is not None and known.si:
-        return known.si in ("m", "m/s")
-    if set(words(column.name)) & SLIDING:
-        return True
-    forces = [column.conversion for column in found.of("force")]
-    return any(force is not None and force.si == "N" for force in forces)
+    if column.si:
+        return column.si in ("m", "m/s")
+    return bool(set(words(column.name)) & SLIDING) or any(f.si == "N" for f in found.of("force"))
 
 
 def travelled(column: SurveyedColumn, t: np.ndarray) -> np.ndarray:
@@ -54,16 +46,16 @@ def position_in_si(column: SurveyedColumn, t: np.ndarray, si: str) -> np.ndarray
     """Position (T,) in ``si``, rad or m; an angle that wraps at a full turn is unwrapped."""
     values = travelled(column, t)
     if is_velocity(column):
-        return values * (column.conversion.scale if column.conversion is not None else 1.0)
+        return values * column.scale
     values = values * scale_to(si, column)
     return np.unwrap(values) if si == "rad" and not in_counts(column) else values
 
 
 def scale_to(si: str, column: SurveyedColumn) -> float:
     """What brings the values of a column to ``si``, by its unit or by the likely one."""
-    known = column.conversion
-    if known is None or known.si != si:
-        known = unit(guesses.likely_unit(si, column.values) or si)
+    if column.si == si:
+        return column.scale
+    known = unit(guesses.likely_unit(si, column.values) or si)
     return known.scale if known is not None else 1.0
 
 

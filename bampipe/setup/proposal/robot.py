@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data.chain import frame_of_tip, read_tree
 from bampipe.data.survey import Survey, SurveyedColumn
 from bampipe.physics.device import Device
@@ -20,8 +20,6 @@ from bampipe.setup.proposal.gears import BEYOND, DOUBTED, MOST_ROWS, Gears, Logg
 from bampipe.setup.proposal.joints import Group, pair_joints
 from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import scale_to
-
-Array = NDArray[np.float64]
 
 LEAST_AT_JOINT = 1.0 / 3.0
 """Share of what the drawing requires below which a torque is that of a motor."""
@@ -74,25 +72,21 @@ def find_robot_columns(
         found: the log; t: (T,) time, s.
         notes: what is guessed is noted, and how sure it is.
     """
-    pairing = pair_joints(device, found)
-    positions = next(iter(pairing.positions), None)
-    drives = next(iter(pairing.drives), None)
-    for what, chosen, others in (
-        ("positions", positions, pairing.positions[1:]),
-        ("drives", drives, pairing.drives[1:]),
-    ):
-        if chosen is not None and others:
-            listed = "; ".join(str(other) for other in others)
-            notes.check.append(f"of several {what}, {chosen} are taken, not {listed}")
+    by_position, by_drive, some_drives = pair_joints(device, found)
+    for what, groups in (("positions", by_position), ("drives", by_drive)):
+        if len(groups) > 1:
+            listed = "; ".join(map(str, groups[1:]))
+            notes.check.append(f"of several {what}, {groups[0]} are taken, not {listed}")
+    positions, drives = next(iter(by_position), None), next(iter(by_drive), None)
     turns, logged, joints = _turns(device, robot), Logged(device, robot, t), _joints(device)
-    columns: dict[str, SurveyedColumn] = {}
-    if positions is not None:
-        columns |= dict(zip(_joints(device), positions.columns, strict=True))
-    if drives is None:
-        return RobotColumns(joints, {**columns, **pairing.some_drives})
-    columns |= dict(zip(device.forces, drives.columns, strict=True))
-    if positions is None:
-        return RobotColumns(joints, columns)
+    if positions is None or drives is None:
+        columns = dict(zip(joints, positions.columns, strict=True)) if positions else {}
+        columns |= dict(zip(device.forces, drives.columns, strict=True)) if drives else {}
+        return RobotColumns(joints, {**columns, **some_drives})
+
+    def pair(positions: Group, drives: Group) -> dict[str, SurveyedColumn]:
+        found = (*positions.columns, *drives.columns)
+        return dict(zip((*joints, *device.forces), found, strict=True))
 
     def explain(positions: Group, drives: Group) -> Gears | None:
         """How the drawing explains the drives; None where they cannot be compared."""
@@ -106,7 +100,6 @@ def find_robot_columns(
     other = explain(other_unit, drives) if other_unit is not None else None
     if other_unit is not None and other is not None and mean_left(other.drives) < _BETTER:
         positions, best = other_unit, other
-        columns |= dict(zip(_joints(device), positions.columns, strict=True))
     left = mean_left(best.drives) if best is not None else np.inf
     sound = best is not None and fits(best.drives)
     beyond = _beyond_range(logged, positions, of_joint=sound)
@@ -114,7 +107,9 @@ def find_robot_columns(
     known = turns is not None and (turns != 1.0).any()
     geared: list[tuple[Group, Gears]] = []
     # Hundreds without a unit are degrees, or radians of a motor.
-    for group in (positions, _in_si(device, stated)):
+    pairs = zip(device.coordinates, stated.columns, strict=True)
+    in_si = replace(stated, columns=tuple(replace(p, unit=p.unit or c.unit) for c, p in pairs))
+    for group in (positions, in_si):
         gears = None
         if turns is not None and known and (beyond or not sound):
             gears = logged.explain_geared(logged.positions(group), drives, turns)
@@ -125,10 +120,10 @@ def find_robot_columns(
         group, gears = min(geared, key=lambda item: mean_left(item[1].drives))
         better = mean_left(gears.drives) < left * (1.0 if known else _BETTER)
         if better or (bool(beyond) if known else not sound):
-            return _geared(device, columns, group, gears, notes, given=known)
+            return _geared(device, pair(group, drives), gears, notes, given=known)
     notes.check += beyond
     if best is None or (beyond and not sound):
-        return RobotColumns(joints, columns)
+        return RobotColumns(joints, pair(positions, drives))
     if not (positions.named or drives.named or sound):
         ordered = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
         other = explain(*ordered)
@@ -139,15 +134,12 @@ def find_robot_columns(
                 f" way, {max(1.0 - left, 0.0):.1%} in the order of the chain"
             )
             best, (positions, drives) = other, ordered
-            columns |= dict(zip(_joints(device), positions.columns, strict=True))
-            columns |= dict(zip(device.forces, drives.columns, strict=True))
     compared = logged.compare(logged.positions(positions), drives, best.ratio, MOST_ROWS)
-    heavy = None
     if compared is not None and device.force_unit != "A":
         heavy = find_heavy(compared, best.mounting)
-    if compared is not None and heavy is not None:
         in_tip = _placed_in_tip(folder, robot)
-        notes.check.append(describe_heavy(compared, best.mounting, heavy, in_tip))
+        notes.check += [describe_heavy(compared, best.mounting, heavy, in_tip)] if heavy else []
+    columns = pair(positions, drives)
     by_input = dict(zip(device.forces, best.drives, strict=True))
     notes.check += _sentences(device, columns, by_input)
     return RobotColumns(joints, columns, by_input, mounting=best.mounting)
@@ -162,16 +154,10 @@ def _placed_in_tip(folder: Path, robot: Robot) -> Callable[[Array], Array]:
 
 
 def _geared(
-    device: Device,
-    columns: Mapping[str, SurveyedColumn],
-    positions: Group,
-    found: Gears,
-    notes: Notes,
-    given: bool = False,
+    device: Device, columns: Mapping[str, SurveyedColumn], found: Gears, notes: Notes, given: bool
 ) -> RobotColumns:
     """The columns of a log on the side of the motors, whose turns may be ``given``."""
     joints = _joints(device)
-    paired = {**columns, **dict(zip(joints, positions.columns, strict=True))}
     ratio = [float(r) if given else float(f"{r:.4g}") for r in found.ratio]
     gears = {joint: r for joint, r in zip(joints, ratio, strict=True) if r != 1.0}
     listed = ", ".join(f"{joint} {turns:g}" for joint, turns in gears.items())
@@ -187,13 +173,7 @@ def _geared(
         f"drawing, drives' inertia and friction explain {explained:.1%} of the drives"
     )
     drives = dict(zip(device.forces, found.drives, strict=True))
-    return RobotColumns(joints, paired, drives, gears, found.mounting)
-
-
-def _in_si(device: Device, group: Group) -> Group:
-    """The positions in rad or m where they state no unit."""
-    pairs = zip(device.coordinates, group.columns, strict=True)
-    return replace(group, columns=tuple(replace(p, unit=p.unit or c.unit) for c, p in pairs))
+    return RobotColumns(joints, columns, drives, gears, found.mounting)
 
 
 def _joints(device: Device) -> list[str]:
@@ -209,25 +189,19 @@ def _in_alphabetical_order(device: Device, group: Group) -> Group:
 
 def _in_unit_of_range(logged: Logged, group: Group) -> Group | None:
     """The positions in degrees or millimetres where they state no unit and only these fit."""
-    device, found = logged.device, []
-    for c, column, width in zip(device.coordinates, group.columns, logged.ranges, strict=True):
-        name, scale = _OTHER_UNITS[c.unit]
-        most = BEYOND * width
-        span = float(np.ptp(np.nan_to_num(column.values)))
-        if column.unit or span <= most or span * scale > most:
-            found.append(column)
-        else:
-            found.append(replace(column, unit=name))
+    coordinates, others = logged.device.coordinates, set()
+    for c, column, width in zip(coordinates, group.columns, logged.ranges, strict=True):
+        span, most = float(np.ptp(np.nan_to_num(column.values))), BEYOND * width
+        if not column.unit and span > most >= span * _OTHER_UNITS[c.unit][1]:
+            others.add(c.unit)
+    if not others:
+        return None
     # One controller gives all angles alike: what is so for one is so for all.
-    angles = {c.unit for c in device.coordinates}
-    for si in angles:
-        name, _ = _OTHER_UNITS[si]
-        own = [k for k, c in enumerate(device.coordinates) if c.unit == si]
-        if any(found[k].unit == name and not group.columns[k].unit for k in own):
-            for k in own:
-                found[k] = replace(found[k], unit=found[k].unit or name)
-    changed = any(new is not old for new, old in zip(found, group.columns, strict=True))
-    return replace(group, columns=tuple(found)) if changed else None
+    columns = [
+        replace(column, unit=column.unit or _OTHER_UNITS[c.unit][0]) if c.unit in others else column
+        for c, column in zip(coordinates, group.columns, strict=True)
+    ]
+    return replace(group, columns=tuple(columns))
 
 
 def _beyond_range(logged: Logged, positions: Group, of_joint: bool) -> list[str]:

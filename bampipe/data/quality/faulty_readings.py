@@ -1,22 +1,41 @@
-"""Readings at a rail: a sensor, a register or a converter that goes no further than it can."""
+"""Readings that are none: wild ones, dead stretches, and what stands at a rail."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Flags
 from bampipe.data.angle_torque import least_squares
+from bampipe.data.quality.channels import fill_missing, take_out
 from bampipe.data.quality.table import TrialTable, find_runs, longest_run
 from bampipe.data.smoothing import SmoothedMotion
 from bampipe.results.ingest import DeadStretch
 
-Flags = NDArray[np.bool_]
-
+POSITION, INPUT = (0.95, 20.0), (0.5, 40.0)
+"""A reading is wild this many times farther from its neighbours than so large a share of the
+readings is. What a position does between three samples is curvature, which has its extremes; an
+input jumps with the friction of every reversal, and its median tells its noise."""
+_CALM = 0.05
+"""Share of that by which its neighbours may change their pace: a machine at a stop turns round, and
+the kick of a controller leaves its drive unsteady."""
+_LONGEST_SPIKE = 2
+"""Samples of one spike, the most."""
+_ROUNDING = 1e-6
+"""Share of the range below which a change is no step of the sensor."""
+_SHORTEST_S = 0.1
+_CHANCE = 1e-9
+"""Of so long a run of equal readings, from the share of equal neighbours in the rest."""
+_UNSTEADY = 0.1
+"""Least share of changes that take back the one before: readings with noise, no set-points."""
+_MOST_DEAD = 0.2
+"""Share of the trial beyond which such runs are steps of a command."""
+_MOVES = 0.02
+"""Share of its travel in the trial that some axis covers meanwhile."""
 _TIMES_BESIDE = 5
 """How much more often a rail is read than any level near it."""
 _LONGEST_RUN = 5
 """Samples in a row at a rail, the least that its longest run has."""
-_LEAST, _MOST = 0.005, 0.6
+_LEAST_AT_RAILS, _MOST_AT_RAILS = 0.005, 0.6
 """Share of the samples at rails: below, they are left; above, the column is rather a command."""
 _FEWEST_LEVELS = 50
 """Different readings of a column that goes from one value to another rather than in steps."""
@@ -26,6 +45,101 @@ _EXPLAINED = 0.5
 """Share of the variance between the rails that the motion must explain to tell what is beyond."""
 _BEYOND = 2.0
 """Times what it leaves there, by which the motion must ask for more than the rail, in the mean."""
+
+
+def find_spikes(values: np.ndarray, rule: tuple[float, float]) -> np.ndarray:
+    """Tell which readings are wild.
+
+    Args:
+        values: (T,) finite readings; rule: `POSITION` or `INPUT`.
+
+    Returns:
+        (T,) bool.
+    """
+    wild = np.zeros(values.size, dtype=bool)
+    if values.size < _LONGEST_SPIKE + 4:
+        return wild
+    share, far = rule
+    changes = np.abs(np.diff(values))
+    changes = changes[changes > _ROUNDING * np.ptp(values)]
+    step = float(changes.min()) if changes.size else 0.0
+    for width in range(1, _LONGEST_SPIKE + 1):
+        end = values.size
+        before, after = values[1 : end - width - 2], values[width + 2 : end - 1]
+        pace = (after - before) / (width + 1)
+        off = np.stack(
+            [values[2 + k : end - width - 1 + k] - before - (k + 1) * pace for k in range(width)]
+        )
+        least = np.abs(off).min(axis=0)
+        turn = np.maximum(
+            np.abs(pace - before + values[: end - width - 3]),
+            np.abs(pace - values[width + 3 :] + after),
+        )
+        limit = far * max(float(np.quantile(least, share)), 0.5 * step)
+        one_sided = np.abs(np.sign(off).sum(axis=0)) == width
+        starts = 2 + np.flatnonzero(one_sided & (least > limit) & (turn < _CALM * least))
+        for k in range(width):
+            wild[starts + k] = True
+    return wild
+
+
+def interpolate_spikes(table: TrialTable) -> None:
+    """Take wild readings of positions and inputs out and interpolate them, where they are few."""
+    rules = {encoder.column: POSITION for encoder in table.session.encoders}
+    rules |= dict.fromkeys(table.inputs, INPUT)
+    some = False
+    for column, rule in rules.items():
+        values = table.columns[column]
+        wild = find_spikes(values, rule)
+        if 0 < wild.sum() <= table.limits.nan_share * len(values):
+            some = True
+            take_out(table, column, wild)
+    if some:
+        fill_missing(table)
+
+
+def note_dead_stretches(table: TrialTable) -> None:
+    """Note where an input reads one value for longer than chance would have it."""
+    positions = [table.columns[encoder.column] for encoder in table.session.encoders]
+    for column in table.inputs:
+        for start, stop in find_equal_runs(table.columns[column], table.t):
+            travel = [np.ptp(q[start:stop]) / max(float(np.ptp(q)), 1e-300) for q in positions]
+            if max(travel, default=0.0) > _MOVES:
+                first, last = float(table.t[start]), float(table.t[stop - 1])
+                table.dead.append(DeadStretch(column=column, start_s=first, end_s=last))
+
+
+def find_equal_runs(values: np.ndarray, t: np.ndarray) -> list[tuple[int, int]]:
+    """First and the one after the last sample of runs of equal readings that chance does not give.
+
+    Args:
+        values: (T,) readings; t: (T,) time stamps, s.
+    """
+    changes = np.diff(values)
+    moved = changes[changes != 0.0]
+    # A set-point goes on the way it went, and an input at its limit stays there.
+    if moved.size < 2 or np.mean(np.diff(np.sign(moved)) != 0.0) < _UNSTEADY:
+        return []
+    starts, stops = find_runs(changes == 0.0)
+    stops = stops + 1
+    long = t[stops - 1] - t[starts] >= _SHORTEST_S
+    equal = int(np.sum((stops - starts - 1)[~long]))
+    share = equal / max(equal + moved.size, 1)
+    least = np.log(_CHANCE) / np.log(max(share, 1e-3)) if share < 1.0 else np.inf
+    found = [
+        (int(start), int(stop))
+        for start, stop in zip(starts[long], stops[long], strict=True)
+        if stop - start > least and not _at_limit(values, start, stop)
+    ]
+    return found if sum(stop - start for start, stop in found) < _MOST_DEAD * values.size else []
+
+
+def _at_limit(values: np.ndarray, start: int, stop: int) -> bool:
+    """Whether a run is at the highest or lowest reading, which others have, too."""
+    here = values[start]
+    if here not in (values.min(), values.max()):
+        return False
+    return int(np.sum(values == here)) > stop - start
 
 
 def find_rails(values: np.ndarray) -> dict[float, Flags]:
@@ -62,7 +176,7 @@ def leave_out_rails(table: TrialTable) -> None:
         share = float(sum(at.mean() for at in rails.values()))
         where = " and ".join(f"{rail:g}" for rail in sorted(rails))
         said = f"{share:.1%} of the samples stand at the rail {where}"
-        most = limits.saturated_share if table.entry.kind == "locked" else _MOST
+        most = limits.saturated_share if table.entry.kind == "locked" else _MOST_AT_RAILS
         if column in volts and share > most:
             raise table.fault(
                 f"{said}: saturated, more than {most:.0%}",
@@ -71,7 +185,7 @@ def leave_out_rails(table: TrialTable) -> None:
                 remedy="lower the gain or the load",
             )
         in_steps = len(np.unique(values)) < _FEWEST_LEVELS and column not in volts
-        if not _LEAST <= share <= _MOST or in_steps:
+        if not _LEAST_AT_RAILS <= share <= _MOST_AT_RAILS or in_steps:
             continue
         said = f"column '{column}': {said}"
         if column not in volts:

@@ -1,0 +1,10 @@
+"""Kinds of arrays, as signatures name them; docstrings say their shapes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.int64]
