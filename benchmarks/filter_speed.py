@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.estimate import filterpy_engine
-from bampipe.estimate.unscented import FilterModel, FilterSettings, Trial, filter_trials
+from bampipe.estimate.unscented import ALPHA, FilterModel, FilterSettings, Trial, filter_trials
 from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.system import System
@@ -104,10 +104,7 @@ def make_problem(device: str, seconds: float, seed: int) -> Problem:
         if name in frame:
             u[:, place] = frame[name]
     model = FilterModel(
-        derivative=system.derivative,
-        measure=system.measure,
-        derivative_rows=system.derivative_rows,
-        measure_rows=system.measure_rows,
+        functions=system,
         n_states=2 * n,
         parameters=np.append(system.prior, 0.0),
         free=np.arange(len(system.parameters)),
@@ -226,9 +223,7 @@ def by_c(problem: Problem, folder: Path, options: list[str], repeats: int) -> Me
     compiled.argtypes = [ctypes.c_int, *[pointer] * 8, ctypes.c_double, pointer]
     nx = problem.model.n_states
     n = nx + problem.mean.size
-    spread, _, centre, other = settings.points.weights(n + settings.noise_sd.size)
-    if centre != 0.0:
-        raise SystemExit("the C kernel leaves out the centre, whose weight must be zero")
+    spread = ALPHA**2 * (n + settings.noise_sd.size)
     root = np.zeros((n, n))
     root[:nx, :nx] = np.diag(problem.trial.x_sd)
     root[nx:, nx:] = np.linalg.cholesky(problem.covariance)
@@ -238,7 +233,7 @@ def by_c(problem: Problem, folder: Path, options: list[str], repeats: int) -> Me
         mean = np.concatenate([problem.trial.x, problem.mean])
         failed = compiled(
             len(problem.trial.t), problem.trial.t, problem.trial.u, problem.trial.y, mean,
-            root.copy(), settings.noise_sd, settings.reading_sd, np.array([spread, other]),
+            root.copy(), settings.noise_sd, settings.reading_sd, np.array([spread, 0.5 / spread]),
             settings.longest_step, means,
         )  # fmt: skip
         if failed:
@@ -266,7 +261,7 @@ def by_dynamax(problem: Problem, python: str, folder: Path, repeats: int) -> Mea
         folder / "problem.npz", u=trial.u, y=trial.y, p=problem.model.parameters[:-1],
         nx=problem.model.n_states, noise_sd=settings.noise_sd, reading_sd=settings.reading_sd,
         mean=ahead.mean[1], covariance=ahead.covariance[1], dt=dt,
-        steps=int(steps[0]), alpha=settings.points.alpha,
+        steps=int(steps[0]), alpha=ALPHA,
         logarithmic=int(np.flatnonzero(problem.model.logarithmic)[0]), repeats=repeats,
     )  # fmt: skip
     source = ["def derivative(x, u, p, w, dx):", *body_of_derivative(problem.system)]

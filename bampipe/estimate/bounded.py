@@ -4,7 +4,7 @@ A linear fit hands its normal equations to `solve_bounded`. Sums over trials, ov
 trials but one are sums of normal equations, so a held-out fit needs no second pass over the data:
 
     normal, moment = slope.T @ slope, slope.T @ measured
-    solve_bounded(normal, moment, lower, upper).x
+    solve_bounded(normal, moment, lower, upper)
 
 Coefficients with equal bounds are held at that value. A nonlinear fit wraps the point it has
 reached in an `Iterate` and calls `descend`.
@@ -12,15 +12,13 @@ reached in an `Iterate` and calls `descend`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import lsq_linear
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array, Flags
 
 _RANK_TOLERANCE = 1e-12
 """Of the largest eigenvalue, at unit diagonal: what lies below is rounding."""
@@ -32,7 +30,7 @@ _SMALLEST_SHARE = 1e-3
 """Of a Gauss-Newton step, after which halving it ends."""
 
 
-def scaled_eigenbasis(matrix: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+def scaled_eigenbasis(matrix: Array) -> tuple[Array, Array, Array, Flags]:
     """Eigenvectors of normal equations in coefficients that make their diagonal one.
 
     A coefficient that nothing is known of keeps its scale and is a null vector by itself.
@@ -62,21 +60,8 @@ def invert_scaled(matrix: Array) -> Array:
     return np.asarray((kept / values[~null]) @ kept.T)
 
 
-@dataclass(frozen=True)
-class BoundedSolution:
-    """Solution of a bounded linear least-squares problem.
-
-    Attributes:
-        x: (n,) coefficients within their bounds.
-        at_bound: (n,) which of them are at a bound.
-    """
-
-    x: Array
-    at_bound: NDArray[np.bool_]
-
-
-def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> BoundedSolution:
-    """Minimise ``x^T normal x / 2 - moment^T x`` over ``lower <= x <= upper``.
+def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> Array:
+    """Minimise ``x^T normal x / 2 - moment^T x`` over ``lower <= x <= upper``; return x, (n,).
 
     Directions that the data do not determine are left at zero, the least-norm solution in
     coefficients scaled to unit diagonal. Bounds are met by the active-set method of Stark and
@@ -95,9 +80,8 @@ def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> B
     if open_.size:
         rest = moment[open_] - normal[np.ix_(open_, held)] @ x[held]
         low, high = lower[open_], upper[open_]
-        free = _solve_within(normal[np.ix_(open_, open_)], rest, low, high)
-        x[open_] = free
-    return BoundedSolution(x, np.asarray((x <= lower) | (x >= upper)))
+        x[open_] = _solve_within(normal[np.ix_(open_, open_)], rest, low, high)
+    return x
 
 
 def _solve_within(normal: Array, moment: Array, lower: Array, upper: Array) -> Array:
@@ -119,7 +103,7 @@ def _solve_within(normal: Array, moment: Array, lower: Array, upper: Array) -> A
     return np.asarray(np.clip(x, lower, upper))
 
 
-def _least_norm(basis: tuple[Array, Array, Array, NDArray[np.bool_]], moment: Array) -> Array:
+def _least_norm(basis: tuple[Array, Array, Array, Flags], moment: Array) -> Array:
     """Solution without bounds, (n,), zero along directions that are undetermined.
 
     Args:
@@ -130,9 +114,7 @@ def _least_norm(basis: tuple[Array, Array, Array, NDArray[np.bool_]], moment: Ar
     return np.asarray(vectors @ np.where(null, 0.0, along) / scale)
 
 
-def _solve_definite(
-    normal: Array, moment: Array, lower: Array, upper: Array
-) -> BoundedSolution | None:
+def _solve_definite(normal: Array, moment: Array, lower: Array, upper: Array) -> Array | None:
     """`solve_bounded` where all is determined, by Cholesky factors of the unbounded part.
 
     Coefficients beyond a bound are put there, and released where the slope leads back inside, until
@@ -161,8 +143,7 @@ def _solve_definite(
         slope = matrix @ x - target
         back = fixed & ~held & (((x <= low) & (slope < 0.0)) | ((x >= high) & (slope > 0.0)))
         if not beyond.any() and not back.any():
-            found = np.where(held | (x <= low), lower, np.where(x >= high, upper, x / scale))
-            return BoundedSolution(found, np.asarray((x <= low) | (x >= high)))
+            return np.where(held | (x <= low), lower, np.where(x >= high, upper, x / scale))
         x[beyond] = np.clip(x[beyond], low[beyond], high[beyond])
         fixed = (fixed | beyond) & ~back
     return None
@@ -189,27 +170,12 @@ class Iterate(Protocol):
 Point = TypeVar("Point", bound=Iterate)
 
 
-@dataclass(frozen=True)
-class Descent(Generic[Point]):
-    """Where a descent ended.
-
-    Attributes:
-        last: the point it reached.
-        iterations: Gauss-Newton steps taken.
-        converged: whether the last one no longer changed the cost.
-        at_bound: (n,) which parameters are at a bound.
-    """
-
-    last: Point
-    iterations: int
-    converged: bool
-    at_bound: NDArray[np.bool_]
-
-
 def descend(
     start: Point, lower: Array, upper: Array, most_iterations: int, tolerance: float = 1e-10
-) -> Descent[Point]:
+) -> Point:
     """Take Gauss-Newton steps within bounds, each halved until the cost does not rise.
+
+    Returns the point where they end.
 
     Args:
         start: where to start, within the bounds.
@@ -217,10 +183,9 @@ def descend(
         most_iterations: the most steps.
         tolerance: change of the cost below which the descent has converged.
     """
-    at, iterations, gained = start, 0, np.inf
-    while iterations < most_iterations and gained >= tolerance:
-        iterations += 1
-        step = solve_bounded(*at.normal_equations(), lower - at.value, upper - at.value).x
+    at = start
+    for _ in range(most_iterations):
+        step = solve_bounded(*at.normal_equations(), lower - at.value, upper - at.value)
         share = 1.0
         while True:
             tried = at.moved(np.clip(at.value + share * step, lower, upper), share)
@@ -229,5 +194,6 @@ def descend(
                 break
             share /= 2.0
         at = tried if gained >= 0.0 else at
-    at_bound = np.asarray((at.value <= lower) | (at.value >= upper))
-    return Descent(at, iterations, abs(gained) < tolerance, at_bound)
+        if not gained >= tolerance:
+            break
+    return at

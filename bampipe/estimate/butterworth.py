@@ -7,15 +7,16 @@ from functools import lru_cache
 import numpy as np
 from scipy.signal import butter, periodogram, sosfiltfilt
 
-from bampipe.estimate.differentiation import Array, Derivatives, extend, linear_noise_gains
+from bampipe.arrays import Array
+from bampipe.estimate.differentiation import Derivatives, extend, linear_noise_gains
 
 _REACH = 6
 """Samples on either side that a derivative of an input is made of."""
 
 
 @lru_cache(maxsize=64)
-def _design(cutoff_hz: float, rate_hz: float, order: int) -> Array:
-    """Return second-order sections, which are not to be written to.
+def _design(cutoff_hz: float, rate_hz: float) -> Array:
+    """Return the second-order section of one pass, which is not to be written to.
 
     Raises:
         ValueError: the cut-off is not between 0 and half the sampling rate.
@@ -24,12 +25,10 @@ def _design(cutoff_hz: float, rate_hz: float, order: int) -> Array:
         raise ValueError(
             f"the cut-off {cutoff_hz:g} Hz is not between 0 and half of {rate_hz:g} Hz"
         )
-    return np.asarray(butter(order, cutoff_hz, fs=rate_hz, output="sos"), dtype=np.float64)
+    return np.asarray(butter(2, cutoff_hz, fs=rate_hz, output="sos"), dtype=np.float64)
 
 
-def zero_phase(
-    values: Array, rate_hz: float, cutoff_hz: float, order: int = 2
-) -> tuple[Array, Array, Array]:
+def zero_phase(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, Array, Array]:
     """Return ``values`` (T,) low-passed forwards and backwards, and its two derivatives, each (T,).
 
     The derivatives are central differences of fourth order, which follow the true derivative to
@@ -40,9 +39,8 @@ def zero_phase(
         rate_hz: sampling rate, Hz.
         cutoff_hz: half-power frequency of one pass, Hz; both passes together let 50 % of the
             amplitude through there.
-        order: order of one pass.
     """
-    x, added = _low_passed(values, rate_hz, cutoff_hz, order)
+    x, added = _low_passed(values, rate_hz, cutoff_hz)
     inner = np.arange(added, added + len(values))
     ahead, behind = x[np.minimum(inner + 1, len(x) - 1)], x[np.maximum(inner - 1, 0)]
     ahead2, behind2 = x[np.minimum(inner + 2, len(x) - 1)], x[np.maximum(inner - 2, 0)]
@@ -62,7 +60,7 @@ def rates(values: Array, rate_hz: float, cutoff_hz: float, count: int) -> list[A
     """
     found: list[Array] = []
     while len(found) < count:
-        x, added = _low_passed(found[-1] if found else values, rate_hz, cutoff_hz, 2)
+        x, added = _low_passed(found[-1] if found else values, rate_hz, cutoff_hz)
         padded = np.pad(x, _REACH, mode="edge")
         for order, weights in enumerate(_difference_weights(), start=1):
             difference = np.convolve(padded, weights[::-1], mode="valid") * rate_hz**order
@@ -81,28 +79,24 @@ def _difference_weights() -> tuple[Array, Array]:
     return np.asarray(inverse[1]), np.asarray(2.0 * inverse[2])
 
 
-def _low_passed(values: Array, rate_hz: float, cutoff_hz: float, order: int) -> tuple[Array, int]:
+def _low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, int]:
     """``values`` (T,), continued at both ends and low-passed both ways; samples added at each."""
-    sections = _design(cutoff_hz, rate_hz, order)
+    sections = _design(cutoff_hz, rate_hz)
     reach = int(np.ceil(4.0 * rate_hz / cutoff_hz)) + 2
     longer = extend(values, reach, max(4, int(np.ceil(1.5 * rate_hz / cutoff_hz))))
     added = (len(longer) - len(values)) // 2
     return np.asarray(sosfiltfilt(sections, longer, padtype=None), dtype=np.float64), added
 
 
-def smooth(
-    position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float, order: int = 2
-) -> Derivatives:
+def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -> Derivatives:
     """Return the motion behind ``position`` (T,) by :func:`zero_phase`, with error bands.
 
     ``noise_sd`` is the standard deviation of the white noise on the samples; motion above the
     cut-off is lost and is not in the bands.
     """
-    results = zero_phase(position, rate_hz, cutoff_hz, order)
+    results = zero_phase(position, rate_hz, cutoff_hz)
     edge = int(np.ceil(1.5 * rate_hz / cutoff_hz))
-    gains = linear_noise_gains(
-        lambda x: zero_phase(x, rate_hz, cutoff_hz, order), len(position), edge
-    )
+    gains = linear_noise_gains(lambda x: zero_phase(x, rate_hz, cutoff_hz), len(position), edge)
     return Derivatives(*results, *(noise_sd * gain for gain in gains))
 
 

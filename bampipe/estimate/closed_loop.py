@@ -7,14 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import float64, int64, void
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Indices
 from bampipe.compiled import njit, record_type
 from bampipe.estimate.runge_kutta import runge_kutta
-from bampipe.estimate.simulation import PLANT, make_plant, require_finite, stable_steps
+from bampipe.estimate.simulation import MAX_STEP_S, PLANT, make_plant, require_finite, stable_steps
 from bampipe.model_functions import COMMAND, DERIVATIVE, MEASURE
-
-Array = NDArray[np.float64]
 
 _V = float64[::1]
 _M = float64[:, ::1]
@@ -30,7 +28,7 @@ class _Controller(NamedTuple):
         out: (nf + n_s,) its commands and the rates of its states.
     """
 
-    columns: NDArray[np.int64]
+    columns: Indices
     ticks: int
     states: Array
     limits: Array
@@ -116,7 +114,6 @@ def simulate_controlled(
     force: Sequence[int],
     rate_hz: float = 0.0,
     limits: Sequence[tuple[float, float]] = (),
-    max_step: float = 2.5e-4,
 ) -> tuple[Array, Array, Array]:
     """Integrate machine and controller together from ``x0``: a free run in closed loop.
 
@@ -124,7 +121,7 @@ def simulate_controlled(
     it integrates starts where its first command is nearest to the recorded one.
 
     Args:
-        derivative, x0, p, dt, width, n_noise, max_step: as in `simulate`.
+        derivative, x0, p, dt, width, n_noise: as in `simulate`.
         measure: compiled h(x, u, p, y): what the encoders read.
         command: compiled c(y, r, s, out): commands from readings, references, gains and the states
             of the controller; and the rates of these.
@@ -148,7 +145,7 @@ def simulate_controlled(
     total[:, columns] = 0.0
     readings = np.zeros((len(u), 2 * len(width)))
     bounds = np.array(limits, dtype=np.float64).reshape(-1, 2)
-    plant = make_plant(p, n_noise, width, max_step)
+    plant = make_plant(p, n_noise, width, MAX_STEP_S)
     measure(x[0], total[0], plant.p, readings[0])
     states = _first_states(command, readings[0], references[0], recorded, bounds)
     controller = _Controller(

@@ -12,10 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array, Flags
 
 FEWEST_READINGS = 0.1
 """Share of a window below which a reading is of no use; a slow sensor leaves cells empty too."""
@@ -94,11 +93,9 @@ class WindowTest:
         self.by_reading = np.full(n_readings, np.nan)
         self.useless = np.zeros(n_readings, dtype=bool)
         self.windows = 0
-        self._nis = np.zeros(0)
-        self._squares = np.zeros((0, n_readings))
-        self._present = np.zeros((0, n_readings), dtype=bool)
+        self._waiting = np.zeros((0, 1 + 2 * n_readings))
 
-    def take(self, nis: Array, squares: Array, present: NDArray[np.bool_]) -> list[float]:
+    def take(self, nis: Array, squares: Array, present: Flags) -> list[float]:
         """Add samples; return the mean NIS of a reading of each window that is now whole.
 
         Args:
@@ -106,15 +103,12 @@ class WindowTest:
                 where there was no reading, or none that the filter could use.
             present: (T, ny) whether there was a reading that the filter could use.
         """
-        self._nis = np.concatenate([self._nis, nis])
-        self._squares = np.concatenate([self._squares, squares])
-        self._present = np.concatenate([self._present, present])
-        found = []
-        while self._nis.size >= self._samples:
-            first, self._nis = self._nis[: self._samples], self._nis[self._samples :]
-            parts, self._squares = self._squares[: self._samples], self._squares[self._samples :]
-            there, self._present = self._present[: self._samples], self._present[self._samples :]
-            means = window_means(first, parts.shape[1], self._samples)
+        self._waiting = np.vstack([self._waiting, np.column_stack([nis, squares, present])])
+        found, n = [], squares.shape[1]
+        while len(self._waiting) >= self._samples:
+            window, self._waiting = np.split(self._waiting, [self._samples])
+            parts, there = window[:, 1 : 1 + n], window[:, 1 + n :]
+            means = window_means(window[:, 0], n, self._samples)
             finite = np.isfinite(parts)
             self.useless = there.mean(axis=0) < FEWEST_READINGS
             if not means.size and not self.useless.any():

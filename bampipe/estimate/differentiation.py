@@ -15,11 +15,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval, polyvander
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from bampipe.arrays import Array, Flags
 
 _GAP = 2.5
 """Factor on the usual sampling interval from which on a spline does not bridge it."""

@@ -11,15 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.unscented import Stored
-
-Array = NDArray[np.float64]
-
 
 _BLOCKS = 3
 """Least blocks for each parameter: fewer hardly scatter, for their scores add up to nothing."""
+_ROUNDS, _STEPS = 2, 12
+"""Most passes of a search over all noise levels, and steps of one level in one pass."""
 _SILENT = 1e-20
 """Share of the filter's variance below which a parameter has no score in any block."""
 
@@ -133,8 +132,6 @@ def climb(
     start: Array,
     step: Array,
     lower: Array,
-    most_rounds: int = 2,
-    most_steps: int = 12,
 ) -> tuple[Array, float]:
     """Maximise a likelihood over a few noise levels, one at a time, by doubling steps.
 
@@ -144,18 +141,17 @@ def climb(
     Args:
         log_likelihood: of the logarithms of the levels (k,); minus infinity where it fails.
         start: (k,) logarithms; step: (k,) by how much to try; lower: (k,) least values.
-        most_rounds: passes over all coordinates; most_steps: of one coordinate in one pass.
 
     Returns:
         (k,) best logarithms, and the likelihood there.
     """
     best, value = start.copy(), log_likelihood(start)
-    for _ in range(most_rounds):
+    for _ in range(_ROUNDS):
         before = value
         for k in range(start.size):
             for sign in (1.0, -1.0):
                 moved_any = False
-                for _ in range(most_steps):
+                for _ in range(_STEPS):
                     tried = best.copy()
                     tried[k] = max(tried[k] + sign * step[k], lower[k])
                     if tried[k] == best[k]:

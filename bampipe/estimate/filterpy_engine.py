@@ -11,11 +11,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.unscented import (
+    ALPHA,
     FilteredTrial,
     FilterFailure,
     FilterModel,
@@ -24,8 +25,6 @@ from bampipe.estimate.unscented import (
     Trial,
     in_sequence,
 )
-
-Array = NDArray[np.float64]
 
 
 def filter_trials_by_filterpy(
@@ -121,16 +120,15 @@ def _make_filter(
         late = p[-1] * ((u[k] - u[k - 1]) / dt - 0.25 * p[-1] * (c0 + c1))
         start, end = u[k - 1] - late, u[k] - late
         substeps = max(1, int(np.ceil(dt / settings.longest_step - 1e-6)))
-        advance(model.derivative, x, start, end, c0, c1, p, w, dt, substeps, work)
+        advance(model.functions.derivative, x, start, end, c0, c1, p, w, dt, substeps, work)
         return np.concatenate([x, point[nx:n], np.zeros(nw)])
 
     def read(point: Array, k: int) -> Array:
         model.place_parameters(point[nx:n], p)
-        model.measure(point[:nx].copy(), u[k], p, reading)
+        model.functions.measure(point[:nx].copy(), u[k], p, reading)
         return reading[settings.observed].copy()
 
-    chosen = settings.points
-    points = MerweScaledSigmaPoints(n + nw, chosen.alpha, chosen.beta, chosen.kappa)
+    points = MerweScaledSigmaPoints(n + nw, ALPHA, 2.0, 0.0)
     ukf = UnscentedKalmanFilter(n + nw, ny, 1.0, hx=read, fx=move, points=points)
     ukf.x = np.concatenate([trial.x, np.zeros(n - nx + nw)])
     ukf.P = np.zeros((n + nw, n + nw))

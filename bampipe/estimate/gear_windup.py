@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.errors import InputError
-
-Array = NDArray[np.float64]
 
 _BLOCKS = 20
 """Stretches of the record that err independently: their scatter gives the uncertainties."""

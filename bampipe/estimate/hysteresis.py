@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.signal import butter, find_peaks, sosfiltfilt
 
+from bampipe.arrays import Array
 from bampipe.estimate.white_noise import white_noise_sd
 
-Array = NDArray[np.float64]
-
+_TREMOR_HZ = 5.0
 _PROMINENCE = 0.3
 """A reversal stands out by this share of the range of the torque."""
 _LEFTOVER = 0.01
@@ -117,9 +117,9 @@ class Hysteresis:
     yielded: bool
 
 
-def smoothed(torque: Array, rate_hz: float, cutoff_hz: float = 5.0) -> Array:
+def smoothed(torque: Array, rate_hz: float) -> Array:
     """Return the torque (T,) without noise and tremor: low-passed forwards and backwards."""
-    cutoff = min(cutoff_hz, 0.2 * rate_hz)
+    cutoff = min(_TREMOR_HZ, 0.2 * rate_hz)
     sections = butter(2, cutoff, fs=rate_hz, output="sos")
     padding = min(len(torque) - 1, int(2 * rate_hz / cutoff))
     return np.asarray(sosfiltfilt(sections, torque, padlen=padding))
@@ -263,16 +263,13 @@ def energy_lost(torque: Array, deflection: Array, stiffness: float) -> float:
     return float(np.sum(0.5 * (rest[1:] + rest[:-1]) * np.diff(x)))
 
 
-def hysteresis(
-    torque: Array, deflection: Array, rate_hz: float, noise_sd: float | None = None
-) -> Hysteresis:
+def hysteresis(torque: Array, deflection: Array, rate_hz: float) -> Hysteresis:
     """Return the stiffness of a locked axis from its load cycles.
 
     Args:
         torque: generalised force on the axis, (T,), N.m or N.
         deflection: encoder reading, (T,), rad or m.
         rate_hz: sampling rate, Hz.
-        noise_sd: of the torque; by default from the record itself.
 
     Raises:
         ValueError: fewer than two whole branches, or too few encoder counts to fit a line.
@@ -282,8 +279,7 @@ def hysteresis(
         raise ValueError("no whole load cycle: the load must turn round three times at least")
     if min(len(branch.torque) for branch in branches) < 8:
         raise ValueError("the deflection changes by fewer than 8 encoder counts on a branch")
-    noise = white_noise_sd(torque) if noise_sd is None else noise_sd
-    noise /= np.sqrt(2.0)  # a count change takes the mean of two samples
+    noise = white_noise_sd(torque) / np.sqrt(2.0)  # a count change takes the mean of two samples
     start = transition_of(branches, noise)
     window = (start, np.inf)
     compliance, error, _ = _regression(branches, noise, window)
@@ -292,10 +288,8 @@ def hysteresis(
     middle = 0.5 * (start + float(np.median([branch.travel[-1] for branch in branches])))
     early, early_error, _ = _regression(branches, noise, (start, middle))
     late, late_error, _ = _regression(branches, noise, (middle, np.inf))
-    slope_change, slope_change_error = (
-        late / early - 1.0,
-        float(np.hypot(early_error, late_error)) / compliance,
-    )
+    slope_change = late / early - 1.0
+    slope_change_error = float(np.hypot(early_error, late_error)) / compliance
     cycles = tuple(
         _cycle(torque, deflection, branches[k : k + 2], noise, window)
         for k in range(0, len(branches) - 1, 2)

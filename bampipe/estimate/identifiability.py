@@ -13,13 +13,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import rfft
 
+from bampipe.arrays import Array
 from bampipe.estimate.bounded import scaled_eigenbasis
 
-Array = NDArray[np.float64]
-
+_WEAK, _SMALLEST_PART = 0.1, 0.3
+"""Eigenvalue of the information scaled to a unit diagonal below which a direction is weak, and
+share of the largest part of it below which a parameter is left out."""
 _LEAST_NOISE = 1e-12
 """Least noise at any frequency, as a share of the mean over frequencies."""
 
@@ -118,19 +119,13 @@ class Weak:
     strength: float
 
 
-def weak_directions(matrix: Array, limit: float = 0.1, smallest_part: float = 0.3) -> list[Weak]:
-    """Return the directions that hold less than ``limit`` of what each parameter alone would.
-
-    Args:
-        matrix: (n, n) information.
-        limit: on the eigenvalues of the information scaled to a unit diagonal.
-        smallest_part: parameters that move less than this share of the largest are left out.
-    """
+def weak_directions(matrix: Array) -> list[Weak]:
+    """Directions of information (n, n) that hold little of what each parameter alone would."""
     _, value, vector, _ = scaled_eigenbasis(matrix)
     found = []
-    for k in np.flatnonzero(value < limit):
+    for k in np.flatnonzero(value < _WEAK):
         parts = vector[:, k] / vector[np.argmax(np.abs(vector[:, k])), k]
-        order = [int(i) for i in np.argsort(-np.abs(parts)) if abs(parts[i]) >= smallest_part]
+        order = [int(i) for i in np.argsort(-np.abs(parts)) if abs(parts[i]) >= _SMALLEST_PART]
         if len(order) > 1:
             shown = tuple(float(parts[i]) for i in order)
             found.append(Weak(tuple(order), shown, float(max(value[k], 0.0))))

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array, Indices
 
 _SD_OF_MEDIAN = 1.4826
 """Standard deviation over median size, of a Gaussian."""
@@ -33,7 +32,7 @@ class RemovedStretch:
 
 def find_worst_stretch(
     rows: Sequence[tuple[Array, Array]],
-    stretches: Sequence[NDArray[np.int64]],
+    stretches: Sequence[Indices],
     places: Mapping[int, tuple[int, float]],
     sd: Array,
 ) -> RemovedStretch:

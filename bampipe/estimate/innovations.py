@@ -11,10 +11,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array
+
+_LAGS = 20
+"""How far back the test of whiteness looks."""
 
 
 @dataclass(frozen=True)
@@ -43,22 +45,21 @@ def average_stretches(values: Array, length: int) -> Array:
     return np.asarray(values[: count * length].reshape(count, length, -1).mean(axis=1))
 
 
-def check_whiteness(records: Sequence[Array], lags: int = 20) -> InnovationTest | None:
+def check_whiteness(records: Sequence[Array]) -> InnovationTest | None:
     """Ljung and Box's test over records with gaps; None where there are too few values.
 
     Args:
         records: (K,) each, NaN at gaps; products reach over a gap, never over two records.
-        lags: how far back.
     """
     joined = np.concatenate(records)
     size = int(np.isfinite(joined).sum())
-    if size < 5 * lags:
+    if size < 5 * _LAGS:
         return None
     centre = float(np.nanmean(joined))
     variance = float(np.nanmean((joined - centre) ** 2))
-    products, counts = np.zeros(lags), np.zeros(lags)
+    products, counts = np.zeros(_LAGS), np.zeros(_LAGS)
     for record in records:
-        for k in range(1, min(lags, len(record) - 1) + 1):
+        for k in range(1, min(_LAGS, len(record) - 1) + 1):
             product = (record[k:] - centre) * (record[:-k] - centre)
             found = np.isfinite(product)
             products[k - 1] += product[found].sum()
@@ -69,7 +70,7 @@ def check_whiteness(records: Sequence[Array], lags: int = 20) -> InnovationTest 
     statistic = float((size + 2.0) / size * np.sum(counts * correlation**2))
     share = float(np.sum(correlation**2 - 1.0 / counts))
     return InnovationTest(
-        statistic, lags, float(stats.chi2.sf(statistic, lags)), min(max(share, 0.0), 1.0)
+        statistic, _LAGS, float(stats.chi2.sf(statistic, _LAGS)), min(max(share, 0.0), 1.0)
     )
 
 

@@ -23,8 +23,9 @@ import numpy as np
 from numba import boolean, float64, int64, void
 from scipy.optimize import minimize_scalar
 
+from bampipe.arrays import Array, Flags
 from bampipe.compiled import njit, record_type
-from bampipe.estimate.differentiation import Array, Derivatives, Flags
+from bampipe.estimate.differentiation import Derivatives
 
 ORDERS = (3, 4)
 _SETTLED = 1e-10
@@ -50,17 +51,8 @@ def transition(order: int) -> tuple[Array, Array]:
     return step, noise
 
 
-def bandwidth(ratio: float, order: int, rate_hz: float) -> float:
-    """Return the half-amplitude frequency, Hz, of the steady smoother.
-
-    Its response is 1 / (1 + (w/w0)**(2 order)) with w0 = ratio**(1/(2 order)) rad per sample
-    (the Wiener filter of an order-fold integrated white noise, sampling fast against w0).
-    """
-    return float(rate_hz / (2.0 * np.pi) * ratio ** (1.0 / (2 * order)))
-
-
 def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
-    """Return the ratio that gives ``bandwidth_hz``; inverse of :func:`bandwidth`."""
+    """Return the ratio that gives ``bandwidth_hz``; inverse of `MotionModel.bandwidth_hz`."""
     return float((2.0 * np.pi * bandwidth_hz / rate_hz) ** (2 * order))
 
 
@@ -325,13 +317,12 @@ class MotionModel:
 
     @property
     def bandwidth_hz(self) -> float:
-        """Half-amplitude frequency of the smoother, Hz."""
-        return bandwidth(self.ratio, self.order, self.rate_hz)
+        """Half-amplitude frequency of the steady smoother, Hz.
 
-    @property
-    def density(self) -> float:
-        """Spectral density of the noise on the highest derivative, (unit/s**order)² s."""
-        return self.ratio * self.noise_sd**2 * self.rate_hz ** (2 * self.order - 1)
+        Its response is 1 / (1 + (w/w0)**(2 order)) with w0 = ratio**(1/(2 order)) rad per sample
+        (the Wiener filter of an order-fold integrated white noise, sampling fast against w0).
+        """
+        return float(self.rate_hz / (2.0 * np.pi) * self.ratio ** (1.0 / (2 * self.order)))
 
 
 def smooth(position: Array, model: MotionModel, present: Flags | None = None) -> Derivatives:
@@ -471,14 +462,10 @@ class Fit:
     Attributes:
         model: the chosen model.
         log_likelihood: of all innovations, up to a constant common to all models of the data.
-        innovation_variance: mean of v²/S; 1 where the model accounts for the data.
-        at_limit: whether the bandwidth was held at one of its limits.
     """
 
     model: MotionModel
     log_likelihood: float
-    innovation_variance: float
-    at_limit: bool
 
 
 _FINEST = 1e-8
@@ -518,8 +505,8 @@ def maximum_likelihood(
     ]
     priors = [_prior(y, order) for y, _ in scaled]
 
-    def score(log_ratio: float) -> tuple[float, float, float]:
-        """Return -log likelihood, measurement noise variance in units, and mean of v²/S."""
+    def score(log_ratio: float) -> tuple[float, float]:
+        """Return -log likelihood and measurement noise variance in units."""
         logs = squares = 0.0
         count = 0
         for (y, present), (start, spread) in zip(scaled, priors, strict=True):
@@ -530,8 +517,7 @@ def maximum_likelihood(
             logs, squares, count = logs + part[0], squares + part[1], count + part[2]
         best = squares / max(count, 1)
         variance = max(best, 1.0) if quantum > 0.0 else max(best, 1e-30)
-        total = 0.5 * (logs + count * np.log(variance) + squares / variance)
-        return total, variance, best / variance
+        return 0.5 * (logs + count * np.log(variance) + squares / variance), variance
 
     low, high = (float(np.log(ratio_for(b, order, rate_hz))) for b in bandwidth_limits_hz)
     grid = np.linspace(low, high, 9)
@@ -543,8 +529,6 @@ def maximum_likelihood(
         options={"xatol": 0.02},
     )  # fmt: skip
     log_ratio = float(found.x)
-    total, variance, mean = score(log_ratio)
+    total, variance = score(log_ratio)
     model = MotionModel(order, unit * float(np.sqrt(variance)), float(np.exp(log_ratio)), rate_hz)
-    edge = 0.05 * (high - low) / (len(grid) - 1)
-    at_limit = log_ratio - low < edge or high - log_ratio < edge
-    return Fit(model, -total, mean, at_limit)
+    return Fit(model, -total)

@@ -14,14 +14,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.errors import InputError
 from bampipe.estimate.bounded import descend, invert_scaled
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
-
-Array = NDArray[np.float64]
 
 BLOCKS_A_PARAMETER = 3
 """Fewer blocks a parameter, and their scatter knows a standard deviation to a third only. Of 320
@@ -48,7 +46,7 @@ class Stacked:
 
     residual: Array
     slope: Array
-    used: NDArray[np.bool_]
+    used: Flags
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class KnownSlopes:
     """
 
     by_trial: Sequence[Array] | Mapping[int, Array]
-    holds: NDArray[np.bool_]
+    holds: Flags
 
 
 @dataclass(frozen=True)
@@ -90,37 +88,18 @@ class Problem:
 
     residual: Residual
     n_trials: int
-    free: NDArray[np.int64]
+    free: Indices
     lower: Array
     upper: Array
     step: Array
     linear: bool
-    constant: NDArray[np.bool_]
+    constant: Flags
     band: Band
-    standstill: Sequence[NDArray[np.bool_]]
+    standstill: Sequence[Flags]
     precision: Array
     known: Array
     slopes: Slopes | None = None
-    multiplied: NDArray[np.int64] | None = None
-
-
-@dataclass(frozen=True)
-class Minimum:
-    """Where a descent to the least squares ended.
-
-    Attributes:
-        p: (np,) parameters, those not free as given.
-        stacked: by trial, linearised at ``p``.
-        iterations: Gauss-Newton steps taken.
-        converged: whether the last step no longer changed the fit.
-        at_bound: (n_free,) which parameters ended on a bound.
-    """
-
-    p: Array
-    stacked: tuple[Stacked, ...]
-    iterations: int
-    converged: bool
-    at_bound: NDArray[np.bool_]
+    multiplied: Indices | None = None
 
 
 def residual_and_slopes(
@@ -196,7 +175,7 @@ def minimise(
     known: KnownSlopes | None = None,
     at_start: Sequence[Stacked] | None = None,
     tolerance: float = 1e-10,
-) -> Minimum:
+) -> Linearised:
     """Find the free parameters that leave the least squares, weighted by axis, within their bounds.
 
     Each axis is weighted by the scatter of its own residual, which is iterated; parameters in
@@ -223,17 +202,18 @@ def minimise(
         _require_finite(problem, trial, s, p)
     if most_iterations and sum(int(s.used.sum()) for s in stacked) <= problem.free.size:
         raise ValueError("fewer samples clear of standstill than parameters")
-    start_at = _Linearised(problem, chosen, p, stacked)
-    found = descend(start_at, problem.lower, problem.upper, most_iterations, tolerance)
-    return Minimum(
-        p=found.last.p, stacked=tuple(found.last.stacked), iterations=found.iterations,
-        converged=found.converged, at_bound=found.at_bound,
-    )  # fmt: skip
+    start_at = Linearised(problem, chosen, p, stacked)
+    return descend(start_at, problem.lower, problem.upper, most_iterations, tolerance)
 
 
 @dataclass(frozen=True)
-class _Linearised:
-    """The chosen trials, linearised at parameters ``p``: what `descend` follows."""
+class Linearised:
+    """Trials, linearised at parameters ``p``: what `descend` follows.
+
+    Attributes:
+        problem, trials: the model, and the numbers of the trials.
+        p: (np,) parameters, those not free as given; stacked: by trial, linearised there.
+    """
 
     problem: Problem
     trials: Sequence[int]
@@ -269,7 +249,7 @@ class _Linearised:
             moment -= slope.T @ (s.residual * weight).reshape(-1)
         return normal, moment
 
-    def moved(self, value: Array, share: float) -> _Linearised:
+    def moved(self, value: Array, share: float) -> Linearised:
         p = self.p.copy()
         p[self.problem.free] = value
         if self.problem.linear:
@@ -336,7 +316,7 @@ def _scatter(stacked: Sequence[Stacked]) -> Array:
 def covariance_by_blocks(
     rows: Sequence[tuple[Array, Array]],
     precision: Array,
-    blocks: Sequence[NDArray[np.int64]],
+    blocks: Sequence[Indices],
     independent: Sequence[float],
 ) -> Array:
     """Covariance (P, P) by the scatter of the scores of blocks of time (White; Newey and West).

@@ -8,12 +8,10 @@ from functools import lru_cache
 
 import numpy as np
 from numba import float64, int64, void
-from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt_zi
 
+from bampipe.arrays import Array, Indices
 from bampipe.compiled import njit
-
-Array = NDArray[np.float64]
 
 _V = float64[::1]
 _M = float64[:, ::1]
@@ -63,7 +61,7 @@ def _design(cutoff_hz: float, rate_hz: float) -> tuple[Array, Array]:
     return section[0].copy(), np.asarray(sosfilt_zi(section))[0].copy()
 
 
-def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: NDArray[np.int64]) -> Array:
+def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: Indices) -> Array:
     """Low-pass columns forwards and backwards and return the rows ``kept``.
 
     A second-order Butterworth filter in each direction, started in the steady state of the first
@@ -137,12 +135,12 @@ class Band:
         edge = np.tan(np.pi * np.array(self.cutoff_hz) / self.rate_hz)
         return np.asarray((1.0 + (at / edge) ** 4) ** -2.0)
 
-    def thinned_rows(self, count: int) -> NDArray[np.int64]:
+    def thinned_rows(self, count: int) -> Indices:
         """Indices of the samples that thinning keeps of ``count``."""
         margin = int(self.margin_s * self.rate_hz)
         return np.arange(margin, count - margin, self.step, dtype=np.int64)
 
-    def thin(self, values: Array, axes: Sequence[int] | NDArray[np.int64] | None = None) -> Array:
+    def thin(self, values: Array, axes: Sequence[int] | Indices | None = None) -> Array:
         """Low-pass (T, k) without phase and keep the rows `kept`.
 
         Args:

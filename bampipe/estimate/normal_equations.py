@@ -10,11 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.estimate.bounded import solve_bounded
-
-Array = NDArray[np.float64]
 
 _CANCELLED = 1e-8
 """Share of a sum of squares below which what a fit leaves of it may be rounding."""
@@ -46,7 +44,7 @@ class NormalEquations:
         cls,
         slopes: Sequence[Array],
         residuals: Sequence[Array],
-        used: Sequence[NDArray[np.bool_]],
+        used: Sequence[Flags],
         precision: Array | None = None,
         known: Array | None = None,
     ) -> NormalEquations:
@@ -92,7 +90,7 @@ class NormalEquations:
         """
         normal = np.tensordot(weight, self.xx.sum(axis=0), 1) + np.diag(self.precision)
         moment = weight @ self.xy.sum(axis=0) + self.precision * self.known
-        return solve_bounded(normal, moment, lower, upper).x
+        return solve_bounded(normal, moment, lower, upper)
 
     def squares(self, values: Array) -> Array:
         """Sum of squared residuals left with coefficients ``values`` (P,), (K, n_q).

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bampipe.estimate.unscented import FilterModel, FilterSettings, Trial, lower_root, run_kernel
-
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Innovations:
-    """What the filter expected of some samples and what came.
-
-    Attributes:
-        innovation: (T, ny) reading minus prediction, NaN where a reading is missing.
-        innovation_sd: (T, ny); nis: (T,) squared innovation in its own covariance.
-    """
-
-    innovation: Array
-    innovation_sd: Array
-    nis: Array
+from bampipe.arrays import Array
+from bampipe.estimate.unscented import (
+    FilteredTrial,
+    FilterModel,
+    FilterSettings,
+    Trial,
+    join_roots,
+    run_kernel,
+)
 
 
 class OnlineFilter:
@@ -53,26 +44,24 @@ class OnlineFilter:
             x, x_sd: (nx,) state at the first sample and its standard deviation.
             theta, covariance: (nt,) and (nt, nt) parameters, on the scale of estimation.
         """
-        nx = model.n_states
-        lower, upper = model.range
-        joint = np.zeros((x.size + theta.size, x.size + theta.size))
-        joint[:nx, :nx] = np.diag(np.square(x_sd))
-        joint[nx:, nx:] = covariance
         self._model, self._settings = model, settings
-        self._root = lower_root(joint)
+        self._root = join_roots(x_sd, covariance)
         self._last: tuple[float, Array] | None = None
-        self.mean = np.concatenate([x, np.clip(theta, lower, upper)])
+        self.mean = np.concatenate([x, np.clip(theta, *model.range)])
 
     @property
     def covariance(self) -> Array:
         """(n, n) covariance of `mean`."""
         return np.asarray(self._root @ self._root.T)
 
-    def advance(self, t: Array, u: Array, y: Array) -> Innovations:
+    def advance(self, t: Array, u: Array, y: Array) -> FilteredTrial:
         """Take samples; the very first one only starts the clock.
 
         Args:
             t: (T,) s, increasing; u: (T, nu) inputs; y: (T, ny) readings, NaN where missing.
+
+        Returns:
+            The innovations of these samples; of distributions, that at the first one.
 
         Raises:
             FilterFailure: the filter lost the motion; `mean` is then of no use.
@@ -86,8 +75,7 @@ class OnlineFilter:
         found = run_kernel(
             self._model, self._settings, samples, self.mean, self._root, stride=t.size
         )
-        skipped = 0 if self._last is None else 1
+        own = slice(0 if self._last is None else 1, None)
         self._last = (float(t[-1]), np.array(u[-1]))
-        return Innovations(
-            found.innovation[skipped:], found.innovation_sd[skipped:], found.nis[skipped:]
-        )
+        by_sample = ("innovation", "innovation_sd", "nis", "log_likelihood")
+        return replace(found, **{name: getattr(found, name)[own] for name in by_sample})

@@ -7,11 +7,9 @@ the stop operator: an ideal spring that slips.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.compiled import njit
-
-Array = NDArray[np.float64]
 
 
 @njit("float64[:, ::1](float64[::1], float64[::1])", cache=True)

@@ -9,9 +9,8 @@ logarithmic Cholesky factor, every value is possible (Rucker and Wensing 2022, i
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array
 
 _NUMBERS = 10
 _SMALLEST = 1e-6

@@ -4,12 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import boolean, float64, int64, void
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.compiled import njit, record_type
 from bampipe.model_functions import DERIVATIVE_ROWS, MEASURE_ROWS, ROWS
-
-Array = NDArray[np.float64]
 
 _V = float64[::1]
 _M = float64[:, ::1]
@@ -31,11 +29,11 @@ class Estimated(NamedTuple):
 
     n_states: int
     timing: int
-    free: NDArray[np.int64]
-    logarithmic: NDArray[np.bool_]
+    free: Indices
+    logarithmic: Flags
     lower: Array
     upper: Array
-    observed: NDArray[np.int64]
+    observed: Indices
     reads_parameters: bool
 
 

@@ -5,36 +5,35 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import savgol_filter
 
-from bampipe.estimate.differentiation import Array, Derivatives, linear_noise_gains
+from bampipe.arrays import Array
+from bampipe.estimate.differentiation import Derivatives, linear_noise_gains
+
+_DEGREE = 4
 
 
-def window_length(cutoff_hz: float, rate_hz: float, degree: int = 4) -> int:
+def window_length(cutoff_hz: float, rate_hz: float) -> int:
     """Return the odd window, samples, whose half-power frequency is nearest ``cutoff_hz``.
 
     Schafer 2011, eq. 12: with M = (window - 1)/2 the half-power frequency in units of half the
     sampling rate is (degree + 1) / (3.2 M - 4.6).
     """
-    half = ((degree + 1) * 0.5 * rate_hz / cutoff_hz + 4.6) / 3.2
-    return 2 * max(round(half), degree // 2 + 1) + 1
+    half = ((_DEGREE + 1) * 0.5 * rate_hz / cutoff_hz + 4.6) / 3.2
+    return 2 * max(round(half), _DEGREE // 2 + 1) + 1
 
 
-def polynomial(
-    values: Array, rate_hz: float, window: int, degree: int = 4
-) -> tuple[Array, Array, Array]:
+def polynomial(values: Array, rate_hz: float, window: int) -> tuple[Array, Array, Array]:
     """Return the fitted value and its two derivatives at every sample of ``values``, each (T,).
 
     Within half a window of either end the polynomial of the outermost window is used.
 
     Raises:
-        ValueError: the window is longer than the record or not longer than ``degree``.
+        ValueError: the window is longer than the record.
     """
-    if not degree < window <= len(values):
-        raise ValueError(
-            f"a window of {window} samples does not fit degree {degree} and {len(values)} samples"
-        )
+    if not _DEGREE < window <= len(values):
+        raise ValueError(f"a window of {window} samples does not fit {len(values)} samples")
     position, velocity, acceleration = (
         np.asarray(
-            savgol_filter(values, window, degree, deriv=k, delta=1.0 / rate_hz, mode="interp"),
+            savgol_filter(values, window, _DEGREE, deriv=k, delta=1.0 / rate_hz, mode="interp"),
             dtype=np.float64,
         )
         for k in range(3)
@@ -42,29 +41,23 @@ def polynomial(
     return position, velocity, acceleration
 
 
-def smooth_mean(
-    signal: Array, rate_hz: float, cutoff_hz: float, degree: int = 4
-) -> tuple[Array, Array, Array]:
+def smooth_mean(signal: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, Array, Array]:
     """Return what :func:`smooth` does, without the error bands, which take most of its time."""
-    return polynomial(signal, rate_hz, _window(signal, rate_hz, cutoff_hz, degree), degree)
+    return polynomial(signal, rate_hz, _window(signal, rate_hz, cutoff_hz))
 
 
-def smooth(
-    position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float, degree: int = 4
-) -> Derivatives:
+def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -> Derivatives:
     """Return the motion behind ``position`` (T,) by :func:`polynomial`, with error bands.
 
     ``noise_sd`` is the standard deviation of the white noise on the samples; motion above the
     cut-off is lost and is not in the bands.
     """
-    window = _window(position, rate_hz, cutoff_hz, degree)
-    results = polynomial(position, rate_hz, window, degree)
-    gains = linear_noise_gains(
-        lambda x: polynomial(x, rate_hz, window, degree), len(position), window // 2
-    )
+    window = _window(position, rate_hz, cutoff_hz)
+    results = polynomial(position, rate_hz, window)
+    gains = linear_noise_gains(lambda x: polynomial(x, rate_hz, window), len(position), window // 2)
     return Derivatives(*results, *(noise_sd * gain for gain in gains))
 
 
-def _window(signal: Array, rate_hz: float, cutoff_hz: float, degree: int) -> int:
+def _window(signal: Array, rate_hz: float, cutoff_hz: float) -> int:
     longest = len(signal) - (len(signal) + 1) % 2
-    return min(window_length(cutoff_hz, rate_hz, degree), longest)
+    return min(window_length(cutoff_hz, rate_hz), longest)

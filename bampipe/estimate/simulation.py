@@ -14,22 +14,24 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import boolean, float64, int64, void
-from numpy.typing import NDArray
+from numba import float64, int64, void
 from scipy.interpolate import CubicSpline
 
+from bampipe.arrays import Array, Indices
 from bampipe.compiled import njit, record_type
 from bampipe.errors import InputError
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.triangular import cholesky, forward_substitute
 from bampipe.model_functions import DERIVATIVE
 
-Array = NDArray[np.float64]
-
 _V = float64[::1]
 _M = float64[:, ::1]
 _I = int64[::1]
 _MOST_STEPS = 4000
+MAX_STEP_S = 2.5e-4
+"""Longest integration step by default."""
+_BRAKES_S = 0.01
+"""Over which a controller of brakes averages the speed."""
 _WIDEST_GRID_S = 1e-3
 """Longest time over which a continuous force may run straight: at a hundred samples a second, a
 straight line takes 3 % off what acts at 10 Hz, and at a thousand 0.03 %."""
@@ -81,22 +83,21 @@ class _Arm(NamedTuple):
         at, moving: (n,) places in the state of what it moves by each coordinate, and of its rate.
     """
 
-    at: NDArray[np.int64]
-    moving: NDArray[np.int64]
-    force: NDArray[np.int64]
-    rate: NDArray[np.int64]
-    curvature: NDArray[np.int64]
+    at: Indices
+    moving: Indices
+    force: Indices
+    rate: Indices
+    curvature: Indices
     natural_frequency: float
     damping_ratio: float
     bandwidth: float
 
 
 class _Brakes(NamedTuple):
-    """Columns with the commands, gain (T, n_q) and the time over which the speed is averaged, s."""
+    """Columns with the commands, and gain (T, n_q)."""
 
-    columns: NDArray[np.int64]
+    columns: Indices
     gain: Array
-    time: float
 
 
 class _Workspace(NamedTuple):
@@ -208,12 +209,11 @@ def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, work):  # type: ign
 
 @njit(
     void(
-        DERIVATIVE, _M, _M, PLANT, _ARM, record_type(_Brakes, _I, _M, float64), _M, _M, float64,
-        boolean, _WORKSPACE,
+        DERIVATIVE, _M, _M, PLANT, _ARM, record_type(_Brakes, _I, _M), _M, _M, float64, _WORKSPACE,
     ),
     cache=True,
 )  # fmt: skip
-def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt, hold, work):  # type: ignore[no-untyped-def]
+def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt, work):  # type: ignore[no-untyped-def]
     """Fill the rows of ``x`` after the first and add arm force and brake commands to ``u``.
 
     Without columns of force there is no arm, and ``q_ref``, ``qd_ref`` are not read.
@@ -223,7 +223,7 @@ def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt, hold, work):  
     brake, brake_gain, steps = brakes.columns, brakes.gain, work.steps
     n, nf = plant.width.shape[0], force.shape[0]
     fade = np.exp(-bandwidth * dt)
-    follow = 1.0 - np.exp(-dt / brakes.time)
+    follow = 1.0 - np.exp(-dt / _BRAKES_S)
     for k in range(x.shape[0] - 1):
         if nf > 0:
             _solve_goal(derivative, x[k], u[k], plant, arm, q_ref[k], qd_ref[k], work)
@@ -244,11 +244,11 @@ def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt, hold, work):  
         for i in range(x.shape[1]):
             x[k + 1, i] = x[k, i]
         count = stable_steps(derivative, x[k], u[k], plant, dt, steps)
-        end = u[k] if hold else u[k + 1]
         straight = steps[8, : u.shape[1]]
         runge_kutta(
-            derivative, x[k + 1], u[k], end, straight, straight, plant.p, plant.w, dt, count, steps
-        )
+            derivative, x[k + 1], u[k], u[k + 1], straight, straight, plant.p, plant.w, dt, count,
+            steps,
+        )  # fmt: skip
 
 
 def simulate(
@@ -260,9 +260,8 @@ def simulate(
     *,
     width: Array,
     n_noise: int,
-    hold: bool = False,
     smooth: Sequence[int] = (),
-    max_step: float = 2.5e-4,
+    max_step: float = MAX_STEP_S,
 ) -> Array:
     """Integrate the model from ``x0`` under given inputs, without process noise.
 
@@ -274,7 +273,6 @@ def simulate(
         dt: sampling interval, s.
         width: (n_q,) velocity over which friction changes sign, rad/s or m/s.
         n_noise: length of the model's process noise w.
-        hold: keep each input constant over its interval instead.
         smooth: columns of ``u`` that follow a cubic spline between samples, as forces do.
         max_step: longest integration step, s.
 
@@ -286,7 +284,7 @@ def simulate(
     """
     nobody = np.zeros((0, 0))
     return simulate_tracking(
-        derivative, x0, u, p, dt, nobody, nobody, width=width, n_noise=n_noise, force=(), hold=hold,
+        derivative, x0, u, p, dt, nobody, nobody, width=width, n_noise=n_noise, force=(),
         smooth=smooth, max_step=max_step,
     )[0]  # fmt: skip
 
@@ -308,11 +306,9 @@ def simulate_tracking(
     impedance: Impedance | None = None,
     brake: Sequence[int] = (),
     brake_gain: Array | None = None,
-    brake_time: float = 0.01,
     smooth: Sequence[int] = (),
-    max_step: float = 2.5e-4,
-    moved_first: NDArray[np.int64] | None = None,
-    hold: bool = False,
+    max_step: float = MAX_STEP_S,
+    moved_first: Indices | None = None,
 ) -> tuple[Array, Array]:
     """Integrate the model under given inputs plus an arm that holds it near a given motion.
 
@@ -321,7 +317,7 @@ def simulate_tracking(
     the returned inputs, so these with the returned motion are one consistent recording.
 
     Args:
-        derivative, x0, p, dt, width, n_noise, smooth, max_step, hold: as in `simulate`.
+        derivative, x0, p, dt, width, n_noise, smooth, max_step: as in `simulate`.
         u: (T, nu) inputs without the arm's share; copied.
         q_ref, qd_ref: (T, n_q) motion that the arm wants.
         force: columns of ``u`` with the handle force, N. They may be fewer than coordinates; the
@@ -332,7 +328,7 @@ def simulate_tracking(
         impedance: of the arm; by default 12 rad/s, critically damped.
         brake: columns with the brake command of each coordinate, in their order, or none.
         brake_gain: (T, n_q) damping that the brakes render: each command is this times the
-            speed, low-passed over ``brake_time`` (s) as a controller sees it. N.m.s/rad or N.s/m.
+            speed, low-passed as a controller sees it. N.m.s/rad or N.s/m.
         moved_first: (n_q, 2) places in the state of the positions that the arm leads along
             ``q_ref``, and of their rates; by default those of the coordinates.
 
@@ -364,9 +360,9 @@ def simulate_tracking(
             np.array(curvature, dtype=np.int64),
             arm.natural_frequency, arm.damping_ratio, arm.bandwidth,
         ),
-        _Brakes(np.array(brake[: gain.shape[1]], dtype=np.int64), gain, brake_time),
+        _Brakes(np.array(brake[: gain.shape[1]], dtype=np.int64), gain),
         np.array(q_ref, dtype=np.float64, order="C"),  # a copy: columns of a table are read-only
-        np.array(qd_ref, dtype=np.float64, order="C"), dt, hold,
+        np.array(qd_ref, dtype=np.float64, order="C"), dt,
         _Workspace(
             np.zeros((9, max(len(x0), total.shape[1]))),
             np.empty((n, nf)), np.empty((nf, nf)), np.zeros((nf, nf)),
@@ -407,7 +403,7 @@ def count_steps(
     *,
     width: Array,
     n_noise: int,
-    max_step: float = 2.5e-4,
+    max_step: float = MAX_STEP_S,
 ) -> float:
     """Steps that the integration takes from one sample to the next, on average over some states.
 

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array, Flags
 
 LOWEST_LINE = 0.1
 """Cycles a sample from which on a sine counts: below, differences take it out themselves."""
@@ -163,7 +162,7 @@ def _is_uniform(t: Array) -> bool:
     return float(np.ptp(steps)) < _UNEVEN * float(np.mean(steps))
 
 
-def _second_differences(record: Array, lag: int) -> tuple[Array, NDArray[np.bool_]]:
+def _second_differences(record: Array, lag: int) -> tuple[Array, Flags]:
     """Of a record (T,), and which are no jump of the signal, as where friction turns over."""
     wanted = record[2 * lag :] - 2.0 * record[lag:-lag] + record[: -2 * lag]
     return wanted, np.abs(wanted) <= _JUMP * float(np.median(np.abs(wanted)))

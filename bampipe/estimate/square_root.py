@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import float64, int64, types
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.compiled import njit, record_type
 from bampipe.estimate.propagation import (
     ESTIMATED,
@@ -30,12 +30,9 @@ from bampipe.estimate.triangular import (
 )
 from bampipe.model_functions import DERIVATIVE_ROWS, MEASURE_ROWS
 
-Array = NDArray[np.float64]
-
 DONE = 0
 NOT_FINITE = 1
-STATE_NOT_POSITIVE = 2
-INNOVATION_NOT_POSITIVE = 3
+INNOVATION_NOT_POSITIVE = 2
 
 _V = float64[::1]
 _M = float64[:, ::1]
@@ -63,7 +60,7 @@ class Levels(NamedTuple):
         walk_sd: (nt,) random walk of the parameters, per square root of a second.
         reading_sd: (ny,) of the measurement noise, additive.
         spread: squared distance of the sigma points, in variances.
-        centre, other: weight of the central point and of each other one in a covariance.
+        other: weight of each point but the central one, which has none, in a covariance.
         longest_step: of the Runge-Kutta method, s.
         stride: of the stored distributions, samples.
     """
@@ -72,7 +69,6 @@ class Levels(NamedTuple):
     walk_sd: Array
     reading_sd: Array
     spread: float
-    centre: float
     other: float
     longest_step: float
     stride: int
@@ -145,7 +141,7 @@ def allocate(n: int, nx: int, nu: int, ny: int, nw: int, p: Array) -> Workspace:
         DERIVATIVE_ROWS,
         MEASURE_ROWS,
         ESTIMATED,
-        record_type(Levels, _V, _V, _V, float64, float64, float64, float64, int64),
+        record_type(Levels, _V, _V, _V, float64, float64, float64, int64),
         record_type(Samples, _V, _M, _M, _M),
         _V,
         _M,
@@ -181,7 +177,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     nx, observed = estimated.n_states, estimated.observed
     lower, upper = estimated.lower, estimated.upper
     process_sd, walk_sd, reading_sd = levels.process_sd, levels.walk_sd, levels.reading_sd
-    centre, other, stride = levels.centre, levels.other, levels.stride
+    other, stride = levels.other, levels.stride
     means, covariances, innovations, innovation_sd, squares, likelihoods = out
     images, readings, root, columns, reading_columns, noise, cross, gain = work[:8]
     cosine, sine, single, whitened, points = work[8:]
@@ -194,7 +190,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     pairs = n + nw
     # root is R = L^T, so that what is rotated together is contiguous
     wide = root.shape[1]
-    centre_image = centre + 2 * nw * other
+    centre_image = 2 * nw * other
     log_normal = 0.5 * ny * np.log(2.0 * np.pi)
     for i in range(n):
         for j in range(n):
@@ -223,7 +219,6 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                 )
             for pair in range(n, pairs):
                 columns[i, pairs + pair - n] = half * (images[i, pair] - images[i, pairs + pair])
-            single[i] = abs(centre) ** 0.5 * (middle - mean[i])
             for j in range(n):
                 root[i, j] = 0.0
         append_rows(root, nx, columns, columns.shape[1])
@@ -237,13 +232,10 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                     else (factor[i, pair] if pair <= i else 0.0)
                 )
         for i in range(nx, n):
-            single[i] = 0.0
             for j in range(n):
                 root[i, j] = walk_sd[i - nx] * dt**0.5 if i == j else 0.0
         # Columns of the state first; then the parameters' rows start from their random walk.
         append_rows(root, n, columns, wide)
-        if centre != 0.0 and not rank_one_update(root, n, 1.0 if centre > 0.0 else -1.0, single):
-            return STATE_NOT_POSITIVE, k
         missing = False
         for i in range(ny):
             missing = missing or np.isnan(y[k, i])
@@ -270,10 +262,9 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                     cross[i, pair] = half * (readings[i, pair] - readings[i, n + pair])
                 for j in range(ny):
                     noise[i, j] = reading_sd[i] if i == j else 0.0
-                single[i] = abs(centre_image) ** 0.5 * (middle - predicted)
+                single[i] = centre_image**0.5 * (middle - predicted)
             append_rows(noise, ny, reading_columns, wide)
-            if not rank_one_update(noise, ny, 1.0 if centre_image >= 0.0 else -1.0, single):
-                return INNOVATION_NOT_POSITIVE, k
+            rank_one_update(noise, ny, single)
             for i in range(ny):
                 for j in range(i):
                     noise[i, j] = noise[j, i]

@@ -6,11 +6,9 @@ At standstill Coulomb friction is whatever balances the load, and the sign of th
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.estimate.low_pass import Band
-
-Array = NDArray[np.float64]
 
 REST_S = 0.03
 """A rest is longer than this, s, beyond what a change of direction takes by itself."""
@@ -24,9 +22,7 @@ _REACH = 0.02
 """Share that a rest may have in a low-passed sample before the sample is left out."""
 
 
-def find_standstill(
-    qd: Array, qd_sd: Array, rate_hz: float, braked: NDArray[np.bool_] | None = None
-) -> NDArray[np.bool_]:
+def find_standstill(qd: Array, qd_sd: Array, rate_hz: float, braked: Flags | None = None) -> Flags:
     """Tell where an axis stands still.
 
     An axis rests where its velocity stays within five of its standard deviations, where its sign
@@ -55,7 +51,7 @@ def find_standstill(
     return still
 
 
-def find_turns(qd: Array, rate_hz: float) -> NDArray[np.bool_]:
+def find_turns(qd: Array, rate_hz: float) -> Flags:
     """Tell where an axis turns round: within `REST_S` of a change of the velocity's sign.
 
     Args:
@@ -71,7 +67,7 @@ def find_turns(qd: Array, rate_hz: float) -> NDArray[np.bool_]:
     return turns
 
 
-def find_runs(chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def find_runs(chosen: Flags) -> list[tuple[int, int]]:
     """First sample and the one after the last of every run of chosen samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
@@ -108,7 +104,7 @@ def _turning(v: Array, limit: Array, start: int, end: int) -> float:
     return 4.0 * slow * length / max(outside, 1e-30)
 
 
-def find_moving_samples(rest: NDArray[np.bool_], band: Band) -> NDArray[np.bool_]:
+def find_moving_samples(rest: Flags, band: Band) -> Flags:
     """Tell which low-passed, thinned samples no rest reaches into.
 
     Args:

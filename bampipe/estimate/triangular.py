@@ -164,39 +164,32 @@ def forward_substitute(factor, n, vector):  # type: ignore[no-untyped-def]
         vector[i] = total / factor[i, i]
 
 
-@njit(boolean(float64[:, ::1], int64, float64, float64[::1]), cache=True)
-def rank_one_update(upper, n, sign, vector):  # type: ignore[no-untyped-def]
-    """Replace R by the factor of R^T R + sign vector vector^T; ``vector`` (n,) is destroyed.
+@njit(void(float64[:, ::1], int64, float64[::1]), cache=True)
+def rank_one_update(upper, n, vector):  # type: ignore[no-untyped-def]
+    """Replace R by the factor of R^T R + vector vector^T; ``vector`` (>= n,) is destroyed.
 
     Args:
         upper: (>= n, >= n) R, upper triangular; its leading (n, n) block is replaced.
-        n: size; sign: 1 or -1; vector: (>= n,).
-
-    Returns:
-        Whether the result is positive definite (always for ``sign`` = 1).
+        n: size; vector: (>= n,).
     """
     for k in range(n):
-        diagonal = upper[k, k]
-        square = diagonal * diagonal + sign * vector[k] * vector[k]
         if vector[k] == 0.0:
             continue
-        if not square > 0.0:
-            return False
-        updated = square**0.5
+        diagonal = upper[k, k]
+        updated = (diagonal * diagonal + vector[k] * vector[k]) ** 0.5
         if diagonal == 0.0:
             # Sigma points leave the centre behind along a direction of no spread.
             upper[k, k] = updated
             for i in range(k + 1, n):
-                upper[k, i] = sign * vector[i] * vector[k] / updated
+                upper[k, i] = vector[i] * vector[k] / updated
                 vector[i] = 0.0
             continue
         cosine = updated / diagonal
         sine = vector[k] / diagonal
         upper[k, k] = updated
         for i in range(k + 1, n):
-            upper[k, i] = (upper[k, i] + sign * sine * vector[i]) / cosine
+            upper[k, i] = (upper[k, i] + sine * vector[i]) / cosine
             vector[i] = cosine * vector[i] - sine * upper[k, i]
-    return True
 
 
 @njit(void(float64[:, ::1], float64[:, ::1]), cache=True)

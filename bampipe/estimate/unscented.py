@@ -17,20 +17,19 @@ bounds are kept all along, by clamping sigma points and mean.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.estimate.propagation import Estimated
-from bampipe.estimate.sigma_points import SigmaPoints
 from bampipe.estimate.square_root import (
     DONE,
     INNOVATION_NOT_POSITIVE,
     NOT_FINITE,
-    STATE_NOT_POSITIVE,
     Levels,
     Output,
     Samples,
@@ -38,15 +37,14 @@ from bampipe.estimate.square_root import (
     filter_square_root,
 )
 
-Array = NDArray[np.float64]
-
 _REASONS = {
     NOT_FINITE: "the predicted motion grew without bound",
-    STATE_NOT_POSITIVE: "the covariance of the state lost positive definiteness",
     INNOVATION_NOT_POSITIVE: "the covariance of the innovation lost positive definiteness",
 }
-
-
+ALPHA = (2.0 - 3.0**0.5) ** 0.5
+"""Spread of the scaled sigma points (Van der Merwe 2004, with beta = 2 and kappa = 0): the smallest
+that makes no weight in a covariance negative. That of the central point is zero with it, so that a
+covariance is a sum of positive terms; with the usual 1e-3, rounding alone costs nine digits."""
 _NOT_A_SPREAD = (
     "the spread of the parameters is not positive definite any more: priors far too wide, or"
     " parameters that cannot be distinguished"
@@ -72,11 +70,8 @@ class FilterModel:
     """What the filter must know of a model.
 
     Attributes:
-        derivative: compiled f(x, u, p, w, dx), of type ``signatures.DERIVATIVE``.
-        measure: compiled h(x, u, p, y), of type ``signatures.MEASURE``.
-        derivative_rows, measure_rows: the same of many states at once, of types
-            ``signatures.DERIVATIVE_ROWS`` and ``signatures.MEASURE_ROWS``: what the compiled
-            filter calls, with all its sigma points.
+        functions: with the compiled functions ``derivative_rows`` and ``measure_rows``, of the
+            kinds in `bampipe.model_functions`; for filterpy also ``derivative`` and ``measure``.
         n_states: length of x.
         parameters: (np + 1,) values of all parameters, then the timing of the inputs: the time
             by which they were sampled after the positions, s. Channels of one sample are never
@@ -89,19 +84,16 @@ class FilterModel:
             not, the filter need not work them out twice a step.
     """
 
-    derivative: Callable[..., Any]
-    measure: Callable[..., Any]
-    derivative_rows: Callable[..., Any]
-    measure_rows: Callable[..., Any]
+    functions: Any
     n_states: int
     parameters: Array
-    free: NDArray[np.int64]
+    free: Indices
     lower: Array
     upper: Array
     reads_parameters: bool = True
 
     @cached_property
-    def logarithmic(self) -> NDArray[np.bool_]:
+    def logarithmic(self) -> Flags:
         """(nt,) which parameters are estimated as logarithms."""
         return np.asarray(self.lower > 0.0)
 
@@ -152,16 +144,14 @@ class FilterSettings:
         reading_sd: (ny,) standard deviation of the measurement noise.
         noise_sd: (nw,) standard deviation of the process noise of one sample.
         walk_sd: (nt,) random walk of the parameters, per square root of a second.
-        points: spread and weights of the sigma points.
         longest_step: longest Runge-Kutta step, s.
         stride: store the distribution of every so many samples.
     """
 
-    observed: NDArray[np.int64]
+    observed: Indices
     reading_sd: Array
     noise_sd: Array
     walk_sd: Array
-    points: SigmaPoints = field(default_factory=SigmaPoints)
     longest_step: float = 1e-3
     stride: int = 1
 
@@ -265,17 +255,13 @@ def filter_trials(
         FilterFailure: the covariance lost positive definiteness or a number is not finite.
     """
     nx = model.n_states
-    n = nx + model.free.size
 
     def filter_one(
         index: int, trial: Trial, theta: Array, covariance: Array
     ) -> tuple[FilteredTrial, Array, Array]:
         mean = np.concatenate([trial.x, theta])
-        joint = np.zeros((n, n))
-        joint[:nx, :nx] = np.diag(np.square(trial.x_sd))
-        joint[nx:, nx:] = covariance
         try:
-            root = lower_root(joint)
+            root = join_roots(trial.x_sd, covariance)
             filtered = run_kernel(model, settings, trial, mean, root, settings.stride)
         except FilterFailure as failure:
             raise FilterFailure(index, failure.sample, failure.reason) from None
@@ -340,15 +326,15 @@ def run_kernel(
         _array(model.logarithmic, np.bool_), *model.range, _array(settings.observed, np.int64),
         model.reads_parameters,
     )  # fmt: skip
-    spread, _, centre, other = settings.points.weights(n + nw)
+    spread = ALPHA**2 * (n + nw)
     levels = Levels(
         _array(settings.noise_sd), _array(settings.walk_sd), _array(settings.reading_sd),
-        spread, centre, other, float(settings.longest_step), int(stride),
+        spread, 0.5 / spread, float(settings.longest_step), int(stride),
     )  # fmt: skip
     samples = Samples(*map(_array, (trial.t, trial.u, trial.input_curvature, trial.y)))
     ended, sample = filter_square_root(
-        model.derivative_rows, model.measure_rows, estimated, levels, samples, mean, root, out,
-        allocate(n, model.n_states, trial.u.shape[1], ny, nw, p),
+        model.functions.derivative_rows, model.functions.measure_rows, estimated, levels, samples,
+        mean, root, out, allocate(n, model.n_states, trial.u.shape[1], ny, nw, p),
     )  # fmt: skip
     if ended != DONE:
         raise FilterFailure(0, sample, _REASONS[ended])
@@ -374,11 +360,8 @@ def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
             break
         held |= outside
         shift = np.clip(theta, lower, upper)[held] - theta[held]
-        value = (
-            theta
-            + covariance[:, held]
-            @ np.linalg.lstsq(covariance[np.ix_(held, held)], shift, rcond=None)[0]
-        )
+        pull = np.linalg.lstsq(covariance[np.ix_(held, held)], shift, rcond=None)[0]
+        value = theta + covariance[:, held] @ pull
         value[held] = np.clip(theta, lower, upper)[held]
     return np.asarray(value)
 
@@ -388,22 +371,25 @@ def _array(values: Any, kind: type = np.float64) -> NDArray[Any]:
     return np.require(values, dtype=kind, requirements=["C", "W"])
 
 
-def lower_root(covariance: Array) -> Array:
-    """Return the lower L with L L^T = covariance (n, n); zero variances give zero columns.
+def join_roots(x_sd: Array, covariance: Array) -> Array:
+    """Lower root (n, n) of the covariance of a state and of parameters that are independent of it.
 
-    Rounding may leave a covariance of nearly dependent variables a little short of definite: then
-    a part in 10^12 is added to each variance.
+    Zero variances give zero columns. Rounding may leave a covariance of nearly dependent variables
+    a little short of definite: then a part in 10^12 is added to each variance.
+
+    Args:
+        x_sd: (nx,) standard deviations of the state; covariance: (nt, nt) of the parameters.
 
     Raises:
         ValueError: the matrix is not positive semidefinite.
     """
-    known = np.diag(covariance) == 0.0
-    root = np.zeros_like(covariance)
-    keep = np.flatnonzero(~known)
-    part = covariance[np.ix_(keep, keep)]
+    nx, n = x_sd.size, x_sd.size + len(covariance)
+    joint, root = np.zeros((2, n, n))
+    joint[:nx, :nx], joint[nx:, nx:] = np.diag(np.square(x_sd)), covariance
+    keep = np.ix_(*2 * [np.flatnonzero(np.diag(joint))])
     for added in (0.0, 1e-12):
         try:
-            root[np.ix_(keep, keep)] = np.linalg.cholesky(part + added * np.diag(np.diag(part)))
+            root[keep] = np.linalg.cholesky(joint[keep] + added * np.diag(np.diag(joint[keep])))
         except np.linalg.LinAlgError:
             continue
         return root

@@ -10,11 +10,9 @@ to nothing at the frequencies of the motion. It is fitted and taken off first.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.spectral_lines import LOWEST_LINE, find_lines
-
-Array = NDArray[np.float64]
 
 _LOWEST_ORDER, _HIGHEST_ORDER = 2, 6
 _SLOWEST_HZ = 100.0

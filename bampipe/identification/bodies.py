@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Indices
 from bampipe.estimate.bounded import invert_scaled
 from bampipe.estimate.possible_bodies import is_possible, nearest_possible
 from bampipe.identification.least_squares_estimate import SquaresFit
@@ -17,24 +17,15 @@ from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.robot import Robot
 from bampipe.results.identify import BaseEstimate
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
 _SHOWN = 0.5
 """Share of the drawing's uncertainty below which the trials are said to show a combination."""
 
 
 def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list[str]]:
-    """Return the fit with inertial numbers that some body can have, the nearest to its own.
+    """The fit with inertial numbers that some body can have, the nearest; and what to tell of it.
 
     Nearest is what explains the trials and the drawing least badly: the normal equations of the
     fit weigh, and what is no inertial number follows.
-
-    Args:
-        system: the model; squares: its fit.
-
-    Returns:
-        The fit, the same where its numbers are possible; and what to tell of it.
     """
     robot = system.model.device.robot
     if robot is None:
@@ -45,18 +36,15 @@ def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list
     wrong = [name for name, body in zip(names, value, strict=True) if not is_possible(body)]
     if not wrong:
         return squares, []
-    weight, follow = _weight(squares, robot, places)
+    weight, others, slope = _weight(squares, robot, places)
     drawn = np.array([joint.inertial for joint in robot.joints])
     found = nearest_possible(value, weight, drawn)
-    p = squares.p.copy()
+    p, problem = squares.p.copy(), squares.problem
     p[places] = found.ravel()
-    others, slope = follow
     p[others] += slope @ (found - value).ravel()
-    free = squares.free
-    inside = np.isin(free, others)
-    p[free[inside]] = np.clip(
-        p[free[inside]], squares.problem.lower[inside], squares.problem.upper[inside]
-    )
+    inside = np.isin(squares.free, others)
+    moved = squares.free[inside]
+    p[moved] = np.clip(p[moved], problem.lower[inside], problem.upper[inside])
     note = (
         f"No body has the inertial numbers that fit {join_names(wrong)} best: the nearest possible"
         " ones are given."
@@ -64,9 +52,7 @@ def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list
     return replace(squares, p=p), [note]
 
 
-def _weight(
-    squares: SquaresFit, robot: Robot, places: Indices
-) -> tuple[Array, tuple[Indices, Array]]:
+def _weight(squares: SquaresFit, robot: Robot, places: Indices) -> tuple[Array, Indices, Array]:
     """Weight of a change of the inertial numbers, all others refitted, and how these follow.
 
     Returns:
@@ -87,15 +73,14 @@ def _weight(
     slope = np.zeros((len(free), len(places)))
     slope[:, own] = follow[: len(free)]
     weight[np.ix_(own, own)] = 0.5 * (block + block.T)
-    return weight, (squares.free[free], slope)
+    return weight, squares.free[free], slope
 
 
 def base_estimates(system: System, p: Array, covariance: Array) -> tuple[BaseEstimate, ...] | None:
-    """Return the combinations that motion can show, with what the trials add to the drawing.
+    """The combinations that motion can show, with what the trials add to the drawing.
 
     Args:
-        system: the model; p: (>= n_p,) its parameters.
-        covariance: of those estimated, in order.
+        p: (>= n_p,) parameters of the model; covariance: of those estimated, in order.
     """
     robot = system.model.device.robot
     if robot is None:

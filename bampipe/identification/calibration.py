@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.identification.estimates import Estimate
 from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.physics import System, compile_model
@@ -18,16 +18,8 @@ from bampipe.results.ingest import IngestResult
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import ZERO_OF, Signals, calibration_changes
 
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class _Source:
-    """A model and a motion as one standard uncertainty of something makes them."""
-
-    name: str
-    system: System
-    change: Callable[[Motion], Motion]
+_Source = tuple[str, System, Callable[[Motion], Motion]]
+"""Name of what is uncertain; model and motion as one standard uncertainty of it makes them."""
 
 
 def propagate_calibration(
@@ -45,26 +37,25 @@ def propagate_calibration(
     100:2008, 5.1), whichever method made it; one at its bound stays.
 
     Args:
-        system: the model; recipe: the same as data; session: as ingested.
         motions: that were fitted, with every input of the device; squares: the fit to them.
     """
     count = int(np.sum(squares.free < len(system.parameters)))
     held = [int(k) for k in np.flatnonzero(squares.at_bound)]
     found = {}
-    for source in _sources(system, recipe, session):
-        changed = [_residual(source, motion, squares) for motion in motions]
-        found[source.name] = squares.respond(squares.residual_change(changed), held)[:count]
+    for name, theirs, change in _sources(system, recipe, session):
+        changed = [_residual(theirs, change(motion), squares) for motion in motions]
+        found[name] = squares.respond(squares.residual_change(changed), held)[:count]
     return found
 
 
-def _residual(source: _Source, motion: Motion, squares: SquaresFit) -> Array:
+def _residual(system: System, motion: Motion, squares: SquaresFit) -> Array:
     """Residual (T, n_q) of a trial, of functions that are not compiled: they serve once."""
     p = squares.fit.evidence.p
-    timed = source.change(motion).with_input_timing(squares.trials.late_s)
-    u = timed.inputs(source.system.inputs)
-    at = timed.of_mechanism(source.system, u, p).kinematics
-    z = source.system.memory(*at, u, p, timed.t)
-    return source.system.applied(*at, z, u, p) - source.system.required(*at, z, u, p)
+    timed = motion.with_input_timing(squares.trials.late_s)
+    u = timed.inputs(system.inputs)
+    at = timed.of_mechanism(system, u, p).kinematics
+    z = system.memory(*at, u, p, timed.t)
+    return system.applied(*at, z, u, p) - system.required(*at, z, u, p)
 
 
 def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate:
@@ -85,13 +76,13 @@ def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate
 def _sources(system: System, recipe: Recipe, session: IngestResult) -> Iterator[_Source]:
     signals = Signals.of_session(system, session)
     for name, change in calibration_changes(signals):
-        yield _Source(name, system, partial(change.of_motion, signals=signals))
+        yield name, system, partial(change.of_motion, signals=signals)
     for name, constant in system.model.device.constants.items():
         if constant.sd and name in recipe.device.get("constants", {}):
             declaration = deepcopy(dict(recipe.device))
             declaration["constants"][name]["value"] = constant.value + constant.sd
             changed = compile_model(replace(recipe, device=declaration).model())
-            yield _Source(name, changed, lambda motion: motion)
+            yield name, changed, lambda motion: motion
 
 
 def describe_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> tuple[str, ...]:
@@ -100,14 +91,9 @@ def describe_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> tupl
         return (
             "No uncertainty of gains, scales and constants is stated: the intervals hold none.",
         )
-    sd = estimate.sd
-    shares = {
-        name: float(np.max(np.abs(step) / np.maximum(sd, np.finfo(float).tiny)))
-        for name, step in moved.items()
-    }
-    largest = max(shares, key=lambda name: shares[name])
-    sentence = (
+    sd = np.maximum(estimate.sd, np.finfo(float).tiny)
+    largest = max(moved, key=lambda name: float(np.max(np.abs(moved[name]) / sd)))
+    return (
         f"The uncertainty of the calibration is in the intervals ({len(moved)} sources); most of it"
-        f" comes from {largest}."
+        f" comes from {largest}.",
     )
-    return (sentence,)

@@ -20,9 +20,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from bampipe.arrays import Array
 from bampipe.identification.estimates import Estimate
 from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.lists import join_names
@@ -32,8 +32,6 @@ from bampipe.results.identify import Method, MethodTried, MethodValue
 from bampipe.results.rounding import round_with_sd, significant
 from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.replay import steps_to_follow
-
-Array = NDArray[np.float64]
 
 MOST_EVALUATIONS = 2e7
 """Of the model by all sigma points along all trials: some five seconds for each pass."""
@@ -63,12 +61,10 @@ def find_objections(system: System, by_filter: Estimate, by_squares: Estimate) -
     far = apart > chance * np.hypot(by_filter.sd, by_squares.sd)
     found = [*by_filter.doubts]
     if far.any():
+        triples = zip(by_filter.free[far], by_filter.value[far], by_filter.sd[far], strict=True)
         shown = [
             f"`{system.parameters[place].name}` at {round_with_sd(value, sd)}"
-            for place, value, sd, is_far in zip(
-                by_filter.free, by_filter.value, by_filter.sd, far, strict=True
-            )
-            if is_far
+            for place, value, sd in triples
         ]
         found.append(f"the latter puts {join_names(shown, _SHOWN)}, farther away than by chance")
     least = np.finfo(float).tiny
@@ -83,10 +79,9 @@ def find_objections(system: System, by_filter: Estimate, by_squares: Estimate) -
 def tabulate_methods(
     system: System, squares: SquaresFit, published: Estimate, others: Sequence[Estimate], lost: str
 ) -> dict[Method, MethodTried]:
-    """Return what identify.json says of each method, the published one first.
+    """What identify.json says of each method, the published one first.
 
-    Args:
-        lost: why there is no estimate of the filter, "" where there is one or none was sought.
+    ``lost`` says why there is no estimate of the filter, "" where there is one or none was sought.
     """
     found: dict[Method, MethodTried] = {}
     for each in (published, *others):

@@ -12,15 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.estimate.simulation import Runaway, simulate
 from bampipe.physics import System
 from bampipe.results.validate import AxisDrift, Drift
 from bampipe.trials.motion import Motion
 from bampipe.trials.replay import is_stiff
-
-Array = NDArray[np.float64]
 
 HORIZONS_S = (0.1, 0.5, 2.0)
 """A reversal, a movement, several movements of a hand."""
@@ -61,13 +59,8 @@ class _Window:
     state: Array | None
 
 
-@dataclass(frozen=True)
-class _Reach:
-    """A window at one horizon: error (infinite if run away), displacement, is it a move: (n_q,)."""
-
-    error: Array
-    displacement: Array
-    moves: NDArray[np.bool_]
+_Reach = tuple[Array, Array, Flags]
+"""A window at one horizon: error, infinite if run away, displacement, is it a move, (n_q,) each."""
 
 
 def find_drift(
@@ -76,8 +69,6 @@ def find_drift(
     """Run the model from many starts of every trial and say how far it drifts.
 
     Args:
-        system: the model.
-        motions: the trials.
         parameters: for each trial, (>= n_p,) parameters that have not seen it.
         judged: which trials count; all where none does.
 
@@ -158,17 +149,17 @@ def _advance(system: System, window: _Window, horizon: float) -> _Reach | None:
         system.measure(window.state, window.u[end], window.p, reading)
         error = np.abs(reading[: error.size] - measured[-1])
     moves = np.ptp(measured, axis=0) > _MOVES * np.ptp(motion.q, axis=0)
-    return _Reach(error, np.abs(measured[-1] - measured[0]), moves)
+    return error, np.abs(measured[-1] - measured[0]), moves
 
 
 def _simulate(system: System, window: _Window, state: Array, end: int) -> Array | None:
     """Return the state (nx,) at sample ``end``, from ``state`` on; None if it runs away."""
-    width = np.array([c.sign_width for c in system.model.device.coordinates])
     for step in _STEPS_S:
         with contextlib.suppress(Runaway):
             path = simulate(
                 system.derivative, state, window.u[window.at : end + 1], window.p, window.dt,
-                width=width, n_noise=len(system.noise), smooth=system.forced, max_step=step,
+                width=system.sign_widths, n_noise=len(system.noise), smooth=system.forced,
+                max_step=step,
             )  # fmt: skip
             return np.asarray(path[-1])
     return None
@@ -178,21 +169,18 @@ def _drift(
     reached: Sequence[_Reach], axis: int, horizon: float, shorter: AxisDrift
 ) -> dict[str, object]:
     """Return what a horizon, s, adds to what shorter ones say of one axis, or why it is absent."""
-    used = [r for r in reached if r.moves[axis]]
-    error = np.array([r.error[axis] for r in used])
+    used = [(error[axis], way[axis]) for error, way, moves in reached if moves[axis]]
+    error = np.array([error for error, _ in used])
     if len(used) < _LEAST:
         return {"reason": f"In {len(used)} windows of {horizon:g} s the axis moves: too few."}
     if np.mean(np.isinf(error)) > _RUNS_AWAY:
         return {"reason": f"Within {horizon:g} s the simulated motion runs away."}
     median, most = np.quantile(error, [0.5, 0.9], method="inverted_cdf")
-    displacement = float(np.median([r.displacement[axis] for r in used]))
+    displacement = float(np.median([way for _, way in used]))
     if median > displacement or not np.isfinite(most):
         return {"reason": f"In {horizon:g} s the model drifts further than the axis moves."}
     drift = Drift(
-        horizon_s=horizon,
-        median=median,
-        quantile_90=most,
-        displacement=displacement,
+        horizon_s=horizon, median=median, quantile_90=most, displacement=displacement,
         windows=len(used),
-    )
+    )  # fmt: skip
     return {"horizons": (*shorter.horizons, drift)}

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.estimate.influence import RemovedStretch
 from bampipe.estimate.least_squares import Problem
-from bampipe.identification.filter_tables import as_filtered
 from bampipe.phrases.results import TIMING_AT_LIMIT, describe_unidentified
 from bampipe.physics import System
 from bampipe.physics.effect import BoundEffect
@@ -29,9 +28,6 @@ from bampipe.results.identify import (
 )
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd
-from bampipe.trials.motion import Motion
-
-Array = NDArray[np.float64]
 
 MOST_SHOWN = 24
 """Parameters that a headline lists."""
@@ -64,7 +60,7 @@ class Estimate:
     p: Array
     problem: Problem
     covariance: Array
-    at_bound: NDArray[np.bool_]
+    at_bound: Flags
     held_out: Sequence[Array]
     details: Sequence[dict[str, float]]
     report: dict[str, Any]
@@ -78,7 +74,7 @@ class Estimate:
         return {key: self.report[key] for key in ("nis", "innovations", "noise")}
 
     @property
-    def free(self) -> NDArray[np.int64]:
+    def free(self) -> Indices:
         """(n,) places of the estimated parameters of the model."""
         return self.problem.free[: len(self.covariance)]
 
@@ -94,10 +90,9 @@ class Estimate:
 
 
 def input_timing(p: Array, problem: Problem, covariance: Array) -> InputTiming:
-    """Return the timing of the inputs, the last of ``p`` and, where it was estimated, of a problem.
+    """The timing of the inputs, the last of ``p`` (n_p + 1,) and, if estimated, of a problem.
 
-    Args:
-        p: (n_p + 1,) parameters; problem: as fitted; covariance: (n_free, n_free).
+    ``covariance`` is (n_free, n_free).
     """
     timed = problem.free[-1] == len(p) - 1
     return InputTiming(
@@ -106,18 +101,6 @@ def input_timing(p: Array, problem: Problem, covariance: Array) -> InputTiming:
         unit="s",
         limit=problem.upper[-1] if timed else 0.0,
     )
-
-
-def filtered_states(
-    system: System, motions: Sequence[Motion], p: Array, trace: Sequence[Mapping[str, object]]
-) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Tables of a method that leaves the motion as the filter stage did.
-
-    Args:
-        system: the model; motions: the trials; p: (n_p,) its parameters; trace: rows of its trace.
-    """
-    frames = [as_filtered(system, motion, p) for motion in motions]
-    return pd.concat(frames, ignore_index=True), pd.DataFrame(trace)
 
 
 def collect_result(
@@ -132,8 +115,8 @@ def collect_result(
     """Return what identify.json says.
 
     Args:
-        system: the model; estimate: the published one; identifiability: of its parameters.
-        trials: names of the trials; worst: the second that moves least squares most.
+        estimate: the published one; trials: names of the trials.
+        worst: the second that moves least squares most.
         late: timing of the inputs that residuals go by, and its standard deviation, s.
         further: fields of the result as they are; notes among them on how it came about.
     """

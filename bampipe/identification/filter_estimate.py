@@ -7,8 +7,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
 from bampipe.estimate.filter_uncertainty import choose_block, leave_out, sandwich_covariance
 from bampipe.estimate.unscented import (
@@ -55,8 +55,6 @@ from bampipe.results.rounding import significant
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.disturbances import part_trials
 from bampipe.trials.motion import Motion, trial_names, trial_sizes
-
-Array = NDArray[np.float64]
 
 _RESTARTS = 3
 """Searches from least squares, each with four times the process noise of the one before."""
@@ -151,7 +149,7 @@ class _Filtering:
         """(nt,) how well that is known."""
         return np.append(self.task.known, self.late_sd)
 
-    def clear(self, place: int) -> NDArray[np.bool_]:
+    def clear(self, place: int) -> Flags:
         """Which samples of a trial are clear of reversals, (T, n_q)."""
         return clear_of_reversal_mask(self.motions[place], self.task.system, self.trials[place].t)
 
@@ -218,7 +216,7 @@ class _Filtering:
         width = _choose_width(found, self.model, self.trials, narrowed, step)
         if width is None:
             return found, None
-        declared, self.model = self.model, _with_equations(self.model, narrowed(width.factor))
+        declared, self.model = self.model, replace(self.model, functions=narrowed(width.factor))
         value, slope = self.model.to_physical(found.theta)
         around = _AROUND * slope * np.sqrt(np.diag(found.covariance))
         with suppress(MotionLost):  # a narrow sign may throw it off at one reversal of many
@@ -292,11 +290,19 @@ def _find_smoothing(
     A machine with dry friction truly stands still, where the model creeps within the width of its
     smoothed sign. The filter errs in proportion to that width: it is off by twice what half the
     width that it took moves it. A machine that does creep shows that by readings that the narrower
-    sign comes less close to. What widths that are nearly as likely disagree on is as uncertain.
+    sign makes less likely; there, and where that fails, nothing is off. Both are filtered around
+    the answer, over some of the trials and in finer steps, for the narrower one may be stiffer.
+    What widths that are nearly as likely disagree on is as uncertain.
     """
-    factor = 1.0 if width is None else width.factor
-    narrower = filtering.task.narrowed(_NARROWER[0] * factor)
-    off = _moved_by(narrower, found, filtering.model, filtering.trials) / (1.0 - _NARROWER[0])
+    factor, model = 1.0 if width is None else width.factor, filtering.model
+    narrower = replace(model, functions=filtering.task.narrowed(_NARROWER[0] * factor))
+    finer = replace(found.settings, longest_step=0.5 * found.settings.longest_step)
+    trials, off = _some_of(filtering.trials, found), np.zeros(model.free.size)
+    with suppress(FilterFailure):
+        value, likely = _filter_some(model, trials, found, finer)
+        moved, likelier = _filter_some(narrower, trials, found, finer)
+        if likelier > likely:
+            off = (moved - value) / (1.0 - _NARROWER[0])
     return off, np.zeros(off.size) if width is None else width.spread
 
 
@@ -337,17 +343,6 @@ def _leave_out(p: Array, found: FilterRun, filtering: _Filtering, covariance: Ar
     return [parameters[group] for group in folds.groups]
 
 
-def _with_equations(model: FilterModel, system: System) -> FilterModel:
-    """The same model with the equations of another system of the same parameters."""
-    return replace(
-        model,
-        derivative=system.derivative,
-        measure=system.measure,
-        derivative_rows=system.derivative_rows,
-        measure_rows=system.measure_rows,
-    )
-
-
 def _some_of(trials: Sequence[Trial], found: FilterRun) -> tuple[list[Trial], Array]:
     """Beginnings of trials, spread evenly, and a covariance to start from around the answer."""
     stride = found.settings.stride
@@ -361,27 +356,20 @@ def _some_of(trials: Sequence[Trial], found: FilterRun) -> tuple[list[Trial], Ar
     return part, _AROUND**2 / share * np.diag(np.diag(found.covariance))
 
 
-def _moved_by(
-    other: System, found: FilterRun, model: FilterModel, trials: Sequence[Trial]
-) -> Array:
-    """Return how far the equations of another system move the answer, (nt,), physical units.
+def _filter_some(
+    model: FilterModel,
+    some: tuple[list[Trial], Array],
+    found: FilterRun,
+    settings: FilterSettings,
+) -> tuple[Array, float]:
+    """Answer, (nt,) physical, and log likelihood by what `_some_of` returns.
 
-    Both are filtered around it, over some of the trials and in finer steps, for the other may be
-    stiffer. Where the other makes the readings less likely, or fails, it moves nothing.
+    Raises:
+        FilterFailure: the filter loses the motion.
     """
-    part, spread = _some_of(trials, found)
-    finer = replace(found.settings, longest_step=0.5 * found.settings.longest_step)
-
-    def answer(model: FilterModel) -> tuple[Array, float]:
-        filtered = filter_trials(model, part, found.theta, spread, finer)
-        likely = sum(float(np.nansum(one.log_likelihood)) for one in filtered.trials)
-        return model.to_physical(filtered.theta)[0], likely
-
-    with suppress(FilterFailure):
-        (value, likely), (moved, likelier) = answer(model), answer(_with_equations(model, other))
-        if likelier > likely:
-            return np.asarray(moved - value)
-    return np.zeros(model.free.size)
+    filtered = filter_trials(model, some[0], found.theta, some[1], settings)
+    likely = sum(float(np.nansum(one.log_likelihood)) for one in filtered.trials)
+    return model.to_physical(filtered.theta)[0], likely
 
 
 @dataclass(frozen=True)
@@ -411,20 +399,19 @@ def _choose_width(
     in proportion to the rest. None where no narrower width is likelier.
 
     Args:
-        found: with the declared width; model: the model of that; trials: all of them.
+        found: with the declared width; model: the model of that.
         narrowed: the system by its width, times the device's; step: the longest step, s.
     """
-    part, around = _some_of(trials, found)
+    some = _some_of(trials, found)
     tried: dict[tuple[float, int], tuple[float, Array]] = {}
 
     def best(width: float, parts: Sequence[int]) -> float:
-        theirs = model if width == 1.0 else _with_equations(model, narrowed(width))
+        theirs = model if width == 1.0 else replace(model, functions=narrowed(width))
         for by in parts:
             settings = replace(found.settings, longest_step=step / by)
             with suppress(FilterFailure):
-                filtered = filter_trials(theirs, part, found.theta, around, settings)
-                likely = sum(float(np.nansum(one.log_likelihood)) for one in filtered.trials)
-                tried[width, by] = likely, model.to_physical(filtered.theta)[0]
+                value, likely = _filter_some(theirs, some, found, settings)
+                tried[width, by] = likely, value
         return max((one for (each, _), (one, _) in tried.items() if each == width), default=-np.inf)
 
     ends = (_PARTS[0], _PARTS[-1])

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import spline_curvature
@@ -17,7 +17,6 @@ from bampipe.estimate.unscented import (
     FilteredTrial,
     FilterFailure,
     FilterModel,
-    FilterOutcome,
     FilterSettings,
     Stored,
     Trial,
@@ -28,8 +27,6 @@ from bampipe.identification.sensor_noise import Noise
 from bampipe.physics import System
 from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.reading import input_columns, read_samples
-
-Array = NDArray[np.float64]
 
 _STORED, _STORED_IN_ALL = 20_000, 100_000
 """Most distributions stored of one trial: memory must not grow with the log."""
@@ -150,16 +147,14 @@ def load_filter_trial(
     stride: int,
     choice: FilterChoice,
 ) -> Trial:
-    """Return the raw samples of one trial as the filter reads them.
+    """Return the raw samples of one trial, or of a part of it, as the filter reads them.
 
     The state is that of the mechanism, which is not where its encoders are once a model has
     something between the two.
 
     Args:
-        run: the run folder; motion: the trial, or a part of it; system: the model.
         p: (n_p,) parameters near the answer, for the state at the first sample.
-        noise: of the sensors; stride: the filter stores every so many samples; choice: of the
-            filter.
+        stride: the filter stores every so many samples.
     """
     columns = read_samples(run, motion.trial_id, system)
     t = columns["t"] - columns["t"][0]
@@ -208,7 +203,7 @@ def infer_initial_state(
     """Return the state (nx,) of the mechanism whose encoders read this, and its sd (nx,).
 
     Args:
-        system: the model; p: (n_p,) parameters.
+        p: (n_p,) parameters.
         q: positions that the encoders read, (n_q,); qd: rates of the mechanism, (n_q,).
         u: (n_u,) inputs.
         reading_sd: (n_q,) of a position; speed_sd: (n_q,) of a rate.
@@ -222,7 +217,7 @@ def infer_initial_state(
     )
 
 
-def clear_of_reversal_mask(motion: Motion, system: System, t: Array) -> NDArray[np.bool_]:
+def clear_of_reversal_mask(motion: Motion, system: System, t: Array) -> Flags:
     """Tell where each axis moves well clear of standstill and reversal, (T, n_q).
 
     Within a few widths of the smoothed sign, friction changes faster than the spread of the state,
@@ -230,11 +225,9 @@ def clear_of_reversal_mask(motion: Motion, system: System, t: Array) -> NDArray[
     makes no claim that its innovations could be tested against.
 
     Args:
-        motion: the trial as the filter stage left it; system: the model.
         t: (T,) times at which it is wanted, s since the start of the trial.
     """
-    width = np.array([c.sign_width for c in system.model.device.coordinates])
-    slow = np.abs(motion.qd) < _REVERSAL_WIDTHS * width
+    slow = np.abs(motion.qd) < _REVERSAL_WIDTHS * system.sign_widths
     rate = (len(motion.t) - 1) / float(motion.t[-1] - motion.t[0])
     reach = int(np.ceil(_REVERSAL_MARGIN_S * rate))
     window = np.ones(2 * reach + 1)
@@ -249,7 +242,7 @@ def build_filter_model(
     """Return the model as the filter wants it.
 
     Args:
-        system: the model; trials: whose sampling interval bounds the timing.
+        trials: whose sampling interval bounds the timing.
         start: (n_p,) values of the parameters, those that are not estimated included.
         timing: whether the timing of the inputs is estimated, as the last parameter. A model
             that has a delay of its own cannot tell the two apart.
@@ -262,10 +255,7 @@ def build_filter_model(
         half = 0.5 * float(np.median(np.diff(trials[0].t)))
         places, lower, upper = [*places, len(system.parameters)], [*lower, -half], [*upper, half]
     return FilterModel(
-        derivative=system.derivative,
-        measure=system.measure,
-        derivative_rows=system.derivative_rows,
-        measure_rows=system.measure_rows,
+        functions=system,
         n_states=len(system.states),
         parameters=np.append(start, late_s),
         free=np.array(places, dtype=np.int64),
@@ -292,9 +282,7 @@ def run_filter(
     the end in its own right.
 
     Args:
-        model, trials, settings: as `filter_trials` takes them.
         attempts: where to start, one after the other.
-        choice: which engine.
         report_progress: called with the number of trials done and the index of the next.
         lost_error: makes the error from what happened and the index of the trial.
         axes: names of the readings, for messages.
@@ -302,7 +290,9 @@ def run_filter(
     Raises:
         MotionLost: no attempt followed the motion.
     """
-    engine = _engine(choice)
+    engine = filter_trials
+    if choice.engine == "filterpy":
+        from bampipe.estimate.filterpy_engine import filter_trials_by_filterpy as engine
     order = (*range(1, len(trials)), 0)
     failure: tuple[int, FilterFailure] | None = None
     found: FilterRun | None = None
@@ -337,8 +327,7 @@ def run_filter(
             return found
     if found is not None:
         raise _not_followed_error(found, lost_error, axes)
-    if failure is None:
-        raise RuntimeError("no attempt was made")
+    assert failure is not None
     place, error = failure
     t = trials[place].t[min(error.sample, trials[place].t.size - 1)]
     raise lost_error(
@@ -368,14 +357,6 @@ def _summarise_pass(filtered: FilteredTrial, trial: Trial, block_s: float) -> Pa
         inputs=average_stretches(trial.u, samples),
         stretch_samples=samples,
     )
-
-
-def _engine(choice: FilterChoice) -> Callable[..., FilterOutcome]:
-    if choice.engine == "filterpy":
-        from bampipe.estimate.filterpy_engine import filter_trials_by_filterpy
-
-        return filter_trials_by_filterpy
-    return filter_trials
 
 
 def _not_followed_error(

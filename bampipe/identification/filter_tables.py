@@ -6,32 +6,27 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Indices
 from bampipe.estimate.unscented import FilterModel
 from bampipe.identification.filter_run import FilterRun, Pass
 from bampipe.physics import System
 from bampipe.results.identify import Consistency, Convergence, StateBound
 from bampipe.trials.motion import Motion, trial_names
 
-Array = NDArray[np.float64]
-
 
 def tabulate_nis(found: FilterRun, motions: Sequence[Motion]) -> Consistency:
     """Return the normalised innovation squared: near 1 where the noise levels are right."""
-    size = found.settings.observed.size
-    names = trial_names(motions)
-    of_parts: dict[str, list[Pass]] = {}
+    names, of_parts = trial_names(motions), dict[str, list[Pass]]()
     for place, trial in zip(found.order, found.trials, strict=True):
         of_parts.setdefault(names[place], []).append(trial)
-    by_trial = {
-        name: float(np.average([one.nis for one in parts], weights=[p.counted for p in parts]))
-        / size
-        for name, parts in of_parts.items()
-    }
-    counts = [trial.counted for trial in found.trials]
-    total = np.average([trial.nis for trial in found.trials], weights=counts)
-    return Consistency(mean=total / size, by_trial=by_trial)
+
+    def mean(parts: Sequence[Pass]) -> float:
+        total = np.average([one.nis for one in parts], weights=[one.counted for one in parts])
+        return float(total) / found.settings.observed.size
+
+    by_trial = {name: mean(parts) for name, parts in of_parts.items()}
+    return Consistency(mean=mean(found.trials), by_trial=by_trial)
 
 
 def state_3sigma(system: System, trials: Sequence[Pass]) -> dict[str, StateBound]:
@@ -78,7 +73,7 @@ def _elapsed(passes: Sequence[Pass]) -> list[Array]:
     return times
 
 
-def _thinned(count: int, rows: int) -> NDArray[np.int64]:
+def _thinned(count: int, rows: int) -> Indices:
     """Return indices of at most ``rows`` of ``count`` samples, the last one included."""
     step = -(-count // rows)
     return np.arange(count - 1, -1, -step)[::-1]
@@ -87,13 +82,7 @@ def _thinned(count: int, rows: int) -> NDArray[np.int64]:
 def tabulate_states(
     system: System, motions: Sequence[Motion], found: FilterRun, p: Array, rows: int
 ) -> pd.DataFrame:
-    """Return the filtered motion of every trial, in the order of the session.
-
-    Args:
-        system: the model; motions: the trials; found: the filter's.
-        p: (n_p,) the parameters found.
-        rows: most rows a trial.
-    """
+    """The filtered motion of every trial, at most ``rows`` rows each; ``p`` (n_p,) are found."""
     n = len(system.coordinates)
     frames: dict[int, pd.DataFrame] = {}
     for place, trial in zip(found.order, found.trials, strict=True):
@@ -114,9 +103,7 @@ def with_torques(
     """Return the motion with the trial, the torque of the hand and that against gravity (Fig. 6).
 
     Args:
-        system: the model; motion: the trial as the filter stage left it.
-        t: (K,) times of the rows; columns: each (K,).
-        p: (n_p,) parameters.
+        t: (K,) times of the rows; columns: each (K,); p: (n_p,) parameters.
     """
     u = motion.inputs(system.inputs)
     true = motion.of_mechanism(system, u, p)
@@ -133,11 +120,7 @@ def with_torques(
 
 
 def as_filtered(system: System, motion: Motion, p: Array) -> pd.DataFrame:
-    """Return the states of a trial where the estimate leaves its motion as the filter stage did.
-
-    Args:
-        system: the model; motion: the trial, T samples; p: (n_p,) parameters.
-    """
+    """The states of a trial where the estimate, ``p`` (n_p,), leaves its motion as it was."""
     columns = {}
     for i, axis in enumerate(system.coordinates):
         columns[f"q_{axis}"], columns[f"qd_{axis}"] = motion.q[:, i], motion.qd[:, i]
@@ -158,11 +141,9 @@ def tabulate_trace(
 
     Args:
         names: of the filter's parameters, of which the first ``len(names)`` are stored.
-        model: the filter's; motions: the trials; rows: most rows a trial.
-        found: the passes.
+        rows: most rows a trial.
     """
-    frames = []
-    trial_ids = trial_names(motions)
+    frames, trial_ids = [], trial_names(motions)
     passes = zip(found.steps, found.passes, _elapsed(found.passes), strict=True)
     for place, (step, trial, elapsed) in enumerate(passes):
         keep = _thinned(trial.t.size, rows)
@@ -170,8 +151,7 @@ def tabulate_trace(
         value = np.clip(value, model.lower, model.upper)
         variance = trial.variance[keep, model.n_states :]
         run = int(bool(found.first) and place >= len(found.first))
-        columns = {"t_total": elapsed[keep], "trial_id": trial_ids[step], "run": run}
-        frame = pd.DataFrame(columns)
+        frame = pd.DataFrame({"t_total": elapsed[keep], "trial_id": trial_ids[step], "run": run})
         for k, name in enumerate(names):
             frame[name] = value[:, k]
             frame[f"{name}_sd"] = slope[:, k] * np.sqrt(variance[:, k])

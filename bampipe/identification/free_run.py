@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
@@ -26,8 +26,6 @@ from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.results.ingest import IngestResult
 from bampipe.results.validate import CommandError, FreeRun, FreeRunError
 from bampipe.trials.motion import Motion
-
-Array = NDArray[np.float64]
 
 CLOSED: Final = "closed_loop"
 OPEN: Final = "open_loop"
@@ -59,8 +57,6 @@ def free_runs(
 
     Args:
         run: the run folder, for the channels of the controller.
-        system: the model.
-        motions: the trials.
         parameters: for each trial, (>= n_p,) parameters that have not seen it.
         judged: which trials count for the whole; all where none does.
 
@@ -90,13 +86,14 @@ def free_runs(
                 )
     except InputError as error:
         return FreeRun(reason=f"{mode.replace('_', ' ')}: {error}")
-    forces, counted = {}, [r for r, j in zip(runs, judged, strict=True) if j] or runs
-    if mode == CLOSED:
-        for j, name in enumerate(system.model.device.forces):
-            commanded = np.concatenate([r.command[:, j] for r in counted])
-            given = np.concatenate([r.force[:, j] for r in counted])
-            percent = _percent(commanded - given, given)
-            forces[name] = CommandError(relative_error_percent=percent)
+    counted = [r for r, j in zip(runs, judged, strict=True) if j] or runs
+    given = np.concatenate([r.force for r in counted])
+    off = np.concatenate([r.command for r in counted]) - given
+    names = system.model.device.forces if mode == CLOSED else ()
+    forces = {
+        name: CommandError(relative_error_percent=_percent(off[:, j], given[:, j]))
+        for j, name in enumerate(names)
+    }
     return FreeRun(
         reason="" if mode == CLOSED else reason,
         mode=mode,
@@ -130,7 +127,7 @@ def _closed(run: RunFolder, system: System, motion: Motion, p: Array, law: Contr
     _, total, readings = simulate_controlled(
         system.derivative, system.measure, law.command, _start(system, motion, p), u, r,
         p[: len(system.parameters)], _interval(motion),
-        width=_width(system), n_noise=len(system.noise), force=force, rate_hz=law.rate_hz,
+        width=system.sign_widths, n_noise=len(system.noise), force=force, rate_hz=law.rate_hz,
         limits=law.limits,
     )  # fmt: skip
     measured = np.hstack([motion.q, motion.qd])
@@ -144,7 +141,7 @@ def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -
         start[:n] += push
     x = simulate(
         system.derivative, start, u, p[: len(system.parameters)], _interval(motion),
-        width=_width(system), n_noise=len(system.noise), smooth=system.forced,
+        width=system.sign_widths, n_noise=len(system.noise), smooth=system.forced,
     )  # fmt: skip
     readings = np.empty((len(x), 2 * n))
     for i in range(len(x)):
@@ -172,10 +169,6 @@ def _start(system: System, motion: Motion, p: Array) -> Array:
 
 def _interval(motion: Motion) -> float:
     return float(motion.t[1] - motion.t[0])
-
-
-def _width(system: System) -> Array:
-    return np.array([c.sign_width for c in system.model.device.coordinates])
 
 
 def _axes(system: System, runs: Sequence[_Run]) -> dict[str, FreeRunError]:

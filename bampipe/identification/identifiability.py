@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.identifiability import (
     Weak,
     cramer_rao_bound,
@@ -30,8 +30,6 @@ from bampipe.results.identify import (
     WeakDirection,
 )
 from bampipe.trials.motion import Motion, trial_names
-
-Array = NDArray[np.float64]
 
 _LISTED = 4
 """Trials named in a sentence."""

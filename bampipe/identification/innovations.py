@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Flags
 from bampipe.estimate.innovations import (
     InnovationTest,
     average_stretches,
@@ -29,16 +29,15 @@ _SIGNIFICANT = 0.01
 def innovation_tests(
     system: System,
     found: FilterRun,
-    moving: Callable[[int], NDArray[np.bool_]],
+    moving: Callable[[int], Flags],
 ) -> dict[str, InnovationTests]:
     """Return both tests for each position channel, and a sentence on each.
 
     Args:
-        system: the model; found: the filter's.
         moving: of a trial, by its place, where each axis is clear of standstill and reversal,
             (T, n_q).
     """
-    n = len(system.coordinates)
+    n, lags = len(system.coordinates), [round(lag / STRETCH_S) for lag in _LAGS_S]
     channels = [i for i, name in enumerate(system.inputs) if name != "t"]
     by_trial, inputs = [], []
     for place, trial in zip(found.order, found.trials, strict=True):
@@ -46,11 +45,10 @@ def innovation_tests(
         by_trial.append(np.where(clear, trial.stretches[:, :n], np.nan))
         inputs.append(trial.inputs[:, channels])
     tests = {}
-    for axis in range(n):
+    for axis, name in enumerate(system.coordinates):
         records = [stretches[:, axis] for stretches in by_trial]
-        lags = [round(lag / STRETCH_S) for lag in _LAGS_S]
         own, driven = check_whiteness(records), check_independence(records, inputs, lags)
-        tests[system.coordinates[axis]] = InnovationTests(
+        tests[name] = InnovationTests(
             sentence=_sentence(own, driven),
             whiteness=Whiteness(**vars(own), white=not _fails(own, WHITE_SHARE)) if own else None,
             inputs=Independence(**vars(driven), independent=not _fails(driven, INPUT_SHARE))

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Fit, Session
 from bampipe.errors import InputError
@@ -26,20 +27,15 @@ from bampipe.estimate.least_squares import (
     minimise,
 )
 from bampipe.estimate.simulation import Runaway
-from bampipe.identification.estimates import Estimate, filtered_states, input_timing
+from bampipe.identification.estimates import Estimate, input_timing
+from bampipe.identification.filter_tables import as_filtered
 from bampipe.physics import System
 from bampipe.physics.recipe import Recipe
 from bampipe.results.identify import Convergence, StateBound
-from bampipe.trials.likelihood import (
-    lay_out_samples,
-    solve_bounded,
-    take_samples,
-)
+from bampipe.trials.likelihood import lay_out_samples, solve_bounded, take_samples
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import problem_of
-
-Array = NDArray[np.float64]
 
 _REPLICATES = 6
 _LACKING = 3.0
@@ -80,12 +76,12 @@ class SquaresFit:
     block_s: float
 
     @property
-    def free(self) -> NDArray[np.int64]:
+    def free(self) -> Indices:
         """(n,) places in ``p`` of what is estimated, the timing last where it is."""
         return self.problem.free
 
     @property
-    def at_bound(self) -> NDArray[np.bool_]:
+    def at_bound(self) -> Flags:
         """(n,) which of them lie at the limit of their range."""
         value, slack = self.p[self.free], 1e-9 * (self.problem.upper - self.problem.lower)
         slack = np.where(np.isfinite(slack), slack, 0.0)
@@ -93,25 +89,26 @@ class SquaresFit:
         return np.asarray((value <= low) | (value >= high))
 
     @cached_property
+    def _left(self) -> tuple[tuple[Array, float], ...]:
+        """By axis: what is left, (n,), and its root mean square."""
+        pairs = zip(self.fit.problem.y, self.fit.problem.base, strict=True)
+        every = (y + x @ self.fit.solved.base for y, x in pairs)
+        return tuple(
+            (left, max(float(np.sqrt(np.mean(left**2))), 1e-300) if left.size else 1.0)
+            for left in every
+        )
+
+    @cached_property
     def rows(self) -> tuple[tuple[Array, Array], ...]:
         """By axis: slopes (n, P) by the determined unknowns, what is left (n,); both weighted."""
-        pose, solved = self.fit.problem, self.fit.solved
-        found = []
-        for y, x in zip(pose.y, pose.base, strict=True):
-            left = y + x @ solved.base
-            scale = max(float(np.sqrt(np.mean(left**2))), 1e-300) if left.size else 1.0
-            found.append((x / scale, left / scale))
-        return tuple(found)
+        pairs = zip(self.fit.problem.base, self._left, strict=True)
+        return tuple((x / scale, left / scale) for x, (left, scale) in pairs)
 
     @cached_property
     def weights(self) -> tuple[Array, ...]:
         """By axis: what a residual in N.m or N is multiplied by in `rows`, (n,)."""
-        scale = [
-            np.sqrt(np.mean((y + x @ self.fit.solved.base) ** 2)) if y.size else 1.0
-            for y, x in zip(self.fit.problem.y, self.fit.problem.base, strict=True)
-        ]
-        pairs = zip(self.fit.likelihood.root, scale, strict=True)
-        return tuple(root / max(float(s), 1e-300) for root, s in pairs)
+        pairs = zip(self.fit.likelihood.root, self._left, strict=True)
+        return tuple(root / scale for root, (_, scale) in pairs)
 
     @cached_property
     def normal(self) -> Array:
@@ -173,7 +170,7 @@ class SquaresFit:
         """(n,) standard deviations."""
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
-    def refit(self, kept: Sequence[NDArray[np.bool_]]) -> Array:
+    def refit(self, kept: Sequence[Flags]) -> Array:
         """Parameters (n_p + 1,) by some of the samples, to first order within the bounds.
 
         Args:
@@ -250,7 +247,7 @@ def fit_squares(
 
     Args:
         trials: to be fitted, whose `timing` says how late inputs may be.
-        recipe, system: the model; start: (n_p,) parameters to start from.
+        start: (n_p,) parameters to start from.
         block_s: see `SquaresFit`; remove_bias: whether replicates give weights and bias.
 
     Raises:
@@ -331,7 +328,10 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
             },
             "residual_sd": dict(zip(system.coordinates, residual, strict=True)),
         },
-        tabulate=lambda: filtered_states(system, motions, squares.p[:-1], trace()),
+        tabulate=lambda: (
+            pd.concat([as_filtered(system, m, squares.p[:-1]) for m in motions], ignore_index=True),
+            pd.DataFrame(trace()),
+        ),
     )
 
 

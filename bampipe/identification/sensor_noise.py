@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.estimate.filter_uncertainty import climb
 from bampipe.estimate.unscented import (
     FilterFailure,
@@ -21,8 +21,6 @@ from bampipe.physics import System
 from bampipe.results.identify import NoiseLevels
 from bampipe.trials.motion import Motion
 from bampipe.trials.sensors import Sensors
-
-Array = NDArray[np.float64]
 
 TUNING_SAMPLES = 3000
 """Samples on which the noise levels are tuned."""
@@ -44,7 +42,7 @@ class Noise:
 
     reading_sd: Array
     process_sd: Array
-    is_force: NDArray[np.bool_]
+    is_force: Flags
 
 
 def sensor_noise(
@@ -61,7 +59,6 @@ def sensor_noise(
     the model says that the encoder reads.
 
     Args:
-        sensors: of the session; system: the model; motions: the trials.
         p: (n_p,) parameters near the answer.
         choice: fixes levels that are not to be found.
     """
@@ -135,7 +132,7 @@ def tune_noise(
     settings: FilterSettings,
     model: FilterModel,
     records: Sequence[Trial],
-    clear: Sequence[NDArray[np.bool_]],
+    clear: Sequence[Flags],
     near: tuple[Array, Array],
     noise: Noise,
     choice: FilterChoice,
@@ -147,11 +144,9 @@ def tune_noise(
     twice its size would pay for them everywhere else.
 
     Args:
-        settings: with the levels to start from.
-        model: the filter's; records: the beginnings of trials.
+        settings: with the levels to start from; records: the beginnings of trials.
         clear: (T,) of each, its samples at which no axis reverses; all count where none is clear.
         near: (nt,) parameters near the answer, physical, and (nt,) how well they are known.
-        noise: of the sensors.
         choice: fixes levels that are not to be found.
     """
     quick = replace(settings, longest_step=max(settings.longest_step, _TUNING_STEP_S))
@@ -162,11 +157,9 @@ def tune_noise(
     mean, sd = model.to_estimated(value, np.maximum(spread, np.finfo(float).tiny))
 
     def with_levels(levels: Array) -> FilterSettings:
-        factor = np.exp(levels)
+        reading, *process = np.exp(levels)
         return replace(
-            quick,
-            reading_sd=quick.reading_sd * factor[0],
-            noise_sd=quick.noise_sd * factor[1:],
+            quick, reading_sd=quick.reading_sd * reading, noise_sd=quick.noise_sd * process
         )
 
     def log_likelihood(levels: Array) -> float:

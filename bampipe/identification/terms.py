@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.shape import Variable, variables
 from bampipe.errors import InputError
 from bampipe.physics import System
@@ -17,8 +17,6 @@ from bampipe.results.intervals import NORMAL_95
 from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
 from bampipe.trials.draw import draw_trials
 from bampipe.trials.evidence import Evidence
-
-Array = NDArray[np.float64]
 
 _BINS = 24
 _FEWEST = 8
@@ -150,7 +148,7 @@ def _curves(
         own = force[use, axis]
         if not own.size or np.sqrt(np.mean(own**2)) < _LEAST_SHARE * error[axis]:
             continue
-        best: tuple[float, Variable, NDArray[np.int64]] | None = None
+        best: tuple[float, Variable, Indices] | None = None
         for variable in known[axis]:
             which = _bin(np.concatenate(variable.values)[use])
             share = _explained(own, which)
@@ -180,18 +178,18 @@ def _curves(
         )
 
 
-def _bin(values: Array) -> NDArray[np.int64]:
+def _bin(values: Array) -> Indices:
     """Return the number of the bin of each value; bins hold equal counts."""
     edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, _BINS + 1)))
     found = np.searchsorted(edges, values, side="right") - 1
     return np.clip(found, 0, max(len(edges) - 2, 0)).astype(np.int64)
 
 
-def _means(values: Array, which: NDArray[np.int64], bins: Sequence[int]) -> Array:
+def _means(values: Array, which: Indices, bins: Sequence[int]) -> Array:
     return np.array([values[which == b].mean() for b in bins])
 
 
-def _explained(values: Array, which: NDArray[np.int64]) -> float:
+def _explained(values: Array, which: Indices) -> float:
     """Return the share of the variance of ``values`` that the means of bins carry."""
     count = np.bincount(which)
     means = np.bincount(which, values) / np.maximum(count, 1)

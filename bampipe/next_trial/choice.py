@@ -7,18 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.next_trial.motion import HASTY, Rehearsal
-from bampipe.next_trial.primitives import (
-    Primitive,
-    find_beyond,
-    list_primitives,
-    vary_surroundings,
-)
+from bampipe.next_trial.primitives import Primitive, find_beyond, list_primitives, vary_surroundings
 from bampipe.trials.motion import Motion
-
-Array = NDArray[np.float64]
 
 _VERSIONS = (1, 2, 3, 4, HASTY)
 """As followed by different people."""

@@ -9,9 +9,9 @@ from itertools import combinations
 from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_residual
 from bampipe.diagnosis.session import Fit, Session
@@ -21,8 +21,6 @@ from bampipe.trials.folds import Folds
 from bampipe.trials.likelihood import Likelihood, Noise, lay_out_samples, take_samples
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
-
-Array = NDArray[np.float64]
 
 _STEP = 1e-3
 """Of a parameter, for the slope of what its effect adds to the residual."""
@@ -178,7 +176,7 @@ class Comparison:
         return seen, Likelihood.of(seen, samples, noise, c.bias_error, c.discrepancy, force_sd)
 
     @cached_property
-    def _noise_by_speed(self) -> list[tuple[Array, Array, NDArray[np.int64]]]:
+    def _noise_by_speed(self) -> list[tuple[Array, Array, Indices]]:
         """By axis: speeds at hand in order, the variance of replays there, and their classes."""
         e, likelihood, found = self.fit.evidence, self.fit.likelihood, []
         speeds = [np.abs(m.qd[e.band.thinned_rows(len(m.t))]) for m in e.motions]
@@ -193,9 +191,7 @@ class Comparison:
     def _sums_of(self, evidence: Evidence, likelihood: Likelihood) -> Sums:
         e, n_q = evidence, len(likelihood.samples)
         rows = [
-            np.concatenate(
-                [row for r in self.alternatives for row in self._added_by(r, base)], axis=1
-            )
+            np.hstack([a for r in self.alternatives for a in self._added_by(r, base)])
             for base in e.fitted
         ]
         width = rows[0].shape[1] // n_q
@@ -232,10 +228,8 @@ class Comparison:
         here = [residual(k, values) for k, values in enumerate(alternative.values)]
         rows = [np.sum(here, axis=0) if here else np.zeros(base.motion.q.shape)]
         for number, place in alternative.slopes:
-            q, moved = (
-                alternative.items[number].parameters[place],
-                alternative.values[number].copy(),
-            )
+            q = alternative.items[number].parameters[place]
+            moved = alternative.values[number].copy()
             step = _STEP * max(abs(moved[place]), _STEP * q.sd)
             step = -step if moved[place] + step > q.upper else step
             moved[place] += step
@@ -336,12 +330,9 @@ class Comparison:
         self, contrasts: Mapping[tuple[int, int], Contrast]
     ) -> dict[tuple[int, int], float]:
         """Chance of taking one of each pair of alternatives for the other, with more trials."""
+        odds = [alternative.odds for alternative in self.alternatives]
         return {
-            (i, j): chance_of_confusion(
-                self.alternatives[i].odds,
-                self.alternatives[j].odds,
-                found.distance - self.now[i, j].distance,
-            )
+            (i, j): chance_of_confusion(odds[i], odds[j], found.distance - self.now[i, j].distance)
             for (i, j), found in contrasts.items()
         }
 
@@ -356,20 +347,21 @@ class Comparison:
         then = [self.contrasts(self.at_hand + new, new) for new in sums]
         chances, weights = [self.confusions(found) for found in then], self.weights()
         before, axes = self.confusions(self.now), self.fit.evidence.system.coordinates
-        return tuple(
-            ExpectedConfusion(
-                between=tuple(self.alternatives[k].name for k in pair),
-                weight=weights[pair],
-                before=before[pair],
-                after=float(np.median([found[pair] for found in chances])),
-                distance_before=now.distance,
-                distance_after=float(np.median([found[pair].distance for found in then])),
-                left=dict(
-                    zip(axes, np.median([f[pair].left for f in then], axis=0).tolist(), strict=True)
-                ),
+        expected = []
+        for pair, now in self.now.items():
+            left = np.median([found[pair].left for found in then], axis=0).tolist()
+            expected.append(
+                ExpectedConfusion(
+                    between=tuple(self.alternatives[k].name for k in pair),
+                    weight=weights[pair],
+                    before=before[pair],
+                    after=float(np.median([found[pair] for found in chances])),
+                    distance_before=now.distance,
+                    distance_after=float(np.median([found[pair].distance for found in then])),
+                    left=dict(zip(axes, left, strict=True)),
+                )
             )
-            for pair, now in self.now.items()
-        )
+        return tuple(expected)
 
 
 _ZERO = np.zeros(1)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.next_trial.choice import RankedDesign
 from bampipe.next_trial.discrimination import Comparison
 from bampipe.next_trial.motion import Rehearsal
@@ -16,8 +16,6 @@ from bampipe.next_trial.primitives import Primitive, find_beyond
 from bampipe.next_trial.sensitivity import Detectability
 from bampipe.next_trial.words import describe
 from bampipe.results.next import ExpectedSd, Move, Proposal, Purpose
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -48,9 +46,9 @@ class Forecast:
 
         None on a model to which the trial is not fitted.
         """
-        if self.is_fitted_to(ranked.design):
-            return [self.precision.of_motion(motion) for motion in ranked.expected_motions]
-        return [np.zeros_like(self.precision.information)] * len(ranked.expected_motions)
+        nothing, is_fitted = self.precision.information * 0.0, self.is_fitted_to(ranked.design)
+        motions = ranked.expected_motions
+        return [self.precision.of_motion(one) if is_fitted else nothing for one in motions]
 
     def is_fitted_to(self, design: Primitive) -> bool:
         """Whether the model is fitted to such a trial: with brakes on, if it has their effects."""
@@ -58,67 +56,58 @@ class Forecast:
 
     def proposal(self, ranked: RankedDesign) -> Proposal:
         """The record of a design that has been ranked."""
-        system, design = self.rehearsal.system, ranked.design
-        device = system.model.device
-        axes = device.coordinates
-        added = self.added_by(ranked)
-        moved = set(design.strokes) or set(range(len(axes)))
-        held = [i for i in range(len(axes)) if i not in moved]
-        farther, faster = (
-            tuple(axes[i].name for i in found) for found in find_beyond(design, self.rehearsal.seen)
+        device, seen, design = (
+            self.rehearsal.system.model.device,
+            self.rehearsal.seen,
+            ranked.design,
         )
+        names, added = [axis.name for axis in device.coordinates], self.added_by(ranked)
+        moved = set(design.strokes) or range(len(names))
+        farther, faster = (tuple(names[i] for i in some) for some in find_beyond(design, seen))
+        # Of a model that lacks something, uncertainties are not worth a forecast.
+        has_forecast = self.comparison is None and self.is_fitted_to(design)
         return Proposal(
-            sentence=describe(design, self.rehearsal.seen, device),
+            sentence=describe(design, seen, device),
             seconds=design.seconds,
             moves=describe_moves(design, self.rehearsal),
-            pose={axes[i].name: float(design.pose[i]) for i in held},
+            pose={n: float(design.pose[i]) for i, n in enumerate(names) if i not in moved},
             like=design.example.trial if design.example else "",
             parts=design.parts,
             brakes=design.field,
             levels=dict(design.levels or {}),
             worth=ranked.utility,
             information_gain=float(np.median([self.precision.gain(one) for one in added])),
-            # Of a model that lacks something, uncertainties are not worth a forecast.
-            sd=self._sd(added, design.seconds)
-            if self.comparison is None and self.is_fitted_to(design)
-            else {},
+            sd=self._sd(added, design.seconds) if has_forecast else {},
             confusion=self.comparison.expect(ranked.expected_motions) if self.comparison else (),
             farther=farther,
             faster=faster,
         )
 
     def _sd(self, added: Sequence[Array], seconds: float) -> dict[str, ExpectedSd]:
-        system, found = self.rehearsal.system, self.precision
-        expected = [found.expect(one, seconds) for one in added]
-        low = np.min([one.low for one in expected], axis=0)
-        median = np.median([one.median for one in expected], axis=0)
-        high = np.max([one.high for one in expected], axis=0)
-        units = {q.name: q.unit for q in system.parameters}
+        every = [self.precision.expect(one, seconds) for one in added]
+        columns = zip(
+            self.precision.names,
+            self.precision.sd,
+            np.min([one.low for one in every], axis=0),
+            np.median([one.median for one in every], axis=0),
+            np.max([one.high for one in every], axis=0),
+            strict=True,
+        )
+        units = {q.name: q.unit for q in self.rehearsal.system.parameters}
         return {
-            name: ExpectedSd(
-                before=found.sd[k], after=median[k], low=low[k], high=high[k], unit=units[name]
-            )
-            for k, name in enumerate(found.names)
+            name: ExpectedSd(before=now, after=median, low=low, high=high, unit=units[name])
+            for name, now, low, median, high in columns
         }
 
 
 def describe_moves(design: Primitive, rehearsal: Rehearsal) -> dict[str, Move]:
     """The record of the strokes of a design."""
     axes = rehearsal.system.model.device.coordinates
+    strokes = {i: (s.low, s.high, s.slow, s.fast, s.rest_s) for i, s in design.strokes.items()}
     if design.series is not None:
-        extent = zip(axes, *design.series.extent[:3], strict=True)
-        return {
-            axis.name: Move(low=low, high=high, slow=fast, fast=fast, unit=axis.unit)
-            for axis, low, high, fast in extent
-        }
+        extent = enumerate(zip(*design.series.extent[:3], strict=True))
+        strokes = {i: (low, high, fast, fast, 0.0) for i, (low, high, fast) in extent}
     return {
-        axes[i].name: Move(
-            low=stroke.low,
-            high=stroke.high,
-            slow=stroke.slow,
-            fast=stroke.fast,
-            rest_s=stroke.rest_s,
-            unit=axes[i].unit,
-        )
-        for i, stroke in design.strokes.items()
+        axes[i].name: Move(low=low, high=high, slow=slow, fast=fast, rest_s=rest, unit=axes[i].unit)
+        for i, (low, high, slow, fast, rest) in strokes.items()
     }

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.next_trial.primitives import PEAK, Envelope, Example, Primitive, Series, Stroke
 from bampipe.physics import System
 from bampipe.physics.device import LAST_ORDER, derivative
@@ -18,8 +18,6 @@ from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
 from bampipe.trials.replay import read_by_sensors
 from bampipe.trials.sensors import Sensors
-
-Array = NDArray[np.float64]
 
 _SPEED, _RANGE, _TURN, _DRIFT = 0.2, 0.15, 0.1, 0.05
 """How far people are off: speed and range of a trial, each turn and the slow drift of the middle,
@@ -169,7 +167,7 @@ def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
     It is never faster than the trial, as it would be were its end joined to its beginning.
 
     Args:
-        example: the trial, and how it is followed; t: (T,) times from 0 on, s.
+        t: (T,) times from 0 on, s.
     """
     motion = example.motion
     clock = motion.t - motion.t[0]

@@ -8,8 +8,8 @@ from functools import reduce
 from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.next_trial.choice import RankedDesign
 from bampipe.next_trial.discrimination import Sums
 from bampipe.next_trial.forecast import Forecast, describe_moves
@@ -17,8 +17,6 @@ from bampipe.next_trial.precision import Expected
 from bampipe.next_trial.primitives import FEWEST_STROKES, Primitive
 from bampipe.next_trial.words import describe
 from bampipe.results.next import Plan, PlannedConfusion, PlannedSd, PlannedTrial
-
-Array = NDArray[np.float64]
 
 _MOST_DESIGNS = 8
 """In a plan: what more of them would do is better asked once these are there."""
@@ -87,7 +85,8 @@ def plan_trials(forecast: Forecast, ranked: Sequence[RankedDesign], goal: Goal) 
     """
     options = [_option(forecast, one) for one in ranked]
     chosen: list[_Option] = []
-    outcome, is_full = _at_hand(forecast), False
+    now = forecast.precision.sd
+    outcome, is_full = (Expected(now, now, now), _confusion(forecast, ())), False
     is_enough = _distance(outcome, goal) <= 0.0
     # A published uncertainty may be small by chance: what a trial adds is held against what the
     # trials at hand would be expected to give another time.
@@ -135,10 +134,8 @@ def _option(forecast: Forecast, ranked: RankedDesign) -> _Option:
     """A design by the version whose information is the median one."""
     added = forecast.added_by(ranked)
     order = np.argsort([forecast.precision.gain(one) for one in added])
-    middle = int(order[(len(order) - 1) // 2])
-    sums = (
-        forecast.comparison.sums([ranked.expected_motions[middle]]) if forecast.comparison else None
-    )
+    middle, comparison = int(order[(len(order) - 1) // 2]), forecast.comparison
+    sums = comparison.sums([ranked.expected_motions[middle]]) if comparison else None
     return _Option(ranked.design, added[middle], sums)
 
 
@@ -146,17 +143,10 @@ _Outcome = tuple[Expected, dict[tuple[int, int], float]]
 """Standard deviations, and the chance of confusing each pair of alternatives."""
 
 
-def _at_hand(forecast: Forecast) -> _Outcome:
-    """What the trials at hand give, as published."""
-    now = forecast.precision.sd
-    return Expected(now, now, now), _confusion(forecast, ())
-
-
 def _outcome(forecast: Forecast, chosen: Sequence[_Option]) -> _Outcome:
     """What is expected with ``chosen`` trials recorded."""
-    added = np.zeros_like(forecast.precision.information)
-    for one in chosen:
-        added = added + one.information
+    nothing = np.zeros_like(forecast.precision.information)
+    added = sum((one.information for one in chosen), nothing)
     seconds = sum(one.design.seconds for one in chosen)
     return forecast.precision.expect(added, seconds), _confusion(forecast, chosen)
 
@@ -182,17 +172,27 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
     units = {q.name: q.unit for q in system.parameters}
     seconds = sum(design.seconds for design in found.designs)
     confusion: tuple[PlannedConfusion, ...] = ()
-    comparison = forecast.comparison
-    if comparison is not None:
-        now, alternatives = comparison.confusions(comparison.now), comparison.alternatives
+    sd: dict[str, PlannedSd] = {}
+    if (comparison := forecast.comparison) is not None:
+        now, names = comparison.confusions(comparison.now), comparison.alternatives
         confusion = tuple(
-            PlannedConfusion(
-                between=tuple(alternatives[k].name for k in pair),
-                before=now[pair],
-                after=after,
-            )
-            for pair, after in found.confusion.items()
+            PlannedConfusion(between=(names[i].name, names[j].name), before=now[i, j], after=after)
+            for (i, j), after in found.confusion.items()
         )
+    else:
+        columns = zip(
+            precision.names, precision.sd, found.sd.median, found.sd.low, found.sd.high, goal.sd,
+            strict=True,
+        )  # fmt: skip
+        sd = {
+            name: PlannedSd(
+                before=before, after=after, low=low, high=high, asked=asked, unit=units[name]
+            )
+            for name, before, after, low, high, asked in columns
+        }
+    counted: dict[int, tuple[Primitive, int]] = {}
+    for design in found.designs:
+        counted[id(design)] = design, counted.get(id(design), (design, 0))[1] + 1
     return Plan(
         sentence=_sentence(found, seconds, "uncertainties" if comparison is None else "confusion"),
         seconds=seconds,
@@ -207,31 +207,11 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
                 times=times * design.parts,
                 moves=describe_moves(design, forecast.rehearsal),
             )
-            for design, times in _counted(found.designs)
+            for design, times in counted.values()
         ),
-        sd={}
-        if comparison is not None
-        else {
-            name: PlannedSd(
-                before=precision.sd[k],
-                after=found.sd.median[k],
-                low=found.sd.low[k],
-                high=found.sd.high[k],
-                asked=goal.sd[k],
-                unit=units[name],
-            )
-            for k, name in enumerate(precision.names)
-        },
+        sd=sd,
         confusion=confusion,
     )
-
-
-def _counted(designs: Sequence[Primitive]) -> list[tuple[Primitive, int]]:
-    """Each design once, with how often it is recorded."""
-    counted: dict[int, tuple[Primitive, int]] = {}
-    for design in designs:
-        counted[id(design)] = design, counted.get(id(design), (design, 0))[1] + 1
-    return list(counted.values())
 
 
 def _sentence(found: TrialPlan, seconds: float, what: str) -> str:
@@ -247,7 +227,5 @@ def _sentence(found: TrialPlan, seconds: float, what: str) -> str:
     head = f"With {'one trial' if count == 1 else f'{count} trials'}, {seconds:.0f} s in all,"
     if found.is_enough:
         return f"{head} every {asked}."
-    rest = (
-        "ask again once they are recorded" if found.is_full else "more trials like these add little"
-    )
-    return f"{head} not every {asked}; {rest}."
+    again, little = "ask again once they are recorded", "more trials like these add little"
+    return f"{head} not every {asked}; {again if found.is_full else little}."

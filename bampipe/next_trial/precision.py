@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bampipe.estimate.least_squares import stacked_residual
+from bampipe.arrays import Array
+from bampipe.estimate.least_squares import Problem, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.identifiability import find_information
@@ -17,8 +17,6 @@ from bampipe.physics import System
 from bampipe.results.identify import IdentifyResult
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import problem_of
-
-Array = NDArray[np.float64]
 
 _BLOCK_S = FilterChoice.block_s
 _ALIKE = 0.2
@@ -86,9 +84,8 @@ class Precision:
         the scatter of the residual in its band.
 
         Args:
-            system: the model; motions: the trials that were fitted; band: of residuals.
+            motions: the trials that were fitted; band: of residuals.
             p: (n_p,) the published parameters; identified: with their uncertainty.
-            noise: of the sensors.
         """
         timed = identified.input_timing.limit > 0.0
         full = np.append(p, identified.input_timing.estimate)
@@ -96,16 +93,17 @@ class Precision:
         weight = np.array([scatter.get(axis, 1.0) ** -2.0 for axis in system.coordinates])
         weight *= band.independent_share
 
+        def pose(motion: Motion) -> Problem:
+            return problem_of(system, [motion], band, timing=timed)
+
         def by_sensors(motion: Motion) -> Array:
-            problem = problem_of(system, [motion], band, timing=timed)
-            return find_information(system, motion, problem, 0, full, noise)
+            return find_information(system, motion, pose(motion), 0, full, noise)
 
         def by_residual(motion: Motion) -> Array:
-            problem = problem_of(system, [motion], band, timing=timed)
-            slope = stacked_residual(problem, 0, full).slope
+            slope = stacked_residual(pose(motion), 0, full).slope
             return np.asarray(np.einsum("tap,taq,a->pq", slope, slope, weight))
 
-        problem = problem_of(system, motions[:1], band, timing=timed)
+        problem = pose(motions[0])
         assumed = np.array([q.sd for q in system.parameters])
         names = [system.parameters[i].name for i in problem.free if i < len(p)]
         prior = np.array([assumed[i] if i < len(p) else problem.upper[-1] for i in problem.free])
@@ -127,20 +125,11 @@ class Precision:
             if np.exp(np.mean(np.log(by_scatter / formal))) > _LACKING:
                 of_motion, total, formal = by_residual, other, by_scatter
         return cls(
-            tuple(names),
-            np.array([e.sd for e in entries]),
-            formal,
-            np.array([e.systematic_sd or 0.0 for e in entries]),
-            np.array(lasting),
-            sum(_blocks_of(motion) for motion in motions),
-            total,
-            problem.precision,
-            of_motion,
-        )
-
-    def sd_with(self, added: Array, seconds: float) -> Array:
-        """Standard deviations, (n,), that are expected once there are trials more."""
-        return self.expect(added, seconds).median
+            tuple(names), np.array([e.sd for e in entries]), formal,
+            np.array([e.systematic_sd or 0.0 for e in entries]), np.array(lasting),
+            sum(max(1, int((m.t[-1] - m.t[0]) / _BLOCK_S)) for m in motions),
+            total, problem.precision, of_motion,
+        )  # fmt: skip
 
     def expect(self, added: Array, seconds: float) -> Expected:
         """What will be published once there are trials more.
@@ -207,7 +196,7 @@ class Precision:
         taken = max(blocks, 2 * self._fitted)
         return float(np.sqrt(taken / (taken - self._fitted)))
 
-    def worth_of(self, motion: Motion, parameter: str = "") -> float:
+    def worth_of(self, motion: Motion, parameter: str) -> float:
         """`worth` of one trial."""
         return self.worth(self.of_motion(motion), float(motion.t[-1]), parameter)
 
@@ -221,13 +210,14 @@ class Precision:
         if not parameter:
             return self.gain(added)
         place = self.names.index(parameter)
-        return float(np.log(self.sd[place] / self.sd_with(added, seconds)[place]))
+        return float(np.log(self.sd[place] / self.expect(added, seconds).median[place]))
 
     def gain(self, added: Array) -> float:
         """Half the drop of the log determinant of the covariance of all parameters, nats."""
         n = len(self.names)
+        # In units of the deviations, so that no determinant over- or underflows.
         before, after = (
-            np.linalg.slogdet(_correlation(_covariance(matrix)[:n, :n], self.sd))[1]
+            np.linalg.slogdet(_covariance(matrix)[:n, :n] / np.outer(self.sd, self.sd))[1]
             for matrix in (self.information, self.information + added)
         )
         return float(0.5 * (before - after))
@@ -236,12 +226,3 @@ class Precision:
 def _covariance(information: Array) -> Array:
     scale = 1.0 / np.sqrt(np.diag(information))
     return np.asarray(np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))
-
-
-def _correlation(covariance: Array, sd: Array) -> Array:
-    """The covariance in units of ``sd``, so that its determinant neither over- nor underflows."""
-    return np.asarray(covariance / np.outer(sd, sd))
-
-
-def _blocks_of(motion: Motion) -> int:
-    return max(1, int((motion.t[-1] - motion.t[0]) / _BLOCK_S))

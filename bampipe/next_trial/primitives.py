@@ -6,13 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.physics import System
 from bampipe.trials.measured import trial_of_block
 from bampipe.trials.motion import Motion
-
-Array = NDArray[np.float64]
 
 PEAK = 1.875
 """Highest over mean speed of a stroke of least jerk; of the acceleration, over travel per time
@@ -85,11 +83,7 @@ class Envelope:
 
     @classmethod
     def of_trials(cls, motions: Sequence[Motion], system: System, p: Array) -> Envelope:
-        """The envelope of ``motions``, within the limits of the device.
-
-        Args:
-            motions: the trials at hand; system: the model; p: (n_p,) its parameters.
-        """
+        """The envelope of the trials at hand, by a model with parameters ``p`` (n_p,)."""
         device = system.model.device
         axes = [c.name for c in device.coordinates]
         q, qd, qdd = (
@@ -327,10 +321,7 @@ def list_primitives(
 
 
 def _drop_repeated(designs: Sequence[Primitive]) -> list[Primitive]:
-    """The designs without those that are like an earlier one.
-
-    Slow strokes of several ranges are all made as short as the time allows, about one place.
-    """
+    """The designs, each once: slow strokes of several ranges may be alike for lack of time."""
     found: dict[tuple[object, ...], Primitive] = {}
     for design in designs:
         key: list[object] = [design.parts]
@@ -366,98 +357,65 @@ def find_beyond(
     moves = {i: (stroke.low, stroke.high, stroke.fast) for i, stroke in design.strokes.items()}
     if design.series is not None:
         moves = dict(enumerate(zip(*design.series.extent[:3], strict=True)))
-    farther = [
-        i
-        for i, (low, high, _) in moves.items()
-        if low < seen.low[i] - slack[i] or high > seen.high[i] + slack[i]
-    ]
-    faster = [
-        i for i, (_, _, fast) in moves.items() if fast > (share + _NOTABLE) * float(seen.speed[i])
-    ]
-    return farther, faster
+    lowest, highest = seen.low - slack, seen.high + slack
+    most = (share + _NOTABLE) * seen.speed
+    farther = [i for i, (low, high, _) in moves.items() if low < lowest[i] or high > highest[i]]
+    return farther, [i for i, (_, _, fast) in moves.items() if fast > most[i]]
 
 
 def _list_within(
     reach: Envelope, seen: Envelope, seconds: float, axes: Sequence[int], with_rests: bool
 ) -> list[Primitive]:
     """Primitives within ``reach``; what moves gently stays within ``seen``."""
-    found = [
-        _join([_strokes_of(reach, seconds, axis, span, band) for axis in seen.movable])
-        for band in _SPEEDS.values()
-        for span in (_SPANS["whole"], _SMALL)
+
+    def stroke(axis: int, span: tuple[float, float], pace: str) -> Stroke:
+        return _make_stroke(reach, seconds, axis, span, _SPEEDS[pace])
+
+    whole = _SPANS["whole"]
+    designs = [
+        {axis: stroke(axis, span, pace) for axis in seen.movable}
+        for pace in _SPEEDS
+        for span in (whole, _SMALL)
         if len(seen.movable) > 1
     ]
     for axis in axes:
-        own = [
-            _strokes_of(reach, seconds, axis, span, band)
-            for span in _SPANS.values()
-            for band in _SPEEDS.values()
-        ]
-        own += [
-            _strokes_of(reach, seconds, axis, _SMALL, _SPEEDS[name]) for name in ("slow", "fast")
-        ]
+        own = [stroke(axis, span, pace) for span in _SPANS.values() for pace in _SPEEDS]
+        own += [stroke(axis, _SMALL, pace) for pace in ("slow", "fast")]
         if with_rests:
-            wide = [
-                _strokes_of(reach, seconds, axis, _SPANS["whole"], _SPEEDS[name])
-                for name in ("moderate", "fast")
-            ]
-            own += [replace(one, strokes=_with_rests(one.strokes)) for one in wide]
+            wide = (stroke(axis, whole, pace) for pace in ("moderate", "fast"))
+            own += [replace(one, rest_s=_REST_S) for one in wide]
         others = [i for i in seen.movable if i != axis]
-        gentle = [_gentle(seen, seconds, i, seen.usual[i]) for i in others]
-        found += [_join([one, *gentle]) for one in own]
-        for other in others:
-            # One of them over all of its range.
-            beside = [
-                _strokes_of(reach, seconds, i, _SPANS["whole"], _SPEEDS["moderate"])
-                if i == other
-                else _gentle(seen, seconds, i, seen.usual[i])
-                for i in others
-            ]
-            whole = _strokes_of(reach, seconds, axis, _SPANS["whole"], _SPEEDS["moderate"])
-            found.append(_join([whole, *beside]))
-    return found
+        gentle = {i: _make_gentle(seen, seconds, i, seen.usual[i]) for i in others}
+        designs += [{axis: one, **gentle} for one in own]
+        # One of the others over all of its range.
+        both = {axis: stroke(axis, whole, "moderate"), **gentle}
+        designs += [both | {i: stroke(i, whole, "moderate")} for i in others]
+    return [Primitive(strokes, seen.usual, seconds) for strokes in designs]
 
 
-def _join(parts: Sequence[Primitive]) -> Primitive:
-    """All at once; the first is what it is about."""
-    strokes = {axis: stroke for part in parts for axis, stroke in part.strokes.items()}
-    return replace(parts[0], strokes=strokes)
-
-
-def _with_rests(strokes: Mapping[int, Stroke]) -> dict[int, Stroke]:
-    return {axis: replace(stroke, rest_s=_REST_S) for axis, stroke in strokes.items()}
-
-
-def _gentle(seen: Envelope, seconds: float, axis: int, middle: float) -> Primitive:
-    """Small easy strokes about a place."""
+def _make_gentle(seen: Envelope, seconds: float, axis: int, middle: float) -> Stroke:
+    """Small easy strokes of an axis about a place."""
     share = (middle - seen.low[axis]) / (seen.high[axis] - seen.low[axis])
-    ends = np.clip([share - GENTLE, share + GENTLE], 0.0, 1.0)
-    span = float(ends[0]), float(ends[1])
-    found = _strokes_of(seen, seconds, axis, span, _SPEEDS["moderate"])
-    return replace(found, strokes={axis: replace(found.strokes[axis], gentle=True)})
+    low, high = np.clip([share - GENTLE, share + GENTLE], 0.0, 1.0)
+    span = float(low), float(high)
+    return replace(_make_stroke(seen, seconds, axis, span, _SPEEDS["moderate"]), gentle=True)
 
 
-def _strokes_of(
-    seen: Envelope,
-    seconds: float,
-    axis: int,
-    span: tuple[float, float],
-    band: tuple[float, float],
-) -> Primitive:
-    """Strokes of one axis over part of its range, at part of its speed."""
-    travel = seen.high[axis] - seen.low[axis]
-    low, high = (float(seen.low[axis] + share * travel) for share in span)
-    slow, fast = (float(share * seen.speed[axis]) for share in band)
+def _make_stroke(
+    reach: Envelope, seconds: float, axis: int, span: tuple[float, float], band: tuple[float, float]
+) -> Stroke:
+    """Strokes of one axis over a span of its range, within a band of its speed."""
+    travel = reach.high[axis] - reach.low[axis]
+    low, high = (float(reach.low[axis] + share * travel) for share in span)
+    slow, fast = (float(share * reach.speed[axis]) for share in band)
     longest = seconds * np.sqrt(slow * fast) / (PEAK * FEWEST_STROKES)
     if high - low > longest:
         middle = 0.5 * (low + high)
         low, high = middle - 0.5 * float(longest), middle + 0.5 * float(longest)
     # Not faster than the acceleration that has been seen allows on that travel.
-    most = PEAK * np.sqrt(
-        _ACCELERATION * seen.acceleration[axis] * (high - low) / PEAK_ACCELERATION
-    )
-    fast = min(fast, float(most))
-    return Primitive({axis: Stroke(low, high, min(slow, fast), fast)}, seen.usual, seconds)
+    hardest = _ACCELERATION * reach.acceleration[axis]
+    fast = min(fast, float(PEAK * np.sqrt(hardest * (high - low) / PEAK_ACCELERATION)))
+    return Stroke(low, high, min(slow, fast), fast)
 
 
 def vary_surroundings(seen: Envelope, given: Primitive) -> Iterator[Primitive]:
@@ -467,8 +425,8 @@ def vary_surroundings(seen: Envelope, given: Primitive) -> Iterator[Primitive]:
             low, high = float(reach.low[axis]), float(reach.high[axis])
             if reach is seen or high - low > float(seen.high[axis] - seen.low[axis]):
                 for share in _POSES:
-                    moved = _gentle(reach, given.seconds, axis, low + share * (high - low)).strokes
-                    yield _in_parts(replace(given, strokes={**given.strokes, **moved}), seen)
+                    moved = _make_gentle(reach, given.seconds, axis, low + share * (high - low))
+                    yield _in_parts(replace(given, strokes={**given.strokes, axis: moved}), seen)
     if seen.field.any():
         for field in _FIELDS:
             yield replace(given, field=field)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
+from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_residual
 from bampipe.diagnosis.criteria import Criteria
@@ -22,8 +22,6 @@ from bampipe.physics.parameter import Parameter
 from bampipe.results.next import Detectable
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
-
-Array = NDArray[np.float64]
 
 _FACTORS = np.geomspace(1e-4, 100.0, 241)
 """Of the typical strength: a factor of 1.06 from one to the next, with straight lines between. What
@@ -216,7 +214,7 @@ class Detectability:
     def gain(self, motion: Motion) -> float:
         """Sum of the logarithms by which a trial lowers what goes unnoticed of these effects."""
         now = np.minimum([one.factor for one in self.limits], _FACTORS[-1])
-        then = np.clip(self.factors_with([motion]), 1.0, now)
+        then = np.clip(self.factors_with(motion), 1.0, now)
         return float(np.sum(np.log(now / then)))
 
     def tabulate(self, motions: Sequence[Motion]) -> dict[str, Detectable]:
@@ -225,7 +223,7 @@ class Detectability:
         Args:
             motions: versions of the trial, of which the median counts.
         """
-        after = np.median([self.factors_with([motion]) for motion in motions], axis=0)
+        after = np.median([self.factors_with(motion) for motion in motions], axis=0)
         axes = self.comparison.fit.evidence.system.coordinates
         return {
             one.alternative.name: Detectable(
@@ -240,10 +238,10 @@ class Detectability:
             if one.is_promised
         }
 
-    def factors_with(self, motions: Sequence[Motion]) -> Array:
-        """From which factor on each effect is found once ``motions`` have been recorded."""
+    def factors_with(self, motion: Motion) -> Array:
+        """From which factor on each effect is found once ``motion`` has been recorded."""
         now, before = np.array([one.factor for one in self.limits]), self._factors_at_hand
-        after = self._factors(self.comparison.at_hand + self.comparison.sums(motions))
+        after = self._factors(self.comparison.at_hand + self.comparison.sums([motion]))
         # What is not linear in its strength is taken to change alike.
         ratio = np.ones(len(now))
         known = np.isfinite(before) & np.isfinite(now)
@@ -287,7 +285,11 @@ def _refine(
     """The same with each effect at the strength found: it may not be linear in its strength."""
     refined = list(found)
     for _ in range(3):
-        chosen = [k for k, one in enumerate(refined) if _is_nonlinear(one)]
+        chosen = [
+            k
+            for k, one in enumerate(refined)
+            if not _is_linear(one.item) and 1e-3 < one.factor < np.inf
+        ]
         if not chosen:
             break
         probe = replace(
@@ -297,11 +299,6 @@ def _refine(
         for k, one in zip(chosen, again, strict=True):
             refined[k] = replace(refined[k], factor=refined[k].factor * one.factor, axis=one.axis)
     return refined
-
-
-def _is_nonlinear(found: DetectionLimit) -> bool:
-    """Whether an effect is not linear in its strength, and shows at a strength at all."""
-    return not _is_linear(found.item) and 1e-3 < found.factor < np.inf
 
 
 def _at_strength_found(found: DetectionLimit) -> Alternative:

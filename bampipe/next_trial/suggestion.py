@@ -111,7 +111,6 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
 
     Args:
         session: the trials; final: the model with its most probable set, fitted.
-        result: the diagnosis.
     """
     asked = find_ambiguity(result, session.criteria)
     comparison = compare_alternatives(session, final, asked) if asked is not None else None
@@ -133,16 +132,11 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
     axis = max(expected.left, key=lambda name: expected.left[name])
     first, second = expected.between
     design = describe(best.design, seen, e.system.model.device)
+    before, after = expected.before, expected.after
     return SuggestedTrial(
-        between=expected.between,
-        axis=axis,
-        design=design,
-        separation=expected.left[axis],
+        between=expected.between, axis=axis, design=design, separation=expected.left[axis],
         separation_now=float(now.left[e.system.coordinates.index(axis)]),
-        confusion=expected.after,
-        confusion_now=expected.before,
-        sentence=(
-            f"To tell {first} from {second}, record this: {design} The chance of confusing"
-            f" them would fall from {say_chance(expected.before)} to {say_chance(expected.after)}."
-        ),
-    )
+        confusion=after, confusion_now=before,
+        sentence=f"To tell {first} from {second}, record this: {design} The chance of confusing"
+        f" them would fall from {say_chance(before)} to {say_chance(after)}.",
+    )  # fmt: skip

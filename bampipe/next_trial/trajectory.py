@@ -12,16 +12,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.lists import join_names
 from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.primitives import PARTS, SHORTEST_S, Envelope, Primitive, Series
 from bampipe.physics.device import Device
 from bampipe.results.next import Extent
-
-Array = NDArray[np.float64]
 
 Form = Literal["csv", "json", "yaml"]
 HZ = 100.0
@@ -52,11 +50,10 @@ def require_limits(device: Device, where: str) -> None:
             remedy="record the sentence of `bampipe next` by hand; --plan prints a sheet of trials",
         )
     axes = [c.name for c in device.coordinates]
-    stated = {
-        "lower and upper": device.limits,
-        "speed": device.speed_limits,
+    stated: dict[str, Mapping[str, object]] = {
+        "lower and upper": device.limits, "speed": device.speed_limits,
         "effort": device.effort_limits,
-    }
+    }  # fmt: skip
     lacking = {name: [a for a in axes if a not in known] for name, known in stated.items()}
     if any(lacking.values()):
         said = [f"{name} of {join_names(of, 3)}" for name, of in lacking.items() if of]

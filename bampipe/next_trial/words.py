@@ -8,14 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from bampipe.lists import join_names
-from bampipe.next_trial.primitives import (
-    PEAK,
-    Envelope,
-    Example,
-    Primitive,
-    Stroke,
-    find_beyond,
-)
+from bampipe.next_trial.primitives import PEAK, Envelope, Example, Primitive, Stroke, find_beyond
 from bampipe.physics.device import Coordinate, Device
 
 _AGAIN = 1.2
@@ -32,9 +25,8 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
     if design.example is not None:
         return f"{_imitate(design, design.example, device)}{_with(design, device)}."
     if design.series is not None:
-        text = (
-            f"Let the drives follow the trajectory, for {design.seconds:.3g} s{_in_parts(design)}"
-        )
+        time = f"{design.seconds:.3g} s{_in_parts(design)}"
+        text = f"Let the drives follow the trajectory, for {time}"
         return f"{text}{_with(design, device)}{_say_beyond(design, seen, axes)}."
     first = next(iter(design.strokes))
     beside = [i for i, one in design.strokes.items() if one.gentle]
@@ -52,15 +44,14 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
             f"{name} {end}, {time}" for name, end, time in zip(names, ends, times, strict=True)
         )
         text = f"Move {join_names(names)} back and forth at once, {each}"
-    text += f", for {design.seconds:.3g} s"
-    text += _in_parts(design)
+    text += f", for {design.seconds:.3g} s{_in_parts(design)}"
     if beside:
         about = join_names(_about(design.strokes[i], axes[i].unit) for i in beside)
         others = join_names(axes[i].name for i in beside)
         text += f"; meanwhile keep {others} moving gently, {about}"
-    still = [i for i in range(len(axes)) if i not in design.strokes]
+    still = [axis.name for i, axis in enumerate(axes) if i not in design.strokes]
     if still:
-        text += f"; leave {join_names(axes[i].name for i in still)} alone"
+        text += f"; leave {join_names(still)} alone"
     return f"{text}{_with(design, device)}{_say_beyond(design, seen, axes)}."
 
 
@@ -115,7 +106,7 @@ def _say_beyond(design: Primitive, seen: Envelope, axes: Sequence[Coordinate]) -
     farther, faster = ([axes[i].name for i in group] for group in find_beyond(design, seen))
     if not (farther or faster):
         return ""
-    if farther and faster and set(farther) == set(faster):
+    if set(farther) == set(faster):
         text = f"{join_names(farther)} farther and faster"
     else:
         parts = (farther, "farther"), (faster, "faster")

@@ -10,11 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bampipe.physics.robot import Robot
-
-Array = NDArray[np.float64]
 
 _DEPENDENT = 1e-7
 """Share of a column that those before it leave, below which it depends on them."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any
 
 import sympy as sp
@@ -76,17 +76,11 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]
     _print_Heaviside = _print_sign = _print_Abs = _print_tanh = _print_Function
     _print_sin = _print_cos = _print_tan = _print_exp = _print_log = _print_atan = _print_Function
 
-    def _nest_calls(self, name: str, arguments: Sequence[Any]) -> str:
-        text = self._print(arguments[0])
-        for argument in arguments[1:]:
-            text = f"{name}({text}, {self._print(argument)})"
-        return text
-
     def _print_Max(self, expr: Any) -> str:
-        return self._nest_calls("maximum", expr.args)
+        name, parts = _NAMES[type(expr).__name__], map(self._print, expr.args)
+        return reduce(lambda text, part: f"{name}({text}, {part})", parts)
 
-    def _print_Min(self, expr: Any) -> str:
-        return self._nest_calls("minimum", expr.args)
+    _print_Min = _print_Max
 
     def _print_Pow(self, expr: Any, **_: Any) -> str:
         base, exponent = expr.as_base_exp()
@@ -97,13 +91,23 @@ class _Printer(PythonCodePrinter):  # type: ignore[misc]
             return "(" + "*".join([factor] * int(exponent)) + ")"
         if exponent.is_Integer and exponent < 0:
             return f"(1.0/({self._print(base**-exponent)}))"
-        return f"({self._print(base)})**({self._print(exponent)})"
+        return self._print_power(self._print(base), self._print(exponent))
+
+    def _print_power(self, base: str, exponent: str) -> str:
+        return f"({base})**({exponent})"
 
     def _print_Rational(self, expr: Any) -> str:
         return f"({float(expr)!r})"
 
     def _print_Float(self, expr: Any) -> str:
         return repr(float(expr))
+
+
+class _PortablePrinter(_Printer):
+    """Prints powers as Python and C both take them."""
+
+    def _print_power(self, base: str, exponent: str) -> str:
+        return f"pow({base}, {exponent})"
 
 
 @dataclass(frozen=True)
@@ -133,7 +137,7 @@ class Bodies:
 
     Attributes:
         names: intermediates that it gives, in order; none where the device is no robot.
-        source: of the module; empty without names.
+        source: of the module.
     """
 
     names: tuple[Any, ...]
@@ -143,8 +147,6 @@ class Bodies:
 def bodies_at_state(e: Equations) -> Bodies:
     """``bodies(x, p)``: what the mass matrix and the bias take from a robot's bodies."""
     names, block = _print_bodies(e, [*_upper_entries(e), *e.bias])
-    if not names:
-        return Bodies((), "")
     lines = [*unpack_groups({"x": [*e.q, *e.qd], "p": e.p}, block.used), *block.lines]
     lines += [f"return ({', '.join(block.values)},)"]
     returned = f"types.UniTuple(types.float64, {len(names)})"
@@ -156,21 +158,25 @@ def bodies_at_state(e: Equations) -> Bodies:
 def bodies_along_motion(e: Equations) -> Bodies:
     """``bodies(q, qd, qdd, p, out)``: the forces that a robot's bodies require, (T, names)."""
     names, block = _print_bodies(e, e.dynamics)
-    if not names:
-        return Bodies((), "")
-    row = unpack_groups({"q": e.q, "qd": e.qd, "qdd": e.qdd}, block.used, "row, {}")
+    return Bodies(names, _print_along_motion("bodies", _select_groups(e, "q qd qdd"), e.p, block))
+
+
+def _print_along_motion(
+    name: str, groups: Mapping[str, Sequence[Any]], p: Sequence[Any], block: Block
+) -> str:
+    """Module of a compiled function of groups of columns, then p and out, that fills out's rows."""
+    row = unpack_groups(groups, block.used, "row, {}")
     row += [*block.lines, *(f"out[row, {i}] = {v}" for i, v in enumerate(block.values))]
-    body = [*unpack_groups({"p": e.p}, block.used), *_indent_loop("for row in range(len(q)):", row)]
-    arguments, kinds = "q, qd, qdd, p, out", "M, M, M, V, M"
-    source = compiled_function("bodies", arguments, body, kinds=kinds, options="")
-    return Bodies(names, SCALAR_HEADER + source)
+    body = [*unpack_groups({"p": p}, block.used), *_indent_loop("for row in range(len(q)):", row)]
+    arguments, kinds = ", ".join([*groups, "p, out"]), ", ".join(["M"] * len(groups) + ["V", "M"])
+    return SCALAR_HEADER + compiled_function(name, arguments, body, kinds=kinds, options="")
 
 
 def _print_bodies(e: Equations, results: Sequence[Any]) -> tuple[tuple[Any, ...], Block]:
     """Those of ``e.steps`` that ``results`` take as they are, and their text."""
     wanted: set[Any] = set().union(*(sp.sympify(x, strict=True).free_symbols for x in results))
     names = tuple(name for name, _ in e.steps if name in wanted)
-    return names, print_block(names, e.steps) if names else Block(set(), [], [])
+    return names, print_block(names, e.steps)
 
 
 def _upper_entries(e: Equations) -> list[Any]:
@@ -179,13 +185,16 @@ def _upper_entries(e: Equations) -> list[Any]:
 
 
 def print_block(
-    results: Sequence[Any], steps: Sequence[tuple[Any, Any]] = (), known: Sequence[Any] = ()
+    results: Sequence[Any],
+    steps: Sequence[tuple[Any, Any]] = (),
+    known: Sequence[Any] = (),
+    kind: type[_Printer] = _Printer,
 ) -> Block:
     """The text of ``results``, with those of ``steps`` in front that they need.
 
     Those in ``known`` have been assigned before.
     """
-    printer = _Printer()
+    printer = kind()
     used: set[Any] = set().union(*(sp.sympify(e, strict=True).free_symbols for e in results))
     needed = []
     for name, value in reversed(steps):
@@ -241,7 +250,7 @@ def portable_expressions(
         for f, o in zip(e.dynamics, e.other, strict=True)
     ]
     steps = [(name, value.xreplace(numbers)) for name, value in e.steps]
-    block = print_block(required, steps)
+    block = print_block(required, steps, kind=_PortablePrinter)
     return block.lines, block.values, [symbol for symbol in e.u if symbol in block.used]
 
 
@@ -255,8 +264,17 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
         "initial_memory": ("q u p", e.initial),
         "compensation": ("q qd z u p", [expr for expr in e.compensation if expr != 0]),
     }
+    return _print_over_columns(e, results, ())
+
+
+def _print_over_columns(
+    e: Equations,
+    results: Mapping[str, tuple[str, Sequence[Any]]],
+    steps: Sequence[tuple[Any, Any]],
+) -> str:
+    """Module of functions over columns: by name, their groups and what they return."""
     return ARRAY_HEADER + "".join(
-        function_source(name, _select_groups(e, groups), exprs)
+        function_source(name, _select_groups(e, groups), exprs, steps)
         for name, (groups, exprs) in results.items()
     )
 
@@ -290,10 +308,7 @@ def dynamics_source(e: Equations) -> str:
         "mass_matrix": ("q p", [m for row in e.mass for m in row]),
         "energy": ("q qd p", [e.kinetic, e.potential]),
     }
-    return ARRAY_HEADER + "".join(
-        function_source(name, _select_groups(e, groups), exprs, e.steps)
-        for name, (groups, exprs) in results.items()
-    )
+    return _print_over_columns(e, results, e.steps)
 
 
 def compiled_function(
@@ -424,12 +439,7 @@ def residual_source(e: Equations, bodies: Sequence[Any]) -> str:
     ]
     block = print_block(residual, e.steps, bodies)
     groups = {**_select_groups(e, "q qd qdd"), "b": bodies, **_select_groups(e, "z u")}
-    row = unpack_groups(groups, block.used, "row, {}")
-    row += block.lines + [f"out[row, {i}] = {v}" for i, v in enumerate(block.values)]
-    body = [*unpack_groups({"p": e.p}, block.used), *_indent_loop("for row in range(len(q)):", row)]
-    kinds = "M, M, M, M, M, M, V, M"
-    arguments = "q, qd, qdd, b, z, u, p, out"
-    return SCALAR_HEADER + compiled_function("residual", arguments, body, kinds=kinds, options="")
+    return _print_along_motion("residual", groups, e.p, block)
 
 
 def law_source(

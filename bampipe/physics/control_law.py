@@ -59,15 +59,14 @@ def _print_law(device: Device, inputs: tuple[str, ...]) -> str:
 
     from bampipe.physics.codegen import law_source
 
-    axes = [c.name for c in device.coordinates]
-    motion = [sp.Symbol(f"y{i}", real=True) for i in range(2 * len(axes))]
-    given = [sp.Symbol(f"r{i}", real=True) for i in range(len(inputs))]
-    symbols = dict(zip([*axes, *(f"qd_{a}" for a in axes)], motion, strict=True))
-    symbols |= dict(zip(inputs, given, strict=True))
     assert device.controller is not None
-    states = device.controller.states
-    kept = [sp.Symbol(f"s{i}", real=True) for i in range(len(states))]
-    symbols |= dict(zip(states, kept, strict=True))
+    axes, states = [c.name for c in device.coordinates], device.controller.states
+    groups = {"y": [*axes, *(f"qd_{a}" for a in axes)], "r": inputs, "s": [*states]}
+    motion, given, kept = (
+        {name: sp.Symbol(f"{letter}{i}", real=True) for i, name in enumerate(names)}
+        for letter, names in groups.items()
+    )
+    symbols = motion | given | kept
     symbols |= {name: sp.Float(c.value) for name, c in device.constants.items()}
 
     def no_rate(_: object) -> object:
@@ -79,13 +78,6 @@ def _print_law(device: Device, inputs: tuple[str, ...]) -> str:
 
     parts = [(f"command.{force}", device.controller.command[force]) for force in device.forces]
     parts += [(f"states.{name}.rate", state.rate) for name, state in states.items()]
-    law = [
-        expression.build(
-            tree,
-            symbols,
-            f"device {device.name!r}: controller.{place}",
-            {"sgn": sp.sign, "ddt": no_rate},
-        )
-        for place, tree in parts
-    ]
-    return law_source(motion, given, kept, law)
+    where, special = f"device {device.name!r}: controller", {"sgn": sp.sign, "ddt": no_rate}
+    law = [expression.build(tree, symbols, f"{where}.{place}", special) for place, tree in parts]
+    return law_source([*motion.values()], [*given.values()], [*kept.values()], law)

@@ -87,7 +87,7 @@ def _assemble_equations(d: Vocabulary) -> Equations:
         input_map=forces.input_map, rates=rates, initial=initial,
         offset=terms.offset, offset_rate=offset_rate,
         kinetic=motion.kinetic, potential=motion.potential,
-        dependence=_find_dependence(d, residual, [*rates, *terms.offset], motion, forces.w),
+        dependence=_find_dependence(d, residual, [*rates, *terms.offset], motion.steps, forces.w),
         compensation=find_compensation(d, motion.potential, forces.logged, forces.side),
         delays=find_delays(d, forces.applied),
     )  # fmt: skip
@@ -279,14 +279,8 @@ def _check_dependence(d: Vocabulary, forces: _Forces, terms: _Terms) -> None:
     allow("an offset", terms.offset, symbols_allowed, "positions, forces and parameters")
 
 
-@dataclass(frozen=True)
-class _Motion:
-    """The left side of the equations of motion, by names in ``steps``.
-
-    Attributes:
-        steps, mass, bias, dynamics, kinetic, potential: as in `Equations`.
-        names, numbers: symbols that the steps define, and those that they read.
-    """
+class _Motion(NamedTuple):
+    """The left side of the equations of motion, by names in ``steps``: all as in `Equations`."""
 
     steps: list[tuple[Any, Any]]
     mass: list[list[Any]]
@@ -294,8 +288,6 @@ class _Motion:
     dynamics: list[Any]
     kinetic: Any
     potential: Any
-    names: frozenset[Any] = frozenset()
-    numbers: frozenset[Any] = frozenset()
 
 
 def _combine_motion(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
@@ -311,7 +303,6 @@ def _combine_motion(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
         bodies.steps, [_add(*rows) for rows in zip(energy_motion.mass, bodies.mass, strict=True)],
         _add(energy_motion.bias, bodies.bias), _add(energy_motion.dynamics, bodies.dynamics),
         energy_motion.kinetic + bodies.kinetic, energy_motion.potential + bodies.potential,
-        bodies.names, bodies.numbers,
     )  # fmt: skip
 
 
@@ -365,21 +356,24 @@ def _apply_newton_euler(
     momentum = [sum(m * v for m, v in zip(row, qd, strict=True)) for row in mass]
     kinetic = sum(p * v for p, v in zip(momentum, qd, strict=True)) / 2
     potential = potential_energy(algebra, links, inertial, q, gravity)
-    names = frozenset(name for name, _ in text.steps)
-    numbers_read = frozenset(_collect_symbols(value for _, value in text.steps))
-    return _Motion(text.steps, mass, bias, dynamics, kinetic, potential, names, numbers_read)
+    return _Motion(text.steps, mass, bias, dynamics, kinetic, potential)
 
 
 def _find_dependence(
-    d: Vocabulary, residual: Sequence[Any], beside: Sequence[Any], motion: _Motion, w: Sequence[Any]
+    d: Vocabulary,
+    residual: Sequence[Any],
+    beside: Sequence[Any],
+    steps: Sequence[tuple[Any, Any]],
+    w: Sequence[Any],
 ) -> Dependence:
     """Find how the residual depends on each parameter.
 
     Args:
         residual: one expression an axis; beside: other expressions of the model, in which a
-            parameter makes it nonlinear; motion: whose steps stand in the residual by name; w: the
-            noise, which slopes leave out.
+            parameter makes it nonlinear; steps: that stand in the residual by name; w: the noise,
+            which slopes leave out.
     """
+    step_names, numbers = {name for name, _ in steps}, _collect_symbols(v for _, v in steps)
     found = Dependence([], [], [], [], [], [])
     p, varying = [*d.p.values()], {*d.p.values(), *d.z.values()}
     inputs, no_noise = {*d.channel.values()}, dict.fromkeys(w, 0)
@@ -389,7 +383,7 @@ def _find_dependence(
     for i, symbol in enumerate(p):
         by_axis = {k: sp.diff(e, symbol) for k, e, symbols in with_symbols if symbol in symbols}
         slopes = [*by_axis.values()]
-        slope_symbols, bodily = _collect_symbols(slopes), symbol in motion.numbers
+        slope_symbols, bodily = _collect_symbols(slopes), symbol in numbers
         candidates = slope_symbols.intersection(p[: i + 1])
         sized = [(slope, slope.count_ops() > _LARGE) for slope in slopes]
         small = [slope for slope, is_large in sized if not is_large]
@@ -398,7 +392,7 @@ def _find_dependence(
         curving |= {s for s in candidates - curving if any(sp.diff(e, s) != 0 for e in small)}
         linear = symbol not in curving and symbol not in elsewhere
         constant = linear and not slope_symbols & varying
-        lasts = constant and not bodily and slope_symbols.isdisjoint(motion.names)
+        lasts = constant and not bodily and slope_symbols.isdisjoint(step_names)
         found.linear.append(linear)
         found.constant.append(constant)
         found.unforced.append(constant and slope_symbols.isdisjoint(inputs))

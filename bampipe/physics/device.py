@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, PrivateAttr
 
@@ -153,7 +153,29 @@ _NEEDED = ("coordinates", "inputs", "applied")
 """Tables that every device has; those of a robot are filled in where its file is read."""
 
 
-class Device(Declaration):
+class DeclaredFile(Declaration):
+    """What one TOML file declares, with the parsed file."""
+
+    _declaration: Mapping[str, Any] = PrivateAttr({})
+
+    @property
+    def declaration(self) -> Mapping[str, Any]:
+        """The parsed file."""
+        return self._declaration
+
+    @classmethod
+    def from_declaration(cls, declaration: Mapping[str, Any], where: str) -> Self:
+        """Check a declaration, named ``where`` in messages, and make one of it.
+
+        Raises:
+            InputError: something is missing, unknown or of the wrong type; names the field.
+        """
+        found = read(cls, declaration, where)
+        found._declaration = declaration
+        return found
+
+
+class Device(DeclaredFile):
     """A device: coordinates, energies, inputs and friction of one mechanism."""
 
     schema_: Literal["bampipe.device/1"] = Field(default="bampipe.device/1", alias="schema")
@@ -210,12 +232,6 @@ class Device(Declaration):
     default_effects: Distinct[Text] = Field(
         default=(), description="Effects that its base model has"
     )
-    _declaration: Mapping[str, Any] = PrivateAttr({})
-
-    @property
-    def declaration(self) -> Mapping[str, Any]:
-        """The parsed file."""
-        return self._declaration
 
     @property
     def kinetic(self) -> ast.expr:
@@ -299,15 +315,12 @@ class Device(Declaration):
             return
         axes = [c.name for c in self.coordinates]
         yield from self._faults_of_bodies()
-        for label, table in (
-            ("torque", self.torque),
-            ("applied", self.applied),
-            ("side_load", self.side_load),
-            ("inputs.brakes", self.brakes),
-            ("friction", self.friction),
-            ("limits", self.ranges),
-            *((f"process_noise.{k}.torque", n.torque) for k, n in self.process_noise.items()),
-        ):
+        tables: dict[str, Mapping[str, Any]] = {
+            "torque": self.torque, "applied": self.applied, "side_load": self.side_load,
+            "inputs.brakes": self.brakes, "friction": self.friction, "limits": self.ranges,
+        }  # fmt: skip
+        tables |= {f"process_noise.{k}.torque": n.torque for k, n in self.process_noise.items()}
+        for label, table in tables.items():
             for axis in table:
                 if axis not in axes:
                     yield InputError(
@@ -323,17 +336,14 @@ class Device(Declaration):
             )
         rates = [derivative(f, k) for f in self.forces for k in range(1, len(INPUT_ORDERS))]
         taken = dict.fromkeys(["t", *(f"qd_{a}" for a in axes), *rates], "a built-in symbol")
-        for label, names in (
-            ("coordinates", axes),
-            ("inputs.force", self.forces),
-            ("inputs.brakes", self.brakes.values()),
-            ("inputs.channels", self.channels),
-            ("controller.channels", law.channels if law else ()),
-            ("controller.states", law.states if law else ()),
-            ("constants", self.constants),
-            ("definitions", self.definitions),
-            ("parameters", [p.name for p in self.other_parameters]),
-        ):
+        own: dict[str, Iterable[str]] = {
+            "coordinates": axes, "inputs.force": self.forces,
+            "inputs.brakes": self.brakes.values(), "inputs.channels": self.channels,
+            "controller.channels": law.channels if law else (),
+            "controller.states": law.states if law else (), "constants": self.constants,
+            "definitions": self.definitions, "parameters": [p.name for p in self.other_parameters],
+        }  # fmt: skip
+        for label, names in own.items():
             for name in names:
                 if name in taken:
                     yield InputError(f"{name!r} is the name of {taken[name]} already", where=label)
@@ -367,10 +377,9 @@ class Device(Declaration):
         Raises:
             InputError: there is none.
         """
-        for coordinate in self.coordinates:
-            if coordinate.name == name:
-                return coordinate
-        known = [c.name for c in self.coordinates]
+        known = {c.name: c for c in self.coordinates}
+        if name in known:
+            return known[name]
         raise InputError(
             f"device {self.name!r} has no axis {name!r}{did_you_mean(name, known)}",
             remedy=f"its axes are {', '.join(known)}",
@@ -407,15 +416,5 @@ def derivative(force: str, order: int) -> str:
 
 
 def device_from(declaration: Mapping[str, Any], where: str = "device file") -> Device:
-    """Check a device declaration and make a `Device` of it.
-
-    Args:
-        declaration: the parsed TOML of a device file.
-        where: its name, for messages.
-
-    Raises:
-        InputError: something is missing, unknown or of the wrong type; names the field.
-    """
-    device = read(Device, declaration, where)
-    device._declaration = declaration
-    return device
+    """The device of a parsed file; see `DeclaredFile.from_declaration`."""
+    return Device.from_declaration(declaration, where)

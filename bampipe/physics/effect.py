@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, PrivateAttr, StringConstraints, Tag
+from pydantic import Discriminator, Field, StringConstraints, Tag
 
 from bampipe.errors import InputError, did_you_mean
 from bampipe.physics import expression
-from bampipe.physics.device import INPUT_ORDERS, Device, derivative
+from bampipe.physics.device import INPUT_ORDERS, DeclaredFile, Device, derivative
 from bampipe.physics.expression import Expression, Name
 from bampipe.physics.parameter import Parameter
-from bampipe.schema import ByName, Declaration, Distinct, NamedDeclaration, Text, read
+from bampipe.schema import ByName, Declaration, Distinct, NamedDeclaration, Text
 
 # What an effect of each kind must give, where it may apply.
 _EXPRESSIONS = {
@@ -93,7 +93,7 @@ class State(NamedDeclaration):
         return entry.unit if entry else self.unit
 
 
-class Effect(Declaration):
+class Effect(DeclaredFile):
     """An effect: one physical term that a model may have; `bind` places it on a device."""
 
     schema_: Literal["bampipe.effect/1"] = Field(default="bampipe.effect/1", alias="schema")
@@ -165,12 +165,6 @@ class Effect(Declaration):
     states: Annotated[tuple[State, ...], ByName(Name)] = Field(
         default=(), description="Internal states, by name, where it has memory"
     )
-    _declaration: Mapping[str, Any] = PrivateAttr({})
-
-    @property
-    def declaration(self) -> Mapping[str, Any]:
-        """The parsed file."""
-        return self._declaration
 
     @cached_property
     def expressions(self) -> Mapping[str, ast.expr]:
@@ -240,13 +234,12 @@ class Effect(Declaration):
         if self.robot is not None and self.robot != (device.robot is not None):
             return ()
         if self.scope == "axis":
-            used = self.names
             return tuple(
                 c.name
                 for c in device.coordinates
                 if not self._lacks_kind(c.kind)
-                and ("brake" not in used or c.name in device.brakes)
-                and ("dry" not in used or device.has_dry_friction(c.name))
+                and ("brake" not in self.names or c.name in device.brakes)
+                and ("dry" not in self.names or device.has_dry_friction(c.name))
             )
         if self.scope == "axis_pair":
             return tuple(self.pairs(device))
@@ -386,18 +379,8 @@ class BoundEffect:
 
 
 def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> Effect:
-    """Check an effect declaration and make an `Effect` of it.
-
-    Args:
-        declaration: the parsed TOML of an effect file.
-        where: its name, for messages.
-
-    Raises:
-        InputError: something is missing, unknown or of the wrong type; names the field.
-    """
-    effect = read(Effect, declaration, where)
-    effect._declaration = declaration
-    return effect
+    """The effect of a parsed file; see `DeclaredFile.from_declaration`."""
+    return Effect.from_declaration(declaration, where)
 
 
 def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = ()) -> BoundEffect:
@@ -427,7 +410,9 @@ def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = 
             else f"effect {effect.name!r} needs a target",
             remedy=f"choose from {choices}",
         )
-    axes = _find_axes(effect, target, device)
+    axes: tuple[str, ...] = (target,) if effect.scope == "axis" else ()
+    if effect.scope == "axis_pair":
+        axes = effect.pairs(device)[target]
     kind = device.coordinate(axes[0]).kind if axes else ""
     prefix = f"{effect.name}.{target}" if target else effect.name
     bound = []
@@ -449,13 +434,6 @@ def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = 
             )
         )
     return BoundEffect(effect, target, tuple(bound), axes)
-
-
-def _find_axes(effect: Effect, target: str, device: Device) -> tuple[str, ...]:
-    """The coordinates that ``target`` stands for."""
-    if effect.scope == "axis_pair":
-        return effect.pairs(device)[target]
-    return (target,) if effect.scope == "axis" else ()
 
 
 def unit_of(unit: str, effect: Effect, target: str, device: Device) -> str:

@@ -38,9 +38,8 @@ def check_inertia(model: Model, mass: list[list[Any]], symbols: list[Any]) -> No
     }
     values = np.array([[float(m.subs(numbers)) for m in row] for row in mass])
     if np.linalg.matrix_rank(values) < len(values):
-        bare = [
-            c.name for c, v in zip(model.device.coordinates, values, strict=True) if not v.any()
-        ]
+        rows = zip(model.device.coordinates, values, strict=True)
+        bare = [c.name for c, v in rows if not v.any()]
         raise InputError(
             f"{'coordinate ' + bare[0] if bare else 'some coordinate'} has no inertia of its own",
             where=f"device {model.device.name!r}: energy.kinetic",

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from types import ModuleType
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array, Flags
 
 _STEPS = (1, 3, 12, 48, 192)
 """Steps a sample tried in turn, until a stiff state is integrated without running away."""
@@ -71,7 +70,7 @@ def integrate_memory(
     return np.delete(out, at + np.arange(at.size), axis=0) if at.size else out
 
 
-def _find_switches(u: Array, commands: Sequence[int]) -> NDArray[np.bool_]:
+def _find_switches(u: Array, commands: Sequence[int]) -> Flags:
     """Find where one of ``commands`` has been switched since the sample before, (T, n_u)."""
     switched = np.zeros(u.shape, dtype=bool)
     for i in commands if len(u) > 3 else ():

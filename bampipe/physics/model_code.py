@@ -75,11 +75,10 @@ def whole_code(model: Model) -> Generation:
     equations = _derive_once(model)
     slopes, places = slopes_source(equations)
     along, here = bodies_along_motion(equations), bodies_at_state(equations)
+    lasting = enumerate(equations.dependence.lasting)
     facts = {
         "slopes": places,
-        "lasting": [
-            i for i, by_axis in enumerate(equations.dependence.lasting) if by_axis is not None
-        ],
+        "lasting": [i for i, by_axis in lasting if by_axis is not None],
         "of_bodies": equations.dependence.of_bodies,
         "bodies": len(along.names),
     }

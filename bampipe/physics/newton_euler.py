@@ -14,10 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 Vector = tuple[Any, Any, Any]
-Array = NDArray[np.float64]
 
 ZERO: Vector = (0, 0, 0)
 INERTIAL = 10

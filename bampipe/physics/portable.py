@@ -9,15 +9,12 @@ from __future__ import annotations
 import re
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.physics.codegen import portable_expressions
 from bampipe.physics.derivation import derive
 from bampipe.physics.model import Model
 
-Array = NDArray[np.float64]
 Language = Literal["python", "c"]
 
 _PYTHON = '''"""{title}
@@ -112,8 +109,8 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
     if logged:
         about += f" Forces are those that act; what is logged differs by {logged}."
     if language == "c":
-        lines = [f"const double {_translate_powers(line)};" for line in lines]
-        values = [f"force[{i}] = {_translate_powers(v)};" for i, v in enumerate(values)]
+        lines = [f"const double {line};" for line in lines]
+        values = [f"force[{i}] = {v};" for i, v in enumerate(values)]
     python = language == "python"
     return (_PYTHON if python else _C).format(
         title=f"{model.device.name}{f' with {effects}' if effects else ''}, identified by bampipe.",
@@ -125,23 +122,3 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
         body="\n    ".join(lines) or ("pass" if python else ""),
         values=(", " if python else "\n    ").join(values),
     )
-
-
-def _translate_powers(text: str) -> str:
-    """Python's ``(a)**(b)`` as C's ``pow(a, b)``; all else is written alike in both."""
-    while "**" in text:
-        at = text.index("**")
-        start, end = _find_partner(text, at - 1, -1), _find_partner(text, at + 2, 1)
-        base, exponent = text[start:at], text[at + 2 : end + 1]
-        text = f"{text[:start]}pow({base}, {exponent}){text[end + 1 :]}"
-    return text
-
-
-def _find_partner(text: str, at: int, step: int) -> int:
-    """Place of the parenthesis that matches the one at ``at``, ``step`` by step from there."""
-    depth = 0
-    while True:
-        depth += (text[at] == "(") - (text[at] == ")")
-        if depth == 0:
-            return at
-        at += step

@@ -40,9 +40,6 @@ def describe_equations(device: Device) -> str:
     Rates carry primes: ``θ'`` is the first, ``θ''`` the second derivative. Numbers of the device
     stand by their names; definitions are put in.
 
-    Args:
-        device: from `registry.device_from`.
-
     Returns:
         Text of several lines: coordinates, energies, mass matrix M, terms h, generalised forces Q
         of M q'' + h = Q.
@@ -53,13 +50,16 @@ def describe_equations(device: Device) -> str:
     if device.robot is not None:
         return _describe_robot(device, device.robot)
     potential, equations = _print_equations(Model(device), {})
-    lines = [f"{device.name}: {device.summary}", "", "Coordinates"]
-    for c in device.coordinates:
-        lines.append(f"  {c.symbol} = {c.name}, {c.unit}; generalised force in {c.torque_unit}")
-    lines += ["", "Energies"]
-    lines += ["  kinetic   = q'ᵀ M q' / 2", f"  potential = {potential}"]
-    lines += ["", "M q'' + h = Q, where", *(f"  {line}" for line in equations)]
-    lines += ["", "Numbers", *_list_numbers(device)]
+    axes = (
+        f"  {c.symbol} = {c.name}, {c.unit}; generalised force in {c.torque_unit}"
+        for c in device.coordinates
+    )
+    lines = [
+        f"{device.name}: {device.summary}", "", "Coordinates", *axes,
+        "", "Energies", "  kinetic   = q'ᵀ M q' / 2", f"  potential = {potential}",
+        "", "M q'' + h = Q, where", *(f"  {line}" for line in equations),
+        "", "Numbers", *_list_numbers(device),
+    ]  # fmt: skip
     return "\n".join(lines) + "\n"
 
 
@@ -175,11 +175,7 @@ def _describe_robot(device: Device, robot: Robot) -> str:
         after += f", follows {joint.follows}" if joint.follows else ""
         place, axis = _join_numbers(joint.position), _join_numbers(joint.axis)
         limits = "" if low is None else f"{low:.4g} to {high:.4g} {unit}"
-        body = [
-            f"{joint.mass:.4g}",
-            _join_numbers(joint.center),
-            _join_numbers(joint.principal_moments),
-        ]
+        body = (_join_numbers(n) for n in ([joint.mass], joint.center, joint.principal_moments))
         rows.append([joint.name, joint.kind, after, place, axis, limits, *body])
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     padded = ([cell.ljust(n) for cell, n in zip(row, widths, strict=True)] for row in rows)
@@ -202,12 +198,10 @@ def _join_numbers(values: Iterable[float]) -> str:
 
 def _list_numbers(device: Device, hidden: Container[str] = ()) -> list[str]:
     """One line a constant and a parameter: value, unit, where from."""
-    rows: Mapping[str, tuple[str, str]] = {
-        **{n: (f"{c.value:g} {c.unit}", c.source) for n, c in device.constants.items()},
-        **{
-            p.name: (f"{p.prior:g} ± {p.sd:g} {p.unit}", "prior, to be estimated")
-            for p in device.parameters
-            if p.name not in hidden
-        },
+    rows = {n: (f"{c.value:g} {c.unit}", c.source) for n, c in device.constants.items()}
+    rows |= {
+        p.name: (f"{p.prior:g} ± {p.sd:g} {p.unit}", "prior, to be estimated")
+        for p in device.parameters
+        if p.name not in hidden
     }
     return [f"  {n} = {v.strip()}" + (f"  ({s})" if s else "") for n, (v, s) in rows.items()]

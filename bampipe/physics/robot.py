@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from functools import cached_property
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from bampipe.arrays import Array, Flags
 from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.expression import Name
 from bampipe.physics.newton_euler import (
@@ -32,8 +33,6 @@ from bampipe.schema import (
     Several,
     Text,
 )
-
-Array = NDArray[np.float64]
 
 _LARGEST = 1e9
 """Of a drawn body, kg, m or kg.m2: sums over the bodies stay below what a parameter can be."""
@@ -251,24 +250,21 @@ class Robot(Declaration):
         place = {joint.name: i for i, joint in enumerate(self.joints)}
         return tuple(
             Link(
-                place.get(joint.after, -1),
-                joint.kind == "prismatic",
+                place.get(joint.after, -1), joint.kind == "prismatic",
                 _keep_integers(np.array(joint.axis) / math.hypot(*joint.axis)),
                 _keep_integers(np.array(joint.position)),
                 _matrix_rows(rotation_matrix(joint.rotation)),
-                place.get(joint.follows, -1),
-                joint.ratio,
-                joint.zero,
+                place.get(joint.follows, -1), joint.ratio, joint.zero,
             )
             for joint in self.joints
-        )
+        )  # fmt: skip
 
     @cached_property
-    def matters(self) -> NDArray[np.bool_]:
+    def matters(self) -> Flags:
         """Which inertial numbers change the force of some joint, (joints, 10)."""
-        return np.abs(self.regressor).max(axis=0).reshape(-1, INERTIAL) > _NO_EFFECT * max(
-            float(np.abs(self.regressor).max(initial=0.0)), 1.0
-        )
+        size = np.abs(self.regressor)
+        largest = max(float(size.max(initial=0.0)), 1.0)
+        return size.max(axis=0).reshape(-1, INERTIAL) > _NO_EFFECT * largest
 
     @cached_property
     def regressor(self) -> Array:
@@ -277,9 +273,7 @@ class Robot(Declaration):
         n, moving = len(self.joints), len(self.moving)
         samples = 40 * max(n, 1)
         entries = self.columns(*(rng.uniform(-2.0, 2.0, (moving, samples)).T for _ in range(3)))
-        table = np.array(
-            [[np.broadcast_to(c, samples) for link in row for c in link] for row in entries]
-        )
+        table = np.array([[np.broadcast_to(c, samples) for c in chain(*row)] for row in entries])
         return np.ascontiguousarray(table.transpose(0, 2, 1).reshape(-1, INERTIAL * n))
 
     def describe_mass(self, place: int, factor: float) -> str:

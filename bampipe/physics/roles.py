@@ -63,11 +63,8 @@ def find_delays(d: Vocabulary, applied: list[Any]) -> list[str]:
         for force in d.model.device.forces:
             rate = d.channel[derivative(force, 1)]
             mapped = [sp.diff(e, d.channel[force]).subs(absent) for e in applied]
-            ratio = {
-                sp.simplify(sp.diff(a, rate) / b)
-                for a, b in zip(slope, mapped, strict=True)
-                if b != 0
-            }
+            pairs = ((a, b) for a, b in zip(slope, mapped, strict=True) if b != 0)
+            ratio = {sp.simplify(sp.diff(a, rate) / b) for a, b in pairs}
             if len(ratio) == 1 and next(iter(ratio)).is_number and next(iter(ratio)) != 0:
                 results.append(p.name)
                 break

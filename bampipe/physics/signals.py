@@ -67,7 +67,6 @@ class ActingInputs:
         """Chain the effects of kind ``input`` among ``effects``.
 
         Args:
-            d: the vocabulary of the model.
             effects: its effects, or some of them.
             applied, side: generalised force and side load, by axis, of the logged inputs.
         """

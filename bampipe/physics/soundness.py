@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.physics.model import Model
 from bampipe.physics.system import System, compile_model
-
-Array = NDArray[np.float64]
 
 _SINGULAR = 1e-9
 """Least eigenvalue of a mass matrix, beside the largest inertias along the motion."""
@@ -21,7 +19,6 @@ def require_sound(
     """Refuse a motion on which the equations of motion cannot be solved.
 
     Args:
-        system: the model.
         q, qd, qdd: motion of the mechanism, (T, n_q), rad or m and derivatives.
         u: inputs, (T, n_u); p: parameters, (n_p,); t: time, (T,), s.
         where: what to call the motion in messages.

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bampipe import generated_code
+from bampipe.arrays import Array
 from bampipe.physics.system import System
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -74,11 +72,7 @@ class Structure:
 
 
 def structure(system: System) -> Structure:
-    """Return the structure of a model, derived once and then read from the cache.
-
-    Args:
-        system: the compiled model.
-    """
+    """The structure of a model, derived once and then read from the cache."""
 
     def generate() -> tuple[dict[str, Any], dict[str, str]]:
         from bampipe.physics.structure_code import structure_code

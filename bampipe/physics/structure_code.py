@@ -38,9 +38,8 @@ def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any],
     for expr in (e.kinetic, e.potential) if model.device.robot is None else ():
         factors += _collect_factors(expr - expr.subs(dict.fromkeys(motion, 0)), motion, set(names))
     for expr in (*e.applied, *e.other, *e.rates, *e.offset):
-        factors += _collect_factors(
-            sp.sympify(expr, strict=True).subs(no_noise), motion, set(names)
-        )
+        plain = sp.sympify(expr, strict=True).subs(no_noise)
+        factors += _collect_factors(plain, motion, set(names))
     known_symbols: set[Any] = set()
     while True:
         open_factors = _select_distinct([_strip_known(f, known_symbols) for f in factors])
@@ -119,14 +118,10 @@ def _strip_known(factor: Any, known_symbols: set[Any]) -> Any:
     if not terms_kept:
         return sp.S.Zero
     total = sp.Add(*terms_kept)
-    common = sp.gcd_terms(total).as_independent(
-        *(total.free_symbols - known_symbols), as_Add=False
-    )[0]
-    return (
-        sp.expand(total / common)
-        if common.is_number or common.free_symbols <= known_symbols
-        else total
-    )
+    unknown = total.free_symbols - known_symbols
+    common, _ = sp.gcd_terms(total).as_independent(*unknown, as_Add=False)
+    is_known = common.is_number or common.free_symbols <= known_symbols
+    return sp.expand(total / common) if is_known else total
 
 
 def _select_distinct(factors: Sequence[Any]) -> list[Any]:

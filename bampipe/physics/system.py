@@ -9,9 +9,9 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bampipe import generated_code
+from bampipe.arrays import Array, Indices
 from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.physics.memory import integrate_memory
 from bampipe.physics.model import Model
@@ -21,7 +21,6 @@ from bampipe.physics.parameter import Parameter
 if TYPE_CHECKING:  # it brings sympy, which few need
     from bampipe.physics.model_code import Generation
 
-Array = NDArray[np.float64]
 _TOGETHER = 1024
 """Samples whose slopes by a robot's bodies are taken at once: as many as a processor keeps near."""
 
@@ -77,7 +76,7 @@ class System:
         self.moved_by: tuple[int, ...] = tuple(meta["moved_by"])
         self.driven: bool = meta["driven"]
         self.force_fed: bool = meta["force_fed"]
-        self.moved_first: NDArray[np.int64] = np.array(meta["moved_first"], dtype=np.int64)
+        self.moved_first: Indices = np.array(meta["moved_first"], dtype=np.int64)
         self.compensated: tuple[int, ...] = tuple(meta["compensated"])
         self.delays: tuple[str, ...] = tuple(meta["delays"])
         self.braked: bool = meta["braked"]
@@ -110,6 +109,11 @@ class System:
         orders = range(len(INPUT_ORDERS))
         names = {derivative(f, k) for f in self.model.device.forces for k in orders}
         return tuple(i for i, name in enumerate(self.inputs) if name in names)
+
+    @property
+    def sign_widths(self) -> Array:
+        """Speeds over which the signs of velocities are smoothed, (n_q,), rad/s or m/s."""
+        return np.array([c.sign_width for c in self.model.device.coordinates])
 
     @property
     def prior(self) -> Array:

@@ -93,16 +93,8 @@ def parse_unit(text: str, where: str) -> Dimension:
     return total
 
 
-class _Mismatch(Exception):
-    """Two quantities of an expression do not fit together; the text says which."""
-
-
 # A dimension, or None where a number might carry any.
 Found = Dimension | None
-
-
-def _dimension_of_number(value: float) -> Found:
-    return PURE if 4 * value == int(4 * value) and value != 0 else None
 
 
 def dimension(tree: ast.expr, symbols: Mapping[str, Found]) -> Found:
@@ -116,38 +108,30 @@ def dimension(tree: ast.expr, symbols: Mapping[str, Found]) -> Found:
         InputError: a name is unknown, or quantities of unlike dimension are added or compared, or
             a function is given one that it cannot take.
     """
-    try:
-        return _find_dimension(tree, symbols)
-    except _Mismatch as error:
-        raise InputError(str(error)) from None
-
-
-def _find_dimension(node: ast.expr, symbols: Mapping[str, Found]) -> Found:
-    match node:
+    match tree:
         case ast.Constant(value=value):
-            return _dimension_of_number(float(value))  # type: ignore[arg-type]
+            quarters = 4.0 * float(value)  # type: ignore[arg-type]
+            return PURE if quarters.is_integer() and quarters != 0.0 else None
         case ast.Name(id=name):
             if name not in symbols:
-                raise _Mismatch(f"unknown symbol {name!r}{did_you_mean(name, symbols)}")
+                raise InputError(f"unknown symbol {name!r}{did_you_mean(name, symbols)}")
             return symbols[name]
         case ast.UnaryOp(operand=operand):
-            return _find_dimension(operand, symbols)
+            return dimension(operand, symbols)
         case ast.BinOp(left=left, op=ast.Pow(), right=right):
-            base = _find_dimension(left, symbols)
+            base = dimension(left, symbols)
             power = Fraction(ast.literal_eval(right)).limit_denominator(1000)
             return None if base is None else base**power
         case ast.BinOp(left=left, op=op, right=right):
-            a, b = _find_dimension(left, symbols), _find_dimension(right, symbols)
+            a, b = dimension(left, symbols), dimension(right, symbols)
             if isinstance(op, ast.Add | ast.Sub):
-                return _common_dimension(node, [left, right], [a, b])
+                return _common_dimension(tree, [left, right], [a, b])
             if a is None or b is None:
                 return None
             return a * b if isinstance(op, ast.Mult) else a / b
         case ast.Call(func=ast.Name(id=name), args=args):
-            return _find_call_dimension(
-                node, name, args, [_find_dimension(a, symbols) for a in args]
-            )
-    raise AssertionError(f"unchecked node {type(node).__name__}")
+            return _find_call_dimension(tree, name, args, [dimension(a, symbols) for a in args])
+    raise AssertionError(f"unchecked node {type(tree).__name__}")
 
 
 def _common_dimension(node: ast.expr, parts: list[ast.expr], found: list[Found]) -> Found:
@@ -155,7 +139,7 @@ def _common_dimension(node: ast.expr, parts: list[ast.expr], found: list[Found])
     pairs = [(p, f) for p, f in zip(parts, found, strict=True) if f is not None]
     for part, other in pairs[1:]:
         if other != pairs[0][1]:
-            raise _Mismatch(
+            raise InputError(
                 f"{_quote(node)} puts together {_quote(pairs[0][0])} ({pairs[0][1]}) "
                 f"and {_quote(part)} ({other})"
             )
@@ -177,7 +161,7 @@ def _find_call_dimension(
         case "min" | "max" | "clip":
             return _common_dimension(node, args, found)
     if found[0] not in (None, PURE):
-        raise _Mismatch(f"{name}() takes a pure number, and {_quote(args[0])} is in {found[0]}")
+        raise InputError(f"{name}() takes a pure number, and {_quote(args[0])} is in {found[0]}")
     return PURE
 
 
@@ -253,9 +237,6 @@ def _device_symbols(device: Device, check: _Findings) -> dict[str, Found]:
 def check_device(device: Device) -> list[str]:
     """What is inconsistent in the units and symbols of a device file; empty if nothing is.
 
-    Args:
-        device: from `registry.device_from`.
-
     Returns:
         One plain sentence a finding, the field first.
     """
@@ -287,9 +268,8 @@ def _check_controller(device: Device, symbols: Mapping[str, Found], check: _Find
     """Hold the control law's expressions to the unit of the forces that they command."""
     if device.controller is None:
         return
-    known_symbols = {
-        n: d for n, d in symbols.items() if n not in [p.name for p in device.parameters]
-    }
+    parameters = {p.name for p in device.parameters}
+    known_symbols = {name: of for name, of in symbols.items() if name not in parameters}
     for name, unit in device.controller.channels.items():
         known_symbols[name] = check.unit(unit, f"controller.channels.{name}")
     for name, state in device.controller.states.items():
@@ -319,11 +299,8 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Findings) -> dict
                 symbols["side_load"] = check.expression(side, symbols, f"side_load.{axis}", None)
         if axis in item.axes and item.effect.scope == "axis_pair":
             letter = PAIR[item.axes.index(axis)]
-            symbols |= {
-                f"q_{letter}": unit,
-                f"qd_{letter}": unit / second,
-                f"middle_{letter}": unit,
-            }
+            symbols |= dict.fromkeys((f"q_{letter}", f"middle_{letter}"), unit)
+            symbols[f"qd_{letter}"] = unit / second
     if item.effect.scope == "channel":
         symbols["f"] = symbols[item.target]
     of_each = any(key.endswith(f".{EACH}") for key in item.effect.expressions)
@@ -341,8 +318,6 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
     """What is inconsistent in the units and symbols of an effect at ``target`` of ``device``.
 
     Args:
-        effect: from `registry.effect_from`.
-        device: where it is to act.
         target: axis, force component or pair; empty for an effect of scope ``device``.
 
     Returns:

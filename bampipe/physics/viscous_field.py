@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Sequence
 
 from bampipe.errors import InputError
 from bampipe.physics.device import Device
@@ -14,24 +13,29 @@ NAME = "viscous_field"
 
 
 def viscous_field(device: Device) -> Effect:
-    """Return the damping of the handle, one parameter for each component of the handle's force.
+    """The damping of the handle, one parameter for each component of the handle's force.
 
     The force f at the handle does work at the rate f . v, and so do the generalised forces B f
     that it is mapped to: the handle's velocity in the frame of the force is v = B^T q'. A field
     f = -K v with diagonal K is then the generalised force -B K B^T q'.
 
-    Args:
-        device: with handle forces in N.
-
     Raises:
-        InputError: the device has no brakes or no handle force.
+        InputError: the device has no brakes or no handle force in N.
     """
     if not device.brakes or device.force_unit != "N":
         raise InputError(
             f"device {device.name!r} has no brakes that could render a field at a handle"
         )
+
+    def put_unit(text: str, chosen: str) -> str:
+        """Put one for a force and nought for the others."""
+        forces = device.forces
+        return re.sub(
+            r"\w+", lambda m: str(float(m[0] == chosen)) if m[0] in forces else m[0], text
+        )
+
     gain = {
-        (axis, force): _put_unit(ast.unparse(tree), device.forces, force)
+        (axis, force): put_unit(ast.unparse(tree), force)
         for axis, tree in device.applied.items()
         for force in device.forces
     }
@@ -39,16 +43,11 @@ def viscous_field(device: Device) -> Effect:
         force: " + ".join(f"({gain[axis, force]})*qd_{axis}" for axis in device.applied)
         for force in device.forces
     }
-    components = dict(zip(device.forces, device.components, strict=True))
-    torque = {
-        axis: "-("
-        + " + ".join(
-            f"damping_{components[force]}*({gain[axis, force]})*({speed[force]})"
-            for force in device.forces
-        )
-        + ")"
-        for axis in device.applied
-    }
+    components = [*zip(device.forces, device.components, strict=True)]
+    torque = {}
+    for axis in device.applied:
+        terms = (f"damping_{c}*({gain[axis, force]})*({speed[force]})" for force, c in components)
+        torque[axis] = f"-({' + '.join(terms)})"
     return effect_from(
         {
             "name": NAME,
@@ -71,8 +70,3 @@ def viscous_field(device: Device) -> Effect:
         },
         NAME,
     )
-
-
-def _put_unit(text: str, forces: Sequence[str], chosen: str) -> str:
-    """Put one for a force and nought for the others."""
-    return re.sub(r"\w+", lambda m: str(float(m[0] == chosen)) if m[0] in forces else m[0], text)

@@ -59,9 +59,7 @@ class Vocabulary:
                 self.z[item.prefix, state.name] = symbol
         self.special = {"sgn": self.sgn, "ddt": self.ddt}
         self.sizes: dict[str, int] = {}
-        self.dry: list[Any] = [sp.S.Zero] * len(self.axes)
-        self.weight: list[Any] = [sp.S.Zero] * len(self.axes)
-        self.pull: list[Any] = [sp.S.Zero] * len(self.axes)
+        self.dry, self.weight, self.pull = ([sp.S.Zero] * len(self.axes) for _ in range(3))
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
         self.base |= {
@@ -134,11 +132,8 @@ class Vocabulary:
 
         Channels that are no forces, such as a supply voltage, count as slow: their rate is zero.
         """
-        last = [
-            *self.qdd,
-            *(self.channel[derivative(f, LAST_ORDER)] for f in self.model.device.forces),
-        ]
-        if expr.has(*last):
+        last = [self.channel[derivative(f, LAST_ORDER)] for f in self.model.device.forces]
+        if expr.has(*self.qdd, *last):
             raise InputError("ddt() of an acceleration, or of a force's last derivative")
         brakes = [self.channel[b] for b in self.model.device.brakes.values()]
         if expr.has(*self.z.values(), *brakes):

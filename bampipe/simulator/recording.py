@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.system import System
 from bampipe.simulator.specimen import Config, Specimen, input_column
 from bampipe.simulator.true_trials import TrueTrial
-
-Array = NDArray[np.float64]
 
 ENCODERS = {
     "yaw": ("enc_yaw", 21333.3333, 12000),

@@ -7,16 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.errors import InputError, did_you_mean
 from bampipe.files import read_toml
 from bampipe.physics import Model, registry
 from bampipe.physics.device import Device
-from bampipe.physics.effect import BoundEffect, Effect
+from bampipe.physics.effect import BoundEffect
 from bampipe.physics.system import System, compile_model
-
-Array = NDArray[np.float64]
 
 STIFFNESS = {"rotary": 2200.0, "linear": 109e3}
 """Typical transmission stiffness (Table I), N.m/rad and N/m."""
@@ -122,7 +120,9 @@ def input_column(system: System, name: str) -> int:
 def draw_specimen(config: Config) -> tuple[Specimen, dict[str, float]]:
     """Draw the specimen; also the strength of each effect by canonical name."""
     device = _device(config.device)
-    extra = [_read_effect(Path(path)) for path in config.effect_files]
+    extra = [
+        registry.effect_from(read_toml(path), str(path)) for path in map(Path, config.effect_files)
+    ]
     strengths = dict(_strength(text, config.strength) for text in config.effects)
     if len(strengths) < len(config.effects):
         raise InputError("an effect is named twice")
@@ -145,19 +145,13 @@ def draw_specimen(config: Config) -> tuple[Specimen, dict[str, float]]:
     stiffness = {c.name: STIFFNESS[c.kind] * float(rng.uniform(0.95, 1.05)) for c in
                  device.coordinates}  # fmt: skip
     motion = part("torque", "energy") or compile_model(Model(device))
-    return (
-        Specimen(device, motion, part("input"), part("measurement"), values, delay, stiffness),
-        strengths,
-    )
+    forces, positions = part("input"), part("measurement")
+    return Specimen(device, motion, forces, positions, values, delay, stiffness), strengths
 
 
 def _is_delay(item: BoundEffect) -> bool:
     """The one effect whose expression is a series for what the sensor does exactly."""
     return item.effect.name == "force_delay"
-
-
-def _read_effect(path: Path) -> Effect:
-    return registry.effect_from(read_toml(path), str(path))
 
 
 def _strength(text: str, default: float) -> tuple[str, float]:
@@ -191,15 +185,13 @@ def _effect_values(
     values = {}
     for p in item.parameters:
         draw = float(rng.uniform(-1.0, 1.0))
-        if p.fixed:
-            values[p.name] = p.prior
-        elif p.strength:
-            size = p.sd if p.typical is None else p.typical
+        usual = (p.sd if p.strength else p.prior) if p.typical is None else p.typical
+        if p.strength:
             sign = -1.0 if p.lower < 0 and draw < 0 else 1.0
-            values[p.name] = _between(sign * strength * size, p.lower, p.upper)
+            wanted = sign * strength * usual
         else:
-            shape = p.prior if p.typical is None else p.typical
-            values[p.name] = _between(shape * (1.0 + 0.2 * draw), p.lower, p.upper)
+            wanted = usual * (1.0 + 0.2 * draw)
+        values[p.name] = p.prior if p.fixed else _between(wanted, p.lower, p.upper)
     return values
 
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.simulation import Impedance, simulate_tracking
 from bampipe.physics.device import Coordinate, Device, derivative
 from bampipe.simulator.specimen import Config, Specimen, input_column
-
-Array = NDArray[np.float64]
 
 REACH = {"rotary": 0.65, "linear": 0.8}
 """Largest wanted motion as a share of half the range: people use more of a rod than of a turn."""
@@ -88,10 +86,9 @@ def simulate_moving_trial(
         gain = config.viscous_damping * (system.input_map(pose) ** 2).sum(axis=2)
         x, total = simulate_tracking(
             system.derivative, x0, u, p, dt, q_ref, qd_ref,
-            width=np.array([c.sign_width for c in device.coordinates]),
-            n_noise=len(system.noise), force=force, rate=slopes[0], curvature=slopes[1],
-            impedance=arm, brake=brakes, brake_gain=gain if viscous else None,
-            moved_first=system.moved_first,
+            width=system.sign_widths, n_noise=len(system.noise), force=force,
+            rate=slopes[0], curvature=slopes[1], impedance=arm, brake=brakes,
+            brake_gain=gain if viscous else None, moved_first=system.moved_first,
         )  # fmt: skip
         pose = x[:, :n]
     brake = [system.inputs.index(b) for b in device.brakes.values()]

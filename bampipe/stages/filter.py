@@ -13,12 +13,13 @@ import pandas as pd
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import FILTERED, INGESTED, MOVING, RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother
-from bampipe.estimate.differentiation import Array, Flags, UniformGrid, uniform_grid
+from bampipe.estimate.differentiation import UniformGrid, uniform_grid
 from bampipe.estimate.low_pass import Band
 from bampipe.phrases.results import describe_dead_stretch, list_setup_faults
 from bampipe.physics import Model, System, compile_model

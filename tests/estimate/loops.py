@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bampipe.arrays import Array
 
 
 def load_cycles(cycles: int, amplitude: float, *, rate_hz: float = 500.0, seed: int = 0) -> Array:

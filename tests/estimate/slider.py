@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import numpy as np
 from numba import njit
@@ -94,10 +95,7 @@ def model(start=TRUTH, *, timing: bool = False) -> FilterModel:
     """The slider as the filter wants it; optionally with the timing of the inputs."""
     free = [0, 1, 2, 3] if timing else [0, 1, 2]
     return FilterModel(
-        derivative=derivative,
-        measure=measure,
-        derivative_rows=derivative_rows,
-        measure_rows=measure_rows,
+        functions=sys.modules[__name__],
         n_states=2,
         parameters=np.append(start, 0.0),
         free=np.array(free),

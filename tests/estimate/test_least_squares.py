@@ -12,7 +12,7 @@ from bampipe.errors import InputError
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.influence import RemovedStretch, find_worst_stretch
 from bampipe.estimate.least_squares import (
-    Minimum,
+    Linearised,
     Problem,
     Stacked,
     as_measured,
@@ -54,7 +54,7 @@ def problem(count: int = 3, truth: np.ndarray = TRUTH, **changes: object) -> Pro
     return Problem(**({"precision": nothing, "known": nothing} | standard))  # type: ignore[arg-type]
 
 
-def error_of(found: Minimum) -> float:
+def error_of(found: Linearised) -> float:
     """Root mean square of what a fit leaves."""
     left = np.concatenate([s.residual[s.used] for s in found.stacked])
     return float(np.sqrt(np.mean(left**2)))
@@ -72,7 +72,7 @@ def rows_of(
     return (slope / scale, residual / scale), np.concatenate(numbers)
 
 
-def sd_of(found: Minimum, inner: Problem, block_s: float = 2.0) -> np.ndarray:
+def sd_of(found: Linearised, inner: Problem, block_s: float = 2.0) -> np.ndarray:
     """Standard deviations by blocks of time."""
     rows, blocks = rows_of(as_measured(inner, found.p, found.stacked), block_s)
     alone = float(inner.band.independent_share[0]) * len(blocks)
@@ -85,8 +85,6 @@ def sd_of(found: Minimum, inner: Problem, block_s: float = 2.0) -> np.ndarray:
 def test_recovers_the_truth_from_any_start(factor: float) -> None:
     found = minimise(problem(), factor * TRUTH)
     np.testing.assert_allclose(found.p, TRUTH, rtol=1e-2)
-    assert found.converged
-    assert not found.at_bound.any()
 
 
 def test_a_model_that_is_not_linear_is_found_by_gauss_newton() -> None:
@@ -102,12 +100,11 @@ def test_a_model_that_is_not_linear_is_found_by_gauss_newton() -> None:
     np.testing.assert_allclose(np.exp(found.p), minimise(inner, TRUTH).p, rtol=1e-5)
 
 
-def test_bounds_hold_and_are_reported() -> None:
+def test_bounds_hold() -> None:
     truth = np.array([4.0, 0.0, 2.0])
     inside = problem(truth=truth, lower=np.array([0.0, 0.5, 0.01]))
     found = minimise(inside, TRUTH)
     assert found.p[1] == 0.5
-    assert found.at_bound.tolist() == [False, True, False]
     free = minimise(problem(truth=truth, lower=np.full(3, -np.inf)), TRUTH)
     assert error_of(found) > error_of(free)
 
@@ -144,7 +141,7 @@ def test_a_scale_that_is_free_does_not_collapse(start: float) -> None:
 
 
 def largest_step(
-    found: Minimum, stacked: Sequence[Stacked], inner: Problem, sd: np.ndarray
+    found: Linearised, stacked: Sequence[Stacked], inner: Problem, sd: np.ndarray
 ) -> float:
     """Of Gauss and Newton from a fit of one axis, in its standard deviations."""
     scale = error_of(found)
@@ -352,11 +349,11 @@ def test_axes_that_count_unequally_and_disagree_are_weighed_to_rest() -> None:
         band=Band(RATE, (8.0, 8.0)), standstill=[rest],
     )  # fmt: skip
     found = minimise(shared, np.array([5.0]))
-    assert found.converged
-    assert found.iterations < 10
+    few = minimise(shared, np.array([5.0]), most_iterations=10)
+    np.testing.assert_allclose(few.p, found.p, rtol=1e-6)
 
 
-def worst_second(found: Minimum, inner: Problem) -> tuple[RemovedStretch, np.ndarray]:
+def worst_second(found: Linearised, inner: Problem) -> tuple[RemovedStretch, np.ndarray]:
     """The second of most influence on a fit of one axis, and its standard deviations."""
     (slope, left), seconds = rows_of(found.stacked, 1.0)
     sd, inverse = sd_of(found, inner), np.linalg.inv(slope.T @ slope)

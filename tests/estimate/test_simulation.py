@@ -7,7 +7,7 @@ import pytest
 from numba import njit, types
 
 from bampipe.errors import InputError
-from bampipe.estimate.simulation import Impedance, simulate, simulate_tracking
+from bampipe.estimate.simulation import simulate, simulate_tracking
 
 WIDTH = np.array([2.5e-4])
 
@@ -29,15 +29,6 @@ def test_viscous_decay_is_exact():
     x = run(np.zeros((1001, 3)), [2.0, 3.0, 0.0], v0=1.0)
     t = 0.002 * np.arange(1001)
     np.testing.assert_allclose(x[:, 1], np.exp(-1.5 * t), rtol=1e-9)
-
-
-def test_held_and_linear_inputs_differ_by_half_a_sample():
-    u = np.zeros((1001, 3))
-    u[:, 0] = 0.002 * np.arange(1001)
-    p = [1.0, 0.0, 0.0]
-    linear, held = run(u, p)[-1, 1], run(u, p, hold=True)[-1, 1]
-    assert linear == pytest.approx(0.5 * 2.0**2, rel=1e-9)
-    assert linear - held == pytest.approx(0.5 * 0.002 * 2.0, rel=1e-9)
 
 
 def test_a_smooth_force_keeps_its_strength_between_coarse_samples():
@@ -134,12 +125,6 @@ def test_replay_with_other_friction_stays_near_the_motion():
     moving = np.abs(x[:, 1]) > 0.1
     extra = (total[:, 0] - u[:, 0])[moving] * np.sign(x[moving, 1])
     assert np.median(extra) == pytest.approx(1.0, abs=0.15)  # the arm supplies the added friction
-
-
-def test_without_natural_frequency_the_arm_is_absent():
-    x, u = recording()
-    _, total = track(u, [3.5, 10.0, 4.5], x[:, :1], x[:, 1:], impedance=Impedance(0.0))
-    np.testing.assert_array_equal(total, u)
 
 
 def test_the_rate_of_the_arm_force_is_its_rate():

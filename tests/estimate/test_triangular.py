@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bampipe.estimate.triangular import append_rows, condition, covariance_of, rank_one_update
-from bampipe.estimate.unscented import lower_root
+from bampipe.estimate.unscented import join_roots
 
 RNG = np.random.default_rng(2)
 
@@ -40,23 +40,21 @@ def test_conditioning_is_the_kalman_update():
     assert not np.tril(root, -1).any()
 
 
-def test_a_downdate_that_leaves_nothing_is_refused():
-    upper = np.triu(RNG.normal(size=(4, 4))) + 3.0 * np.eye(4)
-    small, large = 0.1 * upper[0].copy(), 1.5 * upper[0].copy()
-    expected = upper.T @ upper - np.outer(small, small)
-    lowered = upper.copy()
-    assert rank_one_update(lowered, 4, -1.0, small)
-    product = np.empty((4, 4))
-    covariance_of(lowered, product)
+def test_an_update_adds_its_square_also_where_nothing_was():
+    upper, vector = np.triu(RNG.normal(size=(4, 4))) + 3.0 * np.eye(4), RNG.normal(size=4)
+    upper[2] = 0.0
+    expected, product = upper.T @ upper + np.outer(vector, vector), np.empty((4, 4))
+    rank_one_update(upper, 4, vector)
+    covariance_of(upper, product)
     np.testing.assert_allclose(product, expected, atol=1e-13)
-    assert not rank_one_update(upper, 4, -1.0, large)
 
 
 def test_the_root_of_a_covariance_that_rounding_left_indefinite() -> None:
     spread = np.array([1e6, 1e-6, 3.0])
     whole = np.outer(spread, spread)  # all three are one and the same
     whole[0, 1] = whole[1, 0] = whole[0, 1] * (1 + 1e-14)
-    root = lower_root(whole)
-    np.testing.assert_allclose(root @ root.T, whole, rtol=1e-9)
+    root = join_roots(np.array([0.0, 2.0]), whole)
+    np.testing.assert_allclose((root @ root.T)[2:, 2:], whole, rtol=1e-9)
+    np.testing.assert_allclose((root @ root.T)[:2], [[0, 0, 0, 0, 0], [0, 4, 0, 0, 0]])
     with pytest.raises(ValueError, match="not positive definite"):
-        lower_root(np.array([[1.0, 2.0], [2.0, 1.0]]))
+        join_roots(np.zeros(1), np.array([[1.0, 2.0], [2.0, 1.0]]))

@@ -18,7 +18,6 @@ from bampipe.estimate.filter_uncertainty import (
     sandwich_covariance,
 )
 from bampipe.estimate.filterpy_engine import filter_trials_by_filterpy
-from bampipe.estimate.sigma_points import SigmaPoints
 from bampipe.estimate.unscented import FilterFailure, Trial, constrain, filter_trials
 
 
@@ -34,9 +33,8 @@ def short(seed: int, samples: int = 150) -> Trial:
 
 
 @pytest.mark.parametrize("engine", [filter_trials_by_filterpy, filter_by_covariance])
-@pytest.mark.parametrize("alpha", [SigmaPoints().alpha, 0.8, 0.4])
-def test_the_oracles_give_the_same_numbers(engine: Any, alpha: float) -> None:
-    chosen = settings(walk_sd=np.array([0.1, 0.1, 0.05]), points=SigmaPoints(alpha))
+def test_the_oracles_give_the_same_numbers(engine: Any) -> None:
+    chosen = settings(walk_sd=np.array([0.1, 0.1, 0.05]))
     trials = [short(1), short(2)]
     start, sd = 1.3 * TRUTH, 0.3 * TRUTH
     late = replace(model(start), parameters=np.append(start, 4e-4))
@@ -212,11 +210,6 @@ def test_missing_readings_are_bridged() -> None:
     value, _ = model().to_physical(found.theta)
     assert np.isnan(found.trials[0].nis[1000:1050]).all()
     np.testing.assert_allclose(value, TRUTH, rtol=2e-2)
-
-
-def test_sigma_points_refuse_an_impossible_spread() -> None:
-    with pytest.raises(ValueError, match="sigma points"):
-        SigmaPoints(kappa=-5.0).weights(5)
 
 
 def test_climb_finds_the_maximum_on_its_grid() -> None:

@@ -113,17 +113,11 @@ def test_designs_go_beyond_as_far_as_the_device_allows_and_no_farther():
 @pytest.mark.parametrize(("pays", "first_is_beyond"), [(1.5, True), (1.02, False)])
 def test_going_beyond_what_has_been_seen_has_to_pay(pays, first_is_beyond):
     seen = TIMID.within(LIMITS, np.full(3, 20.0))
-    rehearsal = SimpleNamespace(
-        seen=seen,
-        sensors=SimpleNamespace(rate_hz=10.0),
-        system=SimpleNamespace(parameters=("mass",)),
-        record=lambda design, version: design,
-    )
 
-    def worth(design: Primitive) -> float:
-        return pays if any(find_beyond(design, seen)) else 1.0
+    def worth(recorded: tuple[Primitive, int]) -> float:
+        return pays if any(find_beyond(recorded[0], seen)) else 1.0
 
-    space = DesignSpace(rehearsal, 20.0, [0, 1, 2], with_rests=True, with_brakes=True)
+    space = DesignSpace(made_rehearsal(seen), 20.0, [0, 1, 2], with_rests=True, with_brakes=True)
     ranked = rank_designs(space, worth)
     are_beyond = [any(find_beyond(one.design, seen)) for one in ranked]
     assert are_beyond[0] is first_is_beyond
@@ -359,24 +353,28 @@ def made_proposal(after: float, farther: tuple[str, ...] = ()) -> Proposal:
     )  # fmt: skip
 
 
+WIDE = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
+SHARP = ExpectedSd(before=0.05, after=0.005, low=0.0045, high=0.006, unit="kg")
+
+
+def made_result(best: Proposal, purpose: str = "precision", **more) -> NextResult:
+    return NextResult(
+        model="base", purpose=purpose, trials=("t1",), sentence=best.sentence, why="", expected="",
+        proposals=(best,), **more,
+    )  # fmt: skip
+
+
 def explain(
     purpose, best, table=(), unlimited=(), lacking=(), missing=(), unbraked=(), unpromised=()
 ):
     """Why the best proposal is made, and what it is expected to give."""
-    found = NextResult(
-        model="base", purpose=purpose, trials=("t1",), sentence=best.sentence, why="", expected="",
-        proposals=(best,), sensitivity=dict(table), unpromised=unpromised,
-    )  # fmt: skip
+    found = made_result(best, purpose, sensitivity=dict(table), unpromised=unpromised)
     why, expected = explain_proposal(found, unlimited, lacking, missing, unbraked)
     return SimpleNamespace(why=why, expected=expected)
 
 
 def test_a_forecast_in_the_terms_of_another_version_does_not_stop_a_new_proposal(tmp_path):
-    wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
-    found = NextResult(
-        model="base", purpose="precision", trials=("t1",), sentence="Move yaw.", why="",
-        expected="", proposals=(made_proposal(0.1).model_copy(update={"sd": {"mass": wide}}),),
-    )  # fmt: skip
+    found = made_result(made_proposal(0.1).model_copy(update={"sd": {"mass": WIDE}}))
     path = tmp_path / NextResult.file("base")
     found.write(tmp_path)
     assert read_forecasts(tmp_path, "base") == (found,)
@@ -385,9 +383,7 @@ def test_a_forecast_in_the_terms_of_another_version_does_not_stop_a_new_proposal
 
 
 def test_what_a_model_lacks_is_said_to_count_as_noise():
-    wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
-    sharp = ExpectedSd(before=0.05, after=0.005, low=0.0045, high=0.006, unit="kg")
-    best = made_proposal(0.1).model_copy(update={"sd": {"mass": wide, "moment": sharp}})
+    best = made_proposal(0.1).model_copy(update={"sd": {"mass": WIDE, "moment": SHARP}})
     said = explain("precision", best, {}, (), ()).expected
     assert said == (
         "Expected: `mass` ± 0.002 to 0.01 kg, now ± 0.05; `moment` ± 0.005 kg, now ± 0.05"
@@ -447,7 +443,7 @@ def made_precision(
 
 def test_twice_the_information_narrows_an_uncertainty_by_the_root_of_two():
     known = made_precision(0.01, 0.01, 10_000)
-    after = known.sd_with(known.information, 20.0)
+    after = known.expect(known.information, 20.0).median
     assert after[0] == pytest.approx(0.01 / np.sqrt(2.0), rel=1e-3)
     assert known.gain(known.information) == pytest.approx(0.5 * np.log(2.0))
 
@@ -462,15 +458,15 @@ def test_what_trials_are_worth_for_one_parameter_is_the_fall_of_its_logarithm():
 def test_what_few_blocks_widen_goes_with_more_of_them():
     few = made_precision(0.01 * np.sqrt(6 / 4), 0.01, 6)
     nothing = np.zeros((2, 2))
-    assert few.sd_with(nothing, 0.0)[0] < few.sd[0]
-    assert few.sd_with(nothing, 1000.0)[0] == pytest.approx(0.01, rel=0.02)
+    assert few.expect(nothing, 0.0).median[0] < few.sd[0]
+    assert few.expect(nothing, 1000.0).median[0] == pytest.approx(0.01, rel=0.02)
 
 
 def test_what_methods_disagree_by_is_diluted_and_what_a_calibration_leaves_open_stays():
     known = made_precision(np.sqrt(0.01**2 + 0.04**2 + 0.02**2), 0.01, 10_000, 0.04, 0.02)
     nothing, much = np.zeros((2, 2)), 1e6 * known.information
-    assert known.sd_with(nothing, 0.0)[0] == pytest.approx(known.sd[0], rel=1e-3)
-    assert known.sd_with(much, 20.0)[0] == pytest.approx(0.02, rel=1e-3)
+    assert known.expect(nothing, 0.0).median[0] == pytest.approx(known.sd[0], rel=1e-3)
+    assert known.expect(much, 20.0).median[0] == pytest.approx(0.02, rel=1e-3)
     threefold = known.expect(3.0 * known.information, 20.0)
     noise = 0.01**2 / 4.0 + 0.02**2
     # At least it is diluted; mostly it goes, for a method that was misled is found out.
@@ -557,11 +553,7 @@ def test_a_planned_trial_is_shortened_no_further_than_its_strokes_allow():
     ],
 )
 def test_what_came_is_held_against_a_range(came, said):
-    wide = ExpectedSd(before=0.05, after=0.005, low=0.002, high=0.01, unit="kg")
-    proposed = NextResult(
-        model="base", purpose="precision", trials=("t1",), sentence="Move yaw.", why="",
-        expected="", proposals=(made_proposal(0.1).model_copy(update={"sd": {"mass": wide}}),),
-    )  # fmt: skip
+    proposed = made_result(made_proposal(0.1).model_copy(update={"sd": {"mass": WIDE}}))
     identified = SimpleNamespace(trials=("t1", "t2"), parameters={"mass": SimpleNamespace(sd=came)})
     line = compare_forecast(proposed, identified, None)[0]
     assert line.startswith("`mass`: ± 0.002 to 0.01 kg was forecast with trial t2, ± 0.0")
@@ -582,13 +574,9 @@ def test_what_a_trial_was_to_show_is_held_against_the_diagnosis_that_knows_it(
     entry = Detectable(
         parameter="drag.x.size", smallest=5.0, typical=1.0, unit="N", axis="x", with_proposal=0.9
     )
-    sure = ExpectedSd(before=0.05, after=0.005, low=0.0045, high=0.006, unit="kg")
-    best = made_proposal(0.1).model_copy(update={"sd": {"mass": sure}, "confusion": ()})
-    proposed = NextResult(
-        model="base", purpose="sensitivity", trials=("t1",), sentence="Move yaw.", why="",
-        expected="", proposals=(best,), sensitivity={"drag:x": entry},
-        shows=find_shown({"drag:x": entry}),
-    )  # fmt: skip
+    best = made_proposal(0.1).model_copy(update={"sd": {"mass": SHARP}, "confusion": ()})
+    table = {"drag:x": entry}
+    proposed = made_result(best, "sensitivity", sensitivity=table, shows=find_shown(table))
     identified = SimpleNamespace(
         trials=("t1", "t2", "t3"), parameters={"mass": SimpleNamespace(sd=0.005)}
     )
@@ -628,10 +616,8 @@ def test_confusion_is_that_of_a_choice_by_the_odds_that_further_trials_leave():
 )
 def test_sets_that_were_to_be_told_apart_are_held_against_the_diagnosis(selected, undecided, said):
     pair = made_proposal(0.02).confusion[0].model_copy(update={"between": ("a:x", "a:x + b:x")})
-    proposed = NextResult(
-        model="base", purpose="decision", trials=("t1",), sentence="Move yaw.", why="",
-        expected="", proposals=(made_proposal(0.02).model_copy(update={"confusion": (pair,)}),),
-    )  # fmt: skip
+    best = made_proposal(0.02).model_copy(update={"confusion": (pair,)})
+    proposed = made_result(best, "decision")
     identified = SimpleNamespace(trials=("t1", "t2"), parameters={})
     axis = SimpleNamespace(verdict="undecided", probabilities=dict.fromkeys(undecided, 0.5))
     diagnosed = SimpleNamespace(trials=("t2",), selected=selected, axes={"x": axis})

@@ -1,21 +1,17 @@
-"""The unscented filter twice in plain numpy, point by point: second opinions on the compiled one.
+"""The unscented filter in plain numpy, point by point: a second opinion on the compiled one.
 
-Both propagate the covariance itself. `filter_by_covariance` takes measurement noise and random
-walk as additive and draws points afresh before a measurement, as the compiled filter does: the
-numbers must be the same. `filter_augmented` carries one set of points of state, parameters, process
-noise, walk and measurement noise through motion and measurement (Julier and Uhlmann 2004): the same
-where both are linear, else different in the terms that the unscented transform leaves out anyway.
+It propagates the covariance itself; the numbers must be the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.unscented import (
+    ALPHA,
     FilteredTrial,
     FilterFailure,
     FilterModel,
@@ -27,28 +23,6 @@ from bampipe.estimate.unscented import (
 
 Predicted = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """Mean, covariance, expected reading, its covariance, and that of reading and state."""
-
-
-def filter_by_covariance(
-    model: FilterModel,
-    trials: Sequence[Trial],
-    theta: np.ndarray,
-    covariance: np.ndarray,
-    settings: FilterSettings,
-) -> FilterOutcome:
-    """The compiled filter in its covariance form; as `unscented.filter_trials`."""
-    return _filter(_predict_by_covariance, model, trials, theta, covariance, settings)
-
-
-def filter_augmented(
-    model: FilterModel,
-    trials: Sequence[Trial],
-    theta: np.ndarray,
-    covariance: np.ndarray,
-    settings: FilterSettings,
-) -> FilterOutcome:
-    """The filter with all noise in the state; as `unscented.filter_trials`."""
-    return _filter(_predict_augmented, model, trials, theta, covariance, settings)
 
 
 class _Points:
@@ -73,8 +47,7 @@ class _Points:
         known = np.diag(joint) == 0.0
         part = np.ix_(np.flatnonzero(~known), np.flatnonzero(~known))
         root[: self.n, : self.n][part] = np.linalg.cholesky(joint[part])
-        spread = self.settings.points.weights(len(root) + idle)[0]
-        away = np.sqrt(spread) * root.T
+        away = ALPHA * np.sqrt(len(root) + idle) * root.T
         centre = np.concatenate([mean, np.zeros(len(root) - self.n)])
         return centre + np.vstack([np.zeros(len(root)), away, -away])
 
@@ -82,10 +55,10 @@ class _Points:
         self, values: np.ndarray, idle: int = 0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mean of ``values``, deviations from it and these weighted; ``idle`` pairs are unmoved."""
-        _, _, centre, other = self.settings.points.weights((len(values) - 1) // 2 + idle)
+        other = 0.5 / (ALPHA**2 * ((len(values) - 1) // 2 + idle))
         mean = values[0] + other * np.sum(values[1:] - values[0], axis=0)
         weight = np.full((len(values), 1), other)
-        weight[0] = centre + 2 * idle * other
+        weight[0] = 2 * idle * other
         return mean, values - mean, weight * (values - mean)
 
     def place(self, point: np.ndarray) -> np.ndarray:
@@ -102,20 +75,20 @@ class _Points:
             late, c0, c1 = self.p[-1], *self.curvature[k - 1 : k + 1]
             shift = 0.25 * late**2 * (c0 + c1) - late * (self.u[k] - self.u[k - 1]) / dt
             runge_kutta(
-                self.model.derivative, x, self.u[k - 1] + shift, self.u[k] + shift, c0, c1,
-                self.p, w, dt, substeps, work,
+                self.model.functions.derivative, x, self.u[k - 1] + shift, self.u[k] + shift, c0,
+                c1, self.p, w, dt, substeps, work,
             )  # fmt: skip
             point[: self.nx] = x
 
     def read(self, points: np.ndarray, k: int) -> np.ndarray:
         found, output = np.empty((len(points), 2 * self.nx)), np.empty(2 * self.nx)
         for point, row in zip(points, found, strict=True):
-            self.model.measure(self.place(point), self.u[k], self.p, output)
+            self.model.functions.measure(self.place(point), self.u[k], self.p, output)
             row[:] = output
         return found[:, self.settings.observed]
 
 
-def _predict_by_covariance(points: _Points, mean: np.ndarray, joint: np.ndarray, k: int) -> Any:
+def _predict(points: _Points, mean: np.ndarray, joint: np.ndarray, k: int) -> Predicted:
     settings, n = points.settings, points.n
     drawn = points.draw(mean, joint, settings.noise_sd)
     points.carry(drawn, k)
@@ -128,27 +101,14 @@ def _predict_by_covariance(points: _Points, mean: np.ndarray, joint: np.ndarray,
     return mean, joint, expected, s, weighted.T @ (drawn - mean)
 
 
-def _predict_augmented(points: _Points, mean: np.ndarray, joint: np.ndarray, k: int) -> Any:
-    settings, nx, n, nw = points.settings, points.nx, points.n, points.nw
-    walk = settings.walk_sd * np.sqrt(points.t[k] - points.t[k - 1])
-    drawn = points.draw(mean, joint, settings.noise_sd, walk, settings.reading_sd)
-    points.carry(drawn, k)
-    drawn[:, nx:n] += drawn[:, n + nw : n + nw + walk.size]
-    images = points.read(drawn, k) + drawn[:, n + nw + walk.size :]
-    mean, away, weighted = points.moments(drawn[:, :n])
-    expected, unlike, weighted_unlike = points.moments(images)
-    joint, s = away.T @ weighted, unlike.T @ weighted_unlike
-    return mean, joint, expected, s, weighted_unlike.T @ away
-
-
-def _filter(
-    predict: Callable[[_Points, np.ndarray, np.ndarray, int], Predicted],
+def filter_by_covariance(
     model: FilterModel,
     trials: Sequence[Trial],
     theta: np.ndarray,
     covariance: np.ndarray,
     settings: FilterSettings,
 ) -> FilterOutcome:
+    """The compiled filter in its covariance form; as `unscented.filter_trials`."""
     nx, (lower, upper) = model.n_states, model.range
 
     def filter_one(
@@ -162,7 +122,7 @@ def _filter(
         nis, log_likelihood = np.full((2, size), np.nan)
         for k in range(1, size):
             try:
-                mean, joint, expected, s, both = predict(points, mean, joint, k)
+                mean, joint, expected, s, both = _predict(points, mean, joint, k)
                 if np.isfinite(trial.y[k]).all():
                     innovation[k], innovation_sd[k] = trial.y[k] - expected, np.sqrt(np.diag(s))
                     whitened = np.linalg.solve(np.linalg.cholesky(s), innovation[k])

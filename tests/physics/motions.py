@@ -69,6 +69,16 @@ def conservative_bam():
     return registry.device_from(bare)
 
 
-def typical_parameters(system):
-    """Every effect clearly there, (n_p,)."""
-    return np.array([p.prior if p.typical is None else p.typical for p in system.parameters])
+def typical_parameters(system, strength=1.0):
+    """Every effect at ``strength`` times its typical size, (n_p,)."""
+    sizes = [p.prior if p.typical is None else p.typical for p in system.parameters]
+    shares = [strength if p.strength else 1.0 for p in system.parameters]
+    return np.array(sizes) * shares
+
+
+def with_values(system, values):
+    """The priors, with ``values`` by name put in, (n_p,)."""
+    p = system.prior
+    for name, value in values.items():
+        p[system.index(name)] = value
+    return p

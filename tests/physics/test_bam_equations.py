@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import bam_oracle as oracle
 import numpy as np
 import pytest
-from motions import random_motion
+from motions import random_motion, with_values
 from scipy.linalg import expm
 
 from bampipe.physics import Model, System, compile_model, registry
@@ -46,18 +46,11 @@ def at_rest(system, rows):
     return np.zeros((rows, 0)), np.zeros((rows, len(system.inputs)))
 
 
-def with_values(system, **values):
-    p = system.prior
-    for name, value in values.items():
-        p[system.index(name)] = value
-    return p
-
-
 def test_mass_matrix_is_symmetric_positive_definite_over_the_workspace(system):
     grids = [np.linspace(*BAM.limits[c.name], 9) for c in BAM.coordinates]
     q = np.stack(np.meshgrid(*grids), axis=-1).reshape(-1, 3)
     for mass in (0.1, 3.56, 10.0):
-        matrices = system.mass_matrix(q, with_values(system, mass=mass))
+        matrices = system.mass_matrix(q, with_values(system, {"mass": mass}))
         assert np.array_equal(matrices, matrices.transpose(0, 2, 1))
         assert np.linalg.eigvalsh(matrices).min() > 0.05
 
@@ -65,7 +58,7 @@ def test_mass_matrix_is_symmetric_positive_definite_over_the_workspace(system):
 def test_mass_matrix_equals_the_one_by_hand(system):
     q, _, _ = random_motion(BAM, 200, 1)
     expected = np.array([oracle.mass_matrix(row, 3.2) for row in q])
-    found = system.mass_matrix(q, with_values(system, mass=3.2))
+    found = system.mass_matrix(q, with_values(system, {"mass": 3.2}))
     np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)
 
 
@@ -83,7 +76,7 @@ def test_inertia_coriolis_and_gravity_equal_those_by_hand(system):
 
 def test_accelerations_solve_the_equations_by_hand(system):
     q, qd, _ = random_motion(BAM, 50, 3)
-    p = with_values(system, mass=3.2)
+    p = with_values(system, {"mass": 3.2})
     force, brake = np.array([4.0, -7.0, 5.0]), np.array([0.5, 0.0, 2.0])
     u = np.array([*force, *brake])
     assert system.inputs == (*BAM.forces, *BAM.brakes.values())
@@ -138,7 +131,8 @@ def test_tuned_compensator_of_eq_16_is_the_weight_of_the_rod(system):
     np.testing.assert_allclose(literal, weight, rtol=1e-13)
     np.testing.assert_allclose(literal, probe("compensation")(q, 0 * q), rtol=1e-13)
     z, u = at_rest(system, len(q))
-    torque = system.required(q, 0 * q, 0 * q, z, u, with_values(system, mass=oracle.DESIGN_MASS))
+    p = with_values(system, {"mass": oracle.DESIGN_MASS})
+    torque = system.required(q, 0 * q, 0 * q, z, u, p)
     np.testing.assert_allclose(torque[:, 1], 0.0, atol=1e-13)
     np.testing.assert_allclose(
         torque[:, 2], oracle.DESIGN_MASS * oracle.G * np.sin(q[:, 1]), rtol=1e-12
@@ -169,7 +163,7 @@ def test_literal_force_point_of_the_paper_is_the_effect_with_shift_l():
     q, _, _ = random_motion(BAM, 50, 8)
     z, u = at_rest(moved, len(q))
     u[:, :3] = np.random.default_rng(8).normal(0.0, 20.0, size=(len(q), 3))
-    p = with_values(moved, **{"force_application_point.shift": oracle.L})
+    p = with_values(moved, {"force_application_point.shift": oracle.L})
     expected = [
         oracle.jacobian(a).T @ oracle.attitude(a) @ f for a, f in zip(q, u[:, :3], strict=True)
     ]
@@ -182,9 +176,8 @@ def test_friction_and_brakes_take_energy_out_at_every_speed(system):
     qd[::2] *= 10.0 ** np.random.default_rng(9).uniform(-7, 0, size=(200, 1))
     z, u = at_rest(system, len(q))
     u[:, 3:] = np.abs(np.random.default_rng(10).normal(0.0, 30.0, size=(len(q), 3)))
-    frictionless = with_values(
-        system, **{p.name: 0.0 for p in system.parameters if p.name.partition(".")[2]}
-    )
+    rubs = [p.name for p in system.parameters if p.name.partition(".")[2]]
+    frictionless = with_values(system, dict.fromkeys(rubs, 0.0))
     total = system.required(q, qd, 0 * q, z, u, system.prior)
     ideal = system.required(q, qd, 0 * q, z, 0 * u, frictionless)
     power = -(total - ideal) * qd

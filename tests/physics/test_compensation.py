@@ -6,6 +6,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from motions import with_values
 
 from bampipe.physics import Model, System, compile_model, registry
 
@@ -15,9 +16,7 @@ BALANCED = 3.56 * 9.81 * (Q[:, 2] - 0.461) * np.cos(Q[:, 1])
 
 
 def torque(system: System, values: dict[str, float], z: np.ndarray | None = None) -> np.ndarray:
-    p = system.prior
-    for name, value in values.items():
-        p[system.index(name)] = value
+    p = with_values(system, values)
     z = np.zeros((2, len(system.memory_names))) if z is None else z
     return system.compensation(Q, QD, z, np.zeros((2, len(system.inputs))), p)
 

@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 import sympy as sp
+from motions import with_values
 from scipy.signal import lfilter
 
 from bampipe.physics import Model, compile_model, registry
@@ -168,12 +169,10 @@ def test_delays_of_sensor_and_motor_add_up():
 def test_a_force_that_leaks_is_scaled_after_its_zero_is_taken_off():
     effects = ["force_gain:x", "force_crosstalk:xy", "force_bias:x", "force_bias:y"]
     system = compile_model(Model(registry.device("bam"), effects))
-    names = [x.name for x in system.parameters]
-    p = np.array([x.prior for x in system.parameters])
     zero, gain = np.array([1.5, -2.0, 0.0]), np.array([[1.08, 0.05, 0], [0, 1, 0], [0, 0, 1]])
-    p[names.index("force_bias.x.bias")], p[names.index("force_bias.y.bias")] = zero[:2]
-    p[names.index("force_crosstalk.xy.leak")] = 0.05
-    p[names.index("force_gain.x.error")] = 1.0 - 1.0 / 1.08
+    values = {"force_bias.x.bias": zero[0], "force_bias.y.bias": zero[1],
+              "force_crosstalk.xy.leak": 0.05, "force_gain.x.error": 1.0 - 1.0 / 1.08}  # fmt: skip
+    p = with_values(system, values)
     true = np.random.default_rng(1).normal(size=(20, 3)) * 10.0
     read = true @ gain.T + zero
     column = {f"force_{c}": read[:, k] for k, c in enumerate("xyz")}
@@ -188,11 +187,9 @@ def test_a_force_that_leaks_is_scaled_after_its_zero_is_taken_off():
 def test_a_payload_weighs_on_a_tilted_base_too():
     device = registry.device("bam")
     system = compile_model(Model(device, ["handle_payload", "base_tilt"]))
-    names = [x.name for x in system.parameters]
-    p = np.array([x.prior for x in system.parameters])
     tilt_x, tilt_z, payload = 1e-3, -2e-3, 0.4
-    p[names.index("base_tilt.tilt_x")], p[names.index("base_tilt.tilt_z")] = tilt_x, tilt_z
-    p[names.index("handle_payload.payload")] = payload
+    values = {"base_tilt.tilt_x": tilt_x, "base_tilt.tilt_z": tilt_z}
+    p = with_values(system, values | {"handle_payload.payload": payload})
 
     def potential(q):
         """Height of rod and payload along the vertical, from their places on the tilted base."""
@@ -212,15 +209,11 @@ def test_a_payload_weighs_on_a_tilted_base_too():
 
 
 def test_an_encoder_is_corrected_before_what_lies_behind_it():
-    system = compile_model(
-        Model(
-            registry.device("bam"), ["transmission_compliance:extension", "encoder_scale:extension"]
-        )
-    )
-    names = [x.name for x in system.parameters]
-    p = np.array([x.prior for x in system.parameters])
-    p[names.index("encoder_scale.extension.error")] = 0.05
-    p[names.index("transmission_compliance.extension.compliance")] = 2e-4
+    effects = ["transmission_compliance:extension", "encoder_scale:extension"]
+    system = compile_model(Model(registry.device("bam"), effects))
+    values = {"encoder_scale.extension.error": 0.05}
+    values |= {"transmission_compliance.extension.compliance": 2e-4}
+    p = with_values(system, values)
     u = np.zeros((1, len(system.inputs)))
     u[0, system.inputs.index("force_z")] = 30.0
     q = np.array([[0.1, 0.2, 1.0]])
@@ -264,8 +257,7 @@ def test_friction_by_direction_pushes_nothing_that_rests_and_is_no_part_of_what_
 def test_parameters_that_multiply_each_other_are_not_fitted_as_if_they_added_up():
     model = Model(registry.device("bam"), ["base_tilt"])
     system = compile_model(model)
-    names = [x.name for x in system.parameters]
-    mass, tilt = names.index("mass"), names.index("base_tilt.tilt_x")
+    mass, tilt = system.index("mass"), system.index("base_tilt.tilt_x")
     assert system.linear[mass] and system.linear[tilt]
     assert system.is_linear_in([mass]) and not system.is_linear_in([mass, tilt])
     assert compile_model(Model(model.device)).is_linear_in(range(7))

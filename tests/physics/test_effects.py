@@ -13,9 +13,9 @@ from functools import cache
 import numpy as np
 import pytest
 from motions import of_mechanism
+from motions import typical_parameters as typical
 from scipy.optimize import least_squares
 
-from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
 
 BAM = registry.device("bam")
@@ -33,15 +33,6 @@ brake_residual_torque transmission_compliance backlash force_bias force_gain for
 force_delay force_drift force_application_point encoder_scale shear_thinning upper_stop lower_stop
 maxwell_slip unbalance friction_by_pose
 """
-
-
-def typical(system, strength=1.0):
-    """Parameters with every effect at ``strength`` times its typical size."""
-    values = []
-    for p in system.parameters:
-        value = p.prior if p.typical is None else p.typical
-        values.append(value * strength if p.strength else value)
-    return np.array(values)
 
 
 def effect_of(case):
@@ -232,13 +223,6 @@ def test_recovered_from_a_wrong_guess(case):
     after = np.sqrt(np.mean(found.fun**2))
     assert after < 0.02 * before
     np.testing.assert_allclose(found.x, truth[free], rtol=0.03)
-
-
-def test_unknown_effect_and_target_are_named():
-    with pytest.raises(InputError, match="did you mean 'stribeck'"):
-        Model(BAM, ["stribek:yaw"])
-    with pytest.raises(InputError, match="stribeck:pitch"):
-        Model(BAM, ["stribeck:pich"])
 
 
 def test_dry_friction_is_what_turns_with_the_motion_of_an_axis():

@@ -272,7 +272,7 @@ def test_internal_states_are_those_of_a_fine_integration(machine, effect, share)
     q, qd = 0.05 * np.sin(turn) + 0.9, 0.05 * np.cos(turn) * (turn[1] * rate)
     waves = np.sin(2 * np.pi * np.outer(t, 1.1 + 0.3 * np.arange(len(system.inputs))))
     u = np.abs(waves) * 20.0
-    p = np.array([x.prior if x.typical is None else x.typical for x in system.parameters])
+    p = typical_parameters(system)
     found = system.memory(q, qd, 0 * q, u, p, t)
 
     def slope(time, z):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from motions import of_mechanism
+from motions import of_mechanism, with_values
+from motions import typical_parameters as typical
 from scipy.optimize import least_squares
 from small_arm import ARM
 
@@ -47,13 +48,6 @@ def residual(system, p, motion):
     at = of_mechanism(system, *read, u, p, t)
     z = system.memory(*at, u, p, t)
     return (system.applied(*at, z, u, p) - system.required(*at, z, u, p))[:, 0]
-
-
-def typical(system, strength=1.0):
-    sizes = [p.prior if p.typical is None else p.typical for p in system.parameters]
-    return np.array(
-        [s * strength if p.strength else s for s, p in zip(sizes, system.parameters, strict=True)]
-    )
 
 
 @pytest.mark.parametrize(("word", "sign"), [("sum", 1.0), ("difference", -1.0)])
@@ -188,12 +182,9 @@ def test_a_gear_loses_of_the_load_behind_it_without_the_rotor(stiffness):
     torque = 2.0 * qdd + pull + qd + np.sign(qd) + share * np.abs(load) * np.sign(qd)
     u = np.zeros((len(t), len(system.inputs)))
     u[:, [system.inputs.index("torque")]] = torque
-    names = [p.name for p in system.parameters]
-    p = system.prior.copy()
-    p[names.index("gear_loss.joint.share")] = share
-    p[names.index("gear_loss.joint.behind")] = behind
-    if stiffness:
-        p[names.index("return_spring.joint.stiffness")] = stiffness
+    values = {"gear_loss.joint.share": share, "gear_loss.joint.behind": behind}
+    values |= {"return_spring.joint.stiffness": stiffness} if stiffness else {}
+    p = with_values(system, values)
     moving = np.abs(qd[:, 0]) > 1e-6
     left = residual(system, p, (q, qd, qdd, u, t))[moving]
     assert np.abs(left).max() < 1e-4 * np.abs(torque).max()
@@ -223,10 +214,8 @@ def test_hysteresis_of_all_dry_friction_needs_a_device_that_adds_some():
 def test_dry_friction_is_all_that_turns_with_the_motion():
     device = registry.device("magnetic_damper")
     system = compile_model(Model(device, ["hysteresis:piston"]))
-    names = [p.name for p in system.parameters]
-    p = typical(system, 0.0)
-    p[names.index("coulomb.piston")], p[names.index("coulomb_gain")] = 40.0, 200.0
-    p[names.index("hysteresis.piston.share")] = 1.0
+    values = {"coulomb.piston": 40.0, "coulomb_gain": 200.0, "hysteresis.piston.share": 1.0}
+    p = with_values(system, values)
     u = np.array([[{"current": 1.5}.get(name, 0.0) for name in system.inputs]])
     one = np.array([[0.1]])
     gone = [system.required(0 * one, one, 0 * one, np.array([[z]]), u, p)[0, 0] for z in (0.0, 1.0)]
@@ -299,13 +288,12 @@ GAP, BEHIND, PUSH = 2e-3, 25.0, 50.0
 @pytest.mark.parametrize("effect", ["loose_load", "loose_drive"])
 def test_what_is_loose_flies_free_for_as_long_as_it_crosses_half_the_gap(effect):
     system = compile_model(Model(registry.device("slider"), [f"{effect}:carriage"]))
-    p = {x.name: x.prior for x in system.parameters}
-    p |= dict.fromkeys(("viscous.carriage", "coulomb.carriage", "offset"), 0.0) | {"mass": 70.0}
+    p = dict.fromkeys(("viscous.carriage", "coulomb.carriage", "offset"), 0.0) | {"mass": 70.0}
     own = {"inertia": BEHIND, "gap": GAP, "frequency": 120.0, "damping": 1.0}
     p |= {f"{effect}.carriage.{name}": value for name, value in own.items()}
     if effect == "loose_drive":
         p["loose_drive.carriage.lightness"] = 1.0 / BEHIND
-    values = np.array([p[x.name] for x in system.parameters])
+    values = with_values(system, p)
     t = np.arange(0.0, 1.0, 1e-3)[:, None]
     # The load is left behind by what the motor moves; or the motor leaves what is held.
     acceleration = PUSH / BEHIND
@@ -352,8 +340,7 @@ def delivered(current: np.ndarray, lag: float) -> np.ndarray:
     u = np.zeros((len(current), len(system.inputs)))
     u[:, system.inputs.index("current")] = current
     still = np.zeros((len(current), 1))
-    p = system.prior
-    p[system.index("channel_lag.current.time_constant")] = lag
+    p = with_values(system, {"channel_lag.current.time_constant": lag})
     return system.memory(still, still, still, u, p, np.arange(len(current)) / RATE)[:, 0]
 
 
@@ -390,10 +377,8 @@ def test_a_quantised_or_smooth_command_is_not_switched() -> None:
 def test_a_hysteresis_over_next_to_nothing_stays_within_its_bounds(distance, symmetry):
     """It is passed many times between two samples; at its end it is the sign of the velocity."""
     system = compile_model(Model(registry.device("magnetic_damper"), ["hysteresis:piston"]))
-    names = [item.name for item in system.parameters]
-    p = system.prior.copy()
-    p[names.index("hysteresis.piston.distance")] = distance
-    p[names.index("hysteresis.piston.symmetry")] = symmetry
+    shapes = {"hysteresis.piston.distance": distance, "hysteresis.piston.symmetry": symmetry}
+    p = with_values(system, shapes)
     t = np.arange(0.0, 1.0, 1e-3)
     x, v = 1e-2 * np.sin(31.4 * t)[:, None], 0.314 * np.cos(31.4 * t)[:, None]
     u = np.zeros((len(t), len(system.inputs)))
@@ -407,8 +392,7 @@ def test_a_hysteresis_over_next_to_nothing_stays_within_its_bounds(distance, sym
 def test_a_hysteresis_too_stiff_for_runge_kutta_is_given_up_early():
     """What decides for exponential steps is known at the first sample that moves."""
     system = compile_model(Model(registry.device("magnetic_damper"), ["hysteresis:piston"]))
-    p, names = system.prior.copy(), [item.name for item in system.parameters]
-    p[names.index("hysteresis.piston.distance")] = 1e-6
+    p = with_values(system, {"hysteresis.piston.distance": 1e-6})
     t = np.arange(0.0, 0.1, 1e-3)
     q, qd = 0.3 * t[:, None], np.full((len(t), 1), 0.3)
     u = np.zeros((len(t), len(system.inputs)))
@@ -427,10 +411,8 @@ def coarse_beside_fine(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The state of an effect along a sine, from every so many samples and from all of them."""
     system = compile_model(Model(registry.device("magnetic_damper"), [effect]))
-    names = [item.name for item in system.parameters]
-    p = system.prior.copy()
-    for shape, value in shapes.items():
-        p[names.index(f"{effect.replace(':', '.')}.{shape}")] = value
+    prefix = effect.replace(":", ".")
+    p = with_values(system, {f"{prefix}.{name}": value for name, value in shapes.items()})
     t, w = np.arange(0.0, 1.0, step), 2.0 * np.pi * hz
     u = np.zeros((len(t), len(system.inputs)))
     motion = size * np.sin(w * t), size * w * np.cos(w * t), -size * w**2 * np.sin(w * t)
