@@ -1,7 +1,8 @@
 """Files of text: read with mistakes named, written whole or not at all, and hashed.
 
-Nothing heavy is imported. A file that cannot be read or written raises
-:class:`bampipe.errors.InputError` naming it.
+Nothing heavy is imported. A file that is not there, cannot be read or written, is no regular file,
+too large, or not what is asked for (JSON, TOML) raises :class:`bampipe.errors.InputError`, which
+names it, and the line.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import stat
 import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import date, datetime, time
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -54,20 +55,12 @@ _REMEDIES = {
 
 
 def read_json(path: Path) -> Any:
-    """The value in a JSON file.
-
-    Raises:
-        InputError: no such file, or not JSON (file and line are named).
-    """
+    """The value in a JSON file."""
     return parse_json(read_bytes(path, LARGEST_JSON_BYTES), str(path))
 
 
 def read_json_table(path: Path) -> dict[str, Any]:
-    """The table in a JSON file that bampipe wrote.
-
-    Raises:
-        InputError: as :func:`read_json`, or it holds something else than a table.
-    """
+    """The table in a JSON file that bampipe wrote."""
     try:
         content = read_json(path)
         if isinstance(content, dict):
@@ -79,15 +72,7 @@ def read_json_table(path: Path) -> dict[str, Any]:
 
 
 def parse_json(data: bytes, where: str) -> Any:
-    """The value that the text ``data`` of a JSON file stands for.
-
-    Args:
-        data: the bytes of the file.
-        where: the file, for messages.
-
-    Raises:
-        InputError: not JSON, nested too deeply, or a number that nothing can hold.
-    """
+    """The value that the bytes ``data`` of the JSON file ``where`` stand for."""
     try:
         value = json.loads(data, parse_int=_whole_number)
     except json.JSONDecodeError as error:
@@ -103,11 +88,7 @@ def parse_json(data: bytes, where: str) -> Any:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The table in a TOML file.
-
-    Raises:
-        InputError: no such file, not UTF-8, or not TOML (file and line are named).
-    """
+    """The table in a TOML file."""
     data = read_bytes(path, LARGEST_TOML_BYTES)
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(
@@ -181,16 +162,16 @@ def refuse_links(folder: Path) -> None:
 def require_regular(path: Path) -> os.stat_result:
     """Return the status of ``path``, which is to be read.
 
-    Raises:
-        InputError: no such file, or no regular one: a pipe could be waited for without end, and
-            a device has none.
+    A pipe could be waited for without end, and a device has none.
     """
     try:
         status = os.stat(path)
     except FileNotFoundError as error:
         raise InputError("no such file", where=str(path)) from error
-    except (OSError, ValueError) as error:
-        raise _unreadable(path, error) from error
+    except OSError as error:
+        raise cannot("read", path, error) from error
+    except ValueError as error:
+        raise InputError("no path of a file", where=str(path)) from error
     if stat.S_ISDIR(status.st_mode):
         raise InputError("a folder, where a file is expected", where=str(path))
     if not stat.S_ISREG(status.st_mode):
@@ -203,11 +184,7 @@ def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[BinaryIO]:
     """A binary file that takes the place of ``path`` only when the block ends without error.
 
     Args:
-        path: the file.
         durable: survive a loss of power; not needed for what can be made again.
-
-    Raises:
-        InputError: the folder is read-only, the disk is full, or the like.
     """
     path = Path(path)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -220,11 +197,10 @@ def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[BinaryIO]:
                 os.fsync(stream.fileno())
         partial.replace(path)
     except OSError as error:
-        _discard(partial)
         raise cannot("write", path, error) from error
-    except BaseException:
-        _discard(partial)
-        raise
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -298,11 +274,7 @@ def digest_bytes(content: bytes) -> str:
 
 
 def digest_file(path: Path) -> str:
-    """Return the SHA-256 of the bytes of ``path`` in hexadecimal, read in pieces.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
+    """Return the SHA-256 of the bytes of ``path`` in hexadecimal, read in pieces."""
     require_regular(path)
     try:
         with path.open("rb") as stream:
@@ -324,21 +296,13 @@ def digest_input(path: Path) -> str:
     TOML counts by its bytes: the stage that reads it says what is wrong with it.
     """
     if path.suffix == ".toml":
-        try:
+        with suppress(InputError):
             return digest_content(read_toml(path))
-        except InputError:
-            return digest_file(path)
     return digest_file(path)
 
 
 def cannot(verb: str, path: Path, error: OSError) -> InputError:
-    """Return what to tell the user of a file that cannot be read or written.
-
-    Args:
-        verb: "read" or "write".
-        path: the file.
-        error: what the operating system said.
-    """
+    """Return what to tell the user of a file that cannot be read or written (``verb``)."""
     reason = STORAGE_FAULTS.get(error.errno or 0) or (error.strerror or str(error)).lower()
     return InputError(
         f"cannot {verb}: {reason}", where=str(path), remedy=_REMEDIES.get(error.errno or 0, "")
@@ -346,11 +310,7 @@ def cannot(verb: str, path: Path, error: OSError) -> InputError:
 
 
 def read_bytes(path: Path, limit: int) -> bytes:
-    """The content of a regular file of at most ``limit`` bytes.
-
-    Raises:
-        InputError: no such file, a larger one, or one that cannot be read.
-    """
+    """The content of a regular file of at most ``limit`` bytes."""
     path = Path(path)
     if require_regular(path).st_size > limit:
         raise InputError(f"larger than {limit // 1_000_000} MB", where=str(path))
@@ -358,12 +318,6 @@ def read_bytes(path: Path, limit: int) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise cannot("read", path, error) from error
-
-
-def _unreadable(path: Path, error: OSError | ValueError) -> InputError:
-    if isinstance(error, OSError):
-        return cannot("read", path, error)
-    return InputError("no path of a file", where=str(path))
 
 
 def _whole_number(text: str) -> int:
@@ -379,11 +333,6 @@ def _refuse_deep(value: object, where: str, depth: int = DEEPEST) -> None:
         raise InputError("nested too deeply", where=where)
     for item in value.values() if isinstance(value, Mapping) else value:
         _refuse_deep(item, where, depth - 1)
-
-
-def _discard(partial: Path) -> None:
-    if partial.exists():
-        partial.unlink()
 
 
 def _plain(value: object) -> object:

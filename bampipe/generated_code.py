@@ -2,6 +2,7 @@
 
 All of it is in one folder of the user: the source of each model in one file, by the hash of what it
 depends on, and what is compiled in one folder for each content of the sources, wherever these are.
+Where the folder cannot be made, used or written, an `InputError` says so.
 """
 
 from __future__ import annotations
@@ -79,9 +80,6 @@ def load(key: str, generate: Callable[[], tuple[dict[str, Any], Mapping[str, str
     Args:
         key: hash of everything the code depends on.
         generate: returns the facts and the source of each module.
-
-    Raises:
-        InputError: the folder cannot be used or written.
     """
     path = folder_of_user() / f"model_{key}.json"
     with suppress(OSError, ValueError, TypeError):
@@ -96,11 +94,7 @@ def load(key: str, generate: Callable[[], tuple[dict[str, Any], Mapping[str, str
 
 
 def folder_of_user() -> Path:
-    """Folder of code to run: in ``BAMPIPE_CACHE_DIR``, else in the user's cache folder.
-
-    Raises:
-        InputError: it cannot be made.
-    """
+    """Folder of code to run: in ``BAMPIPE_CACHE_DIR``, else in the user's cache folder."""
     root = os.environ.get("BAMPIPE_CACHE_DIR")
     if not root:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -130,11 +124,7 @@ def hash_sources(folder: Path) -> str:
 
 
 def compiled_folder(sources: Path) -> Path:
-    """Where that is which numba compiled from the modules in ``sources``, made or not.
-
-    Raises:
-        InputError: as `folder_of_user`.
-    """
+    """Where that is which numba compiled from the modules in ``sources``, made or not."""
     return folder_of_user() / f"numba_{hash_sources(sources)[:24]}"
 
 

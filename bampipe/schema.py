@@ -137,12 +137,7 @@ def _named(table: dict[str, NamedDeclaration]) -> tuple[NamedDeclaration, ...]:
 
 
 def read(kind: type[D], content: object, where: str) -> D:
-    """Check what was read from a file against its declaration.
-
-    Args:
-        kind: the declaration.
-        content: the parsed file.
-        where: the file, for messages.
+    """Check the ``content`` of the file ``where`` against its declaration.
 
     Raises:
         InputError: names the file, the field (dotted), what was found, what is expected; and so

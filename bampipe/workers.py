@@ -31,12 +31,13 @@ def end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is None:
         raise RuntimeError("this process was not started as a worker")
-    threading.Thread(target=_end_after, args=(parent.sentinel,), daemon=True).start()
+    sentinel = parent.sentinel
 
+    def end_after_parent() -> None:
+        multiprocessing.connection.wait([sentinel])
+        os._exit(1)
 
-def _end_after(sentinel: int) -> None:
-    multiprocessing.connection.wait([sentinel])
-    os._exit(1)
+    threading.Thread(target=end_after_parent, daemon=True).start()
 
 
 _parent: multiprocessing.connection.Connection | None = None
@@ -61,7 +62,6 @@ def process_pool(
     """A pool of worker processes for the length of the block; what they are at then is given up.
 
     Args:
-        jobs: number of processes.
         initialize: called in each process before its first task, with ``arguments``.
         nested: whether tasks start processes of their own; the workers then begin afresh.
         hear: called with every message of `send_to_parent`.

@@ -493,49 +493,49 @@ def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:
 @pytest.mark.parametrize(
     ("verdict", "selected", "after"),
     [
-        ("unknown_effect", (), "bampipe draft s01 --model base"),
-        ("undecided", (), "bampipe draft s01 --model base"),
-        ("nothing_missing", (), "bampipe report s01 --open"),
-        ("missing", ("stribeck:yaw",), "bampipe report s01 --open"),
+        ("unknown_effect", (), "bampipe draft RUN --model base"),
+        ("undecided", (), "bampipe draft RUN --model base"),
+        ("nothing_missing", (), "bampipe report RUN --open"),
+        ("missing", ("stribeck:yaw",), "bampipe report RUN --open"),
     ],
 )
 def test_after_the_loop_comes_what_its_last_diagnosis_says(
     ingested: Path, verdict: str, selected: tuple[str, ...], after: str
 ) -> None:
-    assert after_loop(ingested, "base", "s01") == "bampipe diagnose s01"
+    assert after_loop(ingested, "base") == "bampipe diagnose RUN"
     other = ingested / "models/base+stribeck.yaw/model.toml"
     other.parent.mkdir(parents=True)
     other.touch()
-    assert after_loop(ingested, "base", "s01") == "bampipe diagnose s01 --model base"
+    assert after_loop(ingested, "base") == "bampipe diagnose RUN --model base"
     axes, command = {"yaw": {"verdict": verdict}}, "bampipe draft RUN --model base"
     write_result(ingested, DiagnoseResult, axes=axes, selected=selected, next=command)
-    assert after_loop(ingested, "base", "s01") == after
+    assert after_loop(ingested, "base") == after
 
 
 def test_what_a_diagnosis_found_comes_before_a_trial_for_the_parameters(ingested: Path) -> None:
     recorded, command = "record that trial", "bampipe extend RUN stribeck:yaw --model base"
     write_result(ingested, NextResult, purpose="precision")
-    assert after_proposal(ingested, "base", "s01").startswith(recorded)
+    assert after_proposal(ingested, "base").startswith(recorded)
     axes = {"yaw": {"verdict": "missing"}}
     write_result(ingested, DiagnoseResult, axes=axes, selected=("stribeck:yaw",), next=command)
-    assert after_proposal(ingested, "base", "s01") == command.replace("RUN", "s01")
+    assert after_proposal(ingested, "base") == command
     write_result(ingested, NextResult, purpose="decision")
-    assert after_proposal(ingested, "base", "s01").startswith(recorded)
+    assert after_proposal(ingested, "base").startswith(recorded)
 
 
 def test_a_diagnosis_is_asked_for_where_none_is_or_none_knows_the_new_trial(
     ingested: Path,
 ) -> None:
-    diagnose = "bampipe diagnose s01"
+    diagnose = "bampipe diagnose RUN"
     write_result(ingested, NextResult, purpose="precision")
     write_result(ingested, ValidateResult, axes={"yaw": {"standing": "above_floor"}})
-    assert after_proposal(ingested, "base", "s01") == diagnose
+    assert after_proposal(ingested, "base") == diagnose
     axes, command = {"yaw": {"verdict": "undecided"}}, "bampipe next RUN --model base"
     write_result(ingested, DiagnoseResult, axes=axes, trials=("t01",), next=command)
     write_result(ingested, IdentifyResult, trials=("t01",))
-    assert after_run(ingested, "base", "s01") == command.replace("RUN", "s01")
+    assert after_run(ingested, "base") == command
     write_result(ingested, IdentifyResult, trials=("t01", "t02"))
-    assert after_run(ingested, "base", "s01") == diagnose
+    assert after_run(ingested, "base") == diagnose
 
 
 def test_what_has_been_drafted_is_not_asked_for_again(ingested: Path) -> None:
@@ -545,7 +545,13 @@ def test_what_has_been_drafted_is_not_asked_for_again(ingested: Path) -> None:
         ingested, DraftResult, axes={"yaw": {"chance": [{}]}}, next="record more trials like these"
     )
     for after in (after_loop, after_run):
-        assert after(ingested, "base", "s01") == "record more trials like these"
+        assert after(ingested, "base") == "record more trials like these"
+
+
+@pytest.mark.parametrize("option", [["--set", "sigmas=2"], ["--pipeline", "strict"], ["--force"]])
+def test_two_runs_are_compared_as_they_are(command: Command, option: list[str]) -> None:
+    said = one_line_error(*command("compare", "s01", "s02", *option))
+    assert f"{option[0]} has no effect on two runs" in said
 
 
 def test_a_diagnosis_that_is_older_than_its_inputs_is_said(

@@ -102,30 +102,6 @@ def test_changed_trial_reruns_what_depends_on_it(toy: Toy) -> None:
     assert outcome.steps[1].reason == "toy/numbers.json changed"
 
 
-def test_touched_trial_with_equal_content_reruns_nothing(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    os.utime(toy.session / "numbers.txt", (1, 1))
-    assert states(toy.run()) == ["unchanged"] * 4
-
-
-def test_settled_trials_are_not_read_again(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
-    for path in toy.session.iterdir():
-        os.utime(path, (1, 1))
-    toy.run()
-    from bampipe.run import hashing
-
-    read: list[Path] = []
-    monkeypatch.setattr(hashing, "digest_input", lambda path: read.append(path) or "read")
-    monkeypatch.setattr(hashing, "digest_code", lambda stage: "same")
-    memory = hashing.HashMemory(toy.root / ".bampipe" / "hashes.json")
-    hashing.digest_session(toy.session, memory)
-    assert read == []
-    os.utime(toy.session / "numbers.txt", (2, 2))
-    hashing.digest_session(toy.session, memory)
-    assert read == [toy.session / "numbers.txt"]
-
-
 def test_fewer_outputs_leave_no_stale_files(toy: Toy) -> None:
     toy.run()
     assert (toy.root / "toy/parts/2.json").exists()
@@ -171,16 +147,6 @@ def test_damaged_output_is_noticed_named_and_rebuilt(toy: Toy, damage: str) -> N
     assert toy.files() == good
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"schema": "other"}', "\x00\x01"])
-def test_damaged_record_is_rebuilt(toy: Toy, content: str) -> None:
-    toy.run()
-    toy.ran()
-    good = toy.files()
-    (toy.root / "run.json").write_text(content)
-    assert states(toy.run()) == ["done"] * 4
-    assert toy.files() == good
-
-
 def test_from_takes_what_is_before_as_it_stands(toy: Toy) -> None:
     toy.run()
     toy.ran()
@@ -193,11 +159,6 @@ def test_from_refuses_what_was_tampered_with(toy: Toy) -> None:
     toy.run()
     (toy.root / "toy/numbers.json").write_text('{"numbers": [9]}')
     with pytest.raises(InputError, match=r"toy/numbers\.json was changed since toy_read wrote it"):
-        toy.run(first="toy_double")
-
-
-def test_from_needs_what_comes_before(toy: Toy) -> None:
-    with pytest.raises(InputError, match=r"toy/numbers\.json is missing"):
         toy.run(first="toy_double")
 
 
@@ -383,26 +344,6 @@ def test_second_run_waits_or_refuses(toy: Toy) -> None:
     assert process.returncode == 0
 
 
-@pytest.mark.parametrize("number", ["ENOSPC", "EROFS", "EACCES"])
-def test_storage_faults_are_said_plainly(
-    toy: Toy, monkeypatch: pytest.MonkeyPatch, number: str
-) -> None:
-    import errno
-
-    from bampipe.stages import toy_double  # type: ignore[attr-defined]
-
-    toy.run()
-    good = toy.files()
-
-    def fail(*_: object) -> None:
-        raise OSError(getattr(errno, number), "no", str(toy.root))
-
-    monkeypatch.setattr(toy_double, "execute", fail)
-    with pytest.raises(InputError, match="earlier results are untouched"):
-        toy.run(force=True)
-    assert toy.files() == good
-
-
 # Models
 
 
@@ -565,12 +506,6 @@ def test_gate_without_a_number(tmp_path: Path, content: object, optional: bool) 
     assert [v.state for v in found] == ["absent" if optional else "failed"]
 
 
-def test_gate_without_a_result(tmp_path: Path) -> None:
-    assert [
-        v.state for v in gates.judge_gates(gate(), tmp_path, "base", tmp_path / "accepted")
-    ] == ["failed"]
-
-
 def test_failed_gate_decides_the_exit_code(toy: Toy) -> None:
     assert toy.run().exit_code == 0
     (toy.session / "numbers.txt").write_text("1000")
@@ -581,12 +516,14 @@ def test_failed_gate_decides_the_exit_code(toy: Toy) -> None:
 
 def test_junit_counts(tmp_path: Path) -> None:
     verdicts = judged(tmp_path, {"axes": {"yaw": {"a": 1.0}, "pitch": {"a": 3}}})
-    suites = [junit.Suite("s1", tuple(verdicts)), junit.Suite("s2", (), "no\x07 session")]
-    top = ElementTree.fromstring(junit.junit(suites))
+    outcomes = [
+        Outcome(Path("s1"), "done", verdicts=tuple(verdicts)),
+        Outcome(Path("s2"), "refused", error="no\x07 session"),
+    ]
+    top = ElementTree.fromstring(junit.junit(outcomes))
     assert [s.get("failures") for s in top] == ["1", "0"]
     assert [s.get("errors") for s in top] == ["0", "1"]
     assert top.find(".//failure") is not None
-    assert junit.junit(suites) == junit.junit(suites)
 
 
 # Pipelines
@@ -612,6 +549,7 @@ def test_shipped_pipelines_are_sound(name: str) -> None:
         ('schema = "bampipe.pipeline/1"', "schema = ", "not TOML"),
         ('value = "axes.*.value"', 'value = "*.*"', "value"),
         ('result = "toy/double.json"', 'result = "/etc/x.json"', "result"),
+        ("[[gates]]", "[settings.toy_duble]\nfactor = 3\n[[gates]]", "did you mean 'toy_double'"),
     ],
 )
 def test_wrong_pipelines_are_refused(toy: Toy, old: str, new: str, message: str) -> None:
@@ -619,13 +557,6 @@ def test_wrong_pipelines_are_refused(toy: Toy, old: str, new: str, message: str)
     assert old in text
     toy.pipeline_file.write_text(text.replace(old, new))
     with pytest.raises(InputError, match=message):
-        pipelines.load(str(toy.pipeline_file))
-
-
-def test_settings_for_no_stage_are_refused(toy: Toy) -> None:
-    with toy.pipeline_file.open("a") as stream:
-        stream.write("[settings.toy_duble]\nfactor = 3\n")
-    with pytest.raises(InputError, match="did you mean 'toy_double'"):
         pipelines.load(str(toy.pipeline_file))
 
 

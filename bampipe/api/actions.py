@@ -10,7 +10,7 @@ import pandas as pd
 
 from bampipe.api import loop
 from bampipe.api.opened import Run, open_run
-from bampipe.run import batch, record, runner
+from bampipe.run import batch, runner
 from bampipe.run import pipeline as pipelines
 from bampipe.run.events import unheard
 from bampipe.run.request import Request
@@ -18,7 +18,7 @@ from bampipe.run.session_name import session_folder, session_id
 from bampipe.stages import base
 
 if TYPE_CHECKING:
-    from bampipe.declarations.pipeline import Pipeline
+    pass
 
 Path_ = str | Path
 RUNS = "runs"
@@ -56,7 +56,7 @@ def run_session(
             root=root,
             pipeline=pipelines.load(pipeline),
             session=folder,
-            settings=_drop_empty(settings or {}),
+            settings={stage: values for stage, values in (settings or {}).items() if values},
             first=first,
             last=last,
             force=force,
@@ -149,23 +149,13 @@ def follow(run: Run | Path_, model: str = "") -> Run:
     return Run(opened.root)
 
 
-def _drop_empty(given: Mapping[str, Mapping[str, object]]) -> dict[str, Mapping[str, object]]:
-    """The settings of stages that have any."""
-    return {stage: values for stage, values in given.items() if values}
-
-
 def _open(run: Run | Path_) -> Run:
     return run if isinstance(run, Run) else open_run(run)
 
 
-def _read_pipeline(root: Path) -> Pipeline:
-    """The pipeline of a run, with every stage in it."""
-    return pipelines.recorded(record.read(root)).with_every_stage()
-
-
 def _make_options(run: Run) -> loop.LoopOptions:
     batch.limit_threads(1)
-    return loop.LoopOptions(run.root, _read_pipeline(run.root), False, True, unheard)
+    return loop.LoopOptions(run.root, pipelines.whole(run.root), False, True, unheard)
 
 
 def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object) -> dict[str, Any]:
@@ -200,8 +190,8 @@ def _run_stage(
     outcome = runner.run_session(
         Request(
             root=root,
-            pipeline=_read_pipeline(root),
-            settings=_drop_empty({stage: settings}),
+            pipeline=pipelines.whole(root),
+            settings={stage: settings} if settings else {},
             first=stage,
             last=stage,
             model=model,

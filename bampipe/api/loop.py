@@ -29,15 +29,7 @@ MOST_ROUNDS = 4
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """Options of every step of the loop.
-
-    Attributes:
-        root: the run folder.
-        pipeline: whose settings count.
-        force: run even if nothing changed.
-        wait: wait while another process holds the run folder.
-        listen: called with every event.
-    """
+    """Options of every step of the loop, as of a `Request`."""
 
     root: Path
     pipeline: Pipeline
@@ -101,10 +93,9 @@ def list_drafts(root: Path, model: str) -> dict[str, Path]:
     from bampipe.results.draft import DraftResult
 
     run = RunFolder(root)
-    if not run.exists(DraftResult.file(model)):
-        return {}
-    effects = run.read(DraftResult, model).effects
-    return {name: run.path(effect.file) for name, effect in effects.items()}
+    found = run.find(DraftResult, model)
+    effects = found.effects.items() if found is not None else ()
+    return {name: run.path(effect.file) for name, effect in effects}
 
 
 def _find_effect(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | None]:
@@ -128,11 +119,7 @@ def _find_effect(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | Non
 
 
 def adopt_effect(file: Path, runs: Path) -> Path:
-    """Copy an effect file to where every run of the folder ``runs`` finds it; return the copy.
-
-    Raises:
-        InputError: it is no effect file, or its name is that of a built-in effect.
-    """
+    """Copy an effect file to where every run of the folder ``runs`` finds it; return the copy."""
     from bampipe.declarations.files import read_effect
     from bampipe.physics import registry
 
@@ -150,8 +137,6 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
     """Make the child of ``parent`` that has ``effects`` too; identify, validate, compare.
 
     Args:
-        options: run folder, settings, listener.
-        parent: name of a model of this run.
         effects: each ``name[:target]`` of the library or of a draft for the parent, or
             ``file.toml[:target]`` for a lab's own.
 
@@ -195,12 +180,7 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
     """Write the child of ``parent`` with more effects, its ``model.toml`` last: then it counts.
 
     Args:
-        root: the run folder, held.
-        parent: name of a model.
         named: ``name[:target]`` of each effect, and where it comes from if it is a lab's own.
-
-    Raises:
-        InputError: the parent has an effect already, or the device cannot have it.
     """
     from bampipe.declarations.model import ModelFile
     from bampipe.declarations.model_file import load_model
@@ -235,8 +215,6 @@ def follow(
     are not weighed again. If the confirmation finds more, that is added likewise.
 
     Args:
-        options: run folder, settings, listener.
-        model: name of the model to start from.
         tell: called with a line on each finding and each step.
         draft: whether to draft a formula where the diagnosis finds no named effect.
 

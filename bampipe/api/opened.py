@@ -23,15 +23,12 @@ from bampipe.results.validate import ValidateResult
 from bampipe.run import models, record
 
 R = TypeVar("R", bound=Result)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the report; notebooks show it.
-
-    Attributes:
-        path: the SVG file.
-    """
+    """A figure of the report, an SVG file; notebooks show it."""
 
     path: Path
 
@@ -173,22 +170,19 @@ class Run:
     def _read(self, kind: type[R], model: str = "") -> R:
         name = self._choose_model(model) if "{model}" in kind.FILE else ""
         found = self._results.read(kind, name)
-        if found is None:
-            raise self._make_error(kind.file(name), kind.STAGE)
-        return found
+        return self._require(found, kind.file(name), kind.STAGE)
 
     def _table(self, relative: str, stage: str) -> pd.DataFrame:
-        frame = self._results.table(relative)
-        if frame is None:
-            raise self._make_error(relative, stage)
-        return frame
+        return self._require(self._results.table(relative), relative, stage)
 
-    def _make_error(self, relative: str, stage: str) -> InputError:
-        return InputError(
-            f"{relative} is not there yet",
-            where=str(self.root),
-            remedy=f"`bampipe {stage} {self.root}` makes it, or bampipe.{stage}(run)",
-        )
+    def _require(self, found: T | None, relative: str, stage: str) -> T:
+        if found is None:
+            raise InputError(
+                f"{relative} is not there yet",
+                where=str(self.root),
+                remedy=f"`bampipe {stage} {self.root}` makes it, or bampipe.{stage}(run)",
+            )
+        return found
 
 
 def _make_frame(entries: Mapping[str, Record]) -> pd.DataFrame:

@@ -90,9 +90,9 @@ class _Side:
         return np.asarray(frame.reindex(index=free, columns=free, fill_value=0.0))
 
     def describe(self) -> SessionOfPair:
+        found = self.run.find(DiagnoseResult, self.model)
         verdicts = {}
-        if self.run.exists(DiagnoseResult.file(self.model)):
-            found = self.run.read(DiagnoseResult, self.model)
+        if found is not None:
             verdicts = {axis: diagnosis_phrases.verdict(found, axis) for axis in found.axes}
         return SessionOfPair(session=self.name, model=self.model, verdicts=verdicts)
 
@@ -265,12 +265,9 @@ def _bin_residual(e: Evidence, axis: int, values: Array, edges: Array) -> pd.Dat
 
 
 def _make_map(bins: pd.DataFrame, unit: str) -> ResidualMap:
-    half = NORMAL_95 * bins["sd"]
-    return ResidualMap(
-        unit=unit, center=tuple(bins["center"]), mean=tuple(bins["mean"]),
-        low=tuple(bins["mean"] - half), high=tuple(bins["mean"] + half),
-        count=tuple(map(int, bins["count"])), variance_share=0.0,
-    )  # fmt: skip
+    mean, half = bins["mean"], NORMAL_95 * bins["sd"]
+    columns = {"center": bins["center"], "mean": mean, "low": mean - half, "high": mean + half}
+    return ResidualMap.of(unit=unit, count=bins["count"], variance_share=0.0, **columns)
 
 
 def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:

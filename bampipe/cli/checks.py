@@ -7,7 +7,6 @@ import typer
 from bampipe.cli import places, show
 from bampipe.cli.options import RUNS, JsonOption, RunArgument, RunsOption
 from bampipe.run import pipeline as pipelines
-from bampipe.run import record
 from bampipe.run.status import status
 from bampipe.run.verify import verify
 
@@ -18,7 +17,7 @@ def status_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption =
     Example: bampipe status 2026-10-03_s01
     """
     root = places.find_run(run, runs)
-    found = status(root, pipelines.recorded(record.read(root)))
+    found = status(root, pipelines.recorded(root))
     if json:
         show.print_json({"run": str(root), "steps": [vars(step) for step in found]})
         return

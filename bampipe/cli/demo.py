@@ -21,17 +21,7 @@ _SAMPLES = (_PACKAGE / "_sample_runs", _PACKAGE.parent / "sample_runs")
 
 
 def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str], None]) -> None:
-    """Run the whole loop on the session that ships for it.
-
-    Args:
-        runs: folder of run folders.
-        force: run even if nothing changed.
-        listen: called with every event.
-        tell: called with each line of the story.
-
-    Raises:
-        InputError: the session does not ship with this installation.
-    """
+    """Run the whole loop on the session that ships for it; ``tell``: called with each line."""
     from bampipe.results.compare import CompareResult
     from bampipe.results.truth import TruthResult
     from bampipe.results.validate import ValidateResult

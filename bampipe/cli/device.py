@@ -19,14 +19,6 @@ app = typer.Typer(
     help=f"{SUMMARY}\n\nExample: bampipe device check rail.toml",
 )
 
-FaultsOnlyOption = Annotated[bool, typer.Option("--quiet", "-q", help="Faults only.")]
-
-
-PictureOption = Annotated[
-    Path | None,
-    typer.Option(help="Of a robot: draw its joints and bodies into this SVG file.", metavar="FILE"),
-]
-
 
 def summary_of(command: Callable[..., None]) -> str:
     """Return the first line of a command's help: typer itself cuts it short in lists."""
@@ -63,7 +55,7 @@ def show_(
     declaration, where = read_device(device)
     equations, faults = device_faults(declaration, where)
     if not equations:
-        report_faults(faults)
+        _report_faults(faults)
     found = registry.device_from(declaration, where)
     names = [
         f"{effect.name}:{target}" if target else effect.name
@@ -81,15 +73,19 @@ def show_(
     show.say(equations)
     show.say(f"inputs: {', '.join(inputs) or 'none'}")
     show.say(f"effects it can have: {', '.join(names) or 'none'}")
-    if faults:
-        report_faults(faults)
+    _report_faults(faults)
 
 
 def check(
     file: Annotated[str, typer.Argument(help="A device file, or the name of a built-in device.")],
-    picture: PictureOption = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            help="Of a robot: draw its joints and bodies into this SVG file.", metavar="FILE"
+        ),
+    ] = None,
     json: JsonOption = False,
-    quiet: FaultsOnlyOption = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Faults only.")] = False,
 ) -> None:
     """Check a device file, and print its equations of motion and its faults.
 
@@ -107,26 +103,18 @@ def check(
         _draw(declaration, where, picture)
     if json:
         show.print_json({"file": where, "equations": equations.splitlines(), "faults": faults})
-        if faults:
-            raise typer.Exit(2)
-        return
-    if equations and not quiet:
+    elif equations and not quiet:
         show.say(equations)
-    if faults:
-        report_faults(faults)
-    if not quiet:
+    _report_faults(faults, json)
+    if not quiet and not json:
         show.say(f"{where}: names, units and equations fit together")
         if picture is not None:
             show.say(f"wrote {picture}")
-        show.print_advice(_name_next_step(file))
+        show.print_advice(_advise_after_check(file))
 
 
 def _draw(declaration: Mapping[str, Any], where: str, path: Path) -> None:
-    """Write the picture of a robot.
-
-    Raises:
-        InputError: the device is no robot, or the file is not to be written.
-    """
+    """Write the picture of a robot, the only kind of device that has one."""
     from bampipe.declarations.robot_picture import draw_robot
     from bampipe.files import write_text
     from bampipe.physics import registry
@@ -144,8 +132,7 @@ for _name, _command in COMMANDS.items():
     app.command(_name, short_help=summary_of(_command))(_command)
 
 
-def _name_next_step(file: str) -> str:
-    """Return the next step with a sound device file: run its session, or name it in one."""
+def _advise_after_check(file: str) -> str:
     path = Path(file)
     if path.suffix != ".toml":
         return f'device = "{file}" in session.toml, then bampipe run SESSION'
@@ -154,11 +141,12 @@ def _name_next_step(file: str) -> str:
     return f'put it into the folder of the logs, device = "{path.name}" in session.toml'
 
 
-def report_faults(faults: Sequence[str]) -> None:
-    """Print one line a fault on standard error, and leave with exit code 2."""
-    for line in faults:
+def _report_faults(faults: Sequence[str], json: bool = False) -> None:
+    """Print faults on standard error, a line each, unless as ``json`` already; exit with 2."""
+    for line in faults if not json else ():
         show.note(f"bampipe: error: {' '.join(line.split())}")
-    raise typer.Exit(2)
+    if faults:
+        raise typer.Exit(2)
 
 
 def check_effect_file(text: str, device_name: str, json: bool) -> None:
@@ -177,10 +165,7 @@ def check_effect_file(text: str, device_name: str, json: bool) -> None:
     tried, faults = effect_faults(read_effect(file), file, device, target)
     if json:
         show.print_json({"file": file, "device": device_name, "targets": tried, "faults": faults})
-        if faults:
-            raise typer.Exit(2)
-        return
-    if faults:
-        report_faults(faults)
-    show.say(f"{file}: names and units fit on {device_name}, as {', '.join(tried)}")
-    show.print_advice(f"bampipe effects {file}")
+    _report_faults(faults, json)
+    if not json:
+        show.say(f"{file}: names and units fit on {device_name}, as {', '.join(tried)}")
+        show.print_advice(f"bampipe effects {file}")

@@ -10,7 +10,6 @@ from bampipe.cli import show
 from bampipe.errors import InputError, choose_from
 
 if TYPE_CHECKING:
-    from bampipe.diagnosis.signature import Signature
     from bampipe.physics.effect import Effect
 
 COLUMNS, ROWS = 61, 13
@@ -33,16 +32,7 @@ def list_all(json: bool) -> None:
 
 
 def show_one(text: str, device_name: str, json: bool) -> None:
-    """Print one effect: formula, parameters, looks and signature.
-
-    Args:
-        text: ``name[:target]`` or ``file.toml[:target]``.
-        device_name: the built-in device, or the device file, it is shown on.
-        json: print JSON instead.
-
-    Raises:
-        InputError: no such effect, device or target.
-    """
+    """Print the effect ``text``, ``name[:target]`` or ``file.toml[:target]``, in full."""
     from bampipe.declarations.files import read_device, read_effect
     from bampipe.physics import registry
 
@@ -71,21 +61,27 @@ def show_one(text: str, device_name: str, json: bool) -> None:
     found = signature(device, effect, chosen)
     if json:
         shown = {"declaration": dict(effect.declaration), "targets": [t for t in targets if t]}
-        show.print_json({**shown, "signature": _describe_signature(found, chosen)})
+        about: dict[str, object] | None = None
+        if found is not None:
+            kept = ("axis", "unit", "against", "share")
+            about = {"target": chosen, "rms": dict(found.rms)}
+            about |= {name: getattr(found, name) for name in kept}
+        show.print_json({**shown, "signature": about})
         return
-    show.say(f"{effect.name}: {effect.summary}")
-    show.say("")
+    show.say(f"{effect.name}: {effect.summary}\n")
     for line in effect.formulas:
         show.say(f"  {line}")
     show.say("")
-    _print_parameters(effect)
+    rows = list(parameter_rows(effect))
+    head = ["parameter", "axis", "unit", "prior", "sd", "lower", "upper", "typical", ""]
+    used = [k for k in range(len(head)) if k < 1 or any(row[k] not in (None, "") for row in rows)]
+    show.print_table([head[k] for k in used], [[row[k] for k in used] for row in rows])
     names = [f"{effect.name}:{item}" if item else effect.name for item in targets]
     show.say(f"\non {device_name}: {', '.join(names)}")
     show.say(f"looks like: {effect.looks_like}")
     if effect.on_the_machine:
         show.say(f"on the machine: {effect.on_the_machine}")
-    show.say(f"source: {effect.source}")
-    show.say("")
+    show.say(f"source: {effect.source}\n")
     title = f"{effect.name}:{chosen}" if chosen else effect.name
     if found is None:
         show.say(f"{title} leaves nothing in the residual of a free or braked motion")
@@ -97,20 +93,6 @@ def show_one(text: str, device_name: str, json: bool) -> None:
     )
     for line in plot(found.abscissa.tolist(), found.residual.tolist()):
         show.say(line)
-
-
-def _describe_signature(found: Signature | None, target: str) -> dict[str, object] | None:
-    if found is None:
-        return None
-    names = ("axis", "unit", "against", "share")
-    return {"target": target, "rms": dict(found.rms), **{n: getattr(found, n) for n in names}}
-
-
-def _print_parameters(effect: Effect) -> None:
-    rows = list(parameter_rows(effect))
-    head = ["parameter", "axis", "unit", "prior", "sd", "lower", "upper", "typical", ""]
-    used = [k for k in range(len(head)) if k < 1 or any(row[k] not in (None, "") for row in rows)]
-    show.print_table([head[k] for k in used], [[row[k] for k in used] for row in rows])
 
 
 def parameter_rows(effect: Effect) -> Iterator[list[object]]:
@@ -130,12 +112,7 @@ def parameter_rows(effect: Effect) -> Iterator[list[object]]:
 
 
 def plot(abscissa: Sequence[float], ordinate: Sequence[float]) -> list[str]:
-    """Return a scatter plot in characters.
-
-    Args:
-        abscissa: values across, any number of them.
-        ordinate: values upward, as many.
-    """
+    """Return a scatter plot in characters."""
     left, right = min(abscissa), max(abscissa)
     bottom, top = min(0.0, *ordinate), max(0.0, *ordinate)
     wide, high = (right - left) or 1.0, (top - bottom) or 1.0

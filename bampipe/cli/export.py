@@ -52,13 +52,11 @@ def export(
             stream.write(packed)
         show.say(f"{path}: {root.name}, {len(packed) / 1e6:.1f} MB")
         return
-    every = (*FORMS, *recordings)
     chosen = next((known for known in FORMS if known == form), None)
     if chosen is None:
-        raise InputError(
-            f"unknown form {form!r}{did_you_mean(form, every)}",
-            remedy=f"--as {', '.join(every)}",
-        )
+        every = (*FORMS, *recordings)
+        what = f"unknown form {form!r}{did_you_mean(form, every)}"
+        raise InputError(what, remedy=f"--as {', '.join(every)}")
     root = places.find_run(run, runs)
     counting = models.choose_model(root, model)
     text = export_model(RunFolder(root), counting, chosen)

@@ -47,22 +47,13 @@ def init(
     )
     written = [] if dry else write_proposal(folder, proposal)
     if json:
-        show.print_json(
-            {
-                "session": proposal.session,
-                "device": proposal.device,
-                "written": [str(path) for path in written],
-                "fill_in": proposal.fill_in,
-                "check": proposal.check,
-                "left_out": proposal.passed,
-            }
-        )
+        names_kept = ("session", "device", "fill_in", "check")
+        content = {name: getattr(proposal, name) for name in names_kept}
+        written_names = [str(path) for path in written]
+        show.print_json({**content, "written": written_names, "left_out": proposal.passed})
         return
     if dry:
-        show.say(proposal.session.rstrip())
-        if proposal.device:
-            show.say("")
-            show.say(proposal.device.rstrip())
+        show.say("\n\n".join(filter(None, (proposal.session.rstrip(), proposal.device.rstrip()))))
     for path in written:
         show.say(f"wrote {path}")
     if quiet:
@@ -73,10 +64,6 @@ def init(
         ("left out:", proposal.passed),
     ):
         if lines:
-            show.say("")
-            show.say(title)
-            for line in lines:
-                show.say(f"  {line}")
-    show.say("")
+            show.say("\n  ".join((f"\n{title}", *lines)))
     after = f"bampipe run {folder}" if not proposal.fill_in else f"edit {folder}/session.toml"
-    show.say(f"next: {after}")
+    show.print_advice(after)

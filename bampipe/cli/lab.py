@@ -47,7 +47,8 @@ def lab(
         show.print_json(found.content.model_dump(mode="json"))
         return
     table(found)
-    show.print_advice(advice(found), quiet)
+    remedies = (one.remedy for one in found.content.sessions if one.remedy)
+    show.print_advice(next(remedies, f"open {found.folder / 'report.html'}"), quiet)
 
 
 def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> Lab:
@@ -61,13 +62,7 @@ def gather(runs: Path, out: Path | None = None, quiet: bool = False) -> Lab:
 
 
 def refresh(runs: Path, several: bool, quiet: bool) -> None:
-    """Bring the lab's folder up to date after a run, if there is one or there should be.
-
-    Args:
-        runs: the folder of runs.
-        several: whether several sessions were run: that makes a lab.
-        quiet: print nothing.
-    """
+    """Bring the lab's folder up to date after a run, if there is one; ``several`` make one."""
     from bampipe.lab.folders import FILE, is_current, is_foreign, lab_folder, run_folders
 
     folder = lab_folder(runs)
@@ -110,11 +105,3 @@ def table(found: Lab) -> None:
         show.say(f"no control limits yet: they need {fewest} sessions of a device")
     for line in found.skipped:
         show.say(f"left out: {line}")
-
-
-def advice(found: Lab) -> str:
-    """Return the next command."""
-    for one in found.content.sessions:
-        if one.remedy:
-            return one.remedy
-    return f"open {found.folder / 'report.html'}"

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.forecast import print_forecasts
-from bampipe.cli.next_step import after_loop
-from bampipe.cli.one_stage import one_stage, print_settings, whole_pipeline
+from bampipe.cli.next_step import after_loop, print_forecasts
+from bampipe.cli.one_stage import advise, run_stage, stage_command
 from bampipe.cli.options import (
     DEFAULTS,
     RUNS,
@@ -22,14 +20,14 @@ from bampipe.cli.options import (
     RunArgument,
     RunsOption,
     StageOptions,
-    with_stage_options,
 )
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
 from bampipe.run import batch, models
+from bampipe.run import pipeline as pipelines
 
 
-@with_stage_options
+@stage_command("diagnose")
 def diagnose(
     run: RunArgument = None,
     model: BestModelOption = "",
@@ -39,20 +37,17 @@ def diagnose(
 
     Example: bampipe diagnose 2026-10-03_s01
     """
-    if options.list_settings:
-        print_settings("diagnose")
-        return
     from bampipe.results.diagnose import DiagnoseResult
 
     root = places.find_run(run, options.runs)
     chosen = models.choose_model(root, model)
-    one_stage("diagnose", root, options, model=chosen)
+    run_stage("diagnose", root, options, model=chosen)
     if not options.json:
         print_forecasts(root, chosen)
-    _print_next(RunFolder(root).read(DiagnoseResult, chosen).next, root, options)
+    advise(RunFolder(root).read(DiagnoseResult, chosen).next, root, options)
 
 
-@with_stage_options
+@stage_command("draft")
 def draft(
     run: RunArgument = None,
     model: BestModelOption = "",
@@ -66,21 +61,12 @@ def draft(
 
     Example: bampipe draft 2026-10-03_s01
     """
-    if options.list_settings:
-        print_settings("draft")
-        return
     from bampipe.results.draft import DraftResult
 
     root = places.find_run(run, options.runs)
     chosen = models.choose_model(root, model)
-    one_stage("draft", root, options, model=chosen, more={"curve": True} if curve else {})
-    _print_next(RunFolder(root).read(DraftResult, chosen).next, root, options)
-
-
-def _print_next(command: str, root: Path, options: StageOptions) -> None:
-    """Print the command that a result of the run folder ``root`` proposes."""
-    run = places.next_to(root, options.runs)
-    show.print_advice(command.replace("RUN", run), options.quiet, options.json)
+    run_stage("draft", root, options, model=chosen, more={"curve": curve})
+    advise(RunFolder(root).read(DraftResult, chosen).next, root, options)
 
 
 def extend(
@@ -130,17 +116,13 @@ def extend(
         raise InputError("--draft goes with --auto", remedy="or use `bampipe draft RUN`")
     if auto and effects:
         raise InputError("--auto chooses the effects itself", remedy=f"leave out {effects[0]!r}")
-    if (
-        first is not None
-        and not auto
-        and not places.is_run(first, runs)
-        and (not effects or _is_effect(first))
-    ):
+    names_run = first is None or auto or bool(places.run_folder_of(first, runs))
+    if first is not None and not names_run and (not effects or _is_effect(first)):
         effects, first = [first, *effects], None
     if not auto and not effects:
         raise InputError("no effect named", remedy="`bampipe effects` lists them; or use --auto")
     root = places.find_run(first, runs)
-    pipeline = whole_pipeline(root, "")
+    pipeline = pipelines.whole(root)
     parent = models.choose_model(root, model)
     with show.Watcher(quiet or json) as watcher:
         options = loop.LoopOptions(root, pipeline, force, not no_wait, watcher)
@@ -156,9 +138,9 @@ def extend(
     show.say(f"{root}: {last}")
     show.print_summary(ladder)
     show.print_unidentified(RunFolder(root).read(IdentifyResult, last).effects)
-    name = places.next_to(root, runs)
-    asked = f"bampipe diagnose {name}{RunFolder(root).model_option(last)}"
-    show.print_advice(after_loop(root, last, name) if auto else asked, quiet, json)
+    asked = f"bampipe diagnose RUN{RunFolder(root).model_option(last)}"
+    command = after_loop(root, last) if auto else asked
+    show.print_advice(command.replace("RUN", places.next_to(root, runs)), quiet, json)
 
 
 def _is_effect(argument: str) -> bool:

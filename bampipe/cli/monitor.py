@@ -18,9 +18,8 @@ from bampipe.errors import InputError
 from bampipe.run import models
 
 if TYPE_CHECKING:
+    from bampipe.data.stream import SampleStream
     from bampipe.monitor.monitor import Monitor
-    from bampipe.monitor.start import Stream
-    from bampipe.physics import System
 
 POLL_S = 0.02
 SCREEN_S = 0.25
@@ -88,7 +87,11 @@ def monitor(
             show.note(f"bampipe: {text}")
 
     if device:
-        system, start = _compile_device(device), None
+        from bampipe.declarations.files import read_device
+        from bampipe.physics import Model, compile_model, registry
+
+        bare = Model(registry.device_from(*read_device(device)))
+        system, start = compile_model(bare), None
     else:
         folder = RunFolder(places.find_run(run or None, runs))
         chosen = models.choose_model(folder.root, model)
@@ -104,14 +107,7 @@ def monitor(
             os.close(stream.descriptor)
 
 
-def _compile_device(name: str) -> System:
-    from bampipe.declarations.files import read_device
-    from bampipe.physics import Model, compile_model, registry
-
-    return compile_model(Model(registry.device_from(*read_device(name))))
-
-
-def follow(stream: Stream, watch: Monitor, output: _Output, wait: bool) -> None:
+def follow(stream: SampleStream, watch: Monitor, output: _Output, wait: bool) -> None:
     """Filter the stream to its end, or if ``wait``, until the user stops it."""
     try:
         while True:
@@ -152,7 +148,7 @@ class _Output:
         if self._screen:
             self._screen.stop()
 
-    def show(self, watch: Monitor, stream: Stream, final: bool = False) -> None:
+    def show(self, watch: Monitor, stream: SampleStream, final: bool = False) -> None:
         """Show the current state if it is time to."""
         if self._screen:
             if final or time.monotonic() - self._drawn > SCREEN_S:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 from bampipe.cli import places, show
-from bampipe.cli.next_step import after_proposal
 from bampipe.cli.options import StageOptions
-from bampipe.run import batch, record
+from bampipe.run import batch
 from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome, Request
 from bampipe.run.runner import run_session
@@ -25,27 +26,55 @@ _OF_DIAGNOSIS = ("draft", "next")
 """Stages that use a diagnosis."""
 
 
+def stage_command(stage: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return the decorator of a stage's command: its last argument, `StageOptions`, as options.
+
+    With ``--settings`` these are listed instead, whatever else is given.
+    """
+    names = [field.name for field in fields(StageOptions)]
+    hints = get_type_hints(StageOptions, include_extras=True)
+    shared = [
+        inspect.Parameter(
+            field.name,
+            inspect.Parameter.POSITIONAL_OR_KEYWORD,
+            default=field.default,
+            annotation=hints[field.name],
+        )
+        for field in fields(StageOptions)
+    ]
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        own = list(inspect.signature(command, eval_str=True).parameters.values())[:-1]
+
+        @wraps(command)
+        def expanded(**given: Any) -> None:
+            options = StageOptions(**{name: given.pop(name) for name in names})
+            if options.list_settings:
+                _print_settings(stage)
+            else:
+                command(**given, options=options)
+
+        expanded.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]
+        expanded.__annotations__ = {item.name: item.annotation for item in (*own, *shared)}
+        return expanded
+
+    return decorate
+
+
 def parse_settings(given: Sequence[str] | None) -> dict[str, object]:
+    """Return the settings ``NAME=VALUE`` by name."""
     return dict(parse_assignment(text) for text in given or ())
 
 
-def print_settings(stage: str) -> None:
+def _print_settings(stage: str) -> None:
     module = base.load_stage(stage)
-    show.say(f"{stage}: {module.SUMMARY}")
-    show.say("")
+    show.say(f"{stage}: {module.SUMMARY}\n")
     for kind in module.Config.__mro__[:-1]:
         show.say((inspect.getdoc(kind) or "").partition("Attributes:\n")[2].rstrip())
-    show.say("")
-    show.say(f"defaults: {module.Config()}")
+    show.say(f"\ndefaults: {module.Config()}")
 
 
-def whole_pipeline(root: Path, name: str) -> Pipeline:
-    """Return the pipeline whose settings count for single stages, with every stage in it."""
-    chosen = pipelines.load(name) if name else pipelines.recorded(record.read(root))
-    return chosen.with_every_stage()
-
-
-def one_stage(
+def run_stage(
     stage: str,
     root: Path,
     options: StageOptions,
@@ -57,18 +86,16 @@ def one_stage(
     """Run one stage on the results of earlier ones, and print its findings.
 
     Args:
-        stage: its name.
-        root: the run folder.
-        options: of the command.
         session: the session folder, of a stage that reads it.
         model: the only model to run; all that the pipeline names, if empty.
-        more: settings from options that only this stage has.
+        more: settings from options that only this stage has; what is empty was not given.
     """
     batch.limit_threads(1)
-    settings = parse_settings(options.settings) | dict(more or {})
+    settings = parse_settings(options.settings)
+    settings |= {name: value for name, value in (more or {}).items() if value}
     request = Request(
         root=root,
-        pipeline=whole_pipeline(root, options.pipeline),
+        pipeline=pipelines.whole(root, options.pipeline),
         session=session,
         settings={stage: settings} if settings else {},
         first=stage,
@@ -80,9 +107,8 @@ def one_stage(
     with show.Watcher(options.quiet or options.json) as watcher:
         outcome = run_session(request, watcher)
     if options.json:
-        one = len(outcome.steps) == 1
         results = {step.step: step.summary for step in outcome.steps}
-        show.print_json(outcome.steps[0].summary if one else results)
+        show.print_json(outcome.steps[0].summary if len(results) == 1 else results)
         return outcome
     for step in outcome.steps:
         suffix = " (unchanged)" if step.state == "unchanged" else ""
@@ -104,24 +130,21 @@ def _say_if_outdated(root: Path, pipeline: Pipeline, model: str) -> None:
             )
 
 
-def plain_stage(
+def run_stage_of(
     stage: str, run: str | None, options: StageOptions, model: str = "", **more: object
-) -> None:
-    """Run ``stage`` on the run that ``run`` means, or list its settings.
+) -> Path:
+    """Run ``stage`` on the run that ``run`` means, and advise; return the run folder.
 
-    ``more``: as of `one_stage`; what is empty was not given.
+    ``more``: as of `run_stage`.
     """
-    if options.list_settings:
-        print_settings(stage)
-        return
     root = places.find_run(run, options.runs)
-    given = {name: value for name, value in more.items() if value}
-    outcome = one_stage(stage, root, options, model=model, more=given)
-    name = places.next_to(root, options.runs)
-    if stage == "report":
-        command = f"open {root / 'report' / 'report.pdf'}"
-    elif stage == "next":
-        command = after_proposal(root, outcome.steps[0].step.partition(":")[2], name)
-    else:
-        command = f"bampipe {base.AFTER[stage]} {name}"
+    run_stage(stage, root, options, model=model, more=more)
+    if base.AFTER[stage]:
+        advise(f"bampipe {base.AFTER[stage]} RUN", root, options)
+    return root
+
+
+def advise(command: str, root: Path, options: StageOptions) -> None:
+    """Print the command to go on with, in which ``RUN`` stands for the run folder ``root``."""
+    command = command.replace("RUN", places.next_to(root, options.runs))
     show.print_advice(command, options.quiet, options.json)

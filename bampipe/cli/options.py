@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from functools import wraps
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated
 
 import typer
 
@@ -66,28 +63,3 @@ class StageOptions:
 
 
 DEFAULTS = StageOptions()
-
-
-def with_stage_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return ``command`` with the fields of its last argument, `StageOptions`, as options."""
-    names = [field.name for field in fields(StageOptions)]
-    hints = get_type_hints(StageOptions, include_extras=True)
-    own = list(inspect.signature(command, eval_str=True).parameters.values())[:-1]
-    shared = [
-        inspect.Parameter(
-            field.name,
-            inspect.Parameter.POSITIONAL_OR_KEYWORD,
-            default=field.default,
-            annotation=hints[field.name],
-        )
-        for field in fields(StageOptions)
-    ]
-
-    @wraps(command)
-    def expanded(**given: Any) -> None:
-        options = StageOptions(**{name: given.pop(name) for name in names})
-        command(**given, options=options)
-
-    expanded.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]
-    expanded.__annotations__ = {item.name: item.annotation for item in (*own, *shared)}
-    return expanded

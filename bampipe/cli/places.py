@@ -12,18 +12,13 @@ from bampipe.run import record
 from bampipe.run.session_name import session_folder, session_id
 
 
-def known_runs(runs: Path) -> list[Path]:
+def _known_runs(runs: Path) -> list[Path]:
     """Return the run folders in ``runs``, the most recent first."""
     found = [path.parent for path in runs.glob(f"*/{record.FILE}")]
     return sorted(found, key=lambda root: (root / record.FILE).stat().st_mtime_ns, reverse=True)
 
 
-def is_run(argument: str, runs: Path) -> bool:
-    """Return whether ``argument`` is a run folder, or the name of one in ``runs``."""
-    return _run_folder(argument, runs) is not None
-
-
-def _run_folder(argument: str, runs: Path) -> Path | None:
+def run_folder_of(argument: str, runs: Path) -> Path | None:
     """Return the run folder: a bare name is first of all one in ``runs``, anything else a path."""
     is_name = argument == Path(argument).name
     places = (runs / argument, Path(argument)) if is_name else (Path(argument), runs / argument)
@@ -42,36 +37,33 @@ def find_run(argument: str | None, runs: Path) -> Path:
     Raises:
         InputError: there is no such run, or it holds a link.
     """
-    if argument is None:
-        known = known_runs(runs)
-        if not known:
-            raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
-        refuse_links(known[0])
-        return known[0]
-    if (root := _run_folder(argument, runs)) is not None:
-        refuse_links(root)
-        return root
-    argument = str(session_folder(argument))
-    if (Path(argument) / "session.toml").is_file():
-        root = runs / session_id(Path(argument))
-        if (root / record.FILE).is_file():
-            refuse_links(root)
-            return root
-        raise InputError(
-            "this session has not been run", where=argument, remedy=f"`bampipe run {argument}`"
-        )
-    names = [root.name for root in known_runs(runs)]
-    remedy = choose_from(argument, names) or "start with `bampipe run SESSION`"
-    raise InputError(f"no run {argument!r}", where=str(runs), remedy=remedy)
+    known = _known_runs(runs)
+    if argument is None and not known:
+        raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
+    root = known[0] if argument is None else run_folder_of(argument, runs)
+    if argument is not None and root is None:
+        folder = session_folder(argument)
+        if not (folder / "session.toml").is_file():
+            remedy = choose_from(argument, [root.name for root in known])
+            raise InputError(
+                f"no run {argument!r}",
+                where=str(runs),
+                remedy=remedy or "start with `bampipe run SESSION`",
+            )
+        root = runs / session_id(folder)
+        if not (root / record.FILE).is_file():
+            raise InputError(
+                "this session has not been run", where=str(folder), remedy=f"`bampipe run {folder}`"
+            )
+    assert root is not None
+    refuse_links(root)
+    return root
 
 
 def find_sessions(arguments: Sequence[str]) -> list[Path]:
     """Return the session folders that ``arguments`` mean, patterns expanded, each once.
 
-    A folder that a pattern finds counts only if it holds a session.
-
-    Raises:
-        InputError: a pattern finds no session.
+    A folder that a pattern finds counts only if it holds a session; a pattern without is refused.
     """
     found: list[Path] = []
     for argument in (str(session_folder(name)) for name in arguments):

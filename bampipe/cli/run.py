@@ -10,9 +10,8 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.forecast import print_forecasts
 from bampipe.cli.lab import refresh
-from bampipe.cli.next_step import after_run
+from bampipe.cli.next_step import after_run, print_forecasts
 from bampipe.cli.one_stage import parse_settings
 from bampipe.cli.options import (
     RUNS,
@@ -86,7 +85,10 @@ def run(
 
     Example: bampipe run 'sessions/*' --jobs 2 --junit gates.xml
     """
-    _check_engine(engine, scheduler)
+    if engine not in ("local", "dask"):
+        raise InputError(f"no engine {engine!r}", remedy="choose local or dask")
+    if scheduler and engine != "dask":
+        raise InputError("--scheduler needs --engine dask")
     folders = places.find_sessions(sessions)
     at_once = min(jobs, len(folders))
     batch.limit_threads(at_once)
@@ -122,18 +124,11 @@ def run(
         root, chosen = outcomes[0].root, outcomes[0].model
         if not json:
             print_forecasts(root, chosen)
-        command = after_run(root, chosen, places.next_to(requests[0].root, runs))
+        command = after_run(root, chosen).replace("RUN", places.next_to(requests[0].root, runs))
         show.print_advice(command, quiet, json)
     code = max(outcome.exit_code for outcome in outcomes)
     if code:
         raise typer.Exit(code)
-
-
-def _check_engine(engine: str, scheduler: str) -> None:
-    if engine not in ("local", "dask"):
-        raise InputError(f"no engine {engine!r}", remedy="choose local or dask")
-    if scheduler and engine != "dask":
-        raise InputError("--scheduler needs --engine dask")
 
 
 def _make_requests(common: Request, folders: Sequence[Path]) -> tuple[list[Request], list[Outcome]]:
@@ -184,11 +179,10 @@ def _write_summaries(
     """Write the verdicts of the gates as JUnit XML, and add a summary in Markdown, where asked."""
     from bampipe.run.markdown import summary
 
-    suites = [junit_xml.Suite(one.root.name, one.verdicts, one.error) for one in outcomes]
     for path, mode in ((junit, "wb"), (markdown, "ab")):
         if path is None:
             continue
-        content = junit_xml.junit(suites) if path is junit else summary(outcomes).encode()
+        content = junit_xml.junit(outcomes) if path is junit else summary(outcomes).encode()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open(mode) as stream:
@@ -206,14 +200,14 @@ def _report_runs(outcomes: Sequence[Outcome], several: bool, json: bool) -> None
     elif several:
         rows = []
         for outcome in outcomes:
-            gates = (
+            gates = "; ".join(
                 f"{verdict.gate} {verdict.key}: {verdict.message}".replace(" :", ":")
                 for verdict in outcome.verdicts
                 if verdict.state in ("failed", "warned")
             )
             seconds = sum(step.seconds for step in outcome.steps)
             state = STATES[outcome.exit_code]
-            rows.append([outcome.root.name, state, seconds, outcome.error or "; ".join(gates)])
+            rows.append([outcome.root.name, state, seconds, outcome.error or gates])
         show.print_table(["session", "state", "seconds", ""], rows)
     else:
         show.print_outcome(outcomes[0])

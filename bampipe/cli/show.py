@@ -10,7 +10,6 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from bampipe.errors import InputError, printable
@@ -84,11 +83,7 @@ def print_json(content: object) -> None:
 
 
 def page(path: Path) -> None:
-    """Open a page in the user's browser.
-
-    Raises:
-        InputError: no browser can be started.
-    """
+    """Open a page in the user's browser; InputError where none can be started."""
     import webbrowser
 
     if not webbrowser.open(path.resolve().as_uri()):
@@ -97,12 +92,7 @@ def page(path: Path) -> None:
 
 
 def print_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a table: text to the left, in lines where it is long, numbers to the right, no rules.
-
-    Args:
-        head: column names.
-        rows: cells.
-    """
+    """Print a table: text to the left, broken where it is long, numbers to the right, no rules."""
     raw = [list(row) for row in rows]
     cells = [[format_cell(cell) for cell in row] for row in raw]
     last = len(head) - 1  # nothing follows it, so it may be of any length
@@ -274,10 +264,8 @@ def print_outcome(result: Outcome) -> None:
     shown = [verdict for verdict in result.verdicts if verdict.state != "absent"]
     if shown:
         say("")
-        print_table(
-            ["gate", "model", "", "verdict", ""],
-            [[one.gate, one.model, one.key, one.state, one.message] for one in shown],
-        )
+        cells = [[one.gate, one.model, one.key, one.state, one.message] for one in shown]
+        print_table(["gate", "model", "", "verdict", ""], cells)
     if result.model and any(":" in step.step for step in result.steps):
         _print_model(result.model)
 
@@ -345,15 +333,15 @@ class Watcher:
             )
             self.bars.start()
         elif not self.quiet:
-            threading.Thread(target=self._keep_writing, daemon=True).start()
+
+            def keep_writing() -> None:
+                while not self.over.wait(1.0):
+                    self.write_late_lines()
+
+            threading.Thread(target=keep_writing, daemon=True).start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.over.set()
         if self.bars is not None:
             self.bars.stop()
@@ -405,10 +393,6 @@ class Watcher:
                     line.written = now
                     percent = f"{100.0 * line.fraction:.0f} %, {now - line.started:.0f} s"
                     note(f"{name}: {percent}, {line.message}".removesuffix(", "))
-
-    def _keep_writing(self) -> None:
-        while not self.over.wait(1.0):
-            self.write_late_lines()
 
     def _draw(self, event: Event, name: str) -> None:
         if event.kind in ("start", "progress"):

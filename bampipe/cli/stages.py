@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.forecast import print_forecasts
-from bampipe.cli.one_stage import one_stage, plain_stage, print_settings
+from bampipe.cli.next_step import after_proposal, print_forecasts
+from bampipe.cli.one_stage import advise, run_stage, run_stage_of, stage_command
 from bampipe.cli.options import (
     DEFAULTS,
     BestModelOption,
@@ -18,7 +19,6 @@ from bampipe.cli.options import (
     RunArgument,
     SessionArgument,
     StageOptions,
-    with_stage_options,
 )
 from bampipe.errors import InputError
 from bampipe.files import write_text
@@ -26,24 +26,19 @@ from bampipe.run import models
 from bampipe.run.session_name import session_id
 
 
-@with_stage_options
+@stage_command("ingest")
 def ingest(session: SessionArgument, options: StageOptions = DEFAULTS) -> None:
     """Read a session's raw logs: convert to SI units, repair, set bad trials aside.
 
     Example: bampipe ingest sessions/2026-10-03_s01
     """
-    if options.list_settings:
-        print_settings("ingest")
-        return
     folder = places.find_sessions([session])[0]
     root = options.runs / session_id(folder)
-    one_stage("ingest", root, options, session=folder)
-    show.print_advice(
-        f"bampipe filter {places.next_to(root, options.runs)}", options.quiet, options.json
-    )
+    run_stage("ingest", root, options, session=folder)
+    advise("bampipe filter RUN", root, options)
 
 
-@with_stage_options
+@stage_command("filter")
 def filter_(
     run: RunArgument = None,
     method: Annotated[str, typer.Option(help="auto, kalman, butterworth or savitzky_golay.")] = "",
@@ -53,19 +48,19 @@ def filter_(
 
     Example: bampipe filter 2026-10-03_s01 --method butterworth
     """
-    plain_stage("filter", run, options, method=method)
+    run_stage_of("filter", run, options, method=method)
 
 
-@with_stage_options
+@stage_command("stiffness")
 def stiffness(run: RunArgument = None, options: StageOptions = DEFAULTS) -> None:
     """Compute the stiffness of each axis from its hysteresis loops, and its bandwidth.
 
     Example: bampipe stiffness 2026-10-03_s01
     """
-    plain_stage("stiffness", run, options)
+    run_stage_of("stiffness", run, options)
 
 
-@with_stage_options
+@stage_command("identify")
 def identify(
     run: RunArgument = None,
     model: ModelOption = "",
@@ -80,43 +75,34 @@ def identify(
 
     Example: bampipe identify 2026-10-03_s01 --method least-squares
     """
-    plain_stage("identify", run, options, model, method=method, engine=engine)
+    run_stage_of("identify", run, options, model, method=method, engine=engine)
 
 
-@with_stage_options
-def viscous(
-    run: RunArgument = None, model: ModelOption = "", options: StageOptions = DEFAULTS
-) -> None:
-    """Estimate the damping that the brakes rendered in viscous trials, against the command.
+def _command_of_models(stage: str, about: str) -> Callable[..., None]:
+    """Return the command of a stage that runs once a model and has no options of its own."""
 
-    Example: bampipe viscous 2026-10-03_s01
-    """
-    plain_stage("viscous", run, options, model)
+    def command(
+        run: RunArgument = None, model: ModelOption = "", options: StageOptions = DEFAULTS
+    ) -> None:
+        run_stage_of(stage, run, options, model)
 
-
-@with_stage_options
-def performance(
-    run: RunArgument = None, model: ModelOption = "", options: StageOptions = DEFAULTS
-) -> None:
-    """Compute workspace, stiffness, friction, inertia and force at the handle.
-
-    Example: bampipe performance 2026-10-03_s01
-    """
-    plain_stage("performance", run, options, model)
+    command.__doc__ = f"{about}\n\nExample: bampipe {stage} 2026-10-03_s01"
+    return stage_command(stage)(command)
 
 
-@with_stage_options
-def validate(
-    run: RunArgument = None, model: ModelOption = "", options: StageOptions = DEFAULTS
-) -> None:
-    """Compare predicted with measured force, on trials the parameters never saw.
+viscous = _command_of_models(
+    "viscous",
+    "Estimate the damping that the brakes rendered in viscous trials, against the command.",
+)
+performance = _command_of_models(
+    "performance", "Compute workspace, stiffness, friction, inertia and force at the handle."
+)
+validate = _command_of_models(
+    "validate", "Compare predicted with measured force, on trials the parameters never saw."
+)
 
-    Example: bampipe validate 2026-10-03_s01
-    """
-    plain_stage("validate", run, options, model)
 
-
-@with_stage_options
+@stage_command("next")
 def next_(
     run: RunArgument = None,
     model: BestModelOption = "",
@@ -162,25 +148,24 @@ def next_(
     suffix = _choose_trajectory(form, out, plan)
     if sd and not plan:
         raise InputError("--sd needs --plan", remedy="give --plan with it")
-    chosen = model
-    if not options.list_settings and not model:
-        chosen = models.counting_model(places.find_run(run, options.runs))
-    more: dict[str, object] = {"sd": _parse_share(sd)} if sd else {}
-    if not options.list_settings and not options.json:
+    root = places.find_run(run, options.runs)
+    chosen = model or models.counting_model(root)
+    share = _parse_share(sd) if sd else 0.0
+    if not options.json:
         # A new proposal closes forecasts that a recorded trial has followed: compare these first.
-        print_forecasts(places.find_run(run, options.runs), chosen)
-    plain_stage(
-        "next", run, options, chosen, purpose=purpose, seconds=seconds, plan=plan,
-        trajectory=suffix, **more,
-    )  # fmt: skip
-    if suffix and not options.list_settings:
-        file = places.find_run(run, options.runs) / f"models/{chosen}/trajectory.{suffix}"
+        print_forecasts(root, chosen)
+    asked = {"purpose": purpose, "seconds": seconds, "plan": plan, "trajectory": suffix}
+    run_stage("next", root, options, model=chosen, more={**asked, "sd": share})
+    advise(after_proposal(root, chosen), root, options)
+    quiet = options.json or options.quiet
+    if suffix:
+        file = root / f"models/{chosen}/trajectory.{suffix}"
         if out is not None:
             write_text(out, file.read_text(encoding="utf-8"))
-        if not (options.json or options.quiet):
+        if not quiet:
             show.say(f"trajectory: {out or file}")
-    if plan and not (options.json or options.quiet or options.list_settings):
-        show.say(f"sheet: {places.find_run(run, options.runs)}/models/{chosen}/protocol.pdf")
+    if plan and not quiet:
+        show.say(f"sheet: {root}/models/{chosen}/protocol.pdf")
 
 
 def _choose_trajectory(form: str, out: Path | None, plan: bool) -> str:
@@ -211,7 +196,7 @@ def _parse_share(text: str) -> float:
     raise InputError(f"--sd: {text!r} is not a share between 0 and 1", remedy="write 5% or 0.05")
 
 
-@with_stage_options
+@stage_command("compare")
 def compare(
     run: RunArgument = None,
     other: Annotated[
@@ -237,10 +222,15 @@ def compare(
     Example: bampipe compare 2026-10-03_s01 2026-11-14_s01 --out changed.html
     """
     if other is None:
-        plain_stage("compare", run, options)
+        run_stage_of("compare", run, options)
         return
+    given = {"--set": options.settings, "--pipeline": options.pipeline, "--force": options.force}
+    if useless := [name for name, value in given.items() if value]:
+        raise InputError(
+            f"{useless[0]} has no effect on two runs, which are compared as they are",
+            remedy=f"leave {useless[0]} out, or run the stage that it is for",
+        )
     from bampipe.api.pair import compare_runs
-    from bampipe.files import write_text
     from bampipe.report.pair import build_page, tabulate_pair
 
     first, second = (places.find_run(one, options.runs) for one in (run, other))
@@ -260,7 +250,7 @@ def compare(
     show.print_advice(advice, options.quiet)
 
 
-@with_stage_options
+@stage_command("report")
 def report(
     run: RunArgument = None,
     model: BestModelOption = "",
@@ -282,10 +272,8 @@ def report(
 
     Example: bampipe report 2026-10-03_s01 --beside 2026-10-04_s01
     """
-    plain_stage("report", run, options, detail_model=model)
-    if options.list_settings:
-        return
-    root = places.find_run(run, options.runs)
+    root = run_stage_of("report", run, options, detail_model=model)
+    advise(f"open {root / 'report' / 'report.pdf'}", root, options)
     page = root / "report/explore.html"
     if beside:
         from bampipe.stages.report import write_page_of_two

@@ -76,6 +76,10 @@ class RunFolder:
         """
         return kind.read(self.require(kind.file(model), kind.STAGE))
 
+    def find(self, kind: type[R], model: str = "") -> R | None:
+        """Return the result as `read` does; None where its stage has not run."""
+        return self.read(kind, model) if self.exists(kind.file(model)) else None
+
     def glob(self, pattern: str) -> tuple[str, ...]:
         """Return the files that match ``pattern``, relative to the run folder, sorted."""
         found = (path for path in self.root.glob(pattern) if path.is_file())

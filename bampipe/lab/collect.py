@@ -28,18 +28,15 @@ class Lab:
     """A lab's folder, and its content.
 
     Attributes:
-        folder: the lab's folder.
         content: of ``trends.json``.
-        sessions: ids of the sessions, in the order of recording.
+        sessions: their names, in the order of recording.
         skipped: one line on each run folder that could not be read.
-        tables: number of rows of each table.
     """
 
     folder: Path
     content: TrendsResult
     sessions: tuple[str, ...]
     skipped: tuple[str, ...]
-    tables: Mapping[str, int]
 
 
 def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress = silent) -> Lab:
@@ -49,10 +46,7 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
     comes last.
 
     Args:
-        runs: folder of run folders.
-        folder: the lab's folder.
         report: whether to write report.pdf and report.html too.
-        progress: called with the share done.
 
     Raises:
         InputError: there is no run in ``runs``, or a file cannot be written.
@@ -90,7 +84,7 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         LabResult(
             schema="bampipe.lab/1", sessions=sessions, skipped=tuple(skipped), tables=counts
         ).write(folder)
-    return Lab(folder, content, sessions, tuple(skipped), counts)
+    return Lab(folder, content, sessions, tuple(skipped))
 
 
 def _find_pages(folder: Path, roots: Sequence[Path]) -> dict[str, str]:

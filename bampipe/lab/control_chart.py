@@ -14,10 +14,11 @@ Clifford 1959): up to a quarter of the sessions may be off without hiding one an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from bampipe.results.lab import ChartPoint, ControlChart
 
 Array = NDArray[np.float64]
 
@@ -43,37 +44,6 @@ _FACTORS = (
 normal numbers; the test suite draws some of them again. Three only for very many sessions."""
 
 
-@dataclass(frozen=True)
-class Chart:
-    """A control chart of n sessions, in their order.
-
-    Attributes:
-        centre: median of the estimates.
-        between_sd: scatter between sessions, tau; the uncertainty within them is taken out.
-        lower: lower limit for each session, (n,); NaN where there are too few sessions.
-        upper: upper limit for each session, (n,).
-        outside_limits: whether each session lies outside its limits, (n,).
-        run: first and last session of the longest run on one side of the centre, if it is a
-            shift; else None.
-        slope: median slope a session (Theil and Sen), unit of the estimates.
-        slope_p: probability of a trend this clear by chance (Kendall); 1 where there are too few.
-    """
-
-    centre: float
-    between_sd: float
-    lower: Array
-    upper: Array
-    outside_limits: NDArray[np.bool_]
-    run: tuple[int, int] | None
-    slope: float
-    slope_p: float
-
-    @property
-    def drifts(self) -> bool:
-        """Whether there is a trend: less likely by chance than a point beyond the limits."""
-        return self.slope_p < FALSE_ALARM
-
-
 def find_factor(sessions: int) -> float:
     """Return half the width of the limits in standard deviations, for so many sessions."""
     counts, values = zip(*_FACTORS, strict=True)
@@ -82,31 +52,52 @@ def find_factor(sessions: int) -> float:
     return float(np.interp(sessions, counts, values))
 
 
-def make_chart(estimates: Sequence[float] | Array, sds: Sequence[float] | Array) -> Chart:
-    """Return the control chart of ``estimates``.
+def make_chart(
+    device: str, name: str, unit: str, entries: Sequence[tuple[str, float, float]]
+) -> ControlChart:
+    """Return the control chart of a quantity; without limits where there are too few sessions.
 
     Args:
-        estimates: of the sessions in the order of their recording, (n,).
-        sds: standard deviation of each, (n,); 0 where it is not known.
+        entries: session, estimate and standard deviation, 0 where that is not known, in the order
+            of their recording.
     """
-    x, s = np.asarray(estimates, dtype=float), np.asarray(sds, dtype=float)
-    n = len(x)
-    centre = float(np.median(x))
-    if n < FEWEST:
-        unknown = np.full(n, np.nan)
-        return Chart(centre, float("nan"), unknown, unknown, np.zeros(n, bool), None, 0.0, 1.0)
-    sigma = float(np.median(np.abs(np.diff(x)))) / MEDIAN_RANGE
-    between = float(np.sqrt(max(0.0, sigma**2 - float(np.median(s**2)))))
-    half = find_factor(n) * np.sqrt(between**2 + s**2)
-    outside_limits = np.abs(x - centre) > half
-    slope, chance = _find_trend(x)
-    return Chart(
-        centre, between, centre - half, centre + half, outside_limits, _find_run(x), slope, chance
+    sessions, estimates, sds = zip(*entries, strict=True)
+    x, s = np.array(estimates, dtype=float), np.array(sds, dtype=float)
+    centre, half = float(np.median(x)), np.full(len(x), np.inf)
+    between = slope = slope_p = run = None
+    if len(x) >= FEWEST:
+        sigma = float(np.median(np.abs(np.diff(x)))) / MEDIAN_RANGE
+        between = float(np.sqrt(max(0.0, sigma**2 - float(np.median(s**2)))))
+        half = find_factor(len(x)) * np.sqrt(between**2 + s**2)
+        slope, slope_p = _find_trend(x)
+        run = _find_run(x)
+    return ControlChart(
+        device=device,
+        name=name,
+        unit=unit,
+        centre=centre,
+        between_sd=between,
+        slope_per_session=slope,
+        slope_p=slope_p,
+        # Less likely by chance than a point beyond the limits.
+        drifts=slope_p is not None and slope_p < FALSE_ALARM,
+        run=None if run is None else (sessions[run[0]], sessions[run[1]]),
+        points=tuple(
+            ChartPoint(
+                session=session,
+                estimate=value,
+                sd=sd,
+                lower=None if between is None else centre - half[i],
+                upper=None if between is None else centre + half[i],
+                outside_limits=abs(value - centre) > half[i],
+            )
+            for i, (session, value, sd) in enumerate(entries)
+        ),
     )
 
 
 def _find_run(x: Array) -> tuple[int, int] | None:
-    """Return the longest run of RUN_LENGTH or more on one side of the median."""
+    """Return the places of the longest run of RUN_LENGTH or more on one side of the median."""
     side = np.sign(x - np.median(x))
     best: tuple[int, int] | None = None
     start = 0
@@ -120,6 +111,7 @@ def _find_run(x: Array) -> tuple[int, int] | None:
 
 
 def _find_trend(x: Array) -> tuple[float, float]:
+    """Return the median slope a session (Theil and Sen), and its p-value (Kendall)."""
     from scipy.stats import kendalltau, theilslopes
 
     order = np.arange(len(x), dtype=float)

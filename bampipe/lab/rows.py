@@ -69,10 +69,10 @@ def read_run(root: Path) -> SessionRows:
         found = _add_model(run, rows, model, tuple(session.axes))
         nis = nis or found
     _add_trials(run, rows, nis)
-    if run.exists(StiffnessResult.FILE):
-        for axis, entry in run.read(StiffnessResult).axes.items():
-            interval = _make_interval(entry.stiffness, entry.sd)
-            rows.add("stiffness", axis=axis, **entry.model_dump(), **interval)
+    stiffness = run.find(StiffnessResult)
+    for axis, entry in stiffness.axes.items() if stiffness else ():
+        interval = _make_interval(entry.stiffness, entry.sd)
+        rows.add("stiffness", axis=axis, **entry.model_dump(), **interval)
     _add_session(root, rows, session, made)
     return rows
 
@@ -82,28 +82,20 @@ def _add_model(
 ) -> Mapping[str, float]:
     """Add the rows of one model; return its consistency (NIS) by trial."""
     nis: Mapping[str, float] = {}
-    if run.exists(IdentifyResult.file(model)):
-        identified = run.read(IdentifyResult, model)
+    if identified := run.find(IdentifyResult, model):
         nis = identified.nis.by_trial if identified.nis else {}
         for name, found in identified.parameters.items():
             last = name.rpartition(".")[2]
             inner = name.split(".")[1:2]
             axis = last if last in axes else next((part for part in inner if part in axes), None)
-            rows.add(
-                "parameters",
-                model=model,
-                parameter=name,
-                axis=axis,
-                method=identified.method,
-                **found.model_dump(),
-                **_make_interval(found.estimate, found.sd),
-            )
-    if run.exists(ValidateResult.file(model)):
-        for axis, error in run.read(ValidateResult, model).axes.items():
-            over = error.held_out_rmse / error.noise_floor if error.noise_floor else None
-            rows.add("errors", model=model, axis=axis, error_over_floor=over, **error.model_dump())
-    if run.exists(DiagnoseResult.file(model)):
-        diagnosis = run.read(DiagnoseResult, model)
+            about = {"model": model, "parameter": name, "axis": axis, "method": identified.method}
+            interval = _make_interval(found.estimate, found.sd)
+            rows.add("parameters", **about, **found.model_dump(), **interval)
+    validated = run.find(ValidateResult, model)
+    for axis, error in validated.axes.items() if validated else ():
+        over = error.held_out_rmse / error.noise_floor if error.noise_floor else None
+        rows.add("errors", model=model, axis=axis, error_over_floor=over, **error.model_dump())
+    if diagnosis := run.find(DiagnoseResult, model):
         for axis, said in diagnosis.axes.items():
             plain = said.model_dump(mode="json") | {
                 "named": phrases.missing_effects(diagnosis, axis),
@@ -119,13 +111,14 @@ def _add_trials(run: RunFolder, rows: SessionRows, nis: Mapping[str, float]) -> 
         return
     frame = store.read_parquet(run.path("ingest/trials.parquet"))
     for trial in frame.to_dict("records"):
+        numbers = {name: float(trial[name]) for name in ("duration_s", "sample_rate_hz")}
         rows.add(
             "quality",
             trial_id=str(trial["trial_id"]),
             n_samples=int(trial["n_samples"]),
             nis=nis.get(str(trial["trial_id"])),
             **{name: str(trial[name]) for name in ("kind", "status", "reason", "repairs")},
-            **{name: _drop_infinite(trial[name]) for name in ("duration_s", "sample_rate_hz")},
+            **{name: x if math.isfinite(x) else None for name, x in numbers.items()},
         )
 
 
@@ -151,10 +144,6 @@ def _add_session(
         failures=[f"{step}: {text}" for step, text in sorted(run_record.failures.items())],
         bampipe=run_record.versions.get("bampipe"),
     )
-
-
-def _drop_infinite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 def _make_interval(value: float, sd: float) -> dict[str, float]:

@@ -63,41 +63,7 @@ def _make_charts(tables: Tables) -> list[ControlChart]:
             key = (str(row["device"]), name, str(row["unit"] or ""))
             entry = (str(row["session_id"]), float(value), float(row["sd"] or 0.0))
             found.setdefault(key, []).append(entry)
-    return [_make_record(*key, entries) for key, entries in sorted(found.items())]
-
-
-def _make_record(
-    device: str, name: str, unit: str, entries: Sequence[tuple[str, float, float]]
-) -> ControlChart:
-    sessions, values, sds = zip(*entries, strict=True)
-    made = make_chart(values, sds)
-    known = len(sessions) >= FEWEST
-    return ControlChart(
-        device=device,
-        name=name,
-        unit=unit,
-        centre=made.centre,
-        between_sd=made.between_sd if known else None,
-        slope_per_session=made.slope if known else None,
-        slope_p=made.slope_p if known else None,
-        drifts=made.drifts,
-        run=None if made.run is None else (sessions[made.run[0]], sessions[made.run[1]]),
-        points=tuple(
-            ChartPoint(
-                session=session,
-                estimate=value,
-                sd=sd,
-                lower=made.lower[i] if known else None,
-                upper=made.upper[i] if known else None,
-                outside_limits=made.outside_limits[i],
-            )
-            for i, (session, value, sd) in enumerate(entries)
-        ),
-    )
-
-
-def _find_point(chart: ControlChart, session: str) -> ChartPoint | None:
-    return next((point for point in chart.points if point.session == session), None)
+    return [make_chart(*key, entries) for key, entries in sorted(found.items())]
 
 
 def _judge_session(row: TableRow, tables: Tables, charts: Sequence[ControlChart]) -> SessionVerdict:
@@ -113,16 +79,28 @@ def _judge_session(row: TableRow, tables: Tables, charts: Sequence[ControlChart]
     last = [r for r in mine["verdicts"] if r["model"] == model]
     outside = {
         chart: point
-        for chart in (one for one in charts if one.device == device)
-        if (point := _find_point(chart, session)) and point.outside_limits
+        for chart in charts
+        for point in chart.points
+        if chart.device == device and point.session == session and point.outside_limits
     }
+    moved = [
+        MovedParameter.of(
+            chart,
+            parameter=chart.name,
+            estimate=point.estimate,
+            percent=100.0 * (point.estimate - chart.centre) / abs(chart.centre)
+            if chart.centre
+            else None,
+        )
+        for chart, point in outside.items()
+    ]
     judged = SessionVerdict(
         session=session,
         device=device,
         model=model,
         recorded=row["recorded_at"].isoformat() if row["recorded_at"] is not None else "",
         verdict=IN_CONTROL,
-        moved=tuple(_compare_with_centre(*pair) for pair in outside.items()),
+        moved=tuple(moved),
         effects=tuple(dict.fromkeys(named if first else row["effects"])),
         unexplained=tuple(r["axis"] for r in last or first if r["verdict"] == "unknown_effect"),
         diagnosed=bool(last),
@@ -138,14 +116,6 @@ def _judge_session(row: TableRow, tables: Tables, charts: Sequence[ControlChart]
         found = _explain_model(judged, mine["verdicts"], row["effects"], limited)
     verdict, sentence, remedy = found
     return judged.model_copy(update={"verdict": verdict, "sentence": sentence, "remedy": remedy})
-
-
-def _compare_with_centre(chart: ControlChart, point: ChartPoint) -> MovedParameter:
-    value, centre = point.estimate, chart.centre
-    percent = 100.0 * (value - centre) / abs(centre) if centre else None
-    return MovedParameter(
-        parameter=chart.name, estimate=value, centre=centre, percent=percent, unit=chart.unit
-    )
 
 
 def _explain_model(

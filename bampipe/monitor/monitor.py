@@ -40,11 +40,9 @@ class Monitor:
         options: MonitorOptions,
         complain: Callable[[str], None],
     ) -> None:
-        """Wait for the first sample.
+        """Begin at ``start``; where that is None, from the first `FIRST_LOOK` samples.
 
-        Args:
-            system: the model; start: None to begin from the first `FIRST_LOOK` samples.
-            options: of the alarm; complain: called for the first few new starts of the motion.
+        ``complain`` is called for the first few new starts of the motion.
         """
         self.system, self.options, self._complain = system, options, complain
         self.alarm, self.alarms, self.restarts, self.samples = False, 0, 0, 0
@@ -157,7 +155,8 @@ class Monitor:
     def _take(self, t: Array, u: Array, q: Array) -> None:
         """Filter samples, cut where a gap starts the motion anew."""
         ahead = np.diff(t, prepend=t[0] if np.isnan(self._t) else self._t)
-        for first, last in _stretches(ahead, self.options.gap_s):
+        gaps = (int(i) for i in np.flatnonzero(ahead > self.options.gap_s) if i > 0)
+        for first, last in pairwise([0, *gaps, len(ahead)]):
             if ahead[first] > self.options.gap_s and self._filter is not None:
                 self._again(f"a gap of {ahead[first]:.3g} s before {t[first]:.3f} s")
             self._filter_stretch(t[first:last], u[first:last], q[first:last])
@@ -219,9 +218,3 @@ class Monitor:
                 covariance=self._filter.covariance[nx:, nx:],
             )
         self._filter = None
-
-
-def _stretches(ahead: Array, gap: float) -> list[tuple[int, int]]:
-    """Bounds of the stretches of samples without a gap in them."""
-    cuts = [0, *(int(i) for i in np.flatnonzero(ahead > gap) if i > 0), len(ahead)]
-    return list(pairwise(cuts))

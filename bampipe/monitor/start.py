@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +31,6 @@ from bampipe.trials.reading import free_trials, input_columns, read_samples
 from bampipe.trials.sensors import RecordNoise, settle_encoder, settle_force
 
 Array = NDArray[np.float64]
-
-Stream: TypeAlias = SampleStream
-"""What `open_stream` returns."""
 
 _NO_STEP = 3e-6
 """Noise of an encoder that did not move in the first samples, rad or m."""
@@ -64,12 +60,8 @@ class MonitorOptions:
 
     def check(self) -> None:
         """Raise :class:`InputError` where an option makes no sense."""
-        given = {
-            "--window": self.window_s,
-            "--false-alarms": self.false_alarms_per_hour,
-            "--memory": self.memory_s,
-        }
-        for option, value in given.items():
+        given = (self.window_s, self.false_alarms_per_hour, self.memory_s)
+        for option, value in zip(("--window", "--false-alarms", "--memory"), given, strict=True):
             if not value > 0.0:
                 raise InputError("must be positive", where=option)
         if self.window_s > LONGEST_WINDOW_S:
@@ -149,15 +141,12 @@ def open_stream(
     session: Path | None,
     strict: bool,
     complain: Callable[[str], None],
-) -> Stream:
+) -> SampleStream:
     """Open a growing file, or standard input where ``samples`` is ``-``.
 
     Args:
         samples: path, or ``-``; system: the model; session: folder whose raw columns may come.
         strict: raise at a bad line; complain: called for the first ones that are skipped.
-
-    Raises:
-        InputError: there is no such file, or the session file is wrong.
     """
     known = layouts(system, read_session(session) if session is not None else None)
     if samples == "-":

@@ -45,8 +45,7 @@ def times_floor(error: float, floor: float) -> str:
 def list_effects(entry: AxisVerdict, effects: Iterable[str], mark: str = "") -> str:
     """Return ``a:yaw (0.98) and b:yaw (0.95)``: effects of an axis with their probabilities.
 
-    Args:
-        entry: the axis; effects: some of its probable ones; mark: put on either side of a name.
+    ``mark`` stands on either side of a name.
     """
     known = entry.probabilities
     return join_names(f"{mark}{name}{mark} ({probability(known[name])})" for name in effects)
@@ -151,9 +150,7 @@ def null_distribution(null: NullDistribution | None) -> str:
 def describe_axes(result: DiagnoseResult, shapes: Mapping[str, str] = _NO_SHAPES) -> dict[str, str]:
     """Return one or more sentences for each axis.
 
-    Args:
-        result: the diagnosis.
-        shapes: by axis, the shape of the residual of the final model, in words.
+    ``shapes``: by axis, the shape of the residual of the final model, in words.
     """
     said = {}
     for axis, entry in result.axes.items():

@@ -22,9 +22,6 @@ def read_forecasts(root: Path, model: str) -> tuple[NextResult, ...]:
 
     A forecast that another version of bampipe made in other terms cannot be compared and is left
     out: a new proposal replaces it.
-
-    Args:
-        root: the run folder; model: the model of the proposals.
     """
     last, folder = root / NextResult.file(model), root / NextResult.EARLIER.format(model=model)
     paths = [*([last] if last.is_file() else []), *sorted(folder.glob("*.json"))]
@@ -56,11 +53,7 @@ def find_open(forecasts: Sequence[NextResult], proposed: NextResult) -> tuple[Ne
 def compare_forecasts(
     forecasts: Sequence[NextResult], identified: IdentifyResult, diagnosed: DiagnoseResult | None
 ) -> tuple[str, ...]:
-    """Compare each forecast that a new trial has followed with its outcome.
-
-    Args:
-        forecasts: from `read_forecasts`; the others as for `compare_forecast`.
-    """
+    """Compare each forecast that a new trial has followed with its outcome."""
     said: list[str] = []
     for one in forecasts:
         about = f"{one.parameter or one.purpose}, {one.proposals[0].seconds:g} s: "

@@ -71,11 +71,7 @@ def list_setup_faults(setup: SetupResult) -> list[str]:
 def find_failed_checks(
     session: IngestResult, identified: IdentifyResult, errors: Mapping[str, JudgedError]
 ) -> Iterator[str]:
-    """Yield a sentence on every check that a model fails.
-
-    Args:
-        session: the result of ingest; identified: the model; errors: its errors by axis.
-    """
+    """Yield a sentence on every check that a model fails, whose ``errors`` are by axis."""
     for place in session.placeholders:
         yield f"{place}: a placeholder, its source still says `fill in`"
     for axis, channel in session.axes.items():

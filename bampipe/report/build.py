@@ -20,7 +20,6 @@ class Report:
     """The files of a report.
 
     Attributes:
-        pdf: the printed form.
         html: the page for a browser.
         explorer: the page for exploring; "" for a report over several sessions.
         figures: SVG text by name.
@@ -48,15 +47,7 @@ class Report:
 
 
 def build(results: Results, progress: Callable[[float, str], None]) -> Report:
-    """Return the report of ``results``.
-
-    Args:
-        results: the run folder's.
-        progress: called with the share done and what is under way.
-
-    Raises:
-        InputError: ingest has not run, or a result is damaged.
-    """
+    """Return the report of ``results``; ``progress``: called with the share done."""
     sections = []
     for number, name in enumerate(SECTIONS):
         progress(0.7 * number / len(SECTIONS), name)
@@ -71,7 +62,10 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
     progress(0.7, "page for exploring")
     explorer = explorer_page(results, document.subtitle)
     progress(0.85, "typesetting")
-    return Report.of(document, _count_seconds(_read_moment(results)), explorer)
+    when = _read_moment(results)
+    if when is not None and when.tzinfo is None:
+        when = when.replace(tzinfo=datetime.UTC)
+    return Report.of(document, max(0, int(when.timestamp())) if when else 0, explorer)
 
 
 def _list_warnings(results: Results) -> tuple[Block, ...]:
@@ -111,10 +105,3 @@ def _make_subtitle(results: Results) -> str:
 def _read_moment(results: Results) -> datetime.datetime | None:
     recorded = results.session.recorded_at
     return datetime.datetime.fromisoformat(recorded) if recorded else None
-
-
-def _count_seconds(when: datetime.datetime | None) -> int:
-    """Return a moment in seconds since 1970; 0 where it is not known."""
-    if when is None:
-        return 0
-    return max(0, int((when if when.tzinfo else when.replace(tzinfo=datetime.UTC)).timestamp()))

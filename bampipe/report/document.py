@@ -143,7 +143,6 @@ class Figure:
 
     Attributes:
         name: name of its file, without ending.
-        caption: what it shows and how to read it.
         svg: the drawing, 17 cm wide or less.
     """
 
@@ -157,12 +156,7 @@ Block = Paragraph | Subheading | Bullets | Formulas | Callout | Table | Figure
 
 @dataclass(frozen=True)
 class Section:
-    """One section.
-
-    Attributes:
-        title: its heading.
-        blocks: what it holds, in order.
-    """
+    """One section: its heading and its blocks, in order."""
 
     title: str
     blocks: tuple[Block, ...]
@@ -173,9 +167,7 @@ class Document:
     """A whole report.
 
     Attributes:
-        title: its title.
         subtitle: session, device, date of recording.
-        sections: in order, the summary first.
         scale: of its type in print.
     """
 

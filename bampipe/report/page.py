@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from string import Template
 
@@ -101,19 +100,20 @@ def _render_table(table: Table, number: str) -> str:
         for column in columns
     )
     looks = [column.side if column.width else f"{column.side} whole" for column in columns]
-    rows = "\n".join(f"<tr>{_render_cells(looks, row)}</tr>" for row in table.rows)
+    rows = "\n".join(
+        "<tr>{}</tr>".format(
+            "".join(
+                f'<td class="{look}">{_render_spans(cell, breaking=True)}</td>'
+                for look, cell in zip(looks, row, strict=True)
+            )
+        )
+        for row in table.rows
+    )
     note = f'<p class="remark">{_render_spans(table.note)}</p>' if table.note else ""
     return (
         f'<div class="scroll"><table><caption class="caption"><strong>{number}</strong> '
         f"{_render_spans(table.caption)}</caption><thead><tr>{head}</tr></thead>\n"
         f"<tbody>{rows}</tbody></table></div>{note}"
-    )
-
-
-def _render_cells(looks: Sequence[str], row: Sequence[str]) -> str:
-    return "".join(
-        f'<td class="{look}">{_render_spans(cell, breaking=True)}</td>'
-        for look, cell in zip(looks, row, strict=True)
     )
 
 

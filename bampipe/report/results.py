@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -12,72 +12,48 @@ import pandas as pd
 
 from bampipe.declarations.model import read_model_file
 from bampipe.errors import InputError, MissingResultError
-from bampipe.files import read_json_table, read_toml
+from bampipe.files import read_toml
 from bampipe.lists import join_names
 from bampipe.report.document import Paragraph, Section
 from bampipe.results.compare import CompareResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.record import Result
-from bampipe.results.run import RunResult, StepRecord
+from bampipe.results.run import RunResult
 
 R = TypeVar("R", bound=Result)
-
-_RATES = {"rad": "rad/s", "m": "m/s"}
-_FORCES = {"rad": "N.m", "m": "N"}
+T = TypeVar("T")
 
 
 @dataclass
 class Results:
-    """The results of one session.
+    """The results of one session; ``detail_model`` is shown in detail, "" for the best one.
 
-    Attributes:
-        root: the run folder.
-        detail_model: the model shown in detail; "" for the best confirmed one.
+    Raises:
+        InputError: from all that reads, where a file that must be there is not, or is damaged.
     """
 
     root: Path
     detail_model: str = ""
-    _json: dict[str, dict[str, Any] | None] = field(default_factory=dict, repr=False)
     _results: dict[str, Result | None] = field(default_factory=dict, repr=False)
 
     def read(self, kind: type[R], model: str = "") -> R | None:
-        """Return the result ``kind`` of ``model`` (default: the one in detail), None without it.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """Return the result ``kind`` of ``model`` (default: the one in detail), None without it."""
         relative = kind.file(model or (self.model if "{model}" in kind.FILE else ""))
         if relative not in self._results:
             path = self.root / relative
             self._results[relative] = kind.read(path) if path.is_file() else None
         return cast("R | None", self._results[relative])
 
-    def json(self, relative: str) -> dict[str, Any] | None:
-        """Return the contents of a JSON file as plain tables, or None where there is none.
-
-        Raises:
-            InputError: the file is damaged.
-        """
-        if relative not in self._json:
-            path = self.root / relative
-            self._json[relative] = read_json_table(path) if path.is_file() else None
-        return self._json[relative]
-
     def table(
         self, relative: str, columns: Sequence[str] | None = None, trial: str | None = None
     ) -> pd.DataFrame | None:
-        """Return a Parquet file, or the rows of one trial; None where there is no such file.
-
-        Raises:
-            InputError: the file is damaged, or lacks one of ``columns``.
-        """
+        """Return a Parquet file, or the rows of one trial; None where there is no such file."""
         path = self.root / relative
         if not path.is_file():
             return None
         filters = [("trial_id", "==", trial)] if trial is not None else None
         try:
-            chosen = None if columns is None else list(columns)
-            return pd.read_parquet(path, columns=chosen, filters=filters)
+            return pd.read_parquet(path, columns=columns and list(columns), filters=filters)
         except (OSError, ValueError) as error:
             remedy = "make it again (--force)"
             raise InputError("not a sound Parquet file", where=str(path), remedy=remedy) from error
@@ -101,7 +77,11 @@ class Results:
                 if step not in found
                 for name, digest in made.inputs.items()
                 if name in makers
-                and (makers[name] in found or _is_changed(name, stages[makers[name]], digest))
+                # Inputs in TOML count by what they say, outputs by their bytes: not to be compared.
+                and (
+                    makers[name] in found
+                    or (not name.endswith(".toml") and stages[makers[name]].outputs[name] != digest)
+                )
             } - {"report"}
             if not more:
                 return tuple(sorted(found))
@@ -109,31 +89,19 @@ class Results:
 
     @cached_property
     def session(self) -> IngestResult:
-        """The result of ingest.
-
-        Raises:
-            InputError: ingest has not run.
-        """
-        found = self.read(IngestResult)
-        if found is None:
-            raise self._make_error(IngestResult.FILE)
-        return found
+        """The result of ingest."""
+        return self._require(self.read(IngestResult), IngestResult.FILE)
 
     @cached_property
     def trials(self) -> pd.DataFrame:
-        """One row a trial.
+        """One row a trial."""
+        return self._require(self.table("ingest/trials.parquet"), "ingest/trials.parquet")
 
-        Raises:
-            InputError: ingest has not run.
-        """
-        frame = self.table("ingest/trials.parquet")
-        if frame is None:
-            raise self._make_error("ingest/trials.parquet")
-        return frame
-
-    def _make_error(self, relative: str) -> InputError:
-        remedy = f"run `bampipe ingest SESSION` for {self.root} first"
-        return InputError(f"{relative} is missing", where=str(self.root), remedy=remedy)
+    def _require(self, found: T | None, relative: str) -> T:
+        if found is None:
+            remedy = f"run `bampipe ingest SESSION` for {self.root} first"
+            raise InputError(f"{relative} is missing", where=str(self.root), remedy=remedy)
+        return found
 
     @cached_property
     def axes(self) -> tuple[str, ...]:
@@ -149,11 +117,11 @@ class Results:
 
     def rate_unit(self, axis: str) -> str:
         """Return the unit of the velocity of ``axis``."""
-        return _RATES.get(self.unit(axis), f"{self.unit(axis)}/s")
+        return f"{self.unit(axis)}/s"
 
     def force_unit(self, axis: str) -> str:
         """Return the unit of the generalised force of ``axis``."""
-        return _FORCES.get(self.unit(axis), "")
+        return "N.m" if self.is_rotary(axis) else "N"
 
     @property
     def pusher(self) -> str:
@@ -184,11 +152,7 @@ class Results:
 
     @cached_property
     def model(self) -> str:
-        """The model shown in detail.
-
-        Raises:
-            InputError: the model asked for has no results.
-        """
+        """The model shown in detail."""
         if self.detail_model:
             return self.require_model(self.detail_model)
         compared = self.read(CompareResult)
@@ -216,11 +180,7 @@ class Results:
         return f"bampipe diagnose {self.root.name}{option}"
 
     def require_model(self, name: str) -> str:
-        """Return ``name`` of a model with results.
-
-        Raises:
-            InputError: that model has no results.
-        """
+        """Return ``name`` of a model with results."""
         if name in self.models:
             return name
         raise MissingResultError(
@@ -229,9 +189,9 @@ class Results:
             remedy=f"choose from {', '.join(self.models) or 'none: identify first'}",
         )
 
-    def order_axes(self, by_axis: Collection[str]) -> tuple[str, ...]:
-        """Return the axes in ``by_axis`` in the order of the session."""
-        return tuple(axis for axis in self.axes if axis in by_axis)
+    def order_axes(self, by_axis: Mapping[str, T]) -> dict[str, T]:
+        """Return the entries of ``by_axis`` in the order of the session."""
+        return {axis: by_axis[axis] for axis in self.axes if axis in by_axis}
 
     def order_parameters(self, parameters: Iterable[str]) -> tuple[str, ...]:
         """Return names of parameters: those of every axis first, axis by axis, effects last."""
@@ -268,12 +228,3 @@ class Results:
     def cite_paper(self, item: str) -> str:
         """Return " (the paper's <item>)" where the device has a paper, else ""."""
         return f" (the paper's {item})" if self.paper else ""
-
-
-def _is_changed(name: str, maker: StepRecord, digest: str) -> bool:
-    """Whether an input is not what its maker left.
-
-    Inputs in TOML count by what they say, outputs by their bytes: those two cannot be compared, and
-    ``ingest/session.json`` has the digest of the one such file, the device's.
-    """
-    return not name.endswith(".toml") and maker.outputs[name] != digest

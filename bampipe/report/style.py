@@ -34,16 +34,8 @@ PURPLE = "#cc79a7"
 SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 """Colours of axes, components or models, in their order."""
 
-COLOURS = {
-    "ink": INK,
-    "faint": FAINT,
-    "blue": BLUE,
-    "vermillion": VERMILLION,
-    "green": GREEN,
-    "orange": ORANGE,
-    "sky": SKY,
-    "purple": PURPLE,
-}
+_NAMES = ("INK", "FAINT", "BLUE", "VERMILLION", "GREEN", "ORANGE", "SKY", "PURPLE")
+COLOURS: dict[str, str] = {name.lower(): globals()[name] for name in _NAMES}
 """All colours in use, by the name that the page's style sheet gives them."""
 
 _LABEL = 30
@@ -109,24 +101,13 @@ def use_style() -> AbstractContextManager[None]:
 
 
 def make_panels(
-    rows: int,
-    columns: int,
-    height: float,
-    *,
-    width: float = WIDTH,
-    sharex: bool = False,
+    rows: int, columns: int, height: float, *, width: float = WIDTH, sharex: bool = False
 ) -> tuple[Figure, np.ndarray]:
-    """Return a figure of ``rows`` by ``columns`` panels.
+    """Return a figure of panels, and its axes, (rows, columns).
 
     Args:
-        rows: number of rows.
-        columns: number of columns.
-        height: of the whole figure, inches; at most `TALLEST`.
-        width: of the whole figure, inches.
+        height, width: of the whole figure, inches; at most `TALLEST`.
         sharex: one horizontal range for all panels, labelled on the last row.
-
-    Returns:
-        The figure and its axes, (rows, columns).
     """
     figure = Figure(figsize=(width, min(height, TALLEST)), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=sharex)
@@ -169,7 +150,9 @@ def finish(
         handles += more_handles
         names += more_names
     if names:
-        _add_legend(figure, handles, names)
+        columns = int(figure.get_figwidth() / (_LETTER * max(map(len, names)) + _HANDLE))
+        columns = max(1, min(_MOST_LEGEND_COLUMNS, columns, len(names)))
+        figure.legend(handles, names, loc="outside lower center", ncols=columns)
     return document.Figure(name.replace(":", "."), caption, render_svg(figure))
 
 
@@ -259,11 +242,7 @@ def set_limits(axes: Axes, values: Sequence[np.ndarray], *, zero: bool = False) 
 
 
 def use_decades(axes: Axes, values: Sequence[float] | np.ndarray) -> None:
-    """Make the vertical axis logarithmic: plain numbers over a few decades, none crowded.
-
-    Args:
-        axes: the panel; values: all that it shows, above zero.
-    """
+    """Make the vertical axis logarithmic over ``values``, all above zero: no labels crowded."""
     low, high = float(min(values)), float(max(values))
     axes.set_yscale("log")
     axes.set_ylim(low / 1.6, high * 1.6)
@@ -271,13 +250,6 @@ def use_decades(axes: Axes, values: Sequence[float] | np.ndarray) -> None:
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _add_legend(figure: Figure, handles: list[Any], names: list[str]) -> None:
-    """Put a legend below all panels, in as many columns as the figure is wide."""
-    columns = int(figure.get_figwidth() / (_LETTER * max(map(len, names)) + _HANDLE))
-    columns = max(1, min(_MOST_LEGEND_COLUMNS, columns, len(names)))
-    figure.legend(handles, names, loc="outside lower center", ncols=columns)
 
 
 def scale_values(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:

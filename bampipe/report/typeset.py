@@ -39,7 +39,6 @@ def pdf(document: Document, recorded: int) -> bytes:
     """Return ``document`` as PDF: the same document gives the same bytes.
 
     Args:
-        document: what to print.
         recorded: seconds since 1970, the date in the file; ``SOURCE_DATE_EPOCH`` replaces it.
 
     Raises:
@@ -71,6 +70,16 @@ def _print(document: Document, recorded: int) -> tuple[bytes, int]:
             where="SOURCE_DATE_EPOCH",
             remedy="unset it, or give whole seconds since 1970",
         )
+    sections = [
+        {"title": section.title, "blocks": [_describe_block(*pair) for pair in blocks]}
+        for section, blocks in number_blocks(document)
+    ]
+    described = {
+        "title": document.title,
+        "subtitle": document.subtitle,
+        "scale": document.scale,
+        "sections": sections,
+    }
     with temporary_space(), tempfile.TemporaryDirectory(prefix="bampipe-report-") as folder:
         root = Path(folder)
         (root / "figures").mkdir()
@@ -80,29 +89,15 @@ def _print(document: Document, recorded: int) -> tuple[bytes, int]:
                     (root / f"figures/{block.name}.svg").write_text(block.svg, encoding="utf-8")
         source = root / _TEMPLATE.name
         shutil.copyfile(_TEMPLATE, source)
-        (root / "document.json").write_text(
-            json.dumps(_describe_document(document)), encoding="utf-8"
-        )
+        (root / "document.json").write_text(json.dumps(described), encoding="utf-8")
         compiler = typst.Compiler(source, root=root, ignore_system_fonts=True)
         printed = compiler.compile(format="pdf", timestamp=int(stamp))
         assert isinstance(printed, bytes)  # a list of pages comes for other formats
         return printed, json.loads(compiler.query("<pages>", field="value"))[0]
 
 
-def _describe_document(document: Document) -> dict[str, Any]:
-    """Return the document as the template reads it: blocks numbered, text split into spans."""
-    return {
-        "title": document.title,
-        "subtitle": document.subtitle,
-        "scale": document.scale,
-        "sections": [
-            {"title": section.title, "blocks": [_describe_block(*pair) for pair in blocks]}
-            for section, blocks in number_blocks(document)
-        ],
-    }
-
-
 def _describe_block(block: Block, number: str) -> dict[str, Any]:
+    """Return the block as the template reads it, its text split into spans."""
     shown: dict[str, Any] = {"kind": type(block).__name__.lower(), "number": number}
     for field in fields(block):
         value = getattr(block, field.name)

@@ -17,15 +17,6 @@ _MOST_NAMED = 3
 """Held-out trials that a note can name."""
 
 
-def error_over_floor(results: Results, model: str) -> dict[str, float] | None:
-    """Return, by axis, held-out error over noise floor; None where it was not validated."""
-    validated = results.read(ValidateResult, model)
-    if validated is None:
-        return None
-    found = {axis: validated.axes[axis] for axis in results.order_axes(validated.axes)}
-    return {axis: e.held_out_rmse / e.noise_floor for axis, e in found.items() if e.noise_floor}
-
-
 def describe_held_out(validated: ValidateResult) -> str:
     """Return which trials were held out, and from what."""
     names = [name for name, trial in validated.trials.items() if trial.held_out]
@@ -67,9 +58,8 @@ def _list_failures(failed: Sequence[str]) -> str:
 
 
 def _judge_model(results: Results, validated: ValidateResult | None) -> Callout:
-    axes = validated.axes if validated else {}
-    wrong = [a for a in results.order_axes(axes) if axes[a].standing == "floor_implausible"]
-    if wrong:
+    axes = results.order_axes(validated.axes) if validated else {}
+    if wrong := [a for a, error in axes.items() if error.standing == "floor_implausible"]:
         return Callout(
             "attention",
             f"No verdict on {join_names(wrong)}: the noise floor is wrong",
@@ -86,7 +76,7 @@ def _judge_model(results: Results, validated: ValidateResult | None) -> Callout:
             f"The session has been {done}, not validated",
             f"`bampipe validate {results.root.name}` compares measured and predicted force.",
         )
-    ratios = error_over_floor(results, results.model)
+    ratios = {a: e.held_out_rmse / e.noise_floor for a, e in axes.items() if e.noise_floor}
     if not ratios:
         return Callout(
             "note",
@@ -112,7 +102,7 @@ def _judge_model(results: Results, validated: ValidateResult | None) -> Callout:
 
 
 def _judge_diagnosis(results: Results, diagnosis: DiagnoseResult) -> Callout:
-    axes = {axis: diagnosis.axes[axis] for axis in results.order_axes(diagnosis.axes)}
+    axes = results.order_axes(diagnosis.axes)
     sentence = "\n".join(entry.sentence for entry in axes.values())
     model = f"The model{results.list_effects()}"
 

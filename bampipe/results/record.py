@@ -33,6 +33,21 @@ class Record(Declaration):
 
     model_config = ConfigDict(strict=False, serialize_by_alias=True)
 
+    @classmethod
+    def of(cls, *sources: object, **values: object) -> Self:
+        """Return the record of ``values``, and of what ``sources`` have by the names of its fields.
+
+        Arrays become tuples; an earlier source goes before a later one.
+        """
+        found = {
+            name: getattr(one, name)
+            for one in reversed(sources)
+            for name in cls.model_fields
+            if hasattr(one, name)
+        } | values
+        plain = {k: v.tolist() if hasattr(v, "tolist") else v for k, v in found.items()}
+        return cls.model_validate(plain)
+
     @model_serializer(mode="wrap")
     def _without_defaults(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         held = {

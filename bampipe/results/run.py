@@ -20,24 +20,24 @@ def is_result(name: object) -> bool:
     return is_normal(name) and name != RunResult.FILE and not own
 
 
-def _result(name: str) -> str:
+def _check_result(name: str) -> str:
     if not is_result(name):
         raise fault(f"the name {name!r} is not that of a result")
     return name
 
 
-def _input(name: str) -> str:
+def _check_input(name: str) -> str:
     if not name.startswith(_OF_SESSION) and not is_normal(name):
         raise fault(f"the name {name!r} leads out of the run folder")
     return name
 
 
-def _published(name: str) -> str:
-    return name if name == RunResult.FILE else _result(name)
+def _check_published(name: str) -> str:
+    return name if name == RunResult.FILE else _check_result(name)
 
 
-ResultName = Annotated[str, AfterValidator(_result)]
-InputName = Annotated[str, AfterValidator(_input)]
+ResultName = Annotated[str, AfterValidator(_check_result)]
+InputName = Annotated[str, AfterValidator(_check_input)]
 
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$", description="SHA-256")]
 InputDigest = Annotated[
@@ -131,4 +131,4 @@ class Published(Declaration):
     schema_: Literal["bampipe.published/1"] = Field(alias="schema")
     session: Text
     version: Annotated[str, Field(pattern="^[0-9a-f]{16}$")]
-    files: dict[Annotated[str, AfterValidator(_published)], str]
+    files: dict[Annotated[str, AfterValidator(_check_published)], str]

@@ -33,11 +33,7 @@ def file_of(folder: Path, device: str) -> Path:
 
 
 def read(folder: Path, device: str) -> Accepted | None:
-    """Return what was accepted for ``device``; None where nothing was.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """Return what was accepted for ``device``; None where nothing was."""
     path = file_of(folder, device)
     if not path.is_file():
         return None
@@ -54,14 +50,10 @@ def read(folder: Path, device: str) -> Accepted | None:
 def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     """Keep the values of ``model`` in the run ``root`` as those to hold later sessions against.
 
-    Args:
-        root: the run folder.
-        model: name of the model.
-        folder: the folder of accepted values.
-        force: even if a gate failed.
+    Returns the file written.
 
-    Returns:
-        The file written.
+    Args:
+        folder: of accepted values; force: even if a gate failed.
 
     Raises:
         InputError: the model is not identified, a gate failed, or a result was changed by hand.
@@ -90,16 +82,16 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     results: dict[str, dict[str, dict[str, dict[str, object]]]] = {
         IdentifyResult.FILE: {
             "parameters": {
-                name: {"estimate": found.estimate, "sd": found.sd, "unit": found.unit}
+                name: found.model_dump(include={"estimate", "sd", "unit"})
                 for name, found in run.read(IdentifyResult, model).parameters.items()
             }
         }
     }
-    if run.exists(StiffnessResult.FILE):
+    if stiffness := run.find(StiffnessResult):
         results[StiffnessResult.FILE] = {
             "axes": {
-                axis: {"stiffness": found.stiffness, "sd": found.sd, "unit": found.unit}
-                for axis, found in run.read(StiffnessResult).axes.items()
+                axis: found.model_dump(include={"stiffness", "sd", "unit"})
+                for axis, found in stiffness.axes.items()
             }
         }
     path = file_of(folder, session.device)
@@ -119,9 +111,9 @@ def doubts(run: RunFolder, model: str) -> list[str]:
     from bampipe.phrases.results import STANDINGS
     from bampipe.results.validate import ValidateResult
 
-    if not run.exists(ValidateResult.file(model)):
+    found = run.find(ValidateResult, model)
+    if found is None:
         return [f"model {model} has not been validated: `bampipe validate {run.root}`"]
-    found = run.read(ValidateResult, model)
     lines = list(found.failed_checks)
     for axis, error in found.axes.items():
         if error.standing == "above_floor" and error.noise_floor:

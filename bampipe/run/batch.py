@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import traceback
 from collections.abc import Sequence
+from functools import partial
 
 from bampipe.errors import InputError
 from bampipe.run import record
@@ -13,13 +14,6 @@ from bampipe.run.publish import check_address, publish
 from bampipe.run.request import Outcome, Request
 from bampipe.run.runner import run_session
 from bampipe.workers import process_pool, send_to_parent
-
-THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "NUMBA_NUM_THREADS",
-)
 
 
 def share(jobs: int) -> int:
@@ -32,22 +26,15 @@ def limit_threads(jobs: int) -> None:
 
     Linear algebra gets one thread in any case: how many there are changes the last bits of a sum,
     and the same inputs must give the same bytes. To be called before numpy is imported.
-
-    Args:
-        jobs: number of processes.
     """
-    threads = str(share(jobs))
-    for name in THREAD_VARIABLES:
-        single = name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-        os.environ.setdefault(name, "1" if single else threads)
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(name, str(share(jobs)))
 
 
 def run_and_publish(request: Request, listen: Listener) -> Outcome:
-    """Run one session and, where asked, publish its run folder.
-
-    Raises:
-        InputError: bad input, or it could not be published.
-    """
+    """Run one session and, where asked, publish its run folder."""
     if request.publish:
         check_address(request.publish)
     outcome = run_session(request, listen)
@@ -58,12 +45,7 @@ def run_and_publish(request: Request, listen: Listener) -> Outcome:
 
 
 def guarded(request: Request, listen: Listener) -> Outcome:
-    """Run one session; whatever goes wrong becomes part of its outcome.
-
-    Args:
-        request: what to run.
-        listen: called with every event.
-    """
+    """Run one session; whatever goes wrong becomes part of its outcome."""
     try:
         return run_and_publish(request, listen)
     except InputError as error:
@@ -73,29 +55,17 @@ def guarded(request: Request, listen: Listener) -> Outcome:
         return Outcome(request.root, "crashed", error=text, traceback=traceback.format_exc())
 
 
-def _guarded_in_worker(request: Request) -> Outcome:
-    return guarded(request, send_to_parent)
-
-
-def _crashed(request: Request, error: InputError) -> Outcome:
-    return Outcome(request.root, "crashed", error=error.what)
-
-
 def run_sessions(requests: Sequence[Request], jobs: int, listen: Listener) -> list[Outcome]:
-    """Run several sessions.
+    """Run several sessions, no two of which share a run folder; return their outcomes in order.
 
     A worker process that dies (killed, out of memory) costs only the session it was at work on,
-    whose run folder the next run completes.
-
-    Args:
-        requests: one for each session; no two may share a run folder.
-        jobs: number of worker processes; 1 runs everything in this process.
-        listen: called with every event of every session.
-
-    Returns:
-        The outcomes, in the order of the requests.
+    whose run folder the next run completes. With one job everything runs in this process.
     """
     if jobs <= 1 or len(requests) <= 1:
         return [guarded(request, listen) for request in requests]
+
+    def crash(request: Request, error: InputError) -> Outcome:
+        return Outcome(request.root, "crashed", error=error.what)
+
     with process_pool(min(jobs, len(requests)), os.getpid, nested=True, hear=listen) as pool:
-        return list(pool.map(_guarded_in_worker, requests, _crashed))
+        return list(pool.map(partial(guarded, listen=send_to_parent), requests, crash))

@@ -41,12 +41,9 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
 
     Args:
         requests: one for each session; no two may share a run folder.
-        scheduler: address of the scheduler, ``tcp://host:port``; "" starts a cluster of worker
-            processes on this machine for the time of the run.
+        scheduler: its address, ``tcp://host:port``; "" starts a cluster of worker processes on this
+            machine for the time of the run.
         listen: called when a session is done.
-
-    Returns:
-        The outcomes, in the order of the requests.
 
     Raises:
         InputError: Dask is not installed, the scheduler does not answer, or has no workers.

@@ -64,13 +64,8 @@ def judge_gates(gate: Gate, root: Path, model: str, baseline: Path) -> list[Gate
     """Return the verdicts of ``gate`` on the run folder ``root``.
 
     Args:
-        gate: the gate; against accepted values it judges the model that was accepted.
-        root: the run folder.
-        model: name of the model that is judged.
+        gate: against accepted values it judges the model that was accepted, not ``model``.
         baseline: folder of the values last accepted.
-
-    Raises:
-        InputError: the result or the file of accepted values is damaged.
     """
     if gate.against == accepted.ACCEPTED:
         model, found = _judge_change(gate, root, model, baseline)
@@ -101,33 +96,26 @@ def _judge_result(gate: Gate, root: Path, model: str) -> list[GateVerdict]:
         if value is not None and gate.divide_by:
             divisor = _number(divisors.get(key))
             value = value / divisor if divisor else None
-        if gate.judged_by:
-            verdicts.append(_judge_word(gate, key, value, words.get(key)))
+        if gate.judged_by:  # the verdict is stored as a word
+            word = str(words.get(key))
+            number = "no number" if value is None else f"{value:.4g}"
+            parts = [f"{number}, {word.replace('_', ' ')}"]
+            verdicts.append(_found(gate, key, word in gate.passes, value, parts, word))
         elif value is None:
             verdicts.append(_missing(gate, key, f"{relative} has no number at {gate.value}"))
         else:
-            verdicts.append(_judge_number(gate, key, value))
+            limits = []
+            if gate.max is not None and value > gate.max:
+                limits.append(f"{value:.4g} is above {gate.max:g}")
+            if gate.min is not None and value < gate.min:
+                limits.append(f"{value:.4g} is below {gate.min:g}")
+            parts = limits or [f"{value:.4g}"]
+            verdicts.append(_found(gate, key, not limits, value, parts))
     return verdicts
 
 
 def _content(path: Path) -> dict[str, Any] | None:
     return read_json_table(path) if path.is_file() else None
-
-
-def _judge_word(gate: Gate, key: str, value: float | None, word: object) -> GateVerdict:
-    """Return the verdict that a stage stored as a word; ``value`` is shown beside it."""
-    number = "no number" if value is None else f"{value:.4g}"
-    text = f"{number}, {str(word).replace('_', ' ')}"
-    return _found(gate, key, word in gate.passes, value, [text], str(word))
-
-
-def _judge_number(gate: Gate, key: str, value: float) -> GateVerdict:
-    limits = []
-    if gate.max is not None and value > gate.max:
-        limits.append(f"{value:.4g} is above {gate.max:g}")
-    if gate.min is not None and value < gate.min:
-        limits.append(f"{value:.4g} is below {gate.min:g}")
-    return _found(gate, key, not limits, value, limits or [f"{value:.4g}"])
 
 
 def _judge_change(

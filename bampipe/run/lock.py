@@ -42,7 +42,6 @@ def hold(
     file and empties it at the end: a name that is left is that of a process that was killed.
 
     Args:
-        path: the lock file; made if it is not there.
         wait: wait while another process holds it; else refuse.
         waiting: called once, before waiting, with the name of the holder.
         taking_over: called with the name of a holder that was killed.

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, printable
 from bampipe.run.request import Outcome
-
-if TYPE_CHECKING:
-    from bampipe.results.run import GateVerdict
 
 STATES = {0: "passed", 1: "**gate failed**", 2: "**bad input**", 3: "**crashed**"}
 MOST = 30
@@ -18,11 +14,7 @@ MOST = 30
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:
-    """Return the summary of a run as GitHub-flavoured Markdown.
-
-    Args:
-        outcomes: what came of each session.
-    """
+    """Return the summary of a run as GitHub-flavoured Markdown."""
     codes = [outcome.exit_code for outcome in outcomes]
     lines = [f"## bampipe: {_headline(codes)}", ""]
     lines += _table(
@@ -60,11 +52,8 @@ def _headline(codes: Sequence[int]) -> str:
 def _session(outcome: Outcome) -> tuple[str, ...]:
     if outcome.error:
         return outcome.root.name, STATES[outcome.exit_code], "", "", outcome.error
-    counts = [
-        f"{number} {word}"
-        for word in ("failed", "warned")
-        if (number := _count(outcome.verdicts, word))
-    ]
+    states = [verdict.state for verdict in outcome.verdicts]
+    counts = [f"{states.count(one)} {one}" for one in ("failed", "warned") if one in states]
     return (
         outcome.root.name,
         STATES[outcome.exit_code],
@@ -74,20 +63,15 @@ def _session(outcome: Outcome) -> tuple[str, ...]:
     )
 
 
-def _count(verdicts: Iterable[GateVerdict], state: str) -> int:
-    return sum(verdict.state == state for verdict in verdicts)
-
-
 def _errors(run: RunFolder, model: str) -> str:
     """Return held-out error over floor, axis by axis."""
     from bampipe.results.validate import ValidateResult
 
-    if not model or not run.exists(ValidateResult.file(model)):
-        return ""
     try:
-        axes = run.read(ValidateResult, model).axes
+        found = run.find(ValidateResult, model) if model else None
     except InputError:
         return "not readable"
+    axes = found.axes if found else {}
     return ", ".join(
         f"{axis} {error.held_out_rmse / error.noise_floor:.2f}"
         for axis, error in axes.items()
@@ -96,15 +80,11 @@ def _errors(run: RunFolder, model: str) -> str:
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    lines = [_line(head), "|" + "---|" * len(head)]
-    lines += [_line(row) for row in rows[:MOST]]
+    lines = [f"| {' | '.join(map(_cell, cells))} |" for cells in (head, *rows[:MOST])]
+    lines.insert(1, "|" + "---|" * len(head))
     if len(rows) > MOST:
         lines += ["", f"and {len(rows) - MOST} more"]
     return lines
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(_cell(cell) for cell in cells) + " |"
 
 
 def _cell(text: str) -> str:

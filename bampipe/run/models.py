@@ -1,4 +1,7 @@
-"""Model versions in a run folder: the base model and its children."""
+"""Model versions in a run folder: the base model and its children.
+
+A model that is not there, or is damaged, raises `InputError`, which names those that are.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +28,7 @@ def names(root: Path) -> tuple[str, ...]:
 
 
 def read(root: Path, name: str) -> ModelFile:
-    """Read ``models/<name>/model.toml``.
-
-    Raises:
-        InputError: there is none, it is damaged, or its parent is missing.
-    """
+    """Read ``models/<name>/model.toml``."""
     from bampipe.declarations.model import read_model_file
 
     if name not in names(root):
@@ -39,11 +38,7 @@ def read(root: Path, name: str) -> ModelFile:
 
 
 def choose_model(root: Path, name: str) -> str:
-    """Return ``name``, else the model that counts.
-
-    Raises:
-        InputError: there is no such model.
-    """
+    """Return ``name``, else the model that counts."""
     if name:
         read(root, name)
     return name or counting_model(root)
@@ -80,10 +75,8 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
     """Write the base model: the device that the pipeline or else the session names.
 
     Args:
-        root: the run folder; ``ingest/session.json`` must be there where ``device`` is "".
-        device: the pipeline's device, or "".
-        effects: the pipeline's effects of the base model; without any, those that the device file
-            gives it.
+        device: the pipeline's device; "" takes that of ``ingest/session.json``.
+        effects: the pipeline's; without any, those that the device file gives the base model.
     """
     from bampipe.declarations.model import ModelFile
     from bampipe.results.ingest import IngestResult

@@ -1,4 +1,7 @@
-"""Pipelines: which stages run, with which settings, and which results are good enough."""
+"""Pipelines: which stages run, with which settings, and which results are good enough.
+
+One that is not there or says something impossible raises `InputError`.
+"""
 
 from __future__ import annotations
 
@@ -8,25 +11,30 @@ from typing import TYPE_CHECKING
 import bampipe
 from bampipe.errors import InputError, choose_from
 from bampipe.files import read_toml
+from bampipe.run import record
 
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Pipeline
-    from bampipe.results.run import RunResult
 
 SCHEMA = "bampipe.pipeline/1"
 
 
-def recorded(run: RunResult) -> Pipeline:
+def recorded(root: Path) -> Pipeline:
     """Return the pipeline, without its gates, that ``run.json`` keeps; else the default one."""
     from bampipe.declarations.pipeline import Pipeline
     from bampipe.schema import read
 
-    used = run.pipeline
+    used = record.read(root).pipeline
     if used is None:
         return load()
     model = {"device": used.device, "effects": used.effects}
     table = {"name": used.name, "stages": used.stages, "settings": used.settings, "model": model}
     return read(Pipeline, {"schema": SCHEMA, **table}, "run.json: pipeline")
+
+
+def whole(root: Path, name: str = "") -> Pipeline:
+    """Return the pipeline ``name``, else that of the run, with every stage: for single stages."""
+    return (load(name) if name else recorded(root)).with_every_stage()
 
 
 _PACKAGE = Path(bampipe.__file__).parent
@@ -44,11 +52,7 @@ def names() -> tuple[str, ...]:
 
 
 def find(name: str) -> Path:
-    """Return the file of the pipeline ``name``: a shipped one, or a path to a lab's own.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return the file of the pipeline ``name``: a shipped one, or a path to a lab's own."""
     if name.endswith(".toml"):
         path = Path(name)
         if path.is_file():
@@ -60,11 +64,7 @@ def find(name: str) -> Path:
 
 
 def load(name: str = "default") -> Pipeline:
-    """Read and check the pipeline ``name`` (see :func:`find`).
-
-    Raises:
-        InputError: there is none, it is not TOML, or it says something impossible.
-    """
+    """Read and check the pipeline ``name`` (see :func:`find`)."""
     from bampipe.declarations.pipeline import Pipeline
     from bampipe.schema import read
 

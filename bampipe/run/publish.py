@@ -9,6 +9,9 @@ or shared folder and published whole:
 ``current.json`` is written last, in one piece. Whoever reads it first sees the old version or the
 new one, never a mixture; an upload that was cut short is not seen at all, and the next one
 completes it. Versions that no longer count are left: somebody may be reading them.
+
+What fsspec, the driver of a file system or the place itself refuses is an `InputError`; and a run
+folder that holds a link.
 """
 
 from __future__ import annotations
@@ -40,20 +43,12 @@ CURRENT = "current.json"
 
 
 def publish(root: Path, url: str) -> str:
-    """Publish the run folder ``root`` below ``url``.
+    """Publish the run folder ``root`` below ``url``; return the version.
 
-    A version that is there already, whole, is not sent again.
+    Nobody may be at work in it. A version that is there already, whole, is not sent again.
 
     Args:
-        root: the run folder; nobody may be at work in it.
         url: a folder as fsspec names it, such as ``s3://bucket/runs`` or ``file:///mnt/runs``.
-
-    Returns:
-        The version.
-
-    Raises:
-        InputError: fsspec or the driver of that file system is not installed, or it refuses; or
-            the run folder holds a link.
     """
     refuse_links(root)
     files = {
@@ -82,11 +77,7 @@ def publish(root: Path, url: str) -> str:
 
 
 def published(url: str) -> list[str]:
-    """Return the sessions published below ``url``, sorted.
-
-    Raises:
-        InputError: as :func:`publish`.
-    """
+    """Return the sessions published below ``url``, sorted."""
     system, base = _open(url)
     with _driver("cannot be read", url):
         if not system.exists(base):
@@ -102,9 +93,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
     """Fetch the published run of ``session`` into ``runs``, every file held against its hash.
 
     Args:
-        url: as for :func:`publish`.
-        session: its id.
-        runs: folder of run folders.
+        url: as for :func:`publish`; runs: folder of run folders.
         force: replace a run folder that says something else.
 
     Returns:
@@ -153,11 +142,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
 
 
 def check_address(url: str) -> None:
-    """Refuse an address at which nothing can be published, before hours of work.
-
-    Raises:
-        InputError: no such file system, or fsspec or its driver is not installed.
-    """
+    """Refuse an address at which nothing can be published, before hours of work."""
     _open(url)
 
 
@@ -182,7 +167,8 @@ def _driver(what: str, url: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"{what}: {_first_line(error)}", where=url) from error
+        first_line = (str(error) or type(error).__name__).splitlines()[0]
+        raise InputError(f"{what}: {first_line}", where=url) from error
 
 
 def _current(system: Any, here: str) -> Published | None:
@@ -212,7 +198,3 @@ def _is_same(root: Path, files: dict[str, str]) -> bool:
         (root / name).is_file() and digest_file(root / name) == known
         for name, known in files.items()
     )
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]

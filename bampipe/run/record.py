@@ -57,8 +57,7 @@ def require_untouched(root: Path, names: Iterable[str]) -> None:
     """Hold results against the hashes that ``run.json`` keeps of them.
 
     Args:
-        root: the run folder.
-        names: paths relative to it; one that is not there, or that no step wrote, is passed over.
+        root: the run folder; names: paths in it, passed over if not there or not recorded.
 
     Raises:
         InputError: a file was changed or damaged since it was written; says which.
@@ -87,10 +86,9 @@ def write(root: Path, content: RunResult) -> None:
 
 @contextlib.contextmanager
 def lock(root: Path, wait: bool, listen: Listener = unheard) -> Iterator[None]:
-    """Hold the run folder ``root`` alone; what the disk refuses meanwhile is a user's matter.
+    """Hold the run folder ``root``, made if need be; what the disk refuses is a user's matter.
 
     Args:
-        root: the run folder; made if it is not there.
         wait: wait while another process holds it; else refuse.
         listen: called before waiting, and where the last holder was killed.
 
@@ -106,10 +104,14 @@ def lock(root: Path, wait: bool, listen: Listener = unheard) -> Iterator[None]:
     if private.exists() and not is_inside(root, f"{PRIVATE}/lock"):
         refuse_links(root)
     try:
-        _make(private)
+        private.mkdir(parents=True, exist_ok=True)
         with hold(private / "lock", wait, tell("waiting"), tell("taken over")):
             refuse_links(root)
             yield
+    except FileNotFoundError as error:
+        if private.exists():
+            raise
+        raise InputError("no folder can be made here", where=str(root)) from error
     except OSError as error:
         if error.errno not in STORAGE_FAULTS:
             raise
@@ -118,10 +120,3 @@ def lock(root: Path, wait: bool, listen: Listener = unheard) -> Iterator[None]:
             where=os.fspath(error.filename or root),
             remedy="earlier results are untouched",
         ) from error
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except FileNotFoundError as error:
-        raise InputError("no folder can be made here", where=str(folder.parent)) from error

@@ -17,12 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Step:
-    """One stage, for one model where the stage runs once for each.
-
-    Attributes:
-        stage: name of the stage.
-        model: name of the model, or "".
-    """
+    """One stage, for one model where the stage runs once for each."""
 
     stage: str
     model: str = ""
@@ -70,14 +65,10 @@ class Request:
 
 @dataclass(frozen=True)
 class StepResult:
-    """What came of one step.
+    """What came of one step: its state is "done" or "unchanged".
 
     Attributes:
-        step: name of the step.
-        state: "done", "unchanged" or "failed".
-        reason: why it ran.
-        seconds: how long it took.
-        summary: what the stage returned.
+        reason: why it ran; seconds: how long it took; summary: what the stage returned.
     """
 
     step: str
@@ -92,9 +83,7 @@ class Outcome:
     """What came of a run.
 
     Attributes:
-        root: the run folder.
         state: "done", "refused" (bad input) or "crashed" (a fault of bampipe).
-        steps: the steps in order.
         verdicts: of the gates.
         error: one line on what went wrong, or "".
         traceback: where bampipe itself failed, or "".

@@ -61,7 +61,7 @@ class _Runner:
             outputs=written,
             code=hashing.digest_code(step.stage),
             versions=dict(hashing.versions()),
-            summary=_as_stored(summary, step),
+            summary=json.loads(json.dumps(summary, allow_nan=False)),
         )
         seconds = time.perf_counter() - clock
         timing = Timing(started_at=started.isoformat(timespec="seconds"), seconds=round(seconds, 3))
@@ -133,28 +133,8 @@ class _Runner:
         return Outcome(self.root, "done", tuple(results), tuple(verdicts), model=judged)
 
 
-def _as_stored(summary: dict[str, object], step: Step) -> dict[str, object]:
-    """Return the summary as it reads back from JSON."""
-    try:
-        stored: dict[str, object] = json.loads(json.dumps(summary, allow_nan=False))
-    except (TypeError, ValueError) as error:
-        raise RuntimeError(f"the summary of stage {step.name} is not JSON: {error}") from error
-    return stored
-
-
 def run_session(request: Request, listen: Listener = unheard) -> Outcome:
-    """Run the selected stages of one session.
-
-    Args:
-        request: what to run, where.
-        listen: called with every event.
-
-    Returns:
-        What came of it.
-
-    Raises:
-        InputError: bad input; results of earlier runs stay as they were.
-    """
+    """Run the selected stages of one session; bad input leaves earlier results as they were."""
     selected(request)
     fresh = not request.root.exists()
     with record.lock(request.root, request.wait, listen):

@@ -20,11 +20,7 @@ def session_folder(path: str | Path) -> Path:
 
 
 def session_id(session: Path) -> str:
-    """Return the name of the run folder for ``session``: the id in its session file.
-
-    Raises:
-        InputError: there is no session, its id is no name for a folder, or its path is no text.
-    """
+    """Return the name of the run folder for ``session``: the id in its session file."""
     try:
         str(session.resolve()).encode()
     except UnicodeEncodeError as error:

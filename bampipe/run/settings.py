@@ -15,9 +15,8 @@ def configure(stage: str, settings: Mapping[str, object], where: str = "") -> An
     """Return the configuration of ``stage`` with ``settings`` in place of the defaults.
 
     Args:
-        stage: name of the stage.
         settings: values by field name, as TOML or the command line gives them.
-        where: the file the settings come from, for messages.
+        where: the file they come from, for messages.
 
     Raises:
         InputError: an unknown field, a value of the wrong type, or one the stage refuses.

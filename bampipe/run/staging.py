@@ -54,16 +54,9 @@ def written(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, s
     }
     allowed: set[str] = set()
     for pattern in declared:
-        if "*" in pattern:
-            allowed |= {
-                path.relative_to(staging).as_posix()
-                for path in staging.glob(pattern)
-                if path.is_file()
-            }
-        elif pattern in files:
-            allowed.add(pattern)
-        else:
+        if "*" not in pattern and pattern not in files:
             raise RuntimeError(f"stage {step.name} did not write {pattern}, which it declares")
+        allowed |= {path.relative_to(staging).as_posix() for path in staging.glob(pattern)}
     undeclared = sorted(files.keys() - allowed)
     if undeclared:
         raise RuntimeError(f"stage {step.name} wrote {undeclared[0]}, which it does not declare")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, MissingResultError
-from bampipe.files import digest_content, digest_file, digest_input, write_json
+from bampipe.files import digest_content, digest_file, digest_input
 from bampipe.run import hashing, models, record
 from bampipe.run.request import Request, Step
 from bampipe.run.settings import configure, plain
@@ -25,11 +25,7 @@ NEUTRAL = ("session", "jobs")
 
 
 class RunState:
-    """What a run folder records, what its steps depend on, and which of them must run.
-
-    Args:
-        request: what is asked of the runner.
-    """
+    """What a run folder records, what its steps depend on, and which of them must run."""
 
     def __init__(self, request: Request) -> None:
         self.request = request
@@ -41,7 +37,6 @@ class RunState:
         self.timings = dict(self.written.timings)
         self.failures = dict(self.written.failures)
         self.digests: dict[tuple[str, int, int, int], str] = {}
-        self.memory = hashing.HashMemory(self.root / record.PRIVATE / "hashes.json")
         self.session = request.session
 
     # What a step depends on
@@ -62,12 +57,6 @@ class RunState:
         if step.model:
             settings["model"] = step.model
         return settings
-
-    def digest_record(self, step: Step) -> str:
-        """Hash of what ``run.json`` says of the other steps, times and places left out."""
-        return digest_content(
-            {name: made.key for name, made in self.records.items() if name != step.name}
-        )
 
     def session_folder(self) -> Path:
         if self.session is None:
@@ -96,25 +85,20 @@ class RunState:
         """Hashes of all inputs, by path relative to the run folder."""
         found: dict[str, str] = {}
         for pattern in declared:
-            if "*" in pattern:
-                names = self.folder.glob(pattern)
-            else:
-                name = pattern.removesuffix("?")
-                if not self.folder.exists(name):
-                    if pattern.endswith("?"):
-                        continue
-                    raise self.missing(name)
-                names = (name,)
+            names = self.folder.glob(pattern.removesuffix("?"))
+            if not names and not pattern.endswith("?") and "*" not in pattern:
+                raise self.missing(pattern)
             for name in names:
                 if name == record.FILE:
-                    found[name] = self.digest_record(step)
+                    # What it says of the other steps, times and places left out.
+                    others = {k: made.key for k, made in self.records.items() if k != step.name}
+                    found[name] = digest_content(others)
                     continue
                 self.check_untouched(name)
-                path = self.root / name
-                is_text = path.suffix == ".toml"
-                found[name] = digest_input(path) if is_text else self.digest(name)
+                is_text = name.endswith(".toml")
+                found[name] = digest_input(self.root / name) if is_text else self.digest(name)
         if step.stage in base.READS_SESSION:
-            found.update(hashing.digest_session(self.session_folder(), self.memory))
+            found.update(hashing.digest_session(self.session_folder()))
         return dict(sorted(found.items()))
 
     def missing(self, name: str) -> MissingResultError:
@@ -141,19 +125,18 @@ class RunState:
 
     # Whether a step must run
 
-    def declared(self, step: Step) -> tuple[dict[str, object], tuple[str, ...], Any]:
-        """Configuration as recorded, declared inputs, and the configuration itself.
+    def declared(self, step: Step) -> tuple[dict[str, object], tuple[str, ...]]:
+        """Configuration as recorded, and declared inputs.
 
         Where the same settings met the same code before, the record answers, and the module of
-        the stage (which may import much) stays unloaded; the configuration is then None.
+        the stage (which may import much) stays unloaded.
         """
         made = self.records.get(step.name)
         code = hashing.digest_code(step.stage)
         if made is not None and made.settings == self.settings(step) and made.code == code:
-            return made.config, made.declared_inputs, None
+            return made.config, made.declared_inputs
         config = self.configure(step, self.settings(step))
-        declared = base.paths_of(step.model, base.load_stage(step.stage).INPUTS)
-        return lasting(config), declared, config
+        return lasting(config), base.paths_of(step.model, base.load_stage(step.stage).INPUTS)
 
     def reason(self, step: Step) -> str:
         """Why the step must run; "" if it need not."""
@@ -167,7 +150,7 @@ class RunState:
                 return f"{name} is gone"
             if self.digest(name) != written:
                 return f"{name} was changed since it was written"
-        config, declared, _ = self.declared(step)
+        config, declared = self.declared(step)
         inputs = self.inputs(step, declared)
         if self.key(step, config, inputs) == made.key:
             return ""
@@ -209,8 +192,6 @@ class RunState:
             noted = noted.model_copy(update={"pipeline": used, "gates": tuple(verdicts)})
         if noted != self.written:
             self._write(noted)
-        if self.memory.changed:
-            write_json(self.memory.path, self.memory.notes)
 
     def _noted(self) -> RunResult:
         """What is known by now; versions and machine as they were written."""
@@ -247,8 +228,5 @@ def _maker(name: str) -> str:
 
 
 def lasting(config: object) -> dict[str, object]:
-    """Return the fields of a configuration that a result depends on.
-
-    Not the session's place (its content counts) nor the number of processes.
-    """
+    """Return the fields of a configuration that a result depends on: all but `NEUTRAL`."""
     return {name: value for name, value in plain(config).items() if name not in NEUTRAL}

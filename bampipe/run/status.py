@@ -20,7 +20,6 @@ class StepStatus:
     """Where one step of a run stands.
 
     Attributes:
-        step: name of the step.
         state: "current", "stale", "failed" or "not run".
         reason: why it would run again, or what went wrong.
         started_at: when it last ran, UTC, or "".
@@ -35,12 +34,7 @@ class StepStatus:
 
 
 def status(root: Path, pipeline: Pipeline) -> list[StepStatus]:
-    """Return where each step of the run ``root`` stands; changes nothing.
-
-    Args:
-        root: the run folder.
-        pipeline: the pipeline whose settings count.
-    """
+    """Return where each step of the run ``root`` stands by the settings of ``pipeline``."""
     run = RunState(Request(root, pipeline))
     found = []
     shown = [
@@ -65,13 +59,6 @@ def status(root: Path, pipeline: Pipeline) -> list[StepStatus]:
                     reason = "an earlier stage is stale"
                 state = "stale" if reason else "current"
             stale = stale or state != "current"
-            found.append(
-                StepStatus(
-                    step.name,
-                    state,
-                    reason,
-                    timing.started_at if timing else "",
-                    timing.seconds if timing else None,
-                )
-            )
+            last_run = (timing.started_at, timing.seconds) if timing else ("", None)
+            found.append(StepStatus(step.name, state, reason, *last_run))
     return found

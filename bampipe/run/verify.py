@@ -12,9 +12,6 @@ from bampipe.stages import base
 def verify(root: Path) -> list[tuple[str, str]]:
     """Recompute every hash that ``run.json`` records.
 
-    Args:
-        root: the run folder.
-
     Returns:
         Pairs of a file and what became of it: "changed", "gone", or "unknown" for a file that no
         stage recorded; ``run.json`` itself may be "damaged". Empty where all is as it was written.

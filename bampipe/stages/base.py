@@ -100,11 +100,7 @@ def check_stage_name(name: str) -> None:
 
 
 def load_stage(name: str) -> Stage:
-    """Import and return the stage ``name``.
-
-    Raises:
-        InputError: there is no such stage.
-    """
+    """Import and return the stage ``name``; InputError where there is none."""
     check_stage_name(name)
     return cast(Stage, importlib.import_module(f"bampipe.stages.{name}"))
 

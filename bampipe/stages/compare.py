@@ -36,11 +36,7 @@ class Config:
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Put the validated models of a run side by side, parents before children.
-
-    Raises:
-        InputError: no model has been validated, or the parent of one is missing.
-    """
+    """Put the validated models of a run side by side, parents before children."""
     models: dict[str, ModelFile] = {}
     for path in run.glob("models/*/model.toml"):
         name = Path(path).parent.name
@@ -63,8 +59,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     parameters: dict[str, dict[str, Value]] = {}
     for name in order:
         for key, found in run.read(IdentifyResult, name).parameters.items():
-            value = Value(estimate=found.estimate, sd=found.sd, unit=found.unit)
-            parameters.setdefault(key, {})[name] = value
+            parameters.setdefault(key, {})[name] = Value.of(found)
     moved = _moved(parameters, models, confirmed, config.sigmas)
     return CompareResult(
         best=best, ladder=tuple(ladder.values()), parameters=parameters, moved=tuple(moved)
@@ -121,15 +116,6 @@ def _moved(
                     f"{round_with_sd(new.estimate, new.sd)} {new.unit}: "
                     "without what was added it was biased."
                 )
-                moved.append(
-                    Moved(
-                        parameter=name,
-                        model=model,
-                        parent=parent,
-                        change=change,
-                        sd=sd,
-                        unit=new.unit,
-                        sentence=sentence,
-                    )
-                )
+                of_model = {"parameter": name, "model": model, "parent": parent}
+                moved.append(Moved.of(new, **of_model, change=change, sd=sd, sentence=sentence))
     return moved

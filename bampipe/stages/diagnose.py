@@ -31,15 +31,9 @@ from bampipe.physics import compile_model, registry
 from bampipe.physics.effect import effect_from
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
-from bampipe.results.diagnose import (
-    AxisVerdict,
-    DiagnoseResult,
-    RankedEffect,
-    ResidualMap,
-)
+from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, ResidualMap
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.setup import SetupResult
-from bampipe.results.terms import EffectText
 from bampipe.schema import STRICT, Count, Distinct
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.folds import HELD_OUT
@@ -144,10 +138,9 @@ def _require_known(names: Sequence[str], recipe: Recipe, setting: str) -> None:
 
 def _require_sound_setup(run: RunFolder) -> None:
     """Refuse to look for physics where the signals do not mean what is stated."""
-    if not run.exists(SetupResult.FILE):
-        return
-    mistakes = run.read(SetupResult).mistakes
-    if mistakes:
+    setup = run.find(SetupResult)
+    if setup is not None and setup.mistakes:
+        mistakes = setup.mistakes
         raise InputError(
             f"no effect is looked for, since the set-up is wrong: {mistakes[0].sentence}"
             f" ({mistakes[0].evidence})",
@@ -183,18 +176,24 @@ def _result(
     found, given = conclude(session, selection), selection.initial.evidence
     names = given.system.coordinates
     ranking = found.ranking
+    own = {effect.name: effect for effect in map(effect_from, recipe.extra)}
+    known = sorted({entry.effect.partition(":")[0] for entry in ranking[:_DESCRIBED]})
+    maps = {}
+    for i, axis in enumerate(names):
+        drawn = [residual_map(given, i, variable) for variable in variables(given, i)]
+        maps[axis] = {m.variable: ResidualMap.of(m, variance_share=m.share) for m in drawn}
     result = DiagnoseResult(
         model=config.model,
         trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in session.trials.weighed)),
         axes=dict(zip(names, found.axes, strict=True)),
         ranking=ranking,
-        descriptions=_descriptions(ranking[:_DESCRIBED], recipe),
+        descriptions={name: effect_text(own.get(name) or registry.effect(name)) for name in known},
         selected=found.selected,
         sets=found.sets,
         chance=found.chance,
         cut_short=selection.cut_short,
         suggested_trial=None,
-        maps=_maps(given),
+        maps=maps,
         worst_windows=tuple(worst_windows(given)),
         not_weighed=config.without,
         sentence="",
@@ -213,31 +212,6 @@ def _result(
         for axis, entry in result.axes.items()
     }
     return result.model_copy(update={"axes": axes, "sentence": " ".join(said.values())})
-
-
-def _descriptions(ranking: Sequence[RankedEffect], recipe: Recipe) -> dict[str, EffectText]:
-    own = {effect.name: effect for effect in map(effect_from, recipe.extra)}
-    names = {entry.effect.partition(":")[0] for entry in ranking}
-    return {name: effect_text(own.get(name) or registry.effect(name)) for name in sorted(names)}
-
-
-def _maps(evidence: Evidence) -> dict[str, dict[str, ResidualMap]]:
-    maps: dict[str, dict[str, ResidualMap]] = {}
-    for i, axis in enumerate(evidence.system.coordinates):
-        drawn = [residual_map(evidence, i, v) for v in variables(evidence, i)]
-        maps[axis] = {
-            m.variable: ResidualMap(
-                unit=m.unit,
-                center=tuple(m.center),
-                mean=tuple(m.mean),
-                low=tuple(m.low),
-                high=tuple(m.high),
-                count=tuple(m.count),
-                variance_share=m.share,
-            )
-            for m in drawn
-        }
-    return maps
 
 
 def _map_variables(evidence: Evidence) -> pd.DataFrame:

@@ -66,11 +66,7 @@ class Config(Criteria):
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Draft formulas for one model; write them and what they rest on.
-
-    Raises:
-        InputError: there is no diagnosis of the model, or nothing is left by it without a name.
-    """
+    """Draft formulas for one model; write them and what they rest on."""
     diagnosis = run.read(DiagnoseResult, config.model)
     if not diagnosis.unnamed_axes:
         raise NothingToDoError(
@@ -102,13 +98,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     for one in found:
         axis = system.coordinates[one.axis]
         drafted: dict[str, DraftedEffect] = {}
-        if _beats_named_effects(one, diagnosis.axes[axis]):
+        named = diagnosis.axes[axis]
+        if not named.effects or one.chosen.held_out_rmse < named.rmse_after:
             for term in one.terms:
                 file = f"models/{config.model}/drafts/{term.form.name}.toml"
                 write_text(out / file, write_toml(declare(term, source)))
                 drafted[term.form.canonical] = _effect(term, file)
         rows = [row for row in diagnosis.ranking if row.axis == axis]
-        entries[axis] = _axis(axis, one, drafted, diagnosis.axes[axis], rows)
+        entries[axis] = _axis(axis, one, drafted, named, rows)
         effects |= drafted
     selected = tuple(effects)
     advice = (
@@ -135,11 +132,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     }
 
 
-def _beats_named_effects(found: FoundDraft, diagnosed: AxisVerdict) -> bool:
-    """Whether the terms found leave less than the effects that the diagnosis names there."""
-    return not diagnosed.effects or found.chosen.held_out_rmse < diagnosed.rmse_after
-
-
 def _effect(term: Term, file: str) -> DraftedEffect:
     form, unit = term.form, term.form.unit
     units = {name: unit for name in form.shape.strengths}
@@ -159,23 +151,21 @@ def _effect(term: Term, file: str) -> DraftedEffect:
         for name, c in constants.items()
     )
     is_curve = form.shape.name == "curve"
-    return DraftedEffect(
+    return DraftedEffect.of(
+        form,
         file=file,
         axis=form.axis.name,
-        expression=form.expression,
         acts_as=form.factor,
         constants=constants,
-        summary=form.summary,
-        looks_like=form.looks_like,
         sentence=f"{form.summary}." if is_curve else f"{form.summary}: {numbers}.",
-        curve=DraftCurve(
+        curve=DraftCurve.of(
             variable=form.coordinate.words,
             variable_unit=form.coordinate.unit,
             unit=unit,
-            at=tuple(at),
-            mean=tuple(mean),
-            low=tuple(mean - 1.96 * sd),
-            high=tuple(mean + 1.96 * sd),
+            at=at,
+            mean=mean,
+            low=mean - 1.96 * sd,
+            high=mean + 1.96 * sd,
             beside={quantity.words: span.high for quantity, span in form.beside},
         ),
     )
@@ -200,12 +190,7 @@ def _axis(
         effects=tuple(effects),
         chance=found.chance,
         options=tuple(
-            DraftOption(
-                effects=tuple(form.name for form in option.terms),
-                constants=option.constants,
-                held_out_rmse=option.held_out_rmse,
-                log_evidence=option.log_evidence,
-            )
+            DraftOption.of(option, effects=tuple(form.name for form in option.terms))
             for option in found.options
         ),
         rmse_before=before,

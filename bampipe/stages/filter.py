@@ -31,7 +31,7 @@ from bampipe.results.filter import (
     ForceFilter,
     ResidualBand,
 )
-from bampipe.results.ingest import EncoderChannel, IngestResult
+from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import SetupResult
 from bampipe.schema import STRICT, NotNegative
 from bampipe.setup.inspection import inspect_setup
@@ -121,13 +121,14 @@ class _Written:
     interpolated: dict[str, float]
     skipped: dict[str, str]
 
+    def median_sds(self, axis: str) -> dict[str, float]:
+        """Median errors of one axis over the trials."""
+        names = ("position_sd", "velocity_sd", "acceleration_sd")
+        return dict(zip(names, np.median(np.array(self.levels[axis]), axis=0), strict=True))
 
-@dataclass(frozen=True)
-class _Choice:
-    """How one axis is differentiated, and the words for it."""
 
-    filter: AxisFilter
-    report: dict[str, Any]
+def _list_hz(by_axis: Mapping[str, float]) -> str:
+    return ", ".join(f"{axis} {hz:.1f} Hz" for axis, hz in by_axis.items())
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -143,15 +144,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     records, refused = _tuning_records(samples, ids, tuple(axes), rate, config.tuning_samples)
     if not any(records.values()):
         raise _nothing_to_differentiate(run, trials, refused)
-    choices = {
-        axis: _choose(axis, records[axis], rate, axes[axis].resolution or 0.0, config)
-        for axis in axes
-    }
-    method = "kalman" if config.method == "auto" else config.method
+    filters: dict[str, AxisFilter] = {}
+    about: dict[str, dict[str, Any]] = {}
+    for axis, entry in axes.items():
+        filters[axis], about[axis] = _choose(axis, records[axis], rate, entry.resolution, config)
     kinematics = Kinematics(
-        method,
+        "kalman" if config.method == "auto" else config.method,
         rate,
-        {axis: choice.filter for axis, choice in choices.items()},
+        filters,
         min(config.force_cutoff_hz or _FORCE_CUTOFF_HZ, _HIGHEST_CUTOFF * rate),
     )
     path = out / "filter/kinematics.parquet"
@@ -159,7 +159,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.9, "the band of motion and force")
     system = compile_model(Model(load_device(run, session.device)))
     names = [k for k in ids if k in written.interpolated]
-    bands = _bands(system, out, session, kinematics, names, config)
+    # Where residuals are compared, from the trials just written.
+    sensors = Sensors.from_result(session, system.coordinates, system.model.device.forces)
+    bands = find_band(
+        system, _motions(path, names, system, {}), sensors, kinematics, config.band_hz
+    )
     widest = max(band.cutoff_hz for band in bands.values())
     needed = min(_CUTOFF_OVER_BAND * widest, _HIGHEST_CUTOFF * rate)
     if not config.force_cutoff_hz and widest > LEAST_HZ and needed > kinematics.input_cutoff_hz:
@@ -171,17 +175,46 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     held_out = held_out_trials(run)
     fitted = [k for k, name in enumerate(free) if name not in held_out]
     band = Band(rate, tuple(bands[axis].cutoff_hz for axis in system.coordinates))
-    dead = _dead(session)
+    dead = {
+        name: tuple(Disturbance.of(one, reason=describe_dead_stretch(one)) for one in stretches)
+        for name, stretches in session.dead.items()
+    }
     offsets: dict[str, dict[str, float]] = {}
     # Nobody zeroes a sensor between two stretches of one record.
     if trials.loc[trials["trial_id"].isin(free), "file"].nunique() > 1:
         offsets = find_force_offsets(system, _motions(path, free, system, dead), band, fitted)
     if offsets:
         written = _write_motions(path, samples, ids, kinematics, progress, offsets)
-    disturbances = _disturbances(_motions(path, free, system, dead), system, band, fitted, dead)
-    result = _result(config, kinematics, axes, choices, written, bands, disturbances, offsets)
+    disturbances = dict(dead)
+    motions = _motions(path, free, system, dead)
+    for name, found in find_disturbances(system, motions, band, fitted).items():
+        both = (*dead.get(name, ()), *found)
+        disturbances[name] = tuple(sorted(both, key=lambda one: one.start_s))
+    default = "default: bandwidth and order by maximum likelihood, gaps bridged with error bands"
+    result = FilterResult(
+        method=kinematics.method,
+        method_reason=default if config.method == "auto" else "chosen by the user",
+        sample_rate_hz=rate,
+        axes={
+            axis: AxisDifferentiation.of(
+                unit=axes[axis].unit,
+                band=bands[axis],
+                **written.median_sds(axis),
+                **about[axis],
+            )
+            for axis in axes
+        },
+        force=ForceFilter(derivative_cutoff_hz=kinematics.input_cutoff_hz),
+        bridged_fraction=written.interpolated,
+        skipped=written.skipped,
+        disturbances=disturbances,
+        force_offsets=offsets,
+        headline=f"{kinematics.method}, {len(written.interpolated)} trials; bandwidth "
+        f"{_list_hz({axis: one.bandwidth_hz for axis, one in filters.items()})}; residuals compared"
+        f" below {_list_hz({axis: one.cutoff_hz for axis, one in bands.items()})}",
+    )
     progress(0.97, "the set-up")
-    setup = _inspect(system, out, session, names, of_kind - held_out, bands, disturbances)
+    setup = _inspect(system, path, session, names, of_kind - held_out, bands, disturbances)
     setup.write(out)
     notes = [f"{name}: not used: {reason}" for name, reason in written.skipped.items()]
     notes += _describe_offsets(offsets, session)
@@ -250,17 +283,6 @@ def _write_motions(
     return written
 
 
-def _dead(session: IngestResult) -> dict[str, tuple[Disturbance, ...]]:
-    """Where a sensor of a moving trial is dead, by trial."""
-    return {
-        name: tuple(
-            Disturbance(start_s=one.start_s, end_s=one.end_s, reason=describe_dead_stretch(one))
-            for one in stretches
-        )
-        for name, stretches in session.dead.items()
-    }
-
-
 def _motions(
     path: Path,
     names: Sequence[str],
@@ -273,21 +295,6 @@ def _motions(
         return read_motion_of(path, names[number], system, left_out.get(names[number], ()))
 
     return TrialCache(read, len(names), n_samples, names=names)
-
-
-def _disturbances(
-    motions: TrialCache[Motion],
-    system: System,
-    band: Band,
-    fitted: Sequence[int],
-    dead: Mapping[str, tuple[Disturbance, ...]],
-) -> dict[str, tuple[Disturbance, ...]]:
-    """Where a sensor is dead, and what else disturbs the free trials."""
-    found = dict(dead)
-    for name, stretches in find_disturbances(system, motions, band, fitted).items():
-        both = (*found.get(name, ()), *stretches)
-        found[name] = tuple(sorted(both, key=lambda one: one.start_s))
-    return found
 
 
 def _describe_offsets(
@@ -311,7 +318,7 @@ def _describe_offsets(
 
 def _inspect(
     system: System,
-    out: Path,
+    path: Path,
     session: IngestResult,
     ids: Sequence[str],
     free: Collection[str],
@@ -321,7 +328,6 @@ def _inspect(
     """Hold the set-up against some trials ``ids``, those in ``free`` fitted."""
     fitted, others = ([k for k in ids if (k in free) == side] for side in (True, False))
     chosen = [some[k] for some in (fitted, others) for k in spread(len(some))]
-    path = out / "filter/kinematics.parquet"
     motions = [
         read_motion_of(path, name, system, disturbances.get(name, ()), every_input=True)
         for name in chosen
@@ -330,21 +336,6 @@ def _inspect(
     folds = Folds.of_trials(chosen, (), fitted)
     cutoffs = tuple(min(bands[axis].cutoff_hz, HIGHEST_HZ) for axis in system.coordinates)
     return inspect_setup(system, session, motions, Band(session.sample_rate_hz, cutoffs), folds)
-
-
-def _bands(
-    system: System,
-    out: Path,
-    session: IngestResult,
-    kinematics: Kinematics,
-    ids: Sequence[str],
-    config: Config,
-) -> dict[str, ResidualBand]:
-    """Find the band in which residuals are compared, from the trials just written."""
-    path = out / "filter/kinematics.parquet"
-    motions = _motions(path, ids, system, {})
-    sensors = Sensors.from_result(session, system.coordinates, system.model.device.forces)
-    return find_band(system, motions, sensors, kinematics, config.band_hz)
 
 
 def _load(samples: Path, trial_id: str, rate: float) -> _Trial | str:
@@ -386,8 +377,8 @@ def _tuning_records(
 
 def _choose(
     axis: str, records: list[tuple[Array, Flags]], rate: float, resolution: float, config: Config
-) -> _Choice:
-    """Return how to differentiate ``axis``, of which there are these ``records``."""
+) -> tuple[AxisFilter, dict[str, Any]]:
+    """Return how to differentiate ``axis``, of which there are these ``records``, and why."""
     fits = {
         order: kalman_smoother.maximum_likelihood(
             records,
@@ -441,7 +432,7 @@ def _choose(
     }
     if kalman:
         report["order"] = order
-    return _Choice(AxisFilter(cutoff, noise_sd, order if kalman else 0), report)
+    return AxisFilter(cutoff, noise_sd, order if kalman else 0), report
 
 
 def _differentiate(
@@ -450,7 +441,6 @@ def _differentiate(
     """Return the rows of one trial and, per axis, the median error bands (position, ...)."""
     grid, frame = trial.grid, trial.frame
     columns: dict[str, object] = {"trial_id": trial.trial_id, "t": grid.t}
-    bands: dict[str, tuple[float, float, float]] = {}
     motions = {
         axis: kinematics.differentiate(
             axis, grid.resample(frame[f"q_{axis}"].to_numpy(dtype=np.float64)), trial.observed
@@ -460,74 +450,19 @@ def _differentiate(
     columns |= {f"q_{axis}": motion.position for axis, motion in motions.items()}
     columns |= {f"qd_{axis}": motion.velocity for axis, motion in motions.items()}
     columns |= {f"qdd_{axis}": motion.acceleration for axis, motion in motions.items()}
-    columns |= dict(_inputs(grid, frame, kinematics))
-    for name in _named(frame, "brake_"):
-        columns[name] = grid.hold(frame[name].to_numpy(dtype=np.float64))
-    for axis, motion in motions.items():
-        columns[f"q_sd_{axis}"] = motion.position_sd
-        columns[f"qd_sd_{axis}"] = motion.velocity_sd
-        columns[f"qdd_sd_{axis}"] = motion.acceleration_sd
-        bands[axis] = (
-            float(np.median(motion.position_sd)),
-            float(np.median(motion.velocity_sd)),
-            float(np.median(motion.acceleration_sd)),
-        )
-    columns["bridged"] = grid.bridged
-    return pd.DataFrame(columns), bands
-
-
-def _named(frame: pd.DataFrame, prefix: str) -> tuple[str, ...]:
-    """Return the columns whose names start with ``prefix``."""
-    return tuple(str(name) for name in frame.columns if str(name).startswith(prefix))
-
-
-def _inputs(
-    grid: UniformGrid, frame: pd.DataFrame, kinematics: Kinematics
-) -> Iterator[tuple[str, Array]]:
-    """Yield the forces and other input channels, and their band-limited time derivatives."""
-    taken = ("trial_id", "t", *_named(frame, "q_"), *_named(frame, "brake_"))
-    names = [str(name) for name in frame.columns if name not in taken]
+    # Forces and other input channels, and their band-limited time derivatives.
+    names = [n for n in map(str, frame.columns[2:]) if not n.startswith(("q_", "brake_"))]
     inputs = {name: grid.resample(frame[name].to_numpy(dtype=np.float64)) for name in names}
-    yield from inputs.items()
+    columns |= inputs
     for name, values in inputs.items():
-        yield from zip(input_derivatives(name), kinematics.input_rates(values), strict=True)
-
-
-def _result(
-    config: Config,
-    kinematics: Kinematics,
-    axes: Mapping[str, EncoderChannel],
-    choices: dict[str, _Choice],
-    written: _Written,
-    bands: Mapping[str, ResidualBand],
-    disturbances: dict[str, tuple[Disturbance, ...]],
-    offsets: dict[str, dict[str, float]],
-) -> FilterResult:
-    """Return what filter.json holds."""
-    entries = {}
-    for axis, choice in choices.items():
-        position, velocity, acceleration = np.median(np.array(written.levels[axis]), axis=0)
-        entries[axis] = AxisDifferentiation(
-            unit=axes[axis].unit,
-            position_sd=position,
-            velocity_sd=velocity,
-            acceleration_sd=acceleration,
-            band=bands[axis],
-            **choice.report,
-        )
-    widest = ", ".join(f"{axis} {c.filter.bandwidth_hz:.1f} Hz" for axis, c in choices.items())
-    residuals = ", ".join(f"{axis} {band.cutoff_hz:.1f} Hz" for axis, band in bands.items())
-    default = "default: bandwidth and order by maximum likelihood, gaps bridged with error bands"
-    return FilterResult(
-        method=kinematics.method,
-        method_reason=default if config.method == "auto" else "chosen by the user",
-        sample_rate_hz=kinematics.rate_hz,
-        axes=entries,
-        force=ForceFilter(derivative_cutoff_hz=kinematics.input_cutoff_hz),
-        bridged_fraction=written.interpolated,
-        skipped=written.skipped,
-        disturbances=disturbances,
-        force_offsets=offsets,
-        headline=f"{kinematics.method}, {len(written.interpolated)} trials; bandwidth {widest}; "
-        f"residuals compared below {residuals}",
-    )
+        columns |= zip(input_derivatives(name), kinematics.input_rates(values), strict=True)
+    for name in (str(name) for name in frame.columns if str(name).startswith("brake_")):
+        columns[name] = grid.hold(frame[name].to_numpy(dtype=np.float64))
+    medians = {}
+    for axis, motion in motions.items():
+        sds = (motion.position_sd, motion.velocity_sd, motion.acceleration_sd)
+        columns |= zip((f"{rate}_sd_{axis}" for rate in ("q", "qd", "qdd")), sds, strict=True)
+        position, velocity, acceleration = (float(np.median(sd)) for sd in sds)
+        medians[axis] = (position, velocity, acceleration)
+    columns["bridged"] = grid.bridged
+    return pd.DataFrame(columns), medians

@@ -59,11 +59,7 @@ class Config(CleaningLimits):
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Write the sound trials of a session and what became of each.
-
-    Raises:
-        InputError: a mistake in the session file, or no trial is sound.
-    """
+    """Write the sound trials of a session and what became of each."""
     if not config.session:
         raise InputError("no session folder given", remedy="bampipe ingest SESSION")
     session = read_session(Path(config.session))
@@ -76,9 +72,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     every = thinning_factor(session.sample_rate, config.fastest_hz)
     with ParquetAppender(out / "ingest/samples.parquet") as samples:
         rows = _ingest_trials(session, config, every, channels, samples, progress)
-    trials = _trials_table(rows)
+    text = ("trial_id", "file", "kind", "locked_axis", "status", "reason", "repairs")
+    trials = pd.DataFrame(rows).drop(columns="dead").astype(dict.fromkeys(text, "string"))
     write_parquet(out / "ingest/trials.parquet", trials)
-    rate = _rate(session.sample_rate / every, trials)
+    # The announced rate, or the median of the trials where the time stamps say otherwise.
+    rate, measured = session.sample_rate / every, float(trials["sample_rate_hz"].median())
+    if abs(measured - rate) > RATE_TOLERANCE * rate:
+        rate = measured
     description = _description(session, device, rate, every, channels, rows)
     description.write(out)
     if session.device_file is not None:
@@ -106,11 +106,7 @@ def _ingest_trials(
     samples: ParquetAppender,
     progress: Progress,
 ) -> list[dict[str, Any]]:
-    """Write the samples of the sound trials, and return what became of each.
-
-    Raises:
-        InputError: none is sound.
-    """
+    """Write the samples of the sound trials, and return what became of each; refuse if none is."""
     rows: list[dict[str, Any]] = []
     copies = find_copies(session)
     encoders = {each.name for each in session.channels if each.second_encoder_of}
@@ -131,7 +127,10 @@ def _ingest_trials(
         if noise:
             channels.measure_noise(trial)
         rows.append(_row(entry, trial, ""))
-        _append(samples, entry, trial)
+        ids = pa.DictionaryArray.from_arrays(
+            np.zeros(len(trial.t), dtype=np.int32), pa.array([entry.trial_id])
+        )
+        samples.append({"trial_id": ids, "t": trial.t, **trial.columns})
     if all(row["status"] == "set_aside" for row in rows):
         first, *others = _reasons(rows, str(session.root))
         raise InputError(
@@ -171,13 +170,6 @@ def _reasons(rows: list[dict[str, Any]], where: str) -> list[InputError]:
     ]
 
 
-def _append(samples: ParquetAppender, entry: TrialEntry, trial: CleanTrial) -> None:
-    ids = pa.DictionaryArray.from_arrays(
-        np.zeros(len(trial.t), dtype=np.int32), pa.array([entry.trial_id])
-    )
-    samples.append({"trial_id": ids, "t": trial.t, **trial.columns})
-
-
 def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, Any]:
     status = "set_aside"
     if trial is not None:
@@ -199,18 +191,6 @@ def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, 
     }
 
 
-def _trials_table(rows: list[dict[str, Any]]) -> pd.DataFrame:
-    table = pd.DataFrame(rows).drop(columns="dead")
-    text = ("trial_id", "file", "kind", "locked_axis", "status", "reason", "repairs")
-    return table.astype(dict.fromkeys(text, "string"))
-
-
-def _rate(announced: float, trials: pd.DataFrame) -> float:
-    """The ``announced`` rate, or the median of the trials where the time stamps say otherwise."""
-    measured = float(trials["sample_rate_hz"].median())
-    return announced if abs(measured - announced) <= RATE_TOLERANCE * announced else measured
-
-
 def _description(
     session: Session,
     device: Device,
@@ -224,48 +204,34 @@ def _description(
     encoders, forces = channels.encoders(), channels.forces()
     counted = channels.count_warnings()
     own = session.device_file is not None
-    return IngestResult(
-        session_id=session.session_id,
+    return IngestResult.of(
+        session,
         device=device.name,
         device_file=session.device if own else None,
         placeholders=tuple(placeholders(device.declaration)) if own else (),
         device_digest=digest_content(device.declaration) if own else "",
         driven=bool(device.drive),
         default_effects=device.default_effects,
-        recorded_at=session.recorded_at,
-        operator=session.operator,
-        device_serial=session.device_serial,
-        notes=session.notes,
-        simulated=session.simulated,
         sample_rate_hz=rate,
         announced_rate_hz=session.sample_rate,
         kept_every=every,
         axes={
-            encoder.axis: EncoderChannel(
-                unit=encoder.unit,
-                resolution=encoders[encoder.axis].resolution,
+            encoder.axis: EncoderChannel.of(
+                encoders[encoder.axis],
+                encoder,
                 resolution_stated=encoders[encoder.axis].stated,
                 resolution_measured=encoders[encoder.axis].measured,
-                noise_sd=encoders[encoder.axis].noise_sd,
-                scale=encoder.scale,
-                zero=encoder.zero,
-                counts_per_unit=encoder.counts_per_unit,
                 raw_unit=encoder.stated_unit,
-                scale_sd=encoder.scale_sd,
             )
             for encoder in session.encoders
         },
-        force=ForceChannels(
+        force=ForceChannels.of(
+            force,
             columns=force.names if force else (),
             unit=device.force_unit,
             noise_sd={name: found.noise_sd for name, found in forces.items()},
             noise_sd_stated=force.noise_sd if force else None,
             noise_sd_measured={name: found.measured for name, found in forces.items()},
-            calibration=force.calibration if force else (),
-            zero=force.zero if force else (),
-            raw_unit=force.raw_unit if force else "",
-            gain_sd=force.gain_sd if force else 0.0,
-            crosstalk_sd=force.crosstalk_sd if force else 0.0,
             look_like_counts=tuple(counted),
         ),
         sensor_warnings=(
@@ -276,17 +242,7 @@ def _description(
         brakes={
             f"brake_{brake.axis}": RecordedChannel(unit=brake.unit) for brake in session.brakes
         },
-        channels={
-            channel.name: RecordedChannel(
-                unit=channel.unit,
-                scale=channel.scale,
-                offset=channel.offset,
-                raw_unit=channel.raw_unit,
-                scale_sd=channel.scale_sd,
-                second_encoder_of=channel.second_encoder_of,
-            )
-            for channel in session.channels
-        },
+        channels={channel.name: RecordedChannel.of(channel) for channel in session.channels},
         dead={row["trial_id"]: row["dead"] for row in rows if row["dead"]},
     )
 

@@ -47,7 +47,7 @@ from bampipe.phrases.proposal import explain_proposal, find_shown, say_trajector
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
-from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
+from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.next import (
@@ -59,7 +59,7 @@ from bampipe.results.next import (
     Purpose,
     Trajectory,
 )
-from bampipe.results.validate import JudgedError, ValidateResult
+from bampipe.results.validate import ValidateResult
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials, trial_of_block
 from bampipe.trials.motion import Motion
@@ -156,7 +156,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         plan = _plan(case, forecast, space, ranked, result.proposals[0])
         result = result.model_copy(update={"plan": plan})
     result.write(out)
-    _write_earlier(run, out, result)
+    # Earlier proposals whose trial may still come, each named by its content.
+    for one in find_open(read_forecasts(run.root, result.model), result):
+        content = one.model_dump(mode="json")
+        name = f"{digest_content(content)[:12]}.json"
+        write_json(out / NextResult.EARLIER.format(model=result.model) / name, content)
     if result.plan is not None:
         # typst is slow to import: only here
         from bampipe.report.protocol import protocol_sheet
@@ -185,10 +189,8 @@ def _read_case(
         )
     p, found = identified(run, config.model, system), run.read(IdentifyResult, config.model)
     purpose, parameter = _split(config.purpose, list(found.parameters))
-    diagnosed = None
-    if run.exists(DiagnoseResult.file(config.model)):
-        diagnosed = run.read(DiagnoseResult, config.model)
-    elif purpose == "decision":
+    diagnosed = run.find(DiagnoseResult, config.model)
+    if diagnosed is None and purpose == "decision":
         raise InputError(
             "what is to be decided is not known yet",
             where=str(run.root),
@@ -246,7 +248,11 @@ def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
         count = count_affordable(forecast.rehearsal, seconds)
         drawn = list_trajectories(forecast.rehearsal, case.limits, seconds, count)
         return DesignSpace(forecast.rehearsal, seconds, (), drawn, is_driven=True)
-    free = [motion for motion in case.fitted if not _is_braked(motion, brakes)]
+    free = [
+        motion
+        for motion in case.fitted
+        if not any(motion.channels[n].any() for n in brakes.values() if n in motion.channels)
+    ]
     examples, of_effects = imitate_trials(free, case.seen, seconds), forecast.purpose != "precision"
     # No parameters are fitted to what has the brakes on, but for those of brakes.
     brakes_on = of_effects or case.system.braked
@@ -365,14 +371,6 @@ def _write_trajectory(
     return result.model_copy(update={"trajectory": followed})
 
 
-def _write_earlier(run: RunFolder, out: Path, result: NextResult) -> None:
-    """Write the earlier proposals whose trial may still come, each named by its content."""
-    for one in find_open(read_forecasts(run.root, result.model), result):
-        content = one.model_dump(mode="json")
-        name = f"{digest_content(content)[:12]}.json"
-        write_json(out / NextResult.EARLIER.format(model=result.model) / name, content)
-
-
 def _split(asked: str, names: Sequence[str]) -> tuple[Purpose | Literal["auto"], str]:
     """The purpose that ``asked`` means, and the parameter where it is one of ``names``."""
     if asked in names:
@@ -416,16 +414,9 @@ def _find_detectability(case: _Case) -> Detectability:
 
 def _find_lacking(case: _Case) -> list[str]:
     """Axes whose held-out error is above the noise floor."""
-    entries: Mapping[str, AxisVerdict | JudgedError] = {}
-    if case.diagnosed is not None:
-        entries = case.diagnosed.axes
-    elif case.run.exists(ValidateResult.file(case.config.model)):
-        entries = case.run.read(ValidateResult, case.config.model).axes
-    return [axis for axis, entry in entries.items() if entry.standing == "above_floor"]
-
-
-def _is_braked(motion: Motion, brakes: Mapping[str, str]) -> bool:
-    return any(motion.channels[name].any() for name in brakes.values() if name in motion.channels)
+    found = case.diagnosed or case.run.find(ValidateResult, case.config.model)
+    axes = found.axes.items() if found is not None else ()
+    return [axis for axis, entry in axes if entry.standing == "above_floor"]
 
 
 def _summary(result: NextResult) -> dict[str, object]:

@@ -50,15 +50,25 @@ class Config:
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Map joint stiffness, friction and inertia to the handle over the poses of the session.
-
-    Raises:
-        InputError: a setting out of range, or a handle that no pose lets move every way.
-    """
+    """Map joint stiffness, friction and inertia to the handle over the poses of the session."""
     system = compile_model(load_model(run, config.model))
     device = system.model.device
     p = identified(run, config.model, system)
-    reach = _reach(run, system)
+    # The range of each axis that the moving trials covered, (n_q, 2).
+    columns = [f"q_{axis}" for axis in system.coordinates]
+    q = read_parquet(run.require("filter/kinematics.parquet", "filter"), columns=columns)
+    reach = np.stack(
+        [np.nanmin(q.to_numpy(dtype=float), 0), np.nanmax(q.to_numpy(dtype=float), 0)], 1
+    )
+    # Its largest quantile leaves out the noise of the force sensor.
+    forces = read_parquet(
+        run.require("ingest/samples.parquet", "ingest"), columns=[*device.forces]
+    ).to_numpy(dtype=float)
+    sizes = np.linalg.norm(forces, axis=1)
+    sizes = sizes[np.isfinite(sizes)]
+    largest = (
+        Quantity(value=np.quantile(sizes, 0.999), unit=device.force_unit) if sizes.size else None
+    )
     # Only a handle that can be pushed as many ways as there are axes has a stiffness of its own;
     # where a motor drives the device, there is none.
     ways = len(device.forces) == len(system.coordinates)
@@ -67,12 +77,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     return PerformanceResult(
         model=config.model,
         headline=_headline(handle, device.prescribed) if handle else "No handle on this device.",
-        constants={
-            name: DeviceConstant(
-                value=item.value, unit=item.unit, source=item.source, description=item.description
-            )
-            for name, item in device.constants.items()
-        },
+        constants={name: DeviceConstant.of(item) for name, item in device.constants.items()},
         range={
             axis: Range(lower=low, upper=high, unit=unit)
             for axis, unit, (low, high) in zip(
@@ -83,37 +88,12 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             axis: Resolution(value=entry.resolution, unit=entry.unit)
             for axis, entry in run.read(IngestResult).axes.items()
         },
-        largest_force=_largest_force(run, system),
+        largest_force=largest,
         handle=handle,
     ).write(out)
 
 
-def _reach(run: RunFolder, system: System) -> Array:
-    """Return the range of each axis that the moving trials covered, (n_q, 2)."""
-    columns = [f"q_{axis}" for axis in system.coordinates]
-    q = read_parquet(run.require("filter/kinematics.parquet", "filter"), columns=columns)
-    values = q.to_numpy(dtype=float)
-    return np.stack([np.nanmin(values, axis=0), np.nanmax(values, axis=0)], axis=1)
-
-
-def _largest_force(run: RunFolder, system: System) -> Quantity | None:
-    """Return the largest force that the sensor read, its noise left out by the 99.9 % quantile."""
-    device = system.model.device
-    frame = read_parquet(run.require("ingest/samples.parquet", "ingest"), columns=[*device.forces])
-    size = np.linalg.norm(frame.to_numpy(dtype=float), axis=1)
-    size = size[np.isfinite(size)]
-    if not size.size:
-        return None
-    return Quantity(value=np.quantile(size, 0.999), unit=device.force_unit)
-
-
-def _handle(
-    run: RunFolder,
-    system: System,
-    p: Array,
-    reach: Array,
-    points: int,
-) -> Handle:
+def _handle(run: RunFolder, system: System, p: Array, reach: Array, points: int) -> Handle:
     """Return ranges over poses and directions of what acts at the handle.
 
     With v = B^T q' the handle's velocity: its volume element is |det B| dq, joint stiffness K is

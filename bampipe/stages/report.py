@@ -70,11 +70,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 
 
 def write_page_of_two(first: Path, second: Path) -> Path:
-    """Write the page of two runs beside the folder of the first, and return its path.
-
-    Raises:
-        InputError: one of them has no results, or they are not of one device.
-    """
+    """Write the page of two runs beside the folder of the first, and return its path."""
     from bampipe.report.explorer.page import explorer_page
     from bampipe.report.results import Results
 

@@ -18,7 +18,7 @@ from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.gear_windup import Windup, find_windup
-from bampipe.estimate.hysteresis import Branch, Cycle, Hysteresis, hysteresis
+from bampipe.estimate.hysteresis import Hysteresis, hysteresis
 from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.ingest import IngestResult
@@ -45,6 +45,12 @@ _SMOOTHED_S = 0.05
 """Over which the velocity is averaged, whose sign the drive's friction follows."""
 _SURE = 3.0
 """Standard uncertainties from which on compliance and play are more than nothing."""
+
+_COLUMNS = {
+    "trial_id": "str", "axis": "str", "cycle": "int64", "branch": "str",
+    "t": "float64", "torque": "float64", "deflection": "float64", "post_yield": "bool",
+}  # fmt: skip
+"""Of loops.parquet, and their types."""
 
 Array = NDArray[np.float64]
 
@@ -111,8 +117,18 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         for axis in system.coordinates
         if axis in loops
     }
-    _write_loops(out / "stiffness/loops.parquet", loops)
-    headline = "; ".join([*_describe_axes(axes), *_describe_gears(gears)]) or notes[-1]
+    with ParquetAppender(out / "stiffness/loops.parquet") as file:
+        for axis, found in loops.items():
+            for trial in found:
+                file.append(_loop_rows(axis, trial))
+        if not loops:
+            file.append(pd.DataFrame({n: pd.Series(dtype=kind) for n, kind in _COLUMNS.items()}))
+    said = [
+        f"{axis} {round_with_sd(entry.stiffness, entry.sd)} {entry.unit} "
+        f"({entry.bandwidth_rad_s:.3g} rad/s, {entry.bandwidth_hz:.3g} Hz)"
+        for axis, entry in axes.items()
+    ]
+    headline = "; ".join([*said, *_describe_gears(gears)]) or notes[-1]
     return StiffnessResult(axes=axes, notes=tuple(notes), headline=headline, gears=gears).write(out)
 
 
@@ -134,10 +150,8 @@ def _gears(
             continue
         q = frame[[f"q_{name}" for name in system.coordinates]].to_numpy(dtype=np.float64)
         u = np.column_stack([frame.get(name, 0.0 * frame["t"]) for name in system.inputs])
-        still, p = np.zeros_like(q), system.prior
         t = frame["t"].to_numpy(dtype=np.float64)
-        z = system.memory(q, still, still, u, p, t)
-        load = system.applied(q, still, still, z, u, p)
+        load = _applied(system, q, u, t)
         for axis, channel in second.items():
             number = system.coordinates.index(axis)
             rate = np.gradient(q[:, number], t)
@@ -176,17 +190,14 @@ def _gear(
     sure = size > _SURE * windup.compliance_sd
     if not sure:
         notes.append(f"{axis}: its two encoders do not move apart with the load.")
-    return GearStiffness(
+    return GearStiffness.of(
+        windup,
         stiffness=1.0 / size if sure else None,
         sd=windup.compliance_sd / size**2 if sure else None,
         unit=f"{system.torque_units[number]}/{unit}",
         play=None if windup.play is None else windup.play * np.sign(windup.compliance),
-        play_sd=windup.play_sd,
         play_unit=unit,
-        late_s=windup.late_s,
-        late_sd=windup.late_sd,
         side="motor" if windup.compliance > 0.0 else "load",
-        explained=windup.explained,
         channel=channel,
     )
 
@@ -218,11 +229,8 @@ def _loops_of(
         )
     q = np.stack([held[f"q_{name}"] for name in system.coordinates], axis=1)
     u = np.stack([held[name] for name in system.inputs], axis=1)
-    still = np.zeros_like(q)
-    p = system.prior
-    z = system.memory(q, still, still, u, p, grid.t)
-    number = system.coordinates.index(axis)
-    torque = np.ascontiguousarray(system.applied(q, still, still, z, u, p)[:, number])
+    number, still = system.coordinates.index(axis), np.zeros_like(q)
+    torque = np.ascontiguousarray(_applied(system, q, u, grid.t)[:, number])
     deflection = np.ascontiguousarray(q[:, number])
     try:
         found = hysteresis(torque, deflection, rate)
@@ -244,16 +252,20 @@ def _calibration(
     deflection: Array,
 ) -> dict[str, float]:
     """Share of the stiffness of axis ``number`` that one standard uncertainty of each source is."""
-    signals, p = Signals.of_session(system, session), system.prior
+    signals = Signals.of_session(system, session)
     found = {}
     for name, change in calibration_changes(signals):
         moved = change.of_motion(motion, signals)
-        u, still = moved.inputs(system.inputs), moved.qd
-        z = system.memory(moved.q, still, still, u, p, moved.t)
-        theirs = system.applied(moved.q, still, still, z, u, p)[:, number]
+        theirs = _applied(system, moved.q, moved.inputs(system.inputs), moved.t)[:, number]
         torques, deflections = _slope(theirs, torque), _slope(moved.q[:, number], deflection)
         found[name] = torques / deflections - 1.0
     return found
+
+
+def _applied(system: System, q: Array, u: Array, t: Array) -> Array:
+    """Generalised force (T, n_q) of inputs u (T, n_u) on a device at rest in poses q (T, n_q)."""
+    still, p = np.zeros_like(q), system.prior
+    return system.applied(q, still, still, system.memory(q, still, still, u, p, t), u, p)
 
 
 def _slope(values: Array, against: Array) -> float:
@@ -295,7 +307,11 @@ def _axis(
                 "brake slips."
             )
     poses = _poses(system, trials[0].pose)
-    bandwidths = {name: _bandwidth(system, number, stiffness, pose) for name, pose in poses.items()}
+    bandwidths = {}
+    for name, pose in poses.items():
+        inertia = float(system.mass_matrix(pose[None, :], system.prior)[0, number, number])
+        speed = float(np.sqrt(stiffness / inertia))
+        bandwidths[name] = Bandwidth(rad_s=speed, hz=speed / (2.0 * np.pi), inertia=inertia)
     stated = "maximum_extension" if "maximum_extension" in bandwidths else "recorded"
     return AxisStiffness(
         stiffness=stiffness,
@@ -320,16 +336,18 @@ def _axis(
         energy_per_cycle=float(np.mean([cycle.energy for _, cycle in cycles])),
         energy_unit="J",
         yielded=all(trial.found.yielded for trial in trials),
-        cycles=tuple(_cycle(trial, cycle) for trial, cycle in cycles),
-        trials={
-            trial.trial_id: LockedTrial(
-                stiffness=trial.found.stiffness,
-                standard_error=trial.found.standard_error,
-                transition=trial.found.transition,
-                slope_change=trial.found.slope_change,
-                drift=_drift(trial),
+        cycles=tuple(
+            LoopCycle.of(
+                cycle,
+                trial_id=trial.trial_id,
+                duration_s=(cycle.stop - cycle.start) / trial.rate,
+                loop_width=cycle.width_torque,
+                loop_width_deflection=cycle.width_deflection,
             )
-            for trial in trials
+            for trial, cycle in cycles
+        ),
+        trials={
+            trial.trial_id: LockedTrial.of(trial.found, drift=_drift(trial)) for trial in trials
         },
     )
 
@@ -339,20 +357,6 @@ def _drift(trial: _Loops) -> float:
     cycles = trial.found.cycles
     reach = 2.0 * max(cycle.amplitude for cycle in cycles) / trial.found.stiffness
     return (cycles[-1].centre - cycles[0].centre) / reach
-
-
-def _cycle(trial: _Loops, cycle: Cycle) -> LoopCycle:
-    """Return what is stored of one cycle."""
-    return LoopCycle(
-        trial_id=trial.trial_id,
-        duration_s=(cycle.stop - cycle.start) / trial.rate,
-        stiffness=cycle.stiffness,
-        loop_width=cycle.width_torque,
-        loop_width_deflection=cycle.width_deflection,
-        energy=cycle.energy,
-        amplitude=cycle.amplitude,
-        centre=cycle.centre,
-    )
 
 
 def _poses(system: System, recorded: Array) -> dict[str, Array]:
@@ -372,32 +376,6 @@ def _poses(system: System, recorded: Array) -> dict[str, Array]:
     return poses
 
 
-def _bandwidth(system: System, number: int, stiffness: float, pose: Array) -> Bandwidth:
-    """Return sqrt(K / M_ii) at ``pose`` in both units, and M_ii."""
-    inertia = float(system.mass_matrix(pose[None, :], system.prior)[0, number, number])
-    speed = float(np.sqrt(stiffness / inertia))
-    return Bandwidth(rad_s=speed, hz=speed / (2.0 * np.pi), inertia=inertia)
-
-
-def _write_loops(path: Path, loops: Mapping[str, list[_Loops]]) -> None:
-    """Write every sample of the whole cycles; an empty table where there are none."""
-    with ParquetAppender(path) as file:
-        for axis, trials in loops.items():
-            for trial in trials:
-                file.append(_loop_rows(axis, trial))
-        if not loops:
-            file.append(_no_rows())
-
-
-def _no_rows() -> pd.DataFrame:
-    """Return the table without rows."""
-    kinds = {
-        "trial_id": "str", "axis": "str", "cycle": "int64", "branch": "str",
-        "t": "float64", "torque": "float64", "deflection": "float64", "post_yield": "bool",
-    }  # fmt: skip
-    return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in kinds.items()})
-
-
 def _loop_rows(axis: str, trial: _Loops) -> pd.DataFrame:
     """Return the samples of one trial, branch by branch; deflection from the recorded pose."""
     parts = []
@@ -410,7 +388,7 @@ def _loop_rows(axis: str, trial: _Loops) -> pd.DataFrame:
                     "trial_id": trial.trial_id,
                     "axis": axis,
                     "cycle": np.int64(number // 2),
-                    "branch": _side(branch),
+                    "branch": "rising" if branch.direction > 0 else "falling",
                     "t": rows / trial.rate,
                     "torque": torque,
                     "deflection": trial.deflection[rows],
@@ -420,20 +398,6 @@ def _loop_rows(axis: str, trial: _Loops) -> pd.DataFrame:
             )
         )
     return pd.concat(parts, ignore_index=True)
-
-
-def _side(branch: Branch) -> str:
-    """Return the name of the branch."""
-    return "rising" if branch.direction > 0 else "falling"
-
-
-def _describe_axes(axes: Mapping[str, AxisStiffness]) -> list[str]:
-    """The stiffness of every axis that was locked."""
-    return [
-        f"{axis} {round_with_sd(entry.stiffness, entry.sd)} {entry.unit} "
-        f"({entry.bandwidth_rad_s:.3g} rad/s, {entry.bandwidth_hz:.3g} Hz)"
-        for axis, entry in axes.items()
-    ]
 
 
 def _describe_gears(gears: Mapping[str, GearStiffness]) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -30,7 +30,6 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.rounding import significant
 from bampipe.results.validate import (
-    AxisError,
     ForceError,
     FreeRun,
     JudgedError,
@@ -111,14 +110,20 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     require_sound_motions(system, trials.motions)
     progress(0.1, "held-out fits")
     evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds)
-    timing = estimates.input_timing
     # Parameters found with the inputs late are those of inputs that late.
-    late_s = timing.estimate - trials.late_s if timing is not None else 0.0
+    late_s = estimates.input_timing.estimate - trials.late_s
     compared = [compare_trial(evidence, k, p, late_s) for k in range(len(trials.motions))]
     expected = np.ones(len(system.coordinates))
     if np.any(published_rmse(compared) > REFUSAL_RATIO * evidence.held_out_rmse):
         expected = expected_published_ratio(evidence, trials, p, config.seed)
-    notes = _what_is_held_out(trials)
+    notes = []
+    if trials.blocks == len(trials.motions):
+        notes.append(
+            f"One trial: it is left out in {trials.blocks} blocks with gaps between them, by"
+            " parameters fitted to the others."
+        )
+    if trials.folds.nothing_held_out:
+        notes.append("One trial, or one group: nothing is held out; the error is that of the fit.")
     floor: NoiseFloor | None = None
     if config.noise_floor:
         recipe = read_recipe(run, config.model, model)
@@ -131,25 +136,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if system.model.device.robot is not None:
         notes += _silent_joints(system, compared, floor)
     with ParquetAppender(out / f"models/{config.model}/residuals.parquet") as file:
-        for frame in _tables(system, compared):
-            file.append(frame)
+        for name, parts in groupby(compared, key=lambda c: trial_of_block(c.trial_id)):
+            tables = [_tabulate_residuals(system, name, c) for c in parts]
+            file.append(pd.concat(tables, ignore_index=True))
     describe_terms(evidence, p, estimates.covariance, config.model).write(out)
     return _result(run, system, trials, compared, expected, floor, free, notes, estimates).write(
         out
     )
-
-
-def _what_is_held_out(trials: MeasuredTrials) -> list[str]:
-    """Say where it is not one trial after another."""
-    notes = []
-    if trials.blocks == len(trials.motions):
-        notes.append(
-            f"One trial: it is left out in {trials.blocks} blocks with gaps between them, by"
-            " parameters fitted to the others."
-        )
-    if trials.folds.nothing_held_out:
-        notes.append("One trial, or one group: nothing is held out; the error is that of the fit.")
-    return notes
 
 
 def _noise_floor(
@@ -163,7 +156,10 @@ def _noise_floor(
     """The floor, None where the fitted model cannot be simulated, and what to say of it."""
     progress(0.4, "noise floor")
     count = config.repeats or floor_replays(trials.motions)
-    chosen = _choose_trials(evidence)
+    # Where the session holds trials out, these are few, and all are needed to judge by.
+    chosen: Sequence[int] = range(len(evidence.motions))
+    if all(evidence.folds.judged):
+        chosen = draw_trials(evidence.sizes)
     drawn = replace(
         trials,
         motions=[trials.motions[k] for k in chosen],
@@ -185,15 +181,6 @@ def _noise_floor(
                 f" says, leave {significant(creeps)}."
             )
     return found.noise_floor, notes
-
-
-def _choose_trials(evidence: Evidence) -> list[int]:
-    """Numbers of the trials that are replayed for the floor, in order.
-
-    Where the session holds trials out, these are few, and all are needed to judge by.
-    """
-    everything = list(range(len(evidence.motions)))
-    return draw_trials(evidence.sizes) if all(evidence.folds.judged) else everything
 
 
 def _run_freely(
@@ -233,21 +220,6 @@ def _silent_joints(
     return found
 
 
-def _judged(
-    found: AxisError, expected_ratio: float, level: float | None, scatter: float
-) -> JudgedError:
-    """Hold the error of one axis against its noise floor ``level``, which scatters so much."""
-    refused = found.published_rmse > REFUSAL_RATIO * expected_ratio * found.held_out_rmse
-    return JudgedError(
-        **vars(found),
-        noise_floor=level,
-        noise_floor_sd=scatter,
-        standing=compare_with_floor(found.held_out_rmse, level, scatter),
-        expected_ratio=expected_ratio,
-        estimate="refused" if refused else "accepted",
-    )
-
-
 def _result(
     run: RunFolder,
     system: System,
@@ -260,15 +232,18 @@ def _result(
     identified: IdentifyResult,
 ) -> ValidateResult:
     """Return what validate.json says."""
-    axes = {
-        axis: _judged(
+    axes = {}
+    for i, (axis, found) in enumerate(axis_errors(system, compared).items()):
+        level, scatter = (floor.level[i], floor.sd[i]) if floor else (None, 0.0)
+        refused = found.published_rmse > REFUSAL_RATIO * expected[i] * found.held_out_rmse
+        axes[axis] = JudgedError.of(
             found,
-            float(expected[i]),
-            floor.level[i] if floor else None,
-            floor.sd[i] if floor else 0.0,
+            noise_floor=level,
+            noise_floor_sd=scatter,
+            standing=compare_with_floor(found.held_out_rmse, level, scatter),
+            expected_ratio=expected[i],
+            estimate="refused" if refused else "accepted",
         )
-        for i, (axis, found) in enumerate(axis_errors(system, compared).items())
-    }
     forces = {}
     for column, name in enumerate(system.model.device.forces):
         error_of = np.concatenate([c.force_residual[c.used.all(axis=1), column] for c in compared])
@@ -301,21 +276,15 @@ def _result(
     )
 
 
-def _tables(system: System, compared: Sequence[ComparedTrial]) -> Iterator[pd.DataFrame]:
-    """Yield residuals.parquet by trial: predictions by parameters that have not seen it."""
-    for name, parts in groupby(compared, key=lambda c: trial_of_block(c.trial_id)):
-        yield pd.concat([_table(system, name, c) for c in parts], ignore_index=True)
-
-
-def _table(system: System, trial_id: str, c: ComparedTrial) -> pd.DataFrame:
+def _tabulate_residuals(system: System, trial_id: str, c: ComparedTrial) -> pd.DataFrame:
+    """Return rows of residuals.parquet: predictions by parameters that have not seen the trial."""
     columns: dict[str, object] = {"trial_id": trial_id, "t": c.t, "held_out": c.judged}
     for i, axis in enumerate(system.coordinates):
         measured = c.measured[:, i]
         columns[f"torque_measured_{axis}"] = measured
         columns[f"torque_predicted_{axis}"] = measured - c.residual_held_out[:, i]
-        columns[f"torque_predicted_without_friction_{axis}"] = (
-            measured - c.residual_without_friction[:, i]
-        )
+        without = measured - c.residual_without_friction[:, i]
+        columns[f"torque_predicted_without_friction_{axis}"] = without
         columns[f"residual_{axis}"] = c.residual_held_out[:, i]
         columns[f"moving_{axis}"] = c.used[:, i]
     for j, name in enumerate(system.model.device.forces):

@@ -71,10 +71,16 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     The brakes' commands are taken out of the model and what they did is put into the filter's
     state; friction and inertia stay as identified, with their uncertainty.
     """
-    trials = _viscous_trials(run)
+    trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
+    trials = trials[(trials["kind"] == "viscous") & (trials["status"] != "set_aside")]
+    path = run.require("filter/kinematics.parquet", "filter")
+    moving = set(read_parquet(path, columns=["trial_id"])["trial_id"].astype(str))
+    trials = trials[trials["trial_id"].astype(str).isin(moving)]
     target = f"models/{config.model}/viscous"
     if trials.empty:
-        write_parquet(out / f"{target}.parquet", _no_rows())
+        kinds = {"t_total": "float64", "trial_id": "str"}
+        rows = pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in kinds.items()})
+        write_parquet(out / f"{target}.parquet", rows)
         headline = "No trials in a viscous field in this session."
         empty = ViscousResult(model=config.model, directions={}, trials=(), headline=headline)
         return empty.write(out)
@@ -86,37 +92,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         Model(bare.device, [*names, FIELD], [*effects, viscous_field(bare.device)])
     )
     progress(0.1, "reading the trials")
-    motions = [_unbraked(read_motion(run, str(t), system), system) for t in trials["trial_id"]]
+    brakes = [name for name in bare.device.brakes.values() if name in system.inputs]
+    motions = []
+    for name in trials["trial_id"]:  # as if no brake had been commanded
+        motion = read_motion(run, str(name), system)
+        motions.append(motion.with_channels({b: np.zeros(motion.t.size) for b in brakes}))
     commanded = trials["viscous_n_s_per_m"].to_numpy(dtype=float)
     result, frame = _estimated(run, system, motions, commanded, identified, config, progress)
     write_parquet(out / f"{target}.parquet", frame)
     return result.write(out)
-
-
-def _viscous_trials(run: RunFolder) -> pd.DataFrame:
-    """Return the rows of the viscous trials that could be used."""
-    trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
-    usable = trials[(trials["kind"] == "viscous") & (trials["status"] != "set_aside")]
-    path = run.require("filter/kinematics.parquet", "filter")
-    moving = set(read_parquet(path, columns=["trial_id"])["trial_id"].astype(str))
-    return usable[usable["trial_id"].astype(str).isin(moving)]
-
-
-def _no_rows() -> pd.DataFrame:
-    """Return the trace without rows."""
-    kinds = {"t_total": "float64", "trial_id": "str"}
-    return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in kinds.items()})
-
-
-def _unbraked(motion: Motion, system: System) -> Motion:
-    """Return the trial as if no brake had been commanded."""
-    none = np.zeros(motion.t.size)
-    return motion.with_channels({system.inputs[i]: none for i in _brakes(system)})
-
-
-def _brakes(system: System) -> list[int]:
-    names = set(system.model.device.brakes.values())
-    return [i for i, name in enumerate(system.inputs) if name in names]
 
 
 def _estimated(
@@ -130,12 +114,10 @@ def _estimated(
 ) -> tuple[ViscousResult, pd.DataFrame]:
     """Return what viscous.json says, and how the estimates converged."""
     known = identified.parameters
-    start = np.array(
-        [
-            known[item.name].estimate if item.name in known else item.prior
-            for item in system.parameters
-        ]
-    )
+    start = system.prior
+    for i, item in enumerate(system.parameters):
+        if item.name in known:
+            start[i] = known[item.name].estimate
     noise = sensor_noise(read_sensors(run, system), system, motions, start, config)
     settings = untuned_settings(system, noise, config)
     if identified.noise is not None and config.force_noise == 0.0:
@@ -143,12 +125,11 @@ def _estimated(
         settings = replace(settings, noise_sd=np.array(found_sd))
     stride = choose_stride(motions)
     settings = replace(settings, stride=stride)
+    brakes = [name in system.model.device.brakes.values() for name in system.inputs]
     readings = []
     for motion in motions:
         trial = load_filter_trial(run, motion, system, start, noise, stride, config)
-        u = trial.u.copy()
-        u[:, _brakes(system)] = 0.0
-        readings.append(replace(trial, u=u))
+        readings.append(replace(trial, u=np.where(brakes, 0.0, trial.u)))
     free = [item for item in system.parameters if not item.fixed]
     late_s = identified.input_timing.estimate
     model = build_filter_model(system, readings, start, False, late_s)

@@ -107,9 +107,13 @@ def test_junit_is_xml_whatever_a_session_is_called(control: str) -> None:
         value=1.0,
         message=f"bad{control}{MARKUP}",
     )
-    suites = [junit.Suite(f"s{control}", (verdict,)), junit.Suite(MARKUP, (), f"no{control}")]
-    top = ElementTree.fromstring(junit.junit(suites))
-    assert [suite.get("name") for suite in top] == [printable(f"s{control}"), MARKUP]
+    outcomes = [
+        Outcome(Path(f"s{control}"), "done", verdicts=(verdict,)),
+        Outcome(Path("s2"), "refused", error=f"no{control}{MARKUP}"),
+    ]
+    top = ElementTree.fromstring(junit.junit(outcomes))
+    names = [printable(str(suite.get("name"))) for suite in top]
+    assert names == [printable(f"s{control}"), "s2"]
     message = top[0][0][0].get("message")
     assert message is not None and message.endswith(MARKUP)
 

@@ -147,14 +147,6 @@ def test_minimum_bandwidth(run: RunFolder) -> None:
         assert "minimum" in entry["bandwidth_reason"]
 
 
-def test_a_trial_too_short_is_named(tmp_path: Path) -> None:
-    frames = {"a": free_trial(0)[0], "b": free_trial(1)[0].iloc[:10]}
-    kinds = {name: ("free", None) for name in frames}
-    content, kinematics = run_stage(write_ingested(tmp_path / "run", frames, kinds, AXES))
-    assert set(kinematics["trial_id"]) == {"a"}
-    assert "10 sound samples" in content["skipped"]["b"]
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -68,14 +68,9 @@ class _Version:
 
 
 def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
-    """Return everything that the page shows; channels as blocks of ``packer``.
+    """Return everything that the page shows of sessions of one device; ``packer`` packs channels.
 
-    Args:
-        sessions: of one device; trials and models of the second stand behind those of the first.
-        packer: what packs their channels.
-
-    Raises:
-        InputError: the sessions have other axes.
+    Trials and models of a second session stand behind those of the first.
     """
     results = sessions[0]
     for other in sessions[1:]:
@@ -101,6 +96,12 @@ def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
         {"name": a, "noun": results.name_force(a), "unit": format_unit(results.force_unit(a))}
         for a in results.axes
     ]
+    tables = [_make_trials(one) for one in shown]
+    for number, diagnosis in reversed(_read_all(versions, DiagnoseResult)):
+        tables.append(_make_candidates(diagnosis, versions[number].label))
+    path = results.root / "ingest/device.toml"
+    robot = read_toml(path).get("robot", {}) if path.is_file() else {}
+    joints = robot.get("joints", {})
     return {
         "models": [_describe_model(version) for version in versions],
         "shown": results.models.index(results.model) if results.models else 0,
@@ -114,8 +115,8 @@ def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
         "parameters": _list_parameters(results, versions),
         "correlations": _list_correlations(versions),
         "verdicts": _list_verdicts(versions),
-        "joints": _list_joints(results),
-        "tables": [table for table in _make_tables(shown, versions) if table["rows"]],
+        "joints": [{"name": name, **joint} for name, joint in joints.items()],
+        "tables": [table for table in tables if table["rows"]],
     }
 
 
@@ -331,13 +332,6 @@ def _describe_effect(diagnosis: DiagnoseResult, axis: str, name: str, share: flo
     return {"name": name, "probability": share, "ranked": entry, "said": text, "sets": sets}
 
 
-def _list_joints(results: Results) -> list[Content]:
-    """Return the joints of a robot as its device file declares them; none of other devices."""
-    path = results.root / "ingest/device.toml"
-    robot = read_toml(path).get("robot", {}) if path.is_file() else {}
-    return [{"name": name, **joint} for name, joint in robot.get("joints", {}).items()]
-
-
 def _list_errors(results: Results, versions: Sequence[_Version]) -> Content:
     """Return, by axis, held-out error and noise floor of each version, in their order."""
     validated = dict(_read_all(versions, ValidateResult))
@@ -345,11 +339,10 @@ def _list_errors(results: Results, versions: Sequence[_Version]) -> Content:
     for axis in results.axes:
         errors = {n: one.axes[axis] for n, one in validated.items() if axis in one.axes}
         if errors:
+            found = [errors.get(number) for number in range(len(versions))]
             ladder[axis] = [
-                {"error": errors[n].held_out_rmse, "floor": errors[n].noise_floor}
-                if n in errors
-                else {"error": None, "floor": None}
-                for n in range(len(versions))
+                {"error": one and one.held_out_rmse, "floor": one and one.noise_floor}
+                for one in found
             ]
     return ladder
 
@@ -384,18 +377,11 @@ def _list_correlations(versions: Sequence[_Version]) -> list[Content]:
     return found
 
 
-def _make_tables(sessions: Sequence[_Session], versions: Sequence[_Version]) -> Iterable[Content]:
-    for session in sessions:
-        yield _make_trials(session)
-    for number, diagnosis in reversed(_read_all(versions, DiagnoseResult)):
-        yield _make_candidates(diagnosis, versions[number].label)
-
-
 def _make_trials(session: _Session) -> Content:
     results = session.results
     validated = results.read(ValidateResult)
     trials = validated.trials if validated else {}
-    axes = results.order_axes(validated.axes) if validated else ()
+    axes = tuple(results.order_axes(validated.axes)) if validated else ()
     rows: list[list[Cell]] = []
     for row in results.trials.to_dict("records"):
         name, kind = str(row["trial_id"]), str(row["kind"])
@@ -425,18 +411,10 @@ def _make_candidates(diagnosis: DiagnoseResult, label: str) -> Content:
         ]
         for entry in diagnosis.ranking
     ]
-    head = [
-        "Effect",
-        "Axis",
-        "Without",
-        "With",
-        "Unit",
-        "Probability",
-        "p",
-        "Indistinguishable from",
-    ]
+    head = ["Effect", "Axis", "Without", "With", "Unit", "Probability", "p"]
     note = (
         "Held-out error without and with each effect; p: probability that replicates give any "
         "candidate as large a gain."
     )
+    head.append("Indistinguishable from")
     return {"title": f"Candidate effects, {label}", "note": note, "head": head, "rows": rows}

@@ -30,13 +30,7 @@ SCRIPTS = (
 
 
 def explorer_page(results: Results, subtitle: str, beside: Results | None = None) -> str:
-    """Return the page for exploring ``results``.
-
-    Args:
-        results: the run folder's.
-        subtitle: device and date.
-        beside: those of another session of the device, to be shown on the same page.
-    """
+    """Return the page for exploring ``results``, and ``beside``, another session of the device."""
     packer = Packer()
     sessions = [results] if beside is None else [results, beside]
     content = gather_content(sessions, packer)

@@ -32,7 +32,13 @@ from bampipe.report.wording import (
     split_name,
 )
 from bampipe.results.compare import CompareResult
-from bampipe.results.diagnose import DiagnoseResult, RankedEffect, ResidualMap, WorstWindow
+from bampipe.results.diagnose import (
+    AxisVerdict,
+    DiagnoseResult,
+    RankedEffect,
+    ResidualMap,
+    WorstWindow,
+)
 from bampipe.results.draft import DraftResult
 from bampipe.results.next import NextResult
 
@@ -66,13 +72,12 @@ def section(results: Results) -> Section:
 def _show_model(
     results: Results, model: str, found: DiagnoseResult, later: Mapping[str, Maps]
 ) -> list[Block]:
-    axes = found.axes
-    names = results.order_axes(axes)
-    sentences = tuple(axes[axis].sentence for axis in names)
-    blocks: list[Block] = [Bullets(sentences), _tabulate_verdicts(found, names)]
+    axes = results.order_axes(found.axes)
+    sentences = tuple(entry.sentence for entry in axes.values())
+    blocks: list[Block] = [Bullets(sentences), _tabulate_verdicts(found, axes)]
     if limits := phrases.limits(found):
         blocks.append(Paragraph(limits))
-    lacking = [axis for axis in names if axis in found.lacking]
+    lacking = [axis for axis in axes if axis in found.lacking]
     if found.ranking and lacking:
         blocks += [_tabulate_ranking(found.ranking), *_tabulate_sets(found)]
     blocks += _advise(results, model, found) if lacking else [_tell_sensitivity(results, model)]
@@ -114,10 +119,9 @@ def _advise(results: Results, model: str, found: DiagnoseResult) -> list[Block]:
     return [results.state_next(found.next)]
 
 
-def _tabulate_verdicts(found: DiagnoseResult, names: Sequence[str]) -> Table:
+def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -> Table:
     rows = []
-    for axis in names:
-        one = found.axes[axis]
+    for axis, one in axes.items():
         errors = (one.rmse_before, one.rmse_after, one.rmse_beyond_bias, one.noise_floor)
         words, share = phrases.verdict(found, axis), phrases.percent_of_force(one.explained)
         left = format_percent(one.explainable_share)

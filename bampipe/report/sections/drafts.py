@@ -70,8 +70,11 @@ def _draw(
             "replicates that lack nothing."
         )
         return style.finish(figure, name, caption)
-    places = {n: _tell_place(effect) for n, effect in effects.items()}
-    drawn = "".join(f" `{n}` is drawn{place}." for n, place in places.items() if place)
+    drawn = ""
+    for n, effect in effects.items():
+        others = join_names(f"{words} {x:.3g}" for words, x in effect.curve.beside.items())
+        place = _DRAWN_AT[effect.acts_as] + (f", at {others}" if others else "")
+        drawn += f" `{n}` is drawn{place}." if place else ""
     caption = (
         f"The draft for {axis} with its 95 % band over the residual of the model (with the sign "
         "of a force: the residual has the opposite one). Error on held-out trials against the "
@@ -79,12 +82,6 @@ def _draw(
         f"formula on the measured trials and on replicates that lack nothing.{drawn}"
     )
     return style.finish(figure, name, caption, panels[:1])
-
-
-def _tell_place(effect: DraftedEffect) -> str:
-    """Say at which values of its other variables a formula is drawn; "" if it has none."""
-    others = [f"{words} {value:.3g}" for words, value in effect.curve.beside.items()]
-    return _DRAWN_AT[effect.acts_as] + (f", at {join_names(others)}" if others else "")
 
 
 def _draw_curve(

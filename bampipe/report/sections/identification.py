@@ -11,7 +11,7 @@ import pandas as pd
 
 from bampipe.lists import join_names
 from bampipe.phrases.results import METHODS
-from bampipe.report import style, verdicts
+from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
 from bampipe.report.results import Results
 from bampipe.report.wording import (
@@ -27,7 +27,6 @@ from bampipe.report.wording import (
 from bampipe.results.identify import (
     BaseEstimate,
     IdentifyResult,
-    InputTiming,
     ParameterEstimate,
     StateBound,
 )
@@ -120,9 +119,11 @@ def _tabulate_parameters(results: Results, identified: IdentifyResult) -> Table:
 def _qualify_intervals(results: Results) -> str:
     """Return a clause on intervals where the model lacks something, else ""."""
     validated = results.read(ValidateResult)
-    ratios = verdicts.error_over_floor(results, results.model) or {}
-    axes = validated.axes if validated else {}
-    lacking = [ratio for axis, ratio in ratios.items() if axes[axis].standing == "above_floor"]
+    lacking = [
+        error.held_out_rmse / error.noise_floor
+        for error in (validated.axes.values() if validated else ())
+        if error.noise_floor and error.standing == "above_floor"
+    ]
     if not lacking:
         return ""
     return (
@@ -178,25 +179,19 @@ def _list_checks(identified: IdentifyResult) -> str:
             f"The mean normalised innovation squared is {mean}; it is 1 where the noise levels "
             "are right."
         )
-    if timing.sd > 0.0:  # else it was not estimated
-        parts.append(_tell_timing(timing))
+    lag, sd = 1e3 * timing.estimate, 1e3 * timing.sd  # ms; 0 where it was not estimated
+    if sd > 0.0 and abs(lag) < NORMAL_95 * sd:
+        shown = f"(the force lags by {format_with_sd(lag, sd)} ms)"
+        parts.append(f"No delay between force and encoders is shown {shown}.")
+    elif sd > 0.0:
+        verb = "lags" if lag > 0.0 else "leads"
+        parts.append(f"The force {verb} the encoders by {format_with_sd(abs(lag), sd)} ms.")
     return " ".join(parts)
-
-
-def _tell_timing(timing: InputTiming) -> str:
-    """Say by how much the force lags the encoders, where the trials show that it does."""
-    lag, sd = 1e3 * timing.estimate, 1e3 * timing.sd
-    if abs(lag) < NORMAL_95 * sd:
-        shown = format_with_sd(lag, sd)
-        return f"No delay between force and encoders is shown (the force lags by {shown} ms)."
-    verb = "lags" if lag > 0.0 else "leads"
-    return f"The force {verb} the encoders by {format_with_sd(abs(lag), sd)} ms."
 
 
 def _tabulate_states(results: Results, bounds: Mapping[str, StateBound]) -> Table:
     rows = []
-    for axis in results.order_axes(bounds):
-        one = bounds[axis]
+    for axis, one in results.order_axes(bounds).items():
         # A smoother before least squares bounds no position: no column of dashes for it.
         place = "" if one.position is None else format_scaled(one.position, results.unit(axis))
         rows.append((axis, place, format_scaled(one.velocity, results.rate_unit(axis))))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -34,7 +33,8 @@ def section(results: Results) -> Section | None:
     if compared is None or len(compared.ladder) < 2:
         return None
     rungs = compared.ladder
-    axes = results.order_axes({axis for rung in rungs for axis in rung.held_out_rmse})
+    known = {axis for rung in rungs for axis in rung.held_out_rmse}
+    axes = [axis for axis in results.axes if axis in known]
     blocks: list[Block] = [_tabulate_errors(results, rungs, axes), _draw(results, rungs, axes)]
     blocks += tabulate_runs(rungs, axes)
     if compared.parameters:
@@ -136,7 +136,12 @@ def _draw(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Figur
         floor = _make_array(rung.sound_floor(axis) for rung in rungs)
         panel.plot(x, error, "o-", color=style.BLUE, ms=4.5, lw=1.3, label="held-out error")
         panel.plot(x, floor, "s--", color=style.VERMILLION, ms=3.0, lw=1.0, label="noise floor")
-        _choose_range(panel, np.concatenate([error, floor]))
+        both = np.concatenate([error, floor])
+        both = both[np.isfinite(both) & (both > 0.0)]
+        if both.size and both.max() > 10.0 * both.min():
+            style.use_decades(panel, both)
+        else:
+            panel.set_ylim(0.0, 1.1 * both.max(initial=0.0) or 1.0)
         panel.set_xlim(-0.4, len(rungs) - 0.6)
         panel.set_xticks(x, _name_ticks(rungs[0].model, error))
         panel.set_xlabel("version, and its error")
@@ -153,15 +158,6 @@ def _name_ticks(first: str, error: np.ndarray) -> list[str]:
         f"{name}\n{format_digits(float(value))}" if number in shown else name
         for number, (name, value) in enumerate(zip(names, error, strict=True))
     ]
-
-
-def _choose_range(panel: Any, values: np.ndarray) -> None:
-    """Set the vertical range; logarithmic where the values span more than a decade."""
-    known = values[np.isfinite(values) & (values > 0.0)]
-    if known.size and known.max() > 10.0 * known.min():
-        style.use_decades(panel, known)
-    else:
-        panel.set_ylim(0.0, 1.1 * known.max(initial=0.0) or 1.0)
 
 
 def _describe_change(rungs: Sequence[Rung], axes: Sequence[str]) -> str:

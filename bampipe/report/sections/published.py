@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from bampipe.files import read_json_table
 from bampipe.report.document import Block, Bullets, Callout, Section, Subheading, Table
 from bampipe.report.results import Results
 from bampipe.report.wording import NONE, format_digits, format_unit, format_with_sd
@@ -22,7 +23,12 @@ def section(results: Results) -> Section | None:
     paper = results.paper
     if paper is None:
         return None
-    rows = [_compare(results, row) for row in paper["rows"]]
+    rows = []
+    for row in paper["rows"]:
+        value, sd = _read_number(results, row, "value"), _read_number(results, row, "sd")
+        shown = format_digits(value) if sd is None else format_with_sd(value, sd)
+        place = (row["quantity"], row["place"], row["published"])
+        rows.append((*place, shown, format_unit(row["unit"])))
     blocks: list[Block] = [_SIMULATED] if results.session.simulated else []
     blocks.append(
         Table(
@@ -37,12 +43,6 @@ def section(results: Results) -> Section | None:
     if notes := tuple(paper.get("notes", {}).get("text", ())):
         blocks += [Subheading("Where this differs from the paper, and why"), Bullets(notes)]
     return Section("Paper and this session", tuple(blocks))
-
-
-def _compare(results: Results, row: dict[str, Any]) -> tuple[str, ...]:
-    value, sd = _read_number(results, row, "value"), _read_number(results, row, "sd")
-    shown = format_digits(value) if sd is None else format_with_sd(value, sd)
-    return (row["quantity"], row["place"], row["published"], shown, format_unit(row["unit"]))
 
 
 def _tabulate_devices(results: Results, comparison: dict[str, Any]) -> Table:
@@ -83,8 +83,8 @@ def _read_number(results: Results, place: dict[str, Any], key: str) -> float | N
     """Return the number that ``place`` names under ``key``, times its factor."""
     if key not in place:
         return None
-    content = results.json(place["file"].format(model=results.model)) or {}
-    value = _find(content, place[key])
+    path = results.root / place["file"].format(model=results.model)
+    value = _find(read_json_table(path) if path.is_file() else {}, place[key])
     return None if value is None else float(place.get("factor", 1.0)) * value
 
 

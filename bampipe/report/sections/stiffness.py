@@ -47,8 +47,7 @@ def section(results: Results) -> Section | None:
 def _tabulate_axes(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:
     rows = []
     poses: dict[str, str] = {}
-    for axis in results.order_axes(axes):
-        one = axes[axis]
+    for axis, one in results.order_axes(axes).items():
         rows.append(
             (
                 axis,
@@ -60,8 +59,10 @@ def _tabulate_axes(results: Results, axes: Mapping[str, AxisStiffness]) -> Table
                 format_digits(one.bandwidth_hz),
             )
         )
-        if pose := _describe_pose(results, one):
-            poses.setdefault(pose, axis)
+        pose = results.order_axes(one.poses.get(one.bandwidth_pose, {}))
+        parts = ", ".join(f"{name} {x:.3g} {results.unit(name)}" for name, x in pose.items())
+        words = split_name(one.bandwidth_pose) + (f" ({parts})" if parts else "")
+        poses.setdefault(words, axis)
     note = (
         "± standard uncertainty: the scatter of the cycles, and the remaining curvature of the loop"
         " after a reversal. Loop width at constant deflection."
@@ -79,8 +80,7 @@ def _tabulate_axes(results: Results, axes: Mapping[str, AxisStiffness]) -> Table
 
 def _tabulate_gears(results: Results, gears: Mapping[str, GearStiffness]) -> Table:
     rows = []
-    for axis in results.order_axes(gears):
-        gear = gears[axis]
+    for axis, gear in results.order_axes(gears).items():
         stiffness, play = "not seen", "not crossed"
         if gear.stiffness is not None and gear.sd is not None:
             stiffness = format_scaled(gear.stiffness, gear.unit, sd=gear.sd)
@@ -97,13 +97,6 @@ def _tabulate_gears(results: Results, gears: Mapping[str, GearStiffness]) -> Tab
         " friction and inertia. Explained: share of the variance of the difference that stiffness"
         " and play explain, after timing and the losses of the drive.",
     )
-
-
-def _describe_pose(results: Results, entry: AxisStiffness) -> str:
-    name = entry.bandwidth_pose
-    pose = entry.poses.get(name, {})
-    parts = [f"{axis} {pose[axis]:.3g} {results.unit(axis)}" for axis in results.order_axes(pose)]
-    return f"{split_name(name)} ({', '.join(parts)})" if parts else split_name(name)
 
 
 def _draw_loops(results: Results, axes: Mapping[str, AxisStiffness], loops: pd.DataFrame) -> Figure:

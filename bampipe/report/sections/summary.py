@@ -85,8 +85,8 @@ def _describe_ladder(results: Results) -> str:
     if last is first:
         return _explain_rejection(results, compared)
     changes = []
-    for axis in results.order_axes(first.held_out_rmse):
-        before, after = first.held_out_rmse[axis], last.held_out_rmse.get(axis)
+    for axis, before in results.order_axes(first.held_out_rmse).items():
+        after = last.held_out_rmse.get(axis)
         floor = last.noise_floor.get(axis)
         if after is not None:
             unit = format_unit(results.force_unit(axis))

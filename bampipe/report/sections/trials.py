@@ -71,7 +71,16 @@ def _describe_rate(results: Results) -> str:
 
 def _tabulate_trials(results: Results) -> Table:
     records = results.trials.to_dict("records")
-    remarks = {str(row["trial_id"]): _read_remarks(row) for row in records}
+    # The reason of a trial's state and its repairs, each remark by itself.
+    remarks = {
+        str(row["trial_id"]): [
+            part
+            for text in (row.get("reason"), row.get("repairs"))
+            if isinstance(text, str) and text
+            for part in text.split("; ")
+        ]
+        for row in records
+    }
     counts = Counter(
         _blank_numbers(text) for own in remarks.values() for text in own if len(text) > _LONG
     )
@@ -126,12 +135,6 @@ def _describe_kind(row: dict[Any, Any]) -> str:
     return kind
 
 
-def _read_remarks(row: dict[Any, Any]) -> list[str]:
-    """Return the reason of a trial's state and its repairs, each remark by itself."""
-    texts = (row.get("reason"), row.get("repairs"))
-    return [part for text in texts if isinstance(text, str) and text for part in text.split("; ")]
-
-
 def _describe_filter(results: Results, filtered: FilterResult) -> list[Block]:
     method = phrases.FILTERS.get(filtered.method, filtered.method)
     text = f"Velocity and acceleration come from {method} ({filtered.method_reason})."
@@ -148,8 +151,7 @@ def _describe_filter(results: Results, filtered: FilterResult) -> list[Block]:
         title = "Stretches that no estimate and no error uses"
         blocks.append(Table(title, "Trial ~1 | Time (s) ~1 | Why ~6", stretches))
     rows = []
-    for axis in results.order_axes(filtered.axes):
-        one = filtered.axes[axis]
+    for axis, one in results.order_axes(filtered.axes).items():
         rows.append(
             (
                 axis,

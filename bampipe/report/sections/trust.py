@@ -87,8 +87,8 @@ def _tabulate_innovations(
 ) -> Table:
     """Tabulate the tests, in words only where the filter's parameters are those published."""
     rows = []
-    for axis in results.order_axes(tests):
-        own, driven = tests[axis].whiteness, tests[axis].inputs
+    for axis, entry in results.order_axes(tests).items():
+        own, driven = entry.whiteness, entry.inputs
         rows.append(
             (
                 axis,
@@ -96,7 +96,7 @@ def _tabulate_innovations(
                 format_percent(own.share if own else None),
                 _tell_outcome(driven.independent if driven else None),
                 format_percent(driven.share if driven else None),
-                tests[axis].sentence if is_published else "",
+                entry.sentence if is_published else "",
             )
         )
     note = (

@@ -37,7 +37,12 @@ def section(results: Results) -> Section:
     if validated.trials:
         blocks.append(_tabulate_trials(results, validated))
     if validated.forces:
-        blocks.append(Paragraph(_list_force_errors(validated, results.pusher)))
+        shown = join_names(
+            f"{split_name(name)} {format_digits(one.rmse)} {format_unit(one.unit)}"
+            for name, one in validated.forces.items()
+        )
+        place = " at the handle" if results.pusher == "hand" else ""
+        blocks.append(Paragraph(f"Error of the predicted force{place} (RMSE): {shown}."))
     if validated.free_run is not None and validated.free_run.drift:
         blocks += _tabulate_drift(results, validated, validated.free_run.drift)
     if validated.notes:
@@ -53,8 +58,7 @@ def section(results: Results) -> Section:
 
 def _tabulate_axes(results: Results, validated: ValidateResult) -> Table:
     rows = []
-    for axis in results.order_axes(validated.axes):
-        one = validated.axes[axis]
+    for axis, one in results.order_axes(validated.axes).items():
         fit = NONE if one.fit_percent is None else format_decimals(one.fit_percent, 1)
         errors = (one.held_out_rmse, one.noise_floor, one.rmse, one.rmse_without_friction)
         rows.append((axis, *map(format_digits, errors), fit, format_unit(one.unit)))
@@ -86,29 +90,20 @@ def _tabulate_trials(results: Results, validated: ValidateResult) -> Table:
     return Table("RMSE by trial", " | ".join(("Trial | Held out", *heads)), rows, note)
 
 
-def _list_force_errors(validated: ValidateResult, pusher: str) -> str:
-    shown = (
-        f"{split_name(name)} {format_digits(one.rmse)} {format_unit(one.unit)}"
-        for name, one in validated.forces.items()
-    )
-    place = " at the handle" if pusher == "hand" else ""
-    return f"Error of the predicted force{place} (RMSE): {join_names(shown)}."
-
-
 def _tabulate_drift(
     results: Results, validated: ValidateResult, drift: Mapping[str, AxisDrift]
 ) -> list[Block]:
     """Return how far the model drifts in short free runs, and the reasons where it is unknown."""
     axes = results.order_axes(drift)
-    horizons = sorted({h.horizon_s for axis in axes for h in drift[axis].horizons})
-    reasons = {axis: drift[axis].reason for axis in axes if drift[axis].reason}
+    horizons = sorted({h.horizon_s for one in axes.values() for h in one.horizons})
+    reasons = {axis: one.reason for axis, one in axes.items() if one.reason}
     if not horizons and len(reasons) == len(axes) and len(set(reasons.values())) == 1:
         return [Paragraph(f"No short free runs of this model. {next(iter(reasons.values()))}")]
     blocks: list[Block] = []
     if horizons:
         rows = []
-        for axis in axes:
-            found = {h.horizon_s: h for h in drift[axis].horizons}
+        for axis, one in axes.items():
+            found = {h.horizon_s: h for h in one.horizons}
             factor, unit = choose_scale((h.quantile_90 for h in found.values()), results.unit(axis))
             cells: list[str] = []
             for horizon in horizons:
