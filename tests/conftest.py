@@ -1,7 +1,5 @@
 """Fixtures of the whole test suite: toy stages, folders to work in, paths of shared modules."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Runs on sessions of the independent simulators, short enough for tests."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Results for tests: what a test says of them, the rest made up."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from types import UnionType

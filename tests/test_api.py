@@ -1,7 +1,5 @@
 """The Python interface: light to import, read-only, one line for a mistake."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import subprocess

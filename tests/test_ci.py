@@ -1,7 +1,5 @@
 """What a lab's continuous integration uses: accepted values, summaries, documented scripts."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The Dask engine on a real cluster of two worker processes on this machine."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import json

@@ -1,7 +1,5 @@
 """``bampipe device`` and ``bampipe effects check``: equations, and one line for each fault."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

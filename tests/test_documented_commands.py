@@ -7,8 +7,6 @@ line of its own for any lines. After ``<!-- takes minutes -->`` a block is run o
 BAMPIPE_DOCUMENTS=all.
 """
 
-from __future__ import annotations
-
 import ast
 import os
 import re

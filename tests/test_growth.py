@@ -1,7 +1,5 @@
 """What keeps the cost of a session linear in its length."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The law of the house: which layer may import what, and how soon the command line answers."""
 
-from __future__ import annotations
-
 import ast
 import resource
 import subprocess

@@ -1,7 +1,5 @@
 """How a model version is made: what its parent was given counts for the child."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The notebook in docs/: its code runs as it stands, and the outputs stored are those it gives."""
 
-from __future__ import annotations
-
 import ast
 import json
 from pathlib import Path

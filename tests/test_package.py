@@ -1,7 +1,5 @@
 """What describes the package elsewhere says the same as pyproject.toml."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Two sessions of one device side by side, recorded by the simulators that share no code."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

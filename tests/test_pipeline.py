@@ -1,7 +1,5 @@
 """The main job on a shipped session: the run folder that other programs read, twice the same."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

@@ -1,7 +1,5 @@
 """Runs published on file systems that fsspec knows: whole or not at all, and fetched back."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The reference pages of the site name everything that there is."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import runpy

@@ -1,7 +1,5 @@
 """The runner: order, cache by content, whole files, recovery, provenance, gates, batches."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -22,6 +20,7 @@ from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
 from bampipe.results.compare import CompareResult
+from bampipe.results.run import GateVerdict
 from bampipe.run import batch, gates, junit, models, record
 from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome
@@ -477,7 +476,7 @@ def gate(**changes: object) -> Gate:
     return limit.model_copy(update=changes)
 
 
-def judged(tmp_path: Path, content: object, **changes: object) -> list[gates.Verdict]:
+def judged(tmp_path: Path, content: object, **changes: object) -> list[GateVerdict]:
     path = tmp_path / "models" / "base" / "v.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(content))

@@ -1,7 +1,5 @@
 """The JSON Schemas in `schemas/` are those of the declarations."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import tomllib

@@ -1,7 +1,5 @@
 """What `bampipe run` says of its steps beneath their table."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from bampipe.api import actions
 from bampipe.api.opened import open_run
+from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model_file import identified, load_model
 from bampipe.diagnosis.shape import variables
@@ -40,8 +40,6 @@ from bampipe.results.validate import ValidateResult
 from bampipe.run import models
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import read_measured_trials
-
-Array = NDArray[np.float64]
 
 _MAPPED = ("position", "velocity", "direction")
 _BINS, _FEWEST, _SHOWN = 8, 12, 5
@@ -354,7 +352,7 @@ def _solve(e: Evidence, chosen: list[int], limits: Array) -> tuple[Array, Array]
     xx = sums.xx[:, :, chosen][:, :, :, chosen]
     xy, weight = sums.xy[:, :, chosen], limits**-2
 
-    def solve(rows: NDArray[np.bool_]) -> Array:
+    def solve(rows: Flags) -> Array:
         left = np.einsum("kaij,a->ij", xx[rows], weight)
         right = np.einsum("kai,a->i", xy[rows], weight)
         step = np.linalg.lstsq(left, right, rcond=1e-12)[0]

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import NOTHING
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
-
-Array = NDArray[np.float64]
 
 
 def added_columns(

@@ -32,7 +32,7 @@ class Criteria:
         block_s: length of stretches of time that count as independent, s: one must not decide.
         beam: number of sets of effects that are pursued side by side.
         doubt: scale of what is left on an axis, in units of noise and discrepancy, from which on it
-            is something unknown, which effects that take less than it leaves may resemble.
+            is something unknown for certain.
     """
 
     probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.9

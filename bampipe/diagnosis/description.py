@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import gamma
 
+from bampipe.arrays import Array
 from bampipe.diagnosis.shape import BINS, Map, Variable, residual_map, variables
 from bampipe.results.rounding import significant
 from bampipe.trials.evidence import Evidence
-
-Array = NDArray[np.float64]
 
 _VARIABLE, _MENTIONED = 0.2, 0.005
 """Least share of a residual's variance that a variable carries to be named, and to be mentioned

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import csd
 
+from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_columns
 from bampipe.diagnosis.ranges import MachineScale, SearchRange
@@ -18,8 +19,6 @@ from bampipe.physics.system import System
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import Samples, take_samples
 from bampipe.trials.motion import Motion
-
-Array = NDArray[np.float64]
 
 _ALONE, _SEVERAL = 7, 5
 """Values of a shape on the grid: of an effect with one, and of each of an effect with several."""
@@ -236,7 +235,7 @@ class Dictionary:
         return [np.abs(sum(_spectrum(x, x) for x in each)) for each in columns]
 
 
-def _slope_by_force(system: System, motion: Motion, kept: NDArray[np.int64], p: Array) -> Array:
+def _slope_by_force(system: System, motion: Motion, kept: Indices, p: Array) -> Array:
     """Derivative of what the effects of a model add by each measured force, (K, n_q, n_forces).
 
     By a force that is more all the time, so that internal states which follow it have come to rest.

@@ -12,16 +12,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logit, softmax
 
+from bampipe.arrays import Array, Flags
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Pool, Search, added, gone
 from bampipe.diagnosis.session import Fit
 from bampipe.diagnosis.unknown import Unknown, spline_columns, weigh_unknown
-
-Array = NDArray[np.float64]
 
 _DRAWS = 1000
 _NEAR = 14.0
@@ -145,7 +143,7 @@ def _squares(search: Search, keys: tuple[Key, ...]) -> Array:
     return np.array([max(float(rows @ rows), 1e-300) for rows in search.residual_rows(keys)])
 
 
-def _share_explained(search: Search, effect: str, far: NDArray[np.bool_]) -> float:
+def _share_explained(search: Search, effect: str, far: Flags) -> float:
     """Of the mean square without an effect, what it takes on axes that are ``far``; the largest.
 
     What is missing there may resemble an effect that takes less than that leaves. 1 of an effect

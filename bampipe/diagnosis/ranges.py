@@ -9,13 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.physics.effect import BoundEffect
 from bampipe.physics.parameter import Parameter
 from bampipe.trials.evidence import Evidence
-
-Array = NDArray[np.float64]
 
 _TRAVEL = (1e-4, 0.25)
 """Of the travel: finer lengths are crossed within a sample or two."""

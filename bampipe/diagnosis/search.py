@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
 from bampipe.trials.evidence import Evidence
@@ -26,8 +26,6 @@ from bampipe.trials.likelihood import (
     solve_bounded,
     solve_scaled,
 )
-
-Array = NDArray[np.float64]
 
 _STEP = 0.02
 """Of a shape's range: the step of its slope."""
@@ -275,7 +273,7 @@ class Search:
         b: Array,
         inside: Array,
         own: Array,
-        place: NDArray[np.int64],
+        place: Indices,
     ) -> tuple[float, ...]:
         """What each effect adds as far as nothing else in the model takes its place.
 

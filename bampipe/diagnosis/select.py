@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
 from bampipe.diagnosis.probability import Weighed, weigh_sets
 from bampipe.diagnosis.ranges import MachineScale
@@ -24,7 +24,6 @@ from bampipe.diagnosis.session import (
 )
 from bampipe.physics.recipe import Recipe
 
-Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 """Called with a fraction of the work done and what is being done."""
 

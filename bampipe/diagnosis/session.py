@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import (
     Candidate,
     build_candidate_model,
@@ -44,7 +44,6 @@ from bampipe.trials.replay import StandIn, keep_motion, replay_motions
 from bampipe.trials.residuals import ModelOnTrial
 from bampipe.workers import process_pool
 
-Array = NDArray[np.float64]
 Task = TypeVar("Task")
 Returned = TypeVar("Returned")
 

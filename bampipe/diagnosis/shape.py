@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Indices
 from bampipe.results.diagnose import WorstWindow
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.measured import trial_of_block
 from bampipe.trials.motion import Motion
-
-Array = NDArray[np.float64]
 
 BINS = 16
 _LEAST = 12
@@ -167,7 +165,7 @@ def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> 
     return listed
 
 
-def _doing(motion: Motion, rows: NDArray[np.int64], axis: int, unit: str) -> str:
+def _doing(motion: Motion, rows: Indices, axis: int, unit: str) -> str:
     q, qd = motion.q[rows, axis], motion.qd[rows, axis]
     moved = "reversing" if np.any(qd > 0) and np.any(qd < 0) else (
         "moving forwards" if qd.mean() > 0 else "moving backwards"

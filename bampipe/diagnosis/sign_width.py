@@ -10,15 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Fit, Session
 from bampipe.diagnosis.start import search_start
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.measured import MeasuredTrials
-
-Array = NDArray[np.float64]
 
 _STOPS = 0.125
 """Width, times the device's, of a machine that is nearer to a true stop than to its device file.

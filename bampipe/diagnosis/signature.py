@@ -6,15 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.physics import Model, compile_model
 from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.effect import Effect
 from bampipe.physics.parameter import Parameter
 from bampipe.physics.system import System
-
-Array = NDArray[np.float64]
 
 DURATION_S, RATE_HZ = 16.0, 250.0
 SMOOTHING_S = 0.3

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.search import gone, names
 from bampipe.diagnosis.select import open_search, start_of
 from bampipe.diagnosis.session import Fit, Session, system_of
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.measured import MeasuredTrials
-
-Array = NDArray[np.float64]
 
 _ANY_SIZE = 1e-9
 _REPLICATES = 6

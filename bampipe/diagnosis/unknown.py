@@ -11,15 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Search, gone
 from bampipe.diagnosis.shape import since_reversal
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import solve_scaled, take_samples
-
-Array = NDArray[np.float64]
 
 _KNOTS, _KNOTS_OF_OTHERS = 9, 5
 _SIZES = (0.003, 0.01, 0.03, 0.1)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bampipe.diagnosis.criteria import most_probable
 from bampipe.diagnosis.probability import chance_of
@@ -20,8 +19,6 @@ from bampipe.results.diagnose import (
     WeighedSet,
 )
 from bampipe.results.floor import compare_with_floor
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

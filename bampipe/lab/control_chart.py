@@ -16,11 +16,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.results.lab import ChartPoint, ControlChart
-
-Array = NDArray[np.float64]
 
 FEWEST = 6
 """With fewer sessions their scatter is not known well enough for limits."""

@@ -7,8 +7,8 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.data.stream import MOST_COMPLAINTS
 from bampipe.estimate.consistency import WindowTest
 from bampipe.estimate.online import OnlineFilter
@@ -16,8 +16,6 @@ from bampipe.estimate.unscented import FilterFailure
 from bampipe.monitor.start import FIRST_LOOK, MonitorOptions, Start, start_from_samples
 from bampipe.physics import System
 from bampipe.results.intervals import NORMAL_95
-
-Array = NDArray[np.float64]
 
 PORTION = 512
 """Samples filtered at once, so that memory stays the same."""
@@ -191,14 +189,14 @@ class Monitor:
         present = np.isfinite(q) & (np.isfinite(found.nis) | ~complete)[:, None]
         self._take_innovations(test, found.nis, squares, present)
 
-    def _add_unfiltered(self, present: NDArray[np.bool_]) -> None:
+    def _add_unfiltered(self, present: Flags) -> None:
         """Count samples of which the filter made nothing; ``present`` as for the test."""
         if self._test is not None:
             nothing = np.full(present.shape, np.nan)
             self._take_innovations(self._test, np.full(len(present), np.nan), nothing, present)
 
     def _take_innovations(
-        self, test: WindowTest, nis: Array, squares: Array, present: NDArray[np.bool_]
+        self, test: WindowTest, nis: Array, squares: Array, present: Flags
     ) -> None:
         for mean in test.take(nis, squares, present):
             self._judge(bool(mean > self._threshold))

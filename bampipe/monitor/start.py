@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.session import Session, read_session
 from bampipe.data.stream import SampleStream, StreamLayout
@@ -29,8 +29,6 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.trials.reading import free_trials, input_columns, read_samples
 from bampipe.trials.sensors import RecordNoise, settle_encoder, settle_force
-
-Array = NDArray[np.float64]
 
 _NO_STEP = 3e-6
 """Noise of an encoder that did not move in the first samples, rad or m."""

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recipe
@@ -68,8 +68,6 @@ OUTPUTS = (
     "models/{model}/states.parquet",
     "models/{model}/trace.parquet",
 )
-
-Array = NDArray[np.float64]
 
 
 @checked_dataclass(frozen=True, config=STRICT)

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.arrays import Array
 from bampipe.data.chain import read_tree
 from bampipe.data.robot_tree import identifier
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
@@ -79,7 +79,6 @@ OUTPUTS = (
     "models/{model}/trajectory.*",
 )
 
-Array = NDArray[np.float64]
 
 _SHOWN = 3
 """Proposals in the summary."""

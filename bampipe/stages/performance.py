@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model
@@ -32,8 +32,6 @@ from bampipe.schema import STRICT
 SUMMARY = "Workspace, stiffness, friction, inertia and force at the handle"
 INPUTS = (*INGESTED, *FILTERED, "stiffness/stiffness.json?", *IDENTIFIED_MODEL)
 OUTPUTS = ("models/{model}/performance.json",)
-
-Array = NDArray[np.float64]
 
 
 @checked_dataclass(frozen=True, config=STRICT)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.arrays import Array
 from bampipe.data.run_folder import INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
@@ -51,8 +51,6 @@ _COLUMNS = {
     "t": "float64", "torque": "float64", "deflection": "float64", "post_yield": "bool",
 }  # fmt: skip
 """Of loops.parquet, and their types."""
-
-Array = NDArray[np.float64]
 
 
 @checked_dataclass(frozen=True, config=STRICT)

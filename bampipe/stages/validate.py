@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
@@ -71,8 +71,6 @@ which they do not describe the trials they come from, and are refused."""
 
 SILENT_PERCENT = 30.0
 """Fit of a robot's joint below which its parameters say nothing of it."""
-
-Array = NDArray[np.float64]
 
 
 @checked_dataclass(frozen=True, config=STRICT)

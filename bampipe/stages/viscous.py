@@ -10,11 +10,11 @@ from typing import Annotated
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from pydantic import Field
 from pydantic.dataclasses import dataclass as checked_dataclass
 from scipy import stats
 
+from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import read_parquet, write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model
@@ -46,7 +46,6 @@ SUMMARY = "Cartesian damping that the brakes rendered in the viscous trials, aga
 INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)
 OUTPUTS = ("models/{model}/viscous.json", "models/{model}/viscous.parquet")
 
-Array = NDArray[np.float64]
 
 _SIGNIFICANT = 0.05
 _RESTARTS = 4

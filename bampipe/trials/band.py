@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import welch
 
+from bampipe.arrays import Array
 from bampipe.physics import System
 from bampipe.results.filter import ResidualBand
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
 from bampipe.trials.sensors import Sensors
-
-Array = NDArray[np.float64]
 
 LEAST_HZ = 8.0
 """No band is narrower: a change of direction, from which friction is read, is that wide."""

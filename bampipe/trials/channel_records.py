@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections import defaultdict
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data.quality import CleanTrial
 from bampipe.data.session import Session
 from bampipe.estimate.spectral_lines import remove_mains
 from bampipe.physics.device import Device
 from bampipe.results.ingest import MainsHum
 from bampipe.trials.sensors import ChannelNoise, RecordNoise, settle_encoder, settle_force
-
-Array = NDArray[np.float64]
 
 _COUNTS_SPAN = 16.0
 """Counts that a converter's readings span at least: fewer tell nothing from a reading in tens."""

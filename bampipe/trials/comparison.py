@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.errors import InputError
 from bampipe.physics import System
 from bampipe.results.validate import AxisError
@@ -15,8 +15,6 @@ from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.replay import UNLIKE, StandIn, replay_motions
 from bampipe.trials.residuals import ModelOnTrial
-
-Array = NDArray[np.float64]
 
 _EXPECTED_SEED = 3
 """After the user's: of the replay that shows how the published parameters would look if true."""
@@ -32,7 +30,7 @@ class ComparedTrial:
 
     trial_id: str
     t: Array
-    used: NDArray[np.bool_]
+    used: Flags
     measured: Array
     residual: Array
     residual_held_out: Array
@@ -77,7 +75,7 @@ def compare_trial(evidence: Evidence, number: int, p: Array, late_s: float = 0.0
     )
 
 
-def rms(values: Sequence[Array], used: Sequence[NDArray[np.bool_]]) -> Array:
+def rms(values: Sequence[Array], used: Sequence[Flags]) -> Array:
     """Return the root mean square by axis of the samples that count."""
     square = sum(np.sum(v**2 * keep, axis=0) for v, keep in zip(values, used, strict=True))
     count = sum(keep.sum(axis=0) for keep in used)

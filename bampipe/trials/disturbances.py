@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import Stacked, as_measured, minimise, stacked_residual
 from bampipe.estimate.low_pass import Band
@@ -24,9 +24,6 @@ from bampipe.results.filter import Disturbance
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.motion import Motion, n_samples, trial_names, trial_sizes
 from bampipe.trials.residuals import applied_rms, problem_of
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _BLOCK_S = 0.2
 """Length of the blocks of which the errors are compared, s."""
@@ -70,8 +67,8 @@ class _Blocks:
         starts, ends: (B,) s since the start of the trial.
     """
 
-    block: NDArray[np.int64]
-    trial: NDArray[np.int64]
+    block: Indices
+    trial: Indices
     starts: Array
     ends: Array
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.estimate.least_squares import (
     KnownSlopes,
     Problem,
@@ -24,8 +24,6 @@ from bampipe.physics import System
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial, applied_rms, problem_of
-
-Array = NDArray[np.float64]
 
 _REFITS = 6
 """Most Gauss-Newton steps of a refit that starts at the fit to all trials."""
@@ -69,7 +67,7 @@ class Evidence:
     folds: Folds
     residual: tuple[Array, ...]
     jacobian: tuple[Array, ...]
-    used: tuple[NDArray[np.bool_], ...]
+    used: tuple[Flags, ...]
     free: tuple[int, ...]
     lower: Array
     upper: Array
@@ -277,7 +275,7 @@ def _factors(problem: Problem, p: Array, axes: int) -> tuple[float, ...]:
 def _slopes_by_timing(
     fitted: Sequence[ModelOnTrial],
     band: Band,
-    used: Sequence[NDArray[np.bool_]],
+    used: Sequence[Flags],
     timing: tuple[float, float],
 ) -> tuple[Array, ...]:
     """`Evidence.by_timing`; nothing where the timing is not open, or a delay has its place."""

@@ -6,11 +6,9 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.normal_equations import NormalEquations
-
-Array = NDArray[np.float64]
 
 HELD_OUT = -1
 """Group of the trials that the session holds out."""

@@ -10,16 +10,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Indices
 from bampipe.errors import InputError
 from bampipe.estimate.least_squares import Stacked, minimise, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.trials.motion import Motion, trial_names
 from bampipe.trials.residuals import problem_of
-
-Array = NDArray[np.float64]
 
 _PARTS = 6
 """Of a trial, from which its offset is found once more each: they tell its standard error."""
@@ -118,7 +116,7 @@ class _Trial:
         both = np.concatenate([one.slope, one.residual[:, :, None]], axis=2) * weight
         both, forces = (x.reshape(-1, x.shape[2]) for x in (both, gains * weight))
 
-        def solve(rows: NDArray[np.int64] | slice) -> Array:
+        def solve(rows: Indices | slice) -> Array:
             return np.asarray(np.linalg.lstsq(forces[rows], both[rows], rcond=1e-9)[0])
 
         offset = solve(slice(None))

@@ -10,16 +10,13 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bampipe.arrays import Flags
+from bampipe.arrays import Array, Flags
 from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
 from bampipe.estimate.differentiation import Derivatives
 from bampipe.physics.device import LAST_ORDER
 from bampipe.results.filter import FilterResult
 from bampipe.trials.motion import TIMING_ORDERS, Motion, Recording, input_derivatives
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

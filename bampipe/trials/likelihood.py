@@ -20,13 +20,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.physics.effect import BoundEffect
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.motion import Motion
-
-Array = NDArray[np.float64]
 
 _SPEEDS = 12
 """Classes of speed in which the variance of replays is averaged, finer where an axis is slow."""
@@ -61,9 +59,9 @@ class Samples:
         independent: how many independent ones they are.
     """
 
-    rows: NDArray[np.int64]
-    trial: NDArray[np.int64]
-    block: NDArray[np.int64]
+    rows: Indices
+    trial: Indices
+    block: Indices
     independent: float
 
 
@@ -103,7 +101,7 @@ class Noise:
     variance: tuple[Array, ...]
     stopping: tuple[Array, ...]
     residuals: tuple[Array, ...]
-    speed: tuple[NDArray[np.int64], ...]
+    speed: tuple[Indices, ...]
 
     def variance_of_bias(self, axis: int, y: Array) -> Array:
         """How far the bias of a residual ``y``, (n,), may be off, for a relative error of one.
@@ -157,9 +155,7 @@ def describe_noise(
     return Noise(tuple(biases), tuple(variances), stops, tuple(by_axis), tuple(classes))
 
 
-def _by_row(
-    evidence: Evidence, values: Callable[[Motion, NDArray[np.int64]], Array]
-) -> list[Array]:
+def _by_row(evidence: Evidence, values: Callable[[Motion, Indices], Array]) -> list[Array]:
     """Values of each trial at the thinned samples, (K, n_q)."""
     band = evidence.band
     return [values(m, band.thinned_rows(len(m.t))) for m in evidence.motions]
@@ -537,7 +533,7 @@ class Solved:
     """
 
     unknowns: Array
-    held: NDArray[np.bool_]
+    held: Flags
     left: Array
     weight: Array
     cost: float

@@ -7,13 +7,11 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Flags
 from bampipe.physics import System
 from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.trials.cache import TrialCache
-
-Array = NDArray[np.float64]
 
 TIMING_ORDERS = 3
 """Time derivatives by which inputs are moved in time: half a sample, at the highest frequency of a
@@ -65,7 +63,7 @@ class Motion:
     qdd: Array
     qd_sd: Array
     channels: Mapping[str, Array]
-    left_out: NDArray[np.bool_] | None = None
+    left_out: Flags | None = None
     filters: EncoderFilters | None = None
     _columns: dict[tuple[str, ...], Array] = field(default_factory=dict, repr=False, compare=False)
 

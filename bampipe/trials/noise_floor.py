@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.trials.draw import ENOUGH_SAMPLES
 from bampipe.trials.motion import Motion, trial_sizes
-
-Array = NDArray[np.float64]
 
 _SD_OF_DEVIATION = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.data.run_folder import MOVING, RunFolder
 from bampipe.data.store import column_names, read_arrays, read_parquet, row_count, trial_ids
 from bampipe.errors import InputError
@@ -22,8 +22,6 @@ from bampipe.trials.disturbances import disturbed_samples
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import TIMING_ORDERS, Motion, input_derivatives, n_samples
 from bampipe.trials.sensors import Sensors
-
-Array = NDArray[np.float64]
 
 KINEMATICS = "filter/kinematics.parquet"
 

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from bampipe.arrays import Array, Flags
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.simulation import Runaway, count_steps, simulate_tracking
 from bampipe.files import temporary_space
@@ -42,8 +42,6 @@ from bampipe.trials.motion import (
 )
 from bampipe.trials.residuals import ModelOnTrial, residual_and_memory, standstill_of
 from bampipe.trials.sensors import Sensors
-
-Array = NDArray[np.float64]
 
 UNLIKE = 3.0
 """Residual that a fit leaves of a replay, over that of the measurement, beyond which the replay is
@@ -114,10 +112,10 @@ class StandIn:
         return TrialCache(follow, len(self.motions), lambda course: len(course.q))
 
     @cached_property
-    def rests(self) -> TrialCache[NDArray[np.bool_]]:
+    def rests(self) -> TrialCache[Flags]:
         """Where the axes of each trial stand still, (T, n_q)."""
 
-        def find_rest(trial: int) -> NDArray[np.bool_]:
+        def find_rest(trial: int) -> Flags:
             return standstill_of(self.motions[trial], self.system, self.rate_hz)
 
         return TrialCache(find_rest, len(self.motions), len)

@@ -13,9 +13,9 @@ from functools import cached_property
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.estimate.least_squares import (
     Problem,
 )
@@ -25,7 +25,6 @@ from bampipe.physics import System
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.motion import Motion
 
-Array = NDArray[np.float64]
 Found = TypeVar("Found")
 
 
@@ -64,7 +63,7 @@ def problem_of(
     def inputs_at(motion: Motion, p: Array) -> Array:
         return motion.timed_inputs(system.inputs, float(p[n]))
 
-    def left_out(trial: int) -> NDArray[np.bool_]:
+    def left_out(trial: int) -> Flags:
         still = standstill_of(motions[trial], system, band.rate_hz)
         return still if turning else still | find_turns(motions[trial].qd, band.rate_hz)
 
@@ -136,7 +135,7 @@ def problem_of(
     )
 
 
-def _multiplied(system: System, free: Sequence[int]) -> NDArray[np.int64] | None:
+def _multiplied(system: System, free: Sequence[int]) -> Indices | None:
     """Axes whose inputs free parameters multiply, (n_free,), as torque constants of a robot do.
 
     A motor that turns several joints is that of one of them. None where there are none.
@@ -180,7 +179,7 @@ class _Remembered(Generic[Found]):
         return self._known[key]
 
 
-def standstill_of(motion: Motion, system: System, rate_hz: float) -> NDArray[np.bool_]:
+def standstill_of(motion: Motion, system: System, rate_hz: float) -> Flags:
     """Which samples stand still, (T, n_q).
 
     Or are left out. A replay leaves out what the trial does as well: where the machine rests for
@@ -208,7 +207,7 @@ def applied_rms(
     motions: Sequence[Motion],
     band: Band,
     p: Array,
-    used: Sequence[NDArray[np.bool_]],
+    used: Sequence[Flags],
 ) -> Array:
     """Root mean square of the applied force by axis, low-passed as the residual is, (n_q,).
 

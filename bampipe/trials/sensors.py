@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.white_noise import (
     counting_step,
     slow_noise_sd,
@@ -18,8 +18,6 @@ from bampipe.estimate.white_noise import (
     without_feedback,
 )
 from bampipe.results.ingest import IngestResult
-
-Array = NDArray[np.float64]
 
 _COLOURED = 2.0
 """Factor from which on the noise of a thinned record is more than that of the whole one."""

@@ -6,15 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.results.ingest import IngestResult
 from bampipe.trials.motion import Motion
-
-Array = NDArray[np.float64]
 
 ZERO_OF = "zero of "
 """What the uncertainty of an encoder's zero is called, before its axis."""

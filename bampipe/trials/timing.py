@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.estimate.bounded import invert_scaled
 from bampipe.estimate.least_squares import as_measured, stacked_residual
 from bampipe.estimate.low_pass import Band
@@ -14,8 +14,6 @@ from bampipe.estimate.normal_equations import NormalEquations
 from bampipe.physics import System
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import problem_of
-
-Array = NDArray[np.float64]
 
 
 def find_robot_timing(

@@ -1,7 +1,5 @@
 """Text tables as labs write them: the same numbers, or one line that says what to decide."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

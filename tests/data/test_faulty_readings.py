@@ -1,7 +1,5 @@
 """Wild readings and dead sensors, told from what machines do."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

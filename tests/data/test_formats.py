@@ -1,7 +1,5 @@
 """HDF5, JSON, TDMS, ROS bags and MCAP: files that the libraries of their makers wrote."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """MJCF files: the dynamics that MuJoCo reads from them, and what is refused, with a remedy."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Quality rules: what they leave alone, and that nothing unsound comes through."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

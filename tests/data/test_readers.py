@@ -1,7 +1,5 @@
 """Readers: the three kinds of file give the same numbers, and nothing but InputError."""
 
-from __future__ import annotations
-
 import io
 import os
 import tempfile

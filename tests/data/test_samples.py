@@ -1,7 +1,5 @@
 """Samples as loggers store them: held rows, coarse and rolling clocks, sign bits, rails."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The session file: what is read from it, and any damage ends in one plain line."""
 
-from __future__ import annotations
-
 import copy
 import json
 import tomllib

@@ -1,7 +1,5 @@
 """Lines that come in pieces, and lines that are wrong."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """URDF files: chains, what hangs beside them, and what is refused, with a remedy."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """A run folder as far as an export of its model reads it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bampipe.data.device_file import find_robot_file, read_device_file

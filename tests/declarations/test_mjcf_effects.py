@@ -1,7 +1,5 @@
 """Effects in an exported MJCF: MuJoCo and our own simulation under the same inputs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Exported robots: the file that was drawn, and the dynamics that were identified, by Pinocchio."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree

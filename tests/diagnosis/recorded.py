@@ -1,7 +1,5 @@
 """Sessions that several tests of the diagnosis share."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

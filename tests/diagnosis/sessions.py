@@ -1,7 +1,5 @@
 """A short session made from the device itself, with effects, for tests of the diagnosis."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Candidates: on what effects of the model leave, and among rivals on data of other simulators."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

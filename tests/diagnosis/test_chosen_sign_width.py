@@ -1,7 +1,5 @@
 """The trials of a test bench choose the width of the smoothed sign; what follows has it."""
 
-from __future__ import annotations
-
 import pytest
 from independent_runs import record_run, record_trials
 

@@ -1,7 +1,5 @@
 """Candidates belong to the content of a device, not to its name or to what a process did before."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Names beside something unknown that is far above the noise; grids over several shapes."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Formulas drafted for what no effect explains, on sessions of the independent simulators."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Joints whose motion a position controller gives: what the right effect explains is found."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The likelihood: weights, what replays share, stops, heavy tails, bounds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """At most twelve numbers decide: no other is compared with in the rooms that decide."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from dataclasses import fields

@@ -1,7 +1,5 @@
 """What must not be taken for an effect, each on a session of a simulator that shares no code."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Shapes are looked for at the scale of the machine."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Replays of a fitted model: what they need, what they share, and the bias that they show."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

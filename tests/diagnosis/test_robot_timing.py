@@ -1,7 +1,5 @@
 """The timing of a robot's inputs, whatever one drive lacks and friction does where joints turn."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

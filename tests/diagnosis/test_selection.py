@@ -1,7 +1,5 @@
 """The search over sets: found whole, shapes refined, bounds held, the useless dropped."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

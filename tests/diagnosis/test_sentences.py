@@ -1,7 +1,5 @@
 """What a diagnosis says of an axis is true of the numbers beside it."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Mapping

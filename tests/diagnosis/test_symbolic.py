@@ -1,7 +1,5 @@
 """Symbolic regression of a residual: its expressions, and what it finds."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 

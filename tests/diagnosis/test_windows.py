@@ -1,7 +1,5 @@
 """Where a prediction fails most: named by trial, in words that hold at any scale."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hysteresis loops of known stiffness, simulated under an imposed torque."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 

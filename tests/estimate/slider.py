@@ -1,7 +1,5 @@
 """A mass with viscous and Coulomb friction, written by hand, and recordings of it."""
 
-from __future__ import annotations
-
 import math
 import sys
 

@@ -1,7 +1,5 @@
 """A mass on a proportional controller against the solutions known by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numba import njit

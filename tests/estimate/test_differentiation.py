@@ -1,7 +1,5 @@
 """Derivatives of quantised motions: right, within their error bands, and sound at the ends."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The Kalman smoother against its textbook form, and its choice by likelihood."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Stiffness recovered from loops of known stiffness, whatever the friction looks like."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from loops import Array, bouc_wen, elements, load_cycles, measure

@@ -1,7 +1,5 @@
 """Information, its bound and its weak directions, against regressions whose answer is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The tests of innovations: level and power on series whose nature is known."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.estimate.innovations import average_stretches, check_independence, check_whiteness

@@ -1,7 +1,5 @@
 """Least squares on the inverse dynamics of a slider with friction."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sums of products with what is known beforehand."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.estimate.normal_equations import NormalEquations

@@ -1,7 +1,5 @@
 """The online filter and its test of consistency."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Inertial numbers that no body has, and the nearest that some body can have."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.estimate.possible_bodies import is_possible, nearest_possible

@@ -1,7 +1,5 @@
 """Forward simulation on a mass with friction whose answers are known by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numba import njit, types

@@ -1,7 +1,5 @@
 """Mains hum is taken off a record, and nothing else is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

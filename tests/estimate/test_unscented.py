@@ -1,7 +1,5 @@
 """The unscented filter on a slider with friction; filterpy and a plain one are the oracles."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

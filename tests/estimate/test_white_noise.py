@@ -1,7 +1,5 @@
 """White noise of a record is found beside what else is in it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small files that unpack to gigabytes: refused, or read, in the memory that their trial takes."""
 
-from __future__ import annotations
-
 import bz2
 import json
 import os

@@ -1,7 +1,5 @@
 """Code kept on disk: what cannot be read, or was made from other sources, is made again."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess

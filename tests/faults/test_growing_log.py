@@ -1,7 +1,5 @@
 """A log that is still being written: its sound part is read, or it is refused in one line."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Run folders that somebody else prepared: nothing outside them is read, written or removed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Names and sentences out of files that others wrote: shown, never obeyed."""
 
-from __future__ import annotations
-
 import io
 import os
 import shutil

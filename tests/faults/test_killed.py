@@ -1,7 +1,5 @@
 """Commands that are killed or stopped while their worker processes run: no orphan, no lock left."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Declarations that are short to write and long to derive: refused in bounded time, by name."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Mapping

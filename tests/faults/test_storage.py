@@ -1,7 +1,5 @@
 """A disk that is full or read-only, records that are damaged: one line, and nothing lost."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

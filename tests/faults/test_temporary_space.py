@@ -1,7 +1,5 @@
 """A disk of temporary files that is full or absent is named; it is not that of the run folder."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import tempfile

@@ -1,7 +1,5 @@
 """Uncertainty of sensors and drawings reaches the intervals, and is said apart from statistics."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import independent

@@ -1,7 +1,5 @@
 """What estimates rest on, in words."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.identification.identifiability import _leaning, _number

@@ -1,7 +1,5 @@
 """Short free runs: their drift by hand, on an independent simulator, and where there is none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which trials the errors of a free run speak of."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Estimates and their intervals, held against simulators that share no code with bampipe."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from independent_runs import record_run

@@ -1,7 +1,5 @@
 """On which samples the noise levels of the filter are tuned."""
 
-from __future__ import annotations
-
 import pytest
 
 from bampipe.identification.sensor_noise import TUNING_SAMPLES, choose_tuning_trials

@@ -1,7 +1,5 @@
 """Which estimate is published: least squares, or the filter where it agrees and is more precise."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Models with effects: what trials cannot determine, and how the truth is judged."""
 
-from __future__ import annotations
-
 import pytest
 from independent_runs import record_run
 

@@ -1,7 +1,5 @@
 """What the smoothed sign of a velocity adds to intervals, on an arm that truly stands still."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from independent_runs import record_trials

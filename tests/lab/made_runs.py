@@ -1,7 +1,5 @@
 """Run folders with results of known content, for what reads many of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Control limits: how often they cry wolf, and what they see."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A lab's data set, its verdicts and its report, from run folders of known content."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

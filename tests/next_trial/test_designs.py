@@ -1,7 +1,5 @@
 """Designs, how people follow them, and what they are worth: without a session."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from types import SimpleNamespace

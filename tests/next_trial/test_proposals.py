@@ -1,7 +1,5 @@
 """Proposals, followed by somebody on machines whose simulators share no code with the product."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Next and its table judge as the diagnosis does: by its search, its record and its criteria."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Trajectories for drives, held against their limits by a reader of their files alone."""
 
-from __future__ import annotations
-
 import io
 import json
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 It propagates the covariance itself; the numbers must be the same.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

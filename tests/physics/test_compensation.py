@@ -1,7 +1,5 @@
 """What a device has against gravity (eqs 15, 16), and which parameters shift forces in time."""
 
-from __future__ import annotations
-
 import tomllib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Effects that meet on one channel or axis act in their order, on what the one before leaves."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

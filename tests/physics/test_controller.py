@@ -1,7 +1,5 @@
 """Controllers in device files: the law that comes out, and mistakes that are named."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

@@ -5,8 +5,6 @@ from what it does along a motion, starting from a wrong guess. `test_units` hold
 `test_generated_code` that the functions which simulate do the same.
 """
 
-from __future__ import annotations
-
 import re
 from functools import cache
 

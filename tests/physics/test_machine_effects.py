@@ -1,7 +1,5 @@
 """Effects on machines other than the BAM: motors, channels, dry friction that a device commands."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from motions import of_mechanism, with_values

@@ -1,7 +1,5 @@
 """Exported functions of inverse dynamics against the compiled model, run as their users would."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess

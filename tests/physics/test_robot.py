@@ -1,7 +1,5 @@
 """Robots: bodies on joints, held against Pinocchio, which shares no code with the product."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

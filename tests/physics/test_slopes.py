@@ -1,7 +1,5 @@
 """Slopes of the residual that no parameter changes: written out, against differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from physics.small_arm import ARM

@@ -1,7 +1,5 @@
 """Where the equations of motion cannot be solved, it is said in physical words."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

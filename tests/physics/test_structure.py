@@ -1,7 +1,5 @@
 """Which numbers no motion can tell apart, derived from the equations alone."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

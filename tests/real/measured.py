@@ -1,7 +1,5 @@
 """Where measured data of other labs lie, and how these tests run the program on them."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -4,8 +4,6 @@ Published, all samples, friction alike in both directions: M 95.1089 kg, Fv 203.
 Fc 20.3935 N, offset -3.1648 N, relative error 4.0834 %; friction by direction: 3.1117 %.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A servo with a motor model, from its raw JSON logs; one position gain is held out throughout."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -3,8 +3,6 @@
 The numbers mean nothing; files and fields are those that the stages leave.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The page for exploring: what is packed into it, and what a browser makes of it."""
 
-from __future__ import annotations
-
 import base64
 import csv
 import io

@@ -1,7 +1,5 @@
 """The section on what to record next, and the protocol sheet."""
 
-from __future__ import annotations
-
 import re
 from types import SimpleNamespace
 

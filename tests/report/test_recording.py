@@ -1,7 +1,5 @@
 """Recordings of a run for Foxglove and Rerun, opened by the readers of those formats."""
 
-from __future__ import annotations
-
 import io
 import json
 import sys

@@ -1,7 +1,5 @@
 """The report of a made-up run: what it says, and that it says nothing that is not stored."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

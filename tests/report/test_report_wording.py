@@ -1,7 +1,5 @@
 """Numbers, units and names as printed."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """The report in print: pages without holes."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Every check that a model can fail is heard, and said with its axis."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

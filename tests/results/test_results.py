@@ -1,7 +1,5 @@
 """Records of results: what they refuse, what they leave out, how a faulty file is named."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

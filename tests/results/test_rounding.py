@@ -1,7 +1,5 @@
 """An estimate has the digits that its uncertainty leaves it."""
 
-from __future__ import annotations
-
 import pytest
 
 from bampipe.results.rounding import round_with_sd, significant

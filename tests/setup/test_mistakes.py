@@ -1,7 +1,5 @@
 """Mistakes in session files of independent simulators are named; sound ones are left alone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

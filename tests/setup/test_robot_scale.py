@@ -1,7 +1,5 @@
 """The scale of a robot's drives is known by its bodies; how much friction there is, is a guess."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Run folders up to the filter stage, simulated or from a shared session."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A small sound session made in memory, for tests to damage."""
 
-from __future__ import annotations
-
 import copy
 import datetime
 import json

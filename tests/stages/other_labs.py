@@ -1,7 +1,5 @@
 """Logs such as other labs keep, made from known physics: a robot joint and a magnetic damper."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Run folders with an ingested session, for the tests of the stages that read one."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path

@@ -6,8 +6,6 @@ others are kept, or the trial is repaired and the repair is said. The first two 
 meets them, in `test_bad_sessions_cli.py`.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import re

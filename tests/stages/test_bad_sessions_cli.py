@@ -1,7 +1,5 @@
 """The bad-input corpus as a user meets it: exit code, one line, nothing left behind."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

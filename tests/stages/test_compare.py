@@ -1,7 +1,5 @@
 """Which model version is confirmed, and which one counts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The stage diagnose: what it writes, and what it is asked to leave out."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

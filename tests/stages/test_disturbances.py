@@ -1,7 +1,5 @@
 """Hits, dead sensors and warm-ups are left out and said; what a machine does is not."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The filter stage on simulated and shared sessions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A force sensor that is zeroed anew in each trial: its offsets are found, said and taken off."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

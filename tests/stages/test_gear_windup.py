@@ -1,7 +1,5 @@
 """Stiffness and play of gears, from encoders on their two sides."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

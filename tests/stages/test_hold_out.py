@@ -1,7 +1,5 @@
 """Trials that the session holds out: seen by no fit and no diagnosis, only by the verdict."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Ingest of sound sessions: units, files, determinism, other devices, memory."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

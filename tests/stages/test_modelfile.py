@@ -1,7 +1,5 @@
 """What an identified model hands on to the stages after it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from made_results import write_result

@@ -1,7 +1,5 @@
 """The monitor: the batch filter's numbers, an alarm when the plant changes, a growing file."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Ingest over logs as other labs keep them: units, clocks, velocities, dialects."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

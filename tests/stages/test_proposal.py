@@ -1,7 +1,5 @@
 """``bampipe init``: what is proposed for folders of logs, and that it is then a session."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

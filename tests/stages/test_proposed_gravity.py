@@ -1,7 +1,5 @@
 """Gravity in a proposed device file: where the motion shows it, where not, and how sure it is."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable
 from pathlib import Path

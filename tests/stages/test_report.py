@@ -1,7 +1,5 @@
 """The report stage: what it declares is what it reads and writes."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

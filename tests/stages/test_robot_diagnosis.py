@@ -1,7 +1,5 @@
 """What an arm of the independent simulator hides is named, from URDF and logs alone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

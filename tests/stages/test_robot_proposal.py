@@ -1,7 +1,5 @@
 """`bampipe init` on a folder with a URDF and a log of all joints."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

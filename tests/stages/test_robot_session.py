@@ -1,7 +1,5 @@
 """A robot from URDF and log to parameters, beside a truth that Pinocchio simulates."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Sessions made by the simulator: the raw-log format, the truth beside it, the physics inside."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import tomllib

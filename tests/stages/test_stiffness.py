@@ -1,7 +1,5 @@
 """The stiffness stage on simulated and shared sessions."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

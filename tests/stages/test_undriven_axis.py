@@ -1,7 +1,5 @@
 """A machine with an axis that nothing drives: a pole that hangs on a motorised cart."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

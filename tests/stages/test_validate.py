@@ -1,7 +1,5 @@
 """The validate stage on simulated and shared sessions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

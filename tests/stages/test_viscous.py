@@ -1,7 +1,5 @@
 """The viscous field and the performance at the handle, on a simulated session."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Make the toy stages of this folder the only ones, in this process."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Toy: doubles the numbers, slowly or in worker processes where the test asks for it."""
 
-from __future__ import annotations
-
 import os
 import time
 from functools import partial

@@ -1,7 +1,5 @@
 """Toy: one result a model."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pydantic.dataclasses import dataclass as checked_dataclass

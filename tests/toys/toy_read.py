@@ -1,7 +1,5 @@
 """Toy: reads the numbers of a session."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

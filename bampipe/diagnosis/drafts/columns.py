@@ -11,8 +11,8 @@ from functools import cached_property
 from itertools import combinations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.dictionary import Atom, Key
 from bampipe.diagnosis.drafts.forms import (
     DAMPING,
@@ -27,8 +27,6 @@ from bampipe.diagnosis.drafts.quantities import Span, coordinates
 from bampipe.estimate.low_pass import low_pass_at
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import Samples
-
-Array = NDArray[np.float64]
 
 _FINER = 5
 """Times the thinned rate at which columns are made, at least."""
@@ -177,7 +175,7 @@ class FormDictionary:
         return Span(max(float(low), span.low), min(float(high), span.high))
 
     @cached_property
-    def _sampling(self) -> list[tuple[slice, NDArray[np.int64]]]:
+    def _sampling(self) -> list[tuple[slice, Indices]]:
         """By trial: the samples at which columns are made, and which of these are kept."""
         band = self.evidence.band
         fits = [d for d in range(1, band.step + 1) if band.step % d == 0]
@@ -250,7 +248,7 @@ class FormDictionary:
             return -self._pulls[trial][:, axis, [component]]
         return np.ones((1, 1)) if form.factor == FORCE else self._signals[form.factor][trial]
 
-    def _by_forces(self, form: Form, trial: int, kept: NDArray[np.int64]) -> Array:
+    def _by_forces(self, form: Form, trial: int, kept: Indices) -> Array:
         """Slope of what a form follows by the measured forces, (K, n_forces, 1)."""
         forces = self.evidence.system.model.device.forces
         if form.factor == READING:

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
 from bampipe.diagnosis.drafts import symbolic
 from bampipe.diagnosis.drafts.columns import FormDictionary
@@ -27,7 +27,6 @@ from bampipe.results.draft import ChanceOfDraft
 from bampipe.results.floor import compare_with_floor
 from bampipe.trials.evidence import gather_evidence
 
-Array = NDArray[np.float64]
 Progress = Callable[[float, str], None]
 """Called with a fraction of the work done and what is being done."""
 

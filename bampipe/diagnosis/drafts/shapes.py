@@ -12,13 +12,12 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from bampipe.arrays import Array
 from bampipe.estimate.play import drag_along
 from bampipe.physics.expression import parse
 
-Array = NDArray[np.float64]
 Constants = Mapping[str, Any]
 
 

@@ -14,8 +14,8 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bampipe.arrays import Array
 from bampipe.diagnosis.drafts.columns import FormDictionary
 from bampipe.diagnosis.drafts.forms import FORCE, Form
 from bampipe.diagnosis.drafts.quantities import Quantity, coordinates
@@ -23,8 +23,6 @@ from bampipe.diagnosis.drafts.shapes import Shape
 from bampipe.errors import InputError
 from bampipe.physics.expression import build, parse
 from bampipe.trials.likelihood import Problem
-
-Array = NDArray[np.float64]
 
 EXTRA = "formulas"
 """The extra of bampipe that brings pyoperon."""
