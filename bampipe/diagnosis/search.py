@@ -239,8 +239,15 @@ class Search:
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
             member = np.repeat(np.arange(len(keys)), [h.stop - h.start for h in held])[used]
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)
-            if min(sizes) < self.least_size:
-                return Solution(np.inf)
+            products = np.tensordot(weight, xx, 1)
+            for k, size in enumerate(sizes):
+                # Nor can what others would take over beyond their bounds.
+                if (
+                    size < self.least_size
+                    and self._size_within_bounds(all_keys, k, strengths, b, products)
+                    < self.least_size
+                ):
+                    return Solution(np.inf)
             shapes = sum(len(key[1]) for key in keys)
             penalty += float(penalise(inside, spread[used], b[nb:][used], shapes))
         cost = solved.cost - float(volume.sum()) + penalty
@@ -287,6 +294,34 @@ class Search:
             share = alone / max(float(b[at] @ own[here] @ b[at]), 1e-300)
             sizes.append(self._size(key, strength) * float(np.sqrt(max(share, 0.0))))
         return tuple(sizes)
+
+    def _size_within_bounds(
+        self,
+        all_keys: tuple[Key, ...],
+        number: int,
+        strengths: Sequence[Array],
+        b: Array,
+        products: Array,
+    ) -> float:
+        """What an effect of a set adds as far as the best set without it, within bounds, does not.
+
+        Args:
+            all_keys: the set; number: of the effect among those that it adds.
+            strengths: of each; b: all unknowns of the set, (n,).
+            products: weighted, of all columns, (n, n).
+        """
+        key = added(all_keys)[number]
+        rest = self.solve(tuple(other for other in all_keys if other != key))
+        if not np.isfinite(rest.cost):
+            return 0.0
+        others = [*rest.strengths[:number], np.zeros_like(strengths[number]),
+                  *rest.strengths[number:]]  # fmt: skip
+        moved = b - np.concatenate([rest.base, *others])
+        start = len(rest.base) + sum(map(len, strengths[:number]))
+        alone = slice(start, start + len(strengths[number]))
+        whole = float(b[alone] @ products[alone, alone] @ b[alone])
+        share = float(moved @ products @ moved) / max(whole, 1e-300)
+        return self._size(key, strengths[number]) * float(np.sqrt(max(share, 0.0)))
 
     def _size(self, key: Key, strength: Array) -> float:
         """What an effect adds over the applied force of an axis, root mean square, the largest."""
