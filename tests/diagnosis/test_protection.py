@@ -124,6 +124,19 @@ def test_inputs_that_are_read_half_a_sample_late_give_no_delay(record):
         assert not [n for n in probabilities(found) if "delay" in n or "lag" in n]
 
 
+def test_a_delay_that_the_timing_takes_over_only_beyond_its_bounds_has_a_size(record):
+    trials, recipe = record("joint", 5)
+    late = [m.with_input_timing(-1.0 / trials.band.rate_hz) for m in trials.motions]
+    criteria, name = Criteria(size=0.003), "actuator_delay"
+    session = Session(replace(trials, motions=tuple(late)), criteria)
+    fit = session.fit_plainly(recipe, system_of(recipe).prior)
+    with open_search(session, fit, only=(name,)) as search:
+        ((cost, key),) = search.best_beside((), 1)
+        assert search.cost(()) - cost > 20.0
+        # With a timing that knows no bounds little would be left of it.
+        assert max(search.solve((key,)).sizes) < criteria.size
+
+
 TWIN = "other_thinning"
 
 
