@@ -181,11 +181,8 @@ class Dictionary:
     def _slopes(self, item: Candidate, searched: Array) -> dict[int, Array]:
         one_each = np.eye(len(item.linear_indices)) if item.linear_indices else np.zeros((1, 0))
         each = [self._slopes_at(item, self._parameters(item, searched, b)) for b in one_each]
-        nothing = {axis: np.zeros_like(slope) for slopes in each for axis, slope in slopes.items()}
-        return {
-            axis: np.stack([slopes.get(axis, zero) for slopes in each], axis=2)
-            for axis, zero in nothing.items()
-        }
+        zero = {a: np.zeros_like(slope) for slopes in each for a, slope in slopes.items()}
+        return {a: np.stack([s.get(a, z) for s in each], axis=2) for a, z in zero.items()}
 
     def _slopes_at(self, item: Candidate, p: Array) -> dict[int, Array]:
         """The same at given parameters, (n_p,), each (n, n_forces)."""

@@ -306,8 +306,7 @@ class Search:
         """What an effect of a set adds as far as the best set without it, within bounds, does not.
 
         Args:
-            all_keys: the set; number: of the effect among those that it adds.
-            strengths: of each; b: all unknowns of the set, (n,).
+            all_keys: the set; number: of the effect; strengths: of each; b: all unknowns, (n,).
             products: weighted, of all columns, (n, n).
         """
         key = added(all_keys)[number]
