@@ -150,13 +150,10 @@ class Dictionary:
     def scale_left(
         self, name: str, parameters: Mapping[str, float]
     ) -> tuple[dict[int, Array], Array]:
-        """What a candidate changes of how the residual depends on the measured forces.
+        """Slopes of what a candidate adds by each measured force, by axis, and its `Atom.gain`.
 
         Args:
             name: of the candidate; parameters: values of its own, by name.
-
-        Returns:
-            Slopes of what it adds by each force, by axis, each (n, n_forces), and its `gain`.
         """
         item = self.candidates[name]
         count = len(item.system.parameters) - len(item.parameters)

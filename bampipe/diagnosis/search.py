@@ -493,12 +493,13 @@ class Search:
         self, keys: Sequence[Key], most: int, shapes: int = 2
     ) -> list[tuple[float, Key]]:
         """Cost of a set with each candidate added, best first, of those that promise most."""
-        if not np.isfinite(self.cost(keys)):
+        none = self.cost(keys)
+        if not np.isfinite(none):
             return []
         # Close to those of this set: most weights are found in two passes from there.
         self._weight = self.solve(keys).weight
         gains, have = self.gains(keys), {name.removeprefix("-") for name, _ in keys}
-        tried: dict[str, int] = {}
+        tried: dict[str, float] = {}
         best: dict[str, tuple[float, Key]] = {}
         for k in np.argsort(-gains):
             key = self.places[k]
@@ -512,7 +513,8 @@ class Search:
             ):
                 continue
             cost = self.cost((*keys, key))
-            tried[name] = tried.get(name, 0) + 1
+            # One that promised much beyond the bounds of others says little of the next.
+            tried[name] = tried.get(name, 0.0) + (1.0 if cost < none else 0.25)
             if np.isfinite(cost) and cost < best.get(name, (np.inf,))[0]:
                 best[name] = cost, key
         return sorted(best.values())
