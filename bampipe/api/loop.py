@@ -29,7 +29,7 @@ MOST_ROUNDS = 4
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """Options of every step of the loop, as of a `Request`."""
+    """Options of every step of the loop, with the meaning that they have in a `Request`."""
 
     root: Path
     pipeline: Pipeline

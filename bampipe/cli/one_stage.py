@@ -135,7 +135,7 @@ def run_stage_of(
 ) -> Path:
     """Run ``stage`` on the run that ``run`` means, and advise; return the run folder.
 
-    ``more``: as of `run_stage`.
+    ``more``: see `run_stage`.
     """
     root = places.find_run(run, options.runs)
     run_stage(stage, root, options, model=model, more=more)

@@ -30,7 +30,7 @@ _MOST, _MOST_OF_THREE, _MOST_OF_STATES = 60, 120, 300
 happen, not only how large they are; three of them at most, or more."""
 _DIVERGED = 1e30
 """An internal state that is too stiff to be integrated at the sampling rate ends above this."""
-_PASSES = 1e-3
+_NO_SLOPE = 1e-3
 """Slope by a constant force up to which a candidate passes it as it is."""
 _SEGMENT = 128
 """Thinned samples of a segment from which the gain of a filter is found."""
@@ -46,8 +46,7 @@ class Atom:
     Attributes:
         columns: by the number of each axis that it changes, (n, m) for its m strengths.
         slopes: derivative of what it adds by each measured force, by axis, (n, n_forces, m), for
-            each of its strengths at one; empty where what it adds does not depend on the force of
-            that moment.
+            each of its strengths at one; empty where it passes a constant force as it is.
         gain: share of the variance of white noise of the measured force that it leaves in the
             band where it filters that force, by axis, (n_q,); else one.
     """
@@ -193,7 +192,9 @@ class Dictionary:
                 slope = slope - _slope_by_force(e.system, motion, kept, e.p)
             rows.append(slope)
         found = [take_samples(rows, here, a) for a, here in enumerate(self.samples)]
-        return {axis: slope for axis, slope in enumerate(found) if (np.abs(slope) > _PASSES).any()}
+        return {
+            axis: slope for axis, slope in enumerate(found) if (np.abs(slope) > _NO_SLOPE).any()
+        }
 
     def _gain(self, item: Candidate, p: Array, slopes: Mapping[int, Array]) -> Array:
         """What a candidate leaves of the noise of the forces, `Atom.gain`.

@@ -228,7 +228,8 @@ class Search:
         # What an effect of the model costs is not in the cost of the model as it is.
         penalty = self.penalty_of(all_keys)
         if keys:
-            normal = np.tensordot(weight, xx, 1)
+            products = np.tensordot(weight, xx, 1)
+            normal = products.copy()
             normal[:nb, :nb] += p.precision
             used = np.flatnonzero(~solved.held)
             # What a set takes away does not move along: its place can be taken by a twin of it.
@@ -239,7 +240,6 @@ class Search:
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
             member = np.repeat(np.arange(len(keys)), [h.stop - h.start for h in held])[used]
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)
-            products = np.tensordot(weight, xx, 1)
             for k, size in enumerate(sizes):
                 # Nor can what others would take over beyond their bounds.
                 if (
@@ -415,9 +415,8 @@ class Search:
 
     def volume_rows(self, keys: Sequence[Key]) -> list[Array]:
         """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
-        return self._log_slopes(
-            added(tuple(sorted(keys))), self.solve(keys).strengths, self.solve(keys).scale
-        )
+        solved = self.solve(keys)
+        return self._log_slopes(added(tuple(sorted(keys))), solved.strengths, solved.scale)
 
     def cost(self, keys: Sequence[Key]) -> float:
         """Negative log evidence of a set, nats."""

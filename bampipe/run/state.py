@@ -90,7 +90,7 @@ class RunState:
                 raise self.missing(pattern)
             for name in names:
                 if name == record.FILE:
-                    # What it says of the other steps, times and places left out.
+                    # Only what it says of the other steps counts; times and places do not.
                     others = {k: made.key for k, made in self.records.items() if k != step.name}
                     found[name] = digest_content(others)
                     continue

@@ -416,7 +416,7 @@ def test_json_of_arrays(tmp_path, content, names):
     for name, values in zip(names, (T, Q, F), strict=True):
         np.testing.assert_array_equal(trial.columns[name], values)
     np.testing.assert_array_equal(trial.columns["dt"], 0.01)
-    assert len(read_trial(path, ())) == 0  # as of a file whose parts alone are wanted
+    assert len(read_trial(path, ())) == 0  # as for a file of which only parts are wanted
     assert "no column 'x'" in refused(path, ("x",))
 
 
