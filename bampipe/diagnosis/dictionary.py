@@ -142,7 +142,8 @@ class Dictionary:
             for k in range(next(iter(found.values())).shape[1])
         ):
             return None
-        slopes = self._slopes(item, values)
+        one_each = np.eye(len(item.linear_indices)) if item.linear_indices else np.zeros((1, 0))
+        slopes = self._slopes(item, [self._parameters(item, values, b) for b in one_each])
         gain = self._gain(item, self._parameters(item, values), slopes)
         return Atom(found, slopes, gain)
 
@@ -158,8 +159,8 @@ class Dictionary:
         count = len(item.system.parameters) - len(item.parameters)
         own = [parameters[q.name] for q in item.parameters]
         p = np.concatenate([self.evidence.p[:count], own])
-        slopes = self._slopes_at(item, p)
-        return slopes, self._gain(item, p, slopes)
+        slopes = self._slopes(item, [p])
+        return {a: s[:, :, 0] for a, s in slopes.items()}, self._gain(item, p, slopes)
 
     def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
         """`make` each."""
@@ -174,27 +175,30 @@ class Dictionary:
         p[[count + i for i in item.linear_indices]] = strengths
         return p
 
-    def _slopes(self, item: Candidate, searched: Array) -> dict[int, Array]:
-        one_each = np.eye(len(item.linear_indices)) if item.linear_indices else np.zeros((1, 0))
-        each = [self._slopes_at(item, self._parameters(item, searched, b)) for b in one_each]
-        zero = {a: np.zeros_like(slope) for slopes in each for a, slope in slopes.items()}
-        return {a: np.stack([s.get(a, z) for s in each], axis=2) for a, z in zero.items()}
+    def _slopes(self, item: Candidate, probes: Sequence[Array]) -> dict[int, Array]:
+        """Slopes of what a candidate adds by each measured force, by axis, (n, n_forces, m).
 
-    def _slopes_at(self, item: Candidate, p: Array) -> dict[int, Array]:
-        """The same at given parameters, (n_p,), each (n, n_forces)."""
-        e, system, rows = self.evidence, item.system, []
+        At parameters ``probes``, m times (n_p,), that give it the same internal states.
+        """
+        e, system = self.evidence, item.system
         if not (system.driven or system.force_fed):
             return {}
-        for motion in e.motions:
-            kept = e.band.thinned_rows(len(motion.t))
-            slope = _slope_by_force(system, motion, kept, p)
-            if item.is_joint:
-                slope = slope - _slope_by_force(e.system, motion, kept, e.p)
-            rows.append(slope)
+        rows = [_slopes_by_force(system, x, self._kept(x), probes) for x in e.motions]
+        if item.is_joint:
+            rows = [r - plain for r, plain in zip(rows, self._slopes_without, strict=True)]
         found = [take_samples(rows, here, a) for a, here in enumerate(self.samples)]
         return {
             axis: slope for axis, slope in enumerate(found) if (np.abs(slope) > _NO_SLOPE).any()
         }
+
+    def _kept(self, motion: Motion) -> Indices:
+        return self.evidence.band.thinned_rows(len(motion.t))
+
+    @cached_property
+    def _slopes_without(self) -> list[Array]:
+        """Those of the model's own effects, by trial, each (K, n_q, n_forces, 1)."""
+        e = self.evidence
+        return [_slopes_by_force(e.system, x, self._kept(x), [e.p]) for x in e.motions]
 
     def _gain(self, item: Candidate, p: Array, slopes: Mapping[int, Array]) -> Array:
         """What a candidate leaves of the noise of the forces, `Atom.gain`.
@@ -230,24 +234,31 @@ class Dictionary:
         return [np.abs(sum(_spectrum(x, x) for x in each)) for each in columns]
 
 
-def _slope_by_force(system: System, motion: Motion, kept: Indices, p: Array) -> Array:
-    """Derivative of what the effects of a model add by each measured force, (K, n_q, n_forces).
+def _slopes_by_force(
+    system: System, motion: Motion, kept: Indices, probes: Sequence[Array]
+) -> Array:
+    """Derivative of what effects of a model add by each measured force, (K, n_q, n_forces, m).
 
     By a force that is more all the time, so that internal states which follow it have come to rest.
+
+    Args:
+        system: the model; motion: the trial; kept: numbers of the samples, (K,).
+        probes: parameters, m times (n_p,), that give the same internal states.
     """
-    u, forces = motion.inputs(system.inputs), system.model.device.forces
+    u, forces, p = motion.inputs(system.inputs), system.model.device.forces, probes[0]
     motion = motion.of_mechanism(system, u, p)
     at = motion.q[kept], motion.qd[kept], motion.qdd[kept]
     z = system.memory(*motion.kinematics, u, p, motion.t)
-    here, slopes = system.contribution(*at, z[kept], u[kept], p), []
+    here, slopes = [system.contribution(*at, z[kept], u[kept], p) for p in probes], []
     for force in forces:
         more, column = u.copy(), system.inputs.index(force)
         step = 1e-6 * max(float(np.abs(more[:, column]).max()), 1e-6)
         more[:, column] += step
         if system.force_fed:
             z = system.memory(*motion.kinematics, more, p, motion.t)
-        slopes.append((system.contribution(*at, z[kept], more[kept], p) - here) / step)
-    return np.stack(slopes, axis=2)
+        changed = [system.contribution(*at, z[kept], more[kept], p) for p in probes]
+        slopes.append([(new - old) / step for new, old in zip(changed, here, strict=True)])
+    return np.moveaxis(np.array(slopes), (0, 1), (2, 3))
 
 
 def _spectrum(x: Array, y: Array) -> NDArray[np.complex128]:
