@@ -51,7 +51,7 @@ def effects_code(model: Model) -> Generation:
         "moved_by": [
             i for i, p in enumerate(equations.p) if any(e.has(p) for e in equations.offset)
         ],
-        "driven": any(e.has(*forces) for e in added),
+        "driven": any(sp.diff(e, force) != 0 for e in added for force in forces),
         "force_fed": any(e.has(*forces) for e in equations.rates),
         "moved_first": moved_first(equations, forces),
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],

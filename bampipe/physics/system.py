@@ -103,6 +103,16 @@ class System:
         return results
 
     @cached_property
+    def parameters_by_force(self) -> frozenset[int]:
+        """Numbers of the parameters of effects that alone change how a measured force acts."""
+        names, found = [q.name for q in self.parameters], set[int]()
+        for item in self.model.effects if self.driven or self.force_fed else ():
+            alone = compile_model(Model(self.model.device, (item.name,), (item.effect,)))
+            if alone.driven or alone.force_fed:
+                found |= {names.index(q.name) for q in item.parameters}
+        return frozenset(found)
+
+    @cached_property
     def forced(self) -> tuple[int, ...]:
         """Columns of the inputs that hold a force or a time derivative of one."""
         orders = range(len(INPUT_ORDERS))
