@@ -226,9 +226,10 @@ class Search:
         volume = self._volume(self._log_slopes(all_keys, strengths, scale))
         if volume is None:
             return Solution(np.inf)
-        # The cost has what its own parameters leave of the scale in first order, absent ones, too.
-        for place, change in absent.items():
-            volume = volume - p.independent * change * self._own_log_scale[:, place]
+        # The cost has what its own parameters leave of the scale in second order, absent ones, too.
+        places_of, change = list(absent), np.array([*absent.values()])
+        first = self._own_log_scale[:, places_of] @ change
+        volume = volume - p.independent * (first - 0.5 * first**2)
         sizes: tuple[float, ...] = ()
         # What an effect of the model costs is not in the cost of the model as it is.
         penalty = self.penalty_of(all_keys)

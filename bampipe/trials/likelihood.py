@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -314,7 +315,7 @@ class Problem:
     Attributes:
         likelihood: weights and samples.
         y: by axis, (n,); base: by axis, (n, P), by the determined combinations of parameters.
-        precision, known_moment: of what is known of these beforehand, (P, P) and (P,).
+        known_precision, known_moment: of what is known of these beforehand, (P, P) and (P,).
         log_scale: mean log of what the model's effects leave of the measured quantity, by axis,
             (n_q,); log_scale_slopes: by the same combinations, (n_q, P).
         to_parameters: (n_all, P) from these to the free parameters, nuisance parameters last.
@@ -330,7 +331,7 @@ class Problem:
     likelihood: Likelihood
     y: tuple[Array, ...]
     base: tuple[Array, ...]
-    precision: Array
+    known_precision: Array
     known_moment: Array
     log_scale: Array
     log_scale_slopes: Array
@@ -357,6 +358,12 @@ class Problem:
     def moment(self) -> Array:
         """Slope of the log density of all but the residual where nothing changes, (P,)."""
         return np.asarray(self.known_moment + self.independent @ self.log_scale_slopes)
+
+    @cached_property
+    def precision(self) -> Array:
+        """Its curvature, (P, P): a share of the scale is linear in the strength of an effect."""
+        slopes = self.log_scale_slopes
+        return np.asarray(self.known_precision + (self.independent * slopes.T) @ slopes)
 
     @property
     def fixed_cost(self) -> float:
