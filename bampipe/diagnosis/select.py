@@ -145,7 +145,7 @@ def select_effects(
     gains: dict[str, float] = {}
     known: Search | None = None
     last, left_out = False, set[str]()
-    for number in range(_MOST_ROUNDS):
+    for number in range(_MOST_ROUNDS + 1):
         progress(0.1 + 0.1 * number, "weighing sets of effects")
         with open_search(session, current, {*without, *left_out}, known) as search:
             known = search
@@ -156,7 +156,7 @@ def select_effects(
             room = session.criteria.most_effects - len(current.recipe.effects) + len(recipe.effects)
             pool = _explore(search, room, deep=room if number == 0 else min(_DEEP, room))
             moved: Fit | None = None
-            last |= number == _MOST_ROUNDS - 1
+            last |= number >= _MOST_ROUNDS - 1
             better = [(c, k) for c, k in sorted(pool.values()) if c < none - _WORTH]
             broken: list[set[Key]] = []
             kept: dict[tuple[str, ...], float] = {}
@@ -197,14 +197,16 @@ def select_effects(
                 )
                 moved = (
                     None
-                    if number == _MOST_ROUNDS - 1
+                    if number == _MOST_ROUNDS
                     else _leave_out(session, search, current, weighed, recipe.effects)
                 )
                 if moved is None:
                     return Selection(
                         initial, current, weighed, chance, search.largest_gain(), gains,
-                        tuple(steps), number == _MOST_ROUNDS - 1 or room <= 0,
+                        tuple(steps), number >= _MOST_ROUNDS - 1 or room <= 0,
                     )  # fmt: skip
+                # A second time, nothing more is added.
+                last |= bool(left_out)
                 left_out |= {*current.recipe.effects} - {*moved.recipe.effects}
         current = moved
         steps.append(current)
