@@ -188,6 +188,7 @@ def test_mistakes_are_one_line_and_exit_code_two(
     toy: Toy, command: Command, extra: list[str], message: str
 ) -> None:
     assert message in one_line_error(*command("run", *arguments(toy), *extra))
+    assert not toy.root.exists() or extra[0] == "--model"
 
 
 @pytest.mark.parametrize("setting", ["toy_fit.factr=5", "toy_double.factor=many"])

@@ -19,6 +19,7 @@ from bampipe.report import style, typeset
 from bampipe.report.build import Report, build
 from bampipe.report.results import Results
 from bampipe.report.sections import identification, validation
+from bampipe.report.wording import name_parameter
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.draft import DraftResult
 from bampipe.results.validate import ValidateResult
@@ -89,12 +90,7 @@ def test_summary_gives_the_verdict_and_the_key_numbers(full: Report) -> None:
 
 def test_parameters_are_the_stored_ones_rounded_to_their_uncertainty(full: Report) -> None:
     for name, (value, sd, unit) in synthetic_run.parameters(synthetic_run.CHILD).items():
-        cells = next(
-            row
-            for row in re.findall(r"<tr>(.*?)</tr>", full.html, flags=re.DOTALL)
-            if f"<code>{name}</code>" in row.replace("<wbr>", "")
-        )
-        shown = [text_of(f"<main>{cell}").strip() for cell in re.findall(r"<td.*?</td>", cells)]
+        shown = row_of(full.html, name_parameter(name), name)
         estimate, spread = float(shown[2].removesuffix(" *")), float(shown[3])
         assert shown[2].endswith("*") == (name == "stribeck.yaw.speed")
         assert float(shown[5]) == pytest.approx(value + 0.4 * sd, abs=0.06 * sd)
@@ -159,16 +155,13 @@ def test_each_effect_found_is_explained(full: Report) -> None:
     )
     assert "Friction rises as the speed falls. Found: force 1.021 ± 0.064 N·m; speed" in words
     assert "torque = -force*exp(-qd**2)" in words
+    assert "Q[θ] = -1.086 sgn(θ') - 4.171 θ'" in text_of(full.html)
     assert "On the machine. Grease the joint." in words
     assert "Its probability is 0.97. In its place: presliding:yaw (0.03)." in words
     assert "Right: the worst window of yaw without stribeck:yaw (reversing slowly" in words
     assert "the residual falls from 0.2" in words
     assert {"friction", "effect-stribeck-yaw"} <= full.figures.keys()
     assert "Friction builds up over a distance. torque = -z" in words
-
-
-def test_the_equations_have_the_numbers_in_them(full: Report) -> None:
-    assert "Q[θ] = -1.086 sgn(θ') - 4.171 θ'" in text_of(full.html)
 
 
 def test_a_simulated_session_says_so_and_who_recorded_what(full_run: Path, tmp_path: Path) -> None:
@@ -387,12 +380,9 @@ def test_one_model_in_detail_can_be_chosen(full_run: Path) -> None:
         _ = Results(full_run, "bse").model
 
 
-def test_without_ingest_one_line_says_so(tmp_path: Path) -> None:
+def test_missing_and_damaged_results_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"is missing.*bampipe ingest"):
         build(Results(tmp_path), quiet)
-
-
-def test_damaged_results_are_named(tmp_path: Path) -> None:
     synthetic_run.write_ingest(tmp_path)
     (tmp_path / "stiffness").mkdir()
     (tmp_path / "stiffness/stiffness.json").write_text("{")
@@ -441,50 +431,28 @@ def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(
     full_run: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(full_run, tmp_path / "s01")
+    name, formula = "bump_by_position:yaw", "height*exp(-((q - place)/width)**2)"
     curve = {
-        "variable": "position",
-        "variable_unit": "rad",
-        "unit": "N.m",
-        "at": [-0.1, 0.0, 0.1],
-        "mean": [0.0, -1.5, 0.0],
-        "low": [-0.1, -1.6, -0.1],
-        "high": [0.1, -1.4, 0.1],
+        "variable": "position", "variable_unit": "rad", "at": [-0.1, 0.0, 0.1],
+        "mean": [0.0, -1.5, 0.0], "low": [-0.1, -1.6, -0.1], "high": [0.1, -1.4, 0.1],
         "beside": {"extension position": 1.3},
-    }
+    }  # fmt: skip
     axis = {
-        "verdict": "drafted",
-        "effects": ["bump_by_position:yaw"],
-        "chance": [{"gain": 900.0, "gains": [4.0, 6.0, 5.0, 7.0], "p_value": 1e-6}],
-        "options": [
-            {"effects": [], "constants": 0, "held_out_rmse": 0.5},
-            {"effects": ["bump_by_position"], "constants": 3, "held_out_rmse": 0.02},
-        ],
-        "rmse_before": 0.5,
-        "rmse_after": 0.02,
-        "noise_floor": 0.019,
-        "unit": "N.m",
-        "nearest": [{"effect": "upper_stop:yaw", "held_out_rmse": 0.48, "sentence": "?"}],
+        "effects": [name], "chance": [{"gain": 900.0, "gains": [4.0, 6.0, 5.0, 7.0]}],
+        "options": [{"held_out_rmse": 0.5}, {"constants": 3, "held_out_rmse": 0.02}],
+        "rmse_after": 0.02, "noise_floor": 0.019,
+        "nearest": [{"effect": "upper_stop:yaw", "held_out_rmse": 0.48}],
         "sentence": "Yaw: a force on the axis that has a bump at one position.",
-    }
-    effect = {
-        "axis": "yaw",
-        "expression": "height*exp(-((q - place)/width)**2)",
-        "acts_as": "force",
-        "curve": curve,
-    }
+    }  # fmt: skip
+    effect = {"axis": "yaw", "expression": formula, "acts_as": "force", "curve": curve}
     write_result(
-        tmp_path / "s01",
-        DraftResult,
-        model="base",
-        axes={"yaw": axis},
-        effects={"bump_by_position:yaw": effect},
-        selected=["bump_by_position:yaw"],
+        tmp_path / "s01", DraftResult, axes={"yaw": axis}, effects={name: effect}, selected=[name]
     )
     report = build(Results(tmp_path / "s01"), quiet)
     assert "Drafts" in report.sections
     words = text_of(report.html)
     assert "Yaw: a force on the axis that has a bump at one position." in words
-    assert "height*exp(-((q - place)/width)**2)" in words
+    assert formula in words
     assert "is drawn, at extension position 1.3." in words
     assert row_of(report.html, "the draft")[1] == "0.0200"
     assert row_of(report.html, "upper_stop:yaw")[1] == "0.480"

@@ -277,6 +277,10 @@ def test_useless_data_is_an_alarm(
     for column in columns:
         frame.loc[dead, column] = cell
     found = followed(begun, frame.to_csv(index=False), tmp_path)
+    for column in columns:
+        frame[column] = cell
+    for start in (begun[1], None):  # of a run, and of a device alone: useless from the start
+        assert followed((begun[0], start), frame.to_csv(index=False), tmp_path)["alarm"]
     assert found["alarm"] and found["alarms"] == 1
     assert found["restarts"] == 0
     if found["bad_lines"]:
@@ -285,18 +289,6 @@ def test_useless_data_is_an_alarm(
         assert cell in ("nan", "") and columns[0] == "q_yaw"
         assert found["nis"]["useless"] == [name.removeprefix("q_") for name in columns]
         assert found["nis"]["window"] is None
-
-
-@pytest.mark.parametrize("cell", ["nan", "1e308"])
-def test_data_useless_from_the_start_is_an_alarm(
-    run: RunFolder, begun: tuple, tmp_path: Path, cell: str
-) -> None:
-    frame = samples(run, "t00").astype(object)
-    frame["q_yaw"] = cell
-    system, _ = begun
-    for start in (begun[1], None):
-        found = followed((system, start), frame.to_csv(index=False), tmp_path)
-        assert found["alarm"], cell
 
 
 def test_a_slow_sensor_is_no_useless_one(run: RunFolder, begun: tuple, tmp_path: Path) -> None:
