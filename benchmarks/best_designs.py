@@ -30,13 +30,13 @@ from bampipe.declarations.model_file import identified, load_model
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.identifiability import find_information
 from bampipe.identification.sensor_noise import sensor_noise
-from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.primitives import (
     Envelope,
     Primitive,
     list_primitives,
     vary_surroundings,
 )
+from bampipe.next_trial.rehearsal import Rehearsal
 from bampipe.physics import compile_model
 from bampipe.results.identify import IdentifyResult
 from bampipe.trials.measured import read_measured_trials

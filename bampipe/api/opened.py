@@ -12,7 +12,7 @@ import pandas as pd
 
 from bampipe.errors import InputError
 from bampipe.files import refuse_links
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.draft import DraftResult

@@ -99,7 +99,7 @@ def _find_pages(folder: Path, roots: Sequence[Path]) -> dict[str, str]:
 
 def _write_report(folder: Path, pages: Mapping[str, str]) -> None:
     # matplotlib is slow to import: only here
-    from bampipe.report.lab import build_report
+    from bampipe.report.lab_report import build_report
 
     made = build_report(folder, pages)
     with atomic_writer(folder / "report.pdf") as stream:

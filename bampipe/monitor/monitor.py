@@ -52,7 +52,7 @@ class Monitor:
         self._first_t = np.nan
         self._useless = 0
         if start is not None:
-            self._begin(start)
+            self._start_filter(start)
 
     def push(self, names: Sequence[str], values: Array) -> None:
         """Take samples (T, m), columns ``names`` as a `StreamLayout` has them."""
@@ -61,26 +61,26 @@ class Monitor:
             if not np.isfinite(self._first_t):
                 self._first_t = float(part[0, 0])
             t = part[:, 0].copy()
-            u = self._inputs(names, part)
+            u = self._arrange_inputs(names, part)
             q = part[:, [names.index(f"q_{axis}") for axis in self.system.coordinates]]
             self.samples += len(part)
             if self.start is None:
                 useful = np.isfinite(q).all(axis=1)
                 self._useless = 0 if useful.any() else self._useless + len(part)
-                self._judge(self._useless >= FIRST_LOOK)
+                self._set_alarm(self._useless >= FIRST_LOOK)
                 self._waiting.append((t[useful], u[useful], q[useful]))
                 if sum(len(item[0]) for item in self._waiting) < FIRST_LOOK:
                     self._t = float(t[-1])
                     continue
                 t, u, q = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
                 self._waiting.clear()
-                self._begin(start_from_samples(self.system, t, u, q, self.options))
-            self._take(t, u, q)
+                self._start_filter(start_from_samples(self.system, t, u, q, self.options))
+            self._filter_samples(t, u, q)
 
     def note_lines_without_sample(self, lines: int) -> None:
         """Raise the alarm where a window of lines has come and no sample in them."""
         if lines >= (FIRST_LOOK if self.start is None else self.start.window):
-            self._judge(True)
+            self._set_alarm(True)
 
     def report(self) -> dict[str, object]:
         """Return the current state, as JSON can hold it; no state before the filter has begun."""
@@ -130,16 +130,16 @@ class Monitor:
         }
         return content
 
-    def _judge(self, inconsistent: bool) -> None:
+    def _set_alarm(self, inconsistent: bool) -> None:
         self.alarms += inconsistent and not self.alarm
         self.alarm = inconsistent
 
-    def _begin(self, start: Start) -> None:
+    def _start_filter(self, start: Start) -> None:
         self.start = start
         self._test = WindowTest(len(self.system.coordinates), start.window)
         self._threshold = start.reference.threshold(self.options.probability)
 
-    def _inputs(self, names: Sequence[str], values: Array) -> Array:
+    def _arrange_inputs(self, names: Sequence[str], values: Array) -> Array:
         brakes = {name: f"brake_{axis}" for axis, name in self.system.model.device.brakes.items()}
         u = np.zeros((len(values), len(self.system.inputs)))
         for place, name in enumerate(self.system.inputs):
@@ -150,13 +150,13 @@ class Monitor:
                 u[:, place] = values[:, names.index(column)]
         return u
 
-    def _take(self, t: Array, u: Array, q: Array) -> None:
+    def _filter_samples(self, t: Array, u: Array, q: Array) -> None:
         """Filter samples, cut where a gap starts the motion anew."""
         ahead = np.diff(t, prepend=t[0] if np.isnan(self._t) else self._t)
         gaps = (int(i) for i in np.flatnonzero(ahead > self.options.gap_s) if i > 0)
         for first, last in pairwise([0, *gaps, len(ahead)]):
             if ahead[first] > self.options.gap_s and self._filter is not None:
-                self._again(f"a gap of {ahead[first]:.3g} s before {t[first]:.3f} s")
+                self._restart(f"a gap of {ahead[first]:.3g} s before {t[first]:.3f} s")
             self._filter_stretch(t[first:last], u[first:last], q[first:last])
         self._t = float(t[-1])
 
@@ -181,7 +181,7 @@ class Monitor:
         except FilterFailure as failure:
             self._filter = None
             self._add_unfiltered(np.zeros(q.shape, dtype=bool))
-            self._again(f"near {t[min(failure.sample, t.size - 1)]:.3f} s {failure.reason}")
+            self._restart(f"near {t[min(failure.sample, t.size - 1)]:.3f} s {failure.reason}")
             return
         with np.errstate(over="ignore"):
             squares = np.square(found.innovation / found.innovation_sd)
@@ -199,11 +199,11 @@ class Monitor:
         self, test: WindowTest, nis: Array, squares: Array, present: Flags
     ) -> None:
         for mean in test.take(nis, squares, present):
-            self._judge(bool(mean > self._threshold))
+            self._set_alarm(bool(mean > self._threshold))
             worst = np.where(test.useless, np.inf, test.by_reading)
             self._axis = self.system.coordinates[int(np.argmax(worst))]
 
-    def _again(self, why: str) -> None:
+    def _restart(self, why: str) -> None:
         """Start the motion anew; the parameters go on from where they are, if they are known."""
         self.restarts += 1
         if self.restarts <= MOST_COMPLAINTS:

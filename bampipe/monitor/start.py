@@ -103,7 +103,7 @@ class Start:
         )
 
 
-def layouts(system: System, session: Session | None) -> tuple[StreamLayout, ...]:
+def list_layouts(system: System, session: Session | None) -> tuple[StreamLayout, ...]:
     """What the header of a stream for this model may look like.
 
     SI columns named as in ``ingest/samples.parquet``, brake commands being zero where their
@@ -146,7 +146,7 @@ def open_stream(
         samples: path, or ``-``; system: the model; session: folder whose raw columns may come.
         strict: raise at a bad line; complain: called for the first ones that are skipped.
     """
-    known = layouts(system, read_session(session) if session is not None else None)
+    known = list_layouts(system, read_session(session) if session is not None else None)
     if samples == "-":
         return SampleStream(0, "standard input", known, strict, complain)
     try:
@@ -188,7 +188,7 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
             remedy="bampipe run SESSION --set ingest.fastest_hz=0",
         )
     rate = ingested.sample_rate_hz
-    trials = [_trial(run, trial, system) for trial in free_trials(run, fitted=True)]
+    trials = [_read_trial(run, trial, system) for trial in free_trials(run, fitted=True)]
     model = build_filter_model(system, trials, values, False, found.input_timing.estimate)
     sd = np.array([found.parameters[parameter].sd for parameter in names])
     value = values[model.free]
@@ -208,7 +208,9 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
         stride=max(trial.t.size for trial in trials),
     )
     n = len(system.coordinates)
-    speed = np.sqrt(np.mean([np.mean(np.square(_speeds(trial)), axis=0) for trial in trials], 0))
+    speed = np.sqrt(
+        np.mean([np.mean(np.square(_find_speeds(trial)), axis=0) for trial in trials], 0)
+    )
     window = max(2, round(options.window_s * rate))
     start = Start(
         model, settings, theta, covariance, np.maximum(speed, 1e-3),
@@ -271,7 +273,7 @@ def start_from_samples(
     )  # fmt: skip
 
 
-def _trial(run: RunFolder, trial_id: str, system: System) -> Trial:
+def _read_trial(run: RunFolder, trial_id: str, system: System) -> Trial:
     """The raw samples of a trial from the first complete reading on; its state is left open."""
     columns = read_samples(run, trial_id, system)
     t = columns["t"]
@@ -284,7 +286,7 @@ def _trial(run: RunFolder, trial_id: str, system: System) -> Trial:
     return Trial(t[first:], u[first:], y[first:], np.zeros(0), np.zeros(0))
 
 
-def _speeds(trial: Trial) -> Array:
+def _find_speeds(trial: Trial) -> Array:
     """Coarse velocities over a twentieth of a second, (rows, n_q), for their size only."""
     step = max(1, round(0.05 / float(np.median(np.diff(trial.t)))))
     speed = np.diff(trial.y[::step], axis=0) / np.diff(trial.t[::step])[:, None]

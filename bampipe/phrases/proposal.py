@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from bampipe.lists import join_names
 from bampipe.results.next import AS_FORECAST, Detectable, NextResult, Trajectory
 
-_SHOWN = 3
+_MOST_NAMED = 3
 """Parameters or effects that a sentence names."""
 
 
@@ -19,7 +19,7 @@ def say_chance(value: float) -> str:
 def say_sizes(table: Mapping[str, Detectable], names: Iterable[str]) -> str:
     """Return effects with the sizes from which on a proposed trial shows them."""
     sizes = (f"{name} from {table[name].with_proposal:.2g} {table[name].unit}" for name in names)
-    return f"{join_names((size.rstrip() for size in sizes), _SHOWN)} on"
+    return f"{join_names((size.rstrip() for size in sizes), _MOST_NAMED)} on"
 
 
 def say_trajectory(found: Trajectory) -> list[str]:
@@ -36,7 +36,7 @@ def say_trajectory(found: Trajectory) -> list[str]:
         " collisions: the model knows none."
     ]
     if found.assumed:
-        axes = join_names(found.assumed, _SHOWN)
+        axes = join_names(found.assumed, _MOST_NAMED)
         said.append(
             f"No acceleration is stated of {axes} ([limits]): the highest seen in these trials is"
             " the limit."
@@ -88,12 +88,12 @@ def explain_proposal(
         )
     if best.sd and missing:
         why = (
-            f"By the diagnosis the model lacks {join_names(missing, _SHOWN)}: add that first"
+            f"By the diagnosis the model lacks {join_names(missing, _MOST_NAMED)}: add that first"
             f" (`bampipe extend`), and ask again. {why}"
         )
         expected += " These are the uncertainties of a model that lacks something."
     elif best.sd and lacking:
-        error = f"The error of {join_names(lacking, _SHOWN)} is above the noise floor:"
+        error = f"The error of {join_names(lacking, _MOST_NAMED)} is above the noise floor:"
         if missing is None:
             why = f"{error} ask first what the model lacks (`bampipe diagnose`). {why}"
         expected += f" {error} what the model lacks there counts as noise in these uncertainties."
@@ -132,20 +132,20 @@ def _say_unseen(found: NextResult, unbraked: Sequence[str]) -> str:
         if entry.smallest is None and entry.with_proposal is None and name not in unbraked
     ]
     if hidden:
-        sizes = join_names([_say_size(name, table[name]) for name in hidden], _SHOWN)
+        sizes = join_names([_say_size(name, table[name]) for name in hidden], _MOST_NAMED)
         why = f"These trials would not have shown {sizes}."
     else:
         every = "every other effect" if never or unbraked or unpromised else "every effect"
         why = f"These trials would have shown {every} of the library at its typical size."
     if never:
         one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
-        names = join_names(never, _SHOWN)
+        names = join_names(never, _MOST_NAMED)
         why += f" In trials like these {one} out of sight at any size ({names})."
     if unbraked:
-        names = join_names(unbraked, _SHOWN)
+        names = join_names(unbraked, _MOST_NAMED)
         why += f" What brakes do ({names}) shows in viscous trials, of which there are none."
     if unpromised:
-        names = join_names(unpromised, _SHOWN)
+        names = join_names(unpromised, _MOST_NAMED)
         why += (
             f" Of {names} no size is promised: large enough to show, it changes how the motion"
             " turns round."
@@ -167,7 +167,7 @@ def _explain_decision(found: NextResult, unlimited: Sequence[str]) -> tuple[str,
         )
     remedy = (
         f", or a wider motion: the device file states no [limits] of"
-        f" {join_names(unlimited, _SHOWN)}, so that none was tried."
+        f" {join_names(unlimited, _MOST_NAMED)}, so that none was tried."
     )
     return why, (
         f"No trial tried tells them apart: the chance would be {after} after this one. Another load"
@@ -187,7 +187,7 @@ def _say_uncertainties(found: NextResult) -> str:
     sds = found.proposals[0].sd
     falls = {name: sd.after / sd.before for name, sd in sds.items() if sd.before > 0.0}
     names = [found.parameter] if found.parameter else sorted(falls, key=lambda name: falls[name])
-    shown = {name: sds[name] for name in names[:_SHOWN] if name in sds}
+    shown = {name: sds[name] for name in names[:_MOST_NAMED] if name in sds}
     if not shown:
         return "No uncertainties are forecast: the model is not fitted to such a trial."
     parts = [

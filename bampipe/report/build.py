@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from bampipe.report import page, style, typeset
 from bampipe.report.document import Block, Callout, Document, Figure, Section
 from bampipe.report.explorer.page import explorer_page
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.sections import SECTIONS
 from bampipe.results.setup import SetupResult
 

@@ -8,7 +8,7 @@ from bampipe.lists import join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.phrases.results import STANDINGS
 from bampipe.report.document import Callout
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import count_noun, format_digits
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.validate import ValidateResult

@@ -13,7 +13,7 @@ _PREFIXES = ((1e-6, 1e-7, "µ"), (1e-3, 1e-4, "m"), (1.0, 0.1, ""), (1e3, 1e3, "
 """Size of each prefix, and from which largest value on it is used."""
 _PREFIXED = ("rad", "m", "N", "Pa")
 """Units that take a prefix when they lead; kg already has one."""
-_UNIT = re.compile(r"\b(?:(?:k?N|kg)(?:\.(?:m2?|s2?))+(?:/[A-Za-z]+2?)?|(?:rad|m)/s2)\b")
+_UNIT_PATTERN = re.compile(r"\b(?:(?:k?N|kg)(?:\.(?:m2?|s2?))+(?:/[A-Za-z]+2?)?|(?:rad|m)/s2)\b")
 _MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.])")
 _POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]\d+)\b")
 _BASE_PARAMETERS = {"viscous": "viscous damping", "coulomb": "Coulomb friction"}
@@ -30,7 +30,7 @@ def format_unit(text: str) -> str:
 def format_prose(text: str) -> str:
     """Return text with minus signs, powers of ten and units as printed; names are not changed."""
     text = _MINUS.sub("−", _POWER.sub(lambda found: f"{found[1]}{_format_power(found[2])}", text))
-    return _UNIT.sub(lambda found: format_unit(found[0]), text)
+    return _UNIT_PATTERN.sub(lambda found: format_unit(found[0]), text)
 
 
 def _format_power(exponent: int | str) -> str:

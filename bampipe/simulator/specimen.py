@@ -89,7 +89,7 @@ class Specimen:
         return np.array([self.values[p.name] for p in system.parameters])
 
 
-def _device(name: str) -> Device:
+def _find_device(name: str) -> Device:
     """The built-in device of that name.
 
     Raises:
@@ -112,25 +112,25 @@ def _device(name: str) -> Device:
     return device
 
 
-def input_column(system: System, name: str) -> int:
+def find_input_column(system: System, name: str) -> int:
     """Column of an input in u, -1 where the model has no use for it."""
     return system.inputs.index(name) if name in system.inputs else -1
 
 
 def draw_specimen(config: Config) -> tuple[Specimen, dict[str, float]]:
     """Draw the specimen; also the strength of each effect by canonical name."""
-    device = _device(config.device)
+    device = _find_device(config.device)
     extra = [
         registry.effect_from(read_toml(path), str(path)) for path in map(Path, config.effect_files)
     ]
-    strengths = dict(_strength(text, config.strength) for text in config.effects)
+    strengths = dict(_read_strength(text, config.strength) for text in config.effects)
     if len(strengths) < len(config.effects):
         raise InputError("an effect is named twice")
     full = Model(device, strengths, extra)
     rng = np.random.default_rng([config.seed, 0])
-    values = _base_values(device, rng)
+    values = _draw_base_values(device, rng)
     for item in full.effects:
-        values |= _effect_values(item, strengths[item.name], rng)
+        values |= _draw_effect_values(item, strengths[item.name], rng)
     for name, value in config.parameters.items():
         if name not in values:
             known = ", ".join(values)
@@ -154,7 +154,7 @@ def _is_delay(item: BoundEffect) -> bool:
     return item.effect.name == "force_delay"
 
 
-def _strength(text: str, default: float) -> tuple[str, float]:
+def _read_strength(text: str, default: float) -> tuple[str, float]:
     name, sign, number = text.partition("=")
     if not sign:
         return name, default
@@ -167,18 +167,18 @@ def _strength(text: str, default: float) -> tuple[str, float]:
     return name, value
 
 
-def _base_values(device: Device, rng: np.random.Generator) -> dict[str, float]:
+def _draw_base_values(device: Device, rng: np.random.Generator) -> dict[str, float]:
     """Parameters of one specimen of ``device``, around their typical values or priors."""
     spread = {"viscous": 0.15, "coulomb": 0.1}
     values = {}
     for p in device.parameters:
         nominal = p.prior if p.typical is None else p.typical
         factor = 1.0 + spread.get(p.name.partition(".")[0], 0.003) * float(rng.uniform(-1.0, 1.0))
-        values[p.name] = p.prior if p.fixed else _between(nominal * factor, p.lower, p.upper)
+        values[p.name] = p.prior if p.fixed else _clip(nominal * factor, p.lower, p.upper)
     return values
 
 
-def _effect_values(
+def _draw_effect_values(
     item: BoundEffect, strength: float, rng: np.random.Generator
 ) -> dict[str, float]:
     """Parameters of an effect: strengths scaled and signed, shapes within 20 % of typical."""
@@ -191,9 +191,9 @@ def _effect_values(
             wanted = sign * strength * usual
         else:
             wanted = usual * (1.0 + 0.2 * draw)
-        values[p.name] = p.prior if p.fixed else _between(wanted, p.lower, p.upper)
+        values[p.name] = p.prior if p.fixed else _clip(wanted, p.lower, p.upper)
     return values
 
 
-def _between(value: float, lower: float, upper: float) -> float:
+def _clip(value: float, lower: float, upper: float) -> float:
     return min(max(value, lower), upper)

@@ -9,7 +9,7 @@ import numpy as np
 from bampipe.arrays import Array
 from bampipe.estimate.simulation import Impedance, simulate_tracking
 from bampipe.physics.device import Coordinate, Device, derivative
-from bampipe.simulator.specimen import Config, Specimen, input_column
+from bampipe.simulator.specimen import Config, Specimen, find_input_column
 
 REACH = {"rotary": 0.65, "linear": 0.8}
 """Largest wanted motion as a share of half the range: people use more of a rod than of a turn."""
@@ -73,7 +73,7 @@ def simulate_moving_trial(
     if "t" in system.inputs:
         u[:, system.inputs.index("t")] = t
     force = [system.inputs.index(f) for f in device.forces]
-    slopes = [[input_column(system, derivative(f, k)) for f in device.forces] for k in (1, 2)]
+    slopes = [[find_input_column(system, derivative(f, k)) for f in device.forces] for k in (1, 2)]
     n = len(device.coordinates)
     brakes = [system.inputs.index(device.brakes[c.name]) for c in device.coordinates] if (
         viscous or set(device.brakes) == {c.name for c in device.coordinates}

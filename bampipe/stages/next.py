@@ -26,23 +26,23 @@ from bampipe.estimate.simulation import Runaway
 from bampipe.files import digest_content, write_json, write_text
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import sensor_noise
-from bampipe.next_trial.choice import (
+from bampipe.next_trial.discrimination import Comparison
+from bampipe.next_trial.forecast import Forecast
+from bampipe.next_trial.plan import Goal, plan_trials, record_plan
+from bampipe.next_trial.precision import Precision
+from bampipe.next_trial.primitives import Envelope, imitate_trials
+from bampipe.next_trial.ranking import (
     DesignSpace,
     RankedDesign,
     count_affordable,
     find_best_of_each,
     rank_designs,
 )
-from bampipe.next_trial.discrimination import Comparison
-from bampipe.next_trial.forecast import Forecast
-from bampipe.next_trial.motion import Rehearsal
-from bampipe.next_trial.plan import Goal, plan_trials, record_plan
-from bampipe.next_trial.precision import Precision
-from bampipe.next_trial.primitives import Envelope, imitate_trials
+from bampipe.next_trial.rehearsal import Rehearsal
 from bampipe.next_trial.sensitivity import Detectability, find_detectability
 from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity
 from bampipe.next_trial.trajectory import Points, list_trajectories, read_limits, require_limits
-from bampipe.phrases.forecast import find_open, read_forecasts
+from bampipe.phrases.forecast_outcome import find_open, read_forecasts
 from bampipe.phrases.proposal import explain_proposal, find_shown, say_trajectory
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe

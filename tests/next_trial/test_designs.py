@@ -9,17 +9,10 @@ import pytest
 from diagnosis.sessions import BAND, KINEMATICS, SENSORS, bam
 
 from bampipe.diagnosis.session import system_of
-from bampipe.next_trial.choice import DesignSpace, RankedDesign, find_best_of_each, rank_designs
+from bampipe.next_trial.design_sentence import describe_design
 from bampipe.next_trial.discrimination import Alternative, Comparison, chance_of_confusion
 from bampipe.next_trial.forecast import Forecast
-from bampipe.next_trial.motion import (
-    HASTY,
-    Rehearsal,
-    example_path,
-    follow_roughly,
-    stroke_path,
-)
-from bampipe.next_trial.plan import Goal, _shortest, plan_trials
+from bampipe.next_trial.plan import Goal, _find_shortest, plan_trials
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import (
     Envelope,
@@ -30,8 +23,15 @@ from bampipe.next_trial.primitives import (
     list_primitives,
     vary_surroundings,
 )
-from bampipe.next_trial.words import describe
-from bampipe.phrases.forecast import compare_forecast, read_forecasts
+from bampipe.next_trial.ranking import DesignSpace, RankedDesign, find_best_of_each, rank_designs
+from bampipe.next_trial.rehearsal import (
+    HASTY,
+    Rehearsal,
+    example_path,
+    follow_roughly,
+    stroke_path,
+)
+from bampipe.phrases.forecast_outcome import compare_forecast, read_forecasts
 from bampipe.phrases.proposal import explain_proposal, find_shown
 from bampipe.physics import Model, compile_model, registry
 from bampipe.results.next import (
@@ -189,7 +189,9 @@ def test_what_leaves_what_has_been_seen_is_recorded_in_two_trials():
         # Each of them has room for three strokes.
         longest = 1.875 * (stroke.high - stroke.low) / np.sqrt(stroke.slow * stroke.fast)
         assert design.parts == 1 or 3.0 * longest < 1.01 * design.part_s
-    assert ", for 20 s in 2 trials of 10 s; " in describe(beyond[0], seen, registry.device("bam"))
+    assert ", for 20 s in 2 trials of 10 s; " in describe_design(
+        beyond[0], seen, registry.device("bam")
+    )
     assert all(d.parts == 1 for d in every_design(seen) if not any(find_beyond(d, seen)))
     assert all(d.parts == 1 for d in list_primitives(seen, 6.0, [0], with_rests=False))
 
@@ -220,7 +222,7 @@ def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
     assert np.ptp(q[:, 0]) == pytest.approx(0.2, rel=0.02)
     usual = np.abs(qd[1000:2500, 0]).max()
     assert usual == pytest.approx(0.8, rel=0.01)
-    said = describe(first, SEEN, registry.device("bam"))
+    said = describe_design(first, SEEN, registry.device("bam"))
     assert said == (
         "Move yaw and pitch as in trial t01, yaw between −11° and 11° (−0.20 to 0.20 rad) at up to"
         " 23°/s, pitch between −9° and 14° (−0.15 to 0.25 rad) at up to 30°/s, over and over for"
@@ -311,7 +313,7 @@ def test_a_path_has_the_velocity_and_acceleration_that_it_says():
 
 def test_a_sentence_says_where_how_fast_and_how_long():
     design = list_primitives(SEEN, 20.0, [0], with_rests=False)[6]
-    said = describe(design, SEEN, registry.device("bam"))
+    said = describe_design(design, SEEN, registry.device("bam"))
     assert said.startswith("Move yaw slowly back and forth between")
     stroke = design.strokes[0]
     assert f"{np.degrees(stroke.high):.0f}°" in said
@@ -331,13 +333,15 @@ def test_a_sentence_says_what_goes_beyond_the_trials_at_hand():
         (fast, "; this takes yaw faster than so far."),
         (replace(far, fast=4.0), "; this takes yaw farther and faster than so far: try the way"),
     ):
-        assert ending in describe(Primitive({0: stroke, **gentle}, seen.usual, 20.0), seen, device)
+        assert ending in describe_design(
+            Primitive({0: stroke, **gentle}, seen.usual, 20.0), seen, device
+        )
     both = Primitive({0: fast, 1: Stroke(-0.9, -0.5, 0.1, 0.2, gentle=True)}, seen.usual, 20.0)
-    said = describe(both, seen, device)
+    said = describe_design(both, seen, device)
     assert "this takes pitch farther and yaw faster than so far: try the way slowly first" in said
     assert re.search(r"keep pitch moving gently, −40° ± 11° in [0-9.]+ s each way", said)
     near = list_primitives(TIMID, 20.0, [0], with_rests=False)[6]
-    assert "than so far" not in describe(near, seen, device)
+    assert "than so far" not in describe_design(near, seen, device)
 
 
 def made_proposal(after: float, farther: tuple[str, ...] = ()) -> Proposal:
@@ -533,13 +537,13 @@ def test_a_planned_trial_is_shortened_no_further_than_its_strokes_allow():
     quick = Stroke(-0.5, 0.5, 2.0, 2.0)
     slow = replace(quick, slow=0.5, fast=0.5)
     one = Primitive({0: quick}, np.zeros(1), 20.0)
-    assert _shortest(one) == 5.0
-    assert _shortest(replace(one, strokes={0: slow})) == pytest.approx(3 * 1.875 / 0.5)
-    assert _shortest(replace(one, parts=2)) == 10.0
+    assert _find_shortest(one) == 5.0
+    assert _find_shortest(replace(one, strokes={0: slow})) == pytest.approx(3 * 1.875 / 0.5)
+    assert _find_shortest(replace(one, parts=2)) == 10.0
     # Of a trial of 12 s, what is shorter does not cover what it covers.
     (like,) = imitate_trials([made_motion("t01", 2.0)], SEEN, 20.0)
-    assert _shortest(like) == pytest.approx(12.0, abs=0.01)
-    assert _shortest(replace(like, seconds=8.0)) == 8.0
+    assert _find_shortest(like) == pytest.approx(12.0, abs=0.01)
+    assert _find_shortest(replace(like, seconds=8.0)) == 8.0
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from bampipe.errors import InputError
 from bampipe.files import read_json, toml_text, write_json, write_text
 from bampipe.report.explorer.packing import PackedColumn, Packer
 from bampipe.report.explorer.page import explorer_page
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.stages.report import write_page_of_two
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

@@ -17,7 +17,7 @@ from bampipe.data.store import write_parquet
 from bampipe.errors import InputError
 from bampipe.report import style, typeset
 from bampipe.report.build import Report, build
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.sections import identification, validation
 from bampipe.report.wording import name_parameter
 from bampipe.results.diagnose import DiagnoseResult

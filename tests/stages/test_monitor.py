@@ -176,12 +176,12 @@ def test_a_lost_motion_starts_anew(run: RunFolder, begun: tuple) -> None:
 def test_memory_and_speed_hold(run: RunFolder, begun: tuple) -> None:
     """5 kHz sustained, parsing included, on one core; nothing grows."""
     from bampipe.data.stream import SampleStream
-    from bampipe.monitor.start import layouts
+    from bampipe.monitor.start import list_layouts
 
     system, start = begun
     frame = samples(run, "t00")
     source, sink = os.pipe()
-    stream = SampleStream(source, "pipe", layouts(system, None), True, pytest.fail)
+    stream = SampleStream(source, "pipe", list_layouts(system, None), True, pytest.fail)
     monitor = Monitor(system, start, MonitorOptions(), pytest.fail)
     text = frame.to_csv(index=False).encode()
     step, taken, begin = 1 << 14, 0, time.process_time()
@@ -247,11 +247,11 @@ def test_mistakes_are_one_line(
 
 
 def test_a_model_with_a_force_rate_is_refused() -> None:
-    from bampipe.monitor.start import layouts
+    from bampipe.monitor.start import list_layouts
 
     system = compile_model(Model(registry.device("bam"), ("force_delay",)))
     with pytest.raises(InputError, match="known only afterwards"):
-        layouts(system, None)
+        list_layouts(system, None)
 
 
 # Data of no use

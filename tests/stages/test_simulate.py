@@ -16,7 +16,7 @@ import bampipe
 from bampipe.data.session import read_session
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
-from bampipe.simulator.session import Config, simulate_session
+from bampipe.simulator.simulated_session import Config, simulate_session
 from bampipe.trials.motion import Motion
 
 AXES = ("yaw", "pitch", "extension")

@@ -15,7 +15,7 @@ from bampipe.errors import InputError
 from bampipe.files import read_json, write_json, write_text
 from bampipe.progress import silent
 from bampipe.run.settings import configure
-from bampipe.simulator import session as simulation
+from bampipe.simulator import simulated_session as simulation
 from bampipe.stages import identify, validate
 
 SQUARES = identify.Config(method="least-squares")

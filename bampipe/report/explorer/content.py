@@ -14,7 +14,7 @@ from bampipe.files import read_toml
 from bampipe.lists import join_names
 from bampipe.report.document import strip_marks
 from bampipe.report.explorer.packing import Packer
-from bampipe.report.results import R, Results
+from bampipe.report.run_results import R, Results
 from bampipe.report.wording import format_unit, name_trial_state, split_name
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult

@@ -11,7 +11,7 @@ from bampipe.report import verdicts
 from bampipe.report.document import strip_marks
 from bampipe.report.explorer.content import Content, gather_content
 from bampipe.report.explorer.packing import Packer
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 
 _ASSETS = Path(__file__).parent / "assets"
 SCRIPTS = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from bampipe.report.document import Block, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import format_decimals, format_digits, format_stated, format_unit
 from bampipe.results.identify import Combined, DeviceNumber, IdentifyResult
 from bampipe.results.performance import DeviceConstant, PerformanceResult

@@ -20,7 +20,7 @@ from bampipe.report.document import (
     Subheading,
     Table,
 )
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.sections import next_trial
 from bampipe.report.wording import (
     count_noun,
@@ -44,9 +44,9 @@ from bampipe.results.next import NextResult
 
 Maps = Mapping[str, ResidualMap]
 TITLE = "Diagnosis"
-_RANKED = 8
-_WINDOWS = 6
-_MAPS = 6
+_MOST_RANKED = 8
+_MOST_WINDOWS = 6
+_MOST_MAPS = 6
 """Most maps of one axis: those that explain most, best first."""
 
 
@@ -152,7 +152,7 @@ def _tabulate_sets(found: DiagnoseResult) -> list[Block]:
             phrases.probability(one.probability),
             format_digits(one.log_evidence),
         )
-        for one in shown[:_RANKED]
+        for one in shown[:_MOST_RANKED]
     ]
     columns = "Effects | >Probability | >Log evidence over the first (nats)"
     return [Table("Sets of effects, the most probable first", columns, rows), null]
@@ -188,7 +188,7 @@ def tabulate_candidates(
 
 
 def _tabulate_ranking(ranking: Sequence[RankedEffect]) -> Table:
-    shown, more = ranking[:_RANKED], len(ranking) - _RANKED
+    shown, more = ranking[:_MOST_RANKED], len(ranking) - _MOST_RANKED
     rows = [
         (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from))) for one in shown
     ]
@@ -201,7 +201,7 @@ def _tabulate_ranking(ranking: Sequence[RankedEffect]) -> Table:
 
 
 def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Figure:
-    names = sorted(maps, key=lambda name: -maps[name].variance_share)[:_MAPS]
+    names = sorted(maps, key=lambda name: -maps[name].variance_share)[:_MOST_MAPS]
     figure, panels = style.make_grid(len(names), 3, 1.65, column_width=1.9)
     for number, (panel, name) in enumerate(zip(panels, names, strict=True)):
         draw_map(panel, name, maps[name], style.VERMILLION, "the model")
@@ -258,7 +258,7 @@ def _tabulate_windows(results: Results, windows: Sequence[WorstWindow]) -> Table
             f"{format_digits(one.rmse)} {format_unit(one.unit)}",
             one.doing or "–",
         )
-        for one in windows[:_WINDOWS]
+        for one in windows[:_MOST_WINDOWS]
     ]
     return Table(
         "Worst windows: where the prediction fails most, and how the machine moved there",

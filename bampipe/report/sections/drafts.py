@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from bampipe.lists import join_names
 from bampipe.report import style
 from bampipe.report.document import Block, Figure, Formulas, Paragraph, Section, Subheading, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits, format_unit, split_name
 from bampipe.results.diagnose import DiagnoseResult, ResidualMap
 from bampipe.results.draft import AxisDraft, DraftedEffect, DraftResult

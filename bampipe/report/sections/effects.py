@@ -13,7 +13,7 @@ from bampipe.lists import join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.report import style
 from bampipe.report.document import Block, Figure, Formulas, Paragraph, Section, Subheading, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.sections.diagnosis import tabulate_candidates
 from bampipe.report.wording import format_digits, format_unit, format_with_sd, split_name
 from bampipe.results.compare import CompareResult
@@ -22,9 +22,9 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.terms import ModelTerm, TermCurve, TermsResult
 
 TITLE = "Effects"
-_WEIGHED = 8
+_MOST_CANDIDATES = 8
 _ALTERNATIVES = 3
-_LEAST_SHARE = 0.2
+_LEAST_CURVE_SHARE = 0.2
 """Share of a term's variance that its curve has to carry to be drawn."""
 
 
@@ -100,7 +100,7 @@ def _draw_curve(panel: Axes, curve: TermCurve) -> None:
 def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
     """Draw the curves of an effect and, once a version, its worst window without and with it."""
     name = f"effect-{term.name.replace(':', '-')}"
-    curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_SHARE]
+    curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_CURVE_SHARE]
     blocks: list[Block] = []
     if term.curves and not curves:
         words = "No single variable carries a fifth of its force, so that no curve is drawn."
@@ -128,7 +128,9 @@ def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Blo
         f"he worst window of {found.window.axis} without {found.added} ({found.window.doing}), "
         f"where {change}."
     )
-    beside = f"Left: {_describe(term, [first])} Right: t{caption}" if first else f"T{caption}"
+    beside = (
+        f"Left: {_describe_curves(term, [first])} Right: t{caption}" if first else f"T{caption}"
+    )
     blocks.append(style.finish(figure, name, beside, [top]))
     others = [curve for curve in curves if curve is not first]
     return [*blocks, *_draw_contribution(f"{name}-more", term, others)]
@@ -137,11 +139,11 @@ def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Blo
 def _draw_contribution(name: str, term: ModelTerm, curves: Sequence[TermCurve]) -> list[Block]:
     if not curves:
         return []
-    words = _describe(term, curves)
+    words = _describe_curves(term, curves)
     return [_draw_curves(name, curves, words[:1].upper() + words[1:])]
 
 
-def _describe(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
+def _describe_curves(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
     variables = join_names(dict.fromkeys(curve.variable for curve in curves))
     return (
         f"the force that `{term.name}` takes, with its 95 % band, against the variable that it "
@@ -243,6 +245,6 @@ def _tabulate_weighed(results: Results, added: set[str]) -> list[Table]:
         (one, [f"{text.summary}. " + "; ".join(f"`{line}`" for line in text.formulas[:2])])
         for one in diagnosis.ranking
         if one.effect not in added and (text := texts.get(one.effect.partition(":")[0]))
-    ][:_WEIGHED]
+    ][:_MOST_CANDIDATES]
     title = f"Weighed on model `{diagnosis.model}`, best first"
     return [tabulate_candidates(title, rows, "Description and formula ~2.6")] if rows else []

@@ -13,7 +13,7 @@ from bampipe.lists import join_names
 from bampipe.phrases.results import METHODS
 from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     find_digits,
     format_decimals,
@@ -36,7 +36,7 @@ from bampipe.results.validate import ValidateResult
 TITLE = "Identification"
 _LEAST_CALIBRATION = 0.1
 """Share of an SD from which on a table gives the part that calibration has in it."""
-_COLUMNS, _MOST_ROWS = (2, 3, 4), 7
+_PANEL_COLUMNS, _MOST_PANEL_ROWS = (2, 3, 4), 7
 """Of panels: those that leave the fewest places empty, and of these the least."""
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
@@ -214,7 +214,7 @@ def _group_parameters(
 
 def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.DataFrame) -> Figure:
     groups = _group_parameters(results, _select_parameters(identified), trace)
-    few = [n for n in _COLUMNS if len(groups) <= n * _MOST_ROWS] or _COLUMNS[-1:]
+    few = [n for n in _PANEL_COLUMNS if len(groups) <= n * _MOST_PANEL_ROWS] or _PANEL_COLUMNS[-1:]
     columns = min(few, key=lambda columns: (-len(groups) % columns, columns))
     figure, panels = style.make_grid(len(groups), columns, 1.35)
     clock = "t_total" if "t_total" in trace else "t"

@@ -9,7 +9,7 @@ import numpy as np
 from bampipe.lists import join_names
 from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Figure, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
     choose_scale,

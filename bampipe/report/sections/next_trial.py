@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from bampipe.phrases.forecast import compare_forecasts, read_forecasts
+from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts
 from bampipe.report.document import Block, Bullets, Callout, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits, format_percent, format_unit
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from bampipe.report.document import Block, Paragraph, Section, Subheading, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.results.run import RunResult, StepRecord
 
 _DIGITS = 12

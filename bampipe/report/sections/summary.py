@@ -9,7 +9,7 @@ from bampipe.lists import join_names
 from bampipe.phrases.results import METHODS
 from bampipe.report import verdicts
 from bampipe.report.document import Block, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
     count_noun,

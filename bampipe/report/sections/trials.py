@@ -11,7 +11,7 @@ from typing import Any
 from bampipe.lists import join_names
 from bampipe.phrases import results as phrases
 from bampipe.report.document import Block, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
     format_decimals,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from bampipe.report.document import Block, Bullets, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import format_decimals, format_digits, format_percent, format_unit
 from bampipe.results.identify import IdentifiabilityReport, IdentifyResult, InnovationTests
 

@@ -11,7 +11,7 @@ import pandas as pd
 from bampipe.lists import join_names
 from bampipe.report import style, verdicts
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
     choose_scale,
@@ -23,7 +23,7 @@ from bampipe.report.wording import (
 from bampipe.results.validate import AxisDrift, ValidateResult
 
 TITLE = "Validation"
-_WINDOW_S = 12.0
+_SHOWN_S = 12.0
 _SETTLE_S = 1.0
 
 
@@ -152,7 +152,7 @@ def _draw_forces(results: Results, frame: pd.DataFrame) -> Figure:
     kind = "force" if components else "torque"
     figure, panels = style.make_panels(len(names), 1, 0.45 + 1.2 * len(names), sharex=True)
     t = frame["t"].to_numpy()
-    window = (t >= t[0] + _SETTLE_S) & (t <= t[0] + _SETTLE_S + _WINDOW_S)
+    window = (t >= t[0] + _SETTLE_S) & (t <= t[0] + _SETTLE_S + _SHOWN_S)
     part = frame[window] if window.sum() > 10 else frame
     t = part["t"].to_numpy()
     for panel, name in zip(panels[:, 0], names, strict=True):

@@ -19,7 +19,7 @@ from bampipe.files import write_json, write_text
 from bampipe.physics.device import Device
 from bampipe.progress import Progress, silent
 from bampipe.results.truth import TruthResult
-from bampipe.simulator.recording import format_session_file, record_trial
+from bampipe.simulator.sensor_log import format_session_file, record_trial
 from bampipe.simulator.specimen import Config, draw_specimen
 from bampipe.simulator.true_trials import simulate_locked_trial, simulate_moving_trial
 

@@ -13,7 +13,7 @@ from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import AS_FORECAST, NOTHING, ExpectedSd, NextResult, split_effects
 
-_SHOWN = 3
+_MOST_NAMED = 3
 """Parameters that are compared: those with the largest predicted improvement."""
 
 
@@ -80,17 +80,17 @@ def compare_forecast(
     if diagnosed is not None and not set(new) <= set(diagnosed.trials):
         diagnosed = None
     best, said = proposed.proposals[0], []
-    trials = f"{'trial' if len(new) == 1 else 'trials'} {join_names(new, _SHOWN)}"
+    trials = f"{'trial' if len(new) == 1 else 'trials'} {join_names(new, _MOST_NAMED)}"
     falls = sorted(best.sd, key=lambda name: best.sd[name].after / (best.sd[name].before or 1.0))
-    for name in [proposed.parameter] if proposed.parameter in best.sd else falls[:_SHOWN]:
+    for name in [proposed.parameter] if proposed.parameter in best.sd else falls[:_MOST_NAMED]:
         if name in identified.parameters:
             forecast, outcome = best.sd[name], identified.parameters[name].sd
             said.append(
                 f"`{name}`: ± {forecast.number} {forecast.unit} was forecast with {trials},"
                 f" ± {outcome:.2g} resulted (± {forecast.before:.2g} before)"
-                f"{_judge(forecast, outcome)}"
+                f"{_judge_forecast(forecast, outcome)}"
             )
-    for pair in best.confusion[:_SHOWN]:
+    for pair in best.confusion[:_MOST_NAMED]:
         first, second = pair.between
         chance = "of " * (pair.after >= 0.01) + say_chance(pair.after)
         text = f"{first} or {second}: a probability {chance} was forecast of confusing them"
@@ -140,7 +140,7 @@ def _compare_revealed(proposed: NextResult, diagnosed: DiagnoseResult | None) ->
         yield compare(absent, f"the diagnosis does not find {they} hardly larger")
 
 
-def _judge(forecast: ExpectedSd, outcome: float) -> str:
+def _judge_forecast(forecast: ExpectedSd, outcome: float) -> str:
     """Compare an uncertainty with its forecast, as the end of a sentence."""
     if forecast.is_sharp:
         ratio = outcome / forecast.after if forecast.after > 0.0 else 1.0

@@ -12,7 +12,7 @@ from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.system import System
-from bampipe.simulator.specimen import Config, Specimen, input_column
+from bampipe.simulator.specimen import Config, Specimen, find_input_column
 from bampipe.simulator.true_trials import TrueTrial
 
 ENCODERS = {
@@ -101,12 +101,12 @@ def _sensed_force(specimen: Specimen, true: TrueTrial) -> Array:
 
     zero = _sensor_inputs(system, true, np.zeros_like(late))
     constant = corrected(zero)
-    if any(input_column(system, derivative(f, k)) >= 0 for f in names for k in _TOO_HIGH):
+    if any(find_input_column(system, derivative(f, k)) >= 0 for f in names for k in _TOO_HIGH):
         raise InputError("an input effect with a third derivative cannot be simulated")
     response = np.zeros((3, len(late), nf, nf))
     for order in range(3):
         for j, f in enumerate(names):
-            column = input_column(system, derivative(f, order))
+            column = find_input_column(system, derivative(f, order))
             if column >= 0:
                 u = zero.copy()
                 u[:, column] = 1.0

@@ -41,11 +41,11 @@ from bampipe.run import models
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import read_measured_trials
 
-_MAPPED = ("position", "velocity", "direction")
-_BINS, _FEWEST, _SHOWN = 8, 12, 5
+_MAPPED_VARIABLES = ("position", "velocity", "direction")
+_MAP_BINS, _FEWEST_SAMPLES, _MOST_REFITS = 8, 12, 5
 _LEAST_GAIN = 0.03
 """Share of an axis' error above its limit that a further parameter has to remove."""
-_STEPS = 4
+_REFIT_STEPS = 4
 """Gauss-Newton steps of a refit of parameters in which the residual is not linear."""
 
 
@@ -214,9 +214,9 @@ def _compare_states(a: _Side, here: Evidence, there: Evidence) -> tuple[StateCha
     spread, found, every = a.covariance(here), [], []
     for axis, name in enumerate(a.system.coordinates):
         pairs = zip(variables(here, axis), variables(there, axis), strict=True)
-        for one, other in ((x, y) for x, y in pairs if x.name in _MAPPED):
+        for one, other in ((x, y) for x, y in pairs if x.name in _MAPPED_VARIABLES):
             x, y = (np.concatenate(v.values) for v in (one, other))
-            edges = np.unique(np.quantile(np.append(x, y), np.linspace(0.0, 1.0, _BINS + 1)))
+            edges = np.unique(np.quantile(np.append(x, y), np.linspace(0.0, 1.0, _MAP_BINS + 1)))
             if one.name == "direction":
                 edges = np.array([-1.5, 0.0, 1.5])
             bins = [_bin_residual(e, axis, v, edges) for e, v in ((here, x), (there, y))]
@@ -259,7 +259,7 @@ def _bin_residual(e: Evidence, axis: int, values: Array, edges: Array) -> pd.Dat
     between = np.sqrt((by_trial**2).groupby(level=0).sum()) / count
     means.insert(2, "sd", np.maximum(within, between))
     means.insert(3, "count", count)
-    return means[count >= _FEWEST]
+    return means[count >= _FEWEST_SAMPLES]
 
 
 def _make_map(bins: pd.DataFrame, unit: str) -> ResidualMap:
@@ -296,7 +296,7 @@ def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
     alone = [_refit(e, [k], limits) for k in range(len(e.free))]
     alone.sort(key=lambda one: float(np.sum((np.array([*one.errors.values()]) / limits) ** 2)))
     together = _refit_together(e, limits)
-    update: dict[str, object] = {"alone": tuple(alone[:_SHOWN]), "together": together}
+    update: dict[str, object] = {"alone": tuple(alone[:_MOST_REFITS]), "together": together}
     doubtful = {*journey.failed} - {*(together.travels if together is not None else ())}
     doubtful |= {a for a, v in trials.validated.axes.items() if v.standing == "above_floor"}
     if doubtful:
@@ -329,7 +329,7 @@ def _refit(e: Evidence, chosen: list[int], limits: Array) -> Refit:
     start, free = e.p, list(e.free)
     step, error = _solve(e, chosen, limits)
     if not all(e.system.constant[free[k]] for k in chosen):
-        for _ in range(_STEPS):
+        for _ in range(_REFIT_STEPS):
             p = e.p.copy()
             p[[free[k] for k in chosen]] += step
             e = gather_evidence(e.system, e.motions, e.band, p, e.folds, most_iterations=0)

@@ -29,7 +29,7 @@ from bampipe.report.wording import (
 from bampipe.results.floor import AT_FLOOR
 from bampipe.results.lab import ControlChart, SessionVerdict, TrendsResult
 
-_COLUMNS = 3
+_PANEL_COLUMNS = 3
 _MOST_PANELS = 12
 _MOST_NAMES = 12
 _MOST_CALLOUTS = 6
@@ -147,7 +147,7 @@ def _show_charts(trends: TrendsResult) -> list[Section]:
         for start in range(0, len(charts), _MOST_PANELS):
             part = charts[start : start + _MOST_PANELS]
             number = f"-{start // _MOST_PANELS + 1}" if len(charts) > _MOST_PANELS else ""
-            figure, panels = style.make_grid(len(part), _COLUMNS, 1.75, extra=0.25)
+            figure, panels = style.make_grid(len(part), _PANEL_COLUMNS, 1.75, extra=0.25)
             for panel, chart in zip(panels, part, strict=True):
                 _draw_chart(panel, chart)
             caption = "Parameters of the base model and stiffnesses, session by session."
@@ -244,7 +244,7 @@ def _show_errors(folder: Path, trends: TrendsResult) -> list[Section]:
     sessions = [one.session for one in trends.sessions if one.session in with_error]
     axes = list(dict.fromkeys(frame["axis"]))
     counts = (frame["model"] == frame["session_id"].map(model_of)) & (frame["model"] != "base")
-    figure, panels = style.make_grid(len(axes), _COLUMNS, 1.9)
+    figure, panels = style.make_grid(len(axes), _PANEL_COLUMNS, 1.9)
     for panel, axis in zip(panels, axes, strict=True):
         panel.axhspan(0.0, AT_FLOOR, color=style.GREEN, alpha=0.12, lw=0)
         for chosen, colour, mark, name in (
