@@ -1,4 +1,4 @@
-"""A proposed trial compared with its outcome, once it has been recorded."""
+"""A forecast compared with its outcome, once the proposed trial has been recorded."""
 
 from __future__ import annotations
 
@@ -92,8 +92,7 @@ def compare_forecast(
             )
     for pair in best.confusion[:_MOST_NAMED]:
         first, second = pair.between
-        chance = "of " * (pair.after >= 0.01) + say_chance(pair.after)
-        text = f"{first} or {second}: a probability {chance} was forecast of confusing them"
+        text = f"{first} or {second}: the forecast chance of confusion was {say_chance(pair.after)}"
         if diagnosed is None:
             said.append(f"{text}; `bampipe diagnose RUN` tells the outcome.")
         else:

@@ -1,4 +1,4 @@
-"""Sentences about a proposed trial: the reason for it and the expected gain."""
+"""Sentences on a proposed trial: the reason for it and the expected gain."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ def say_trajectory(found: Trajectory) -> list[str]:
         most.append(f"{100.0 * shares[axis]:.0f} % of the {name} ({axis})")
     said = [
         f"The trajectory uses at most {join_names(most)} that its limits allow. Check it for"
-        " collisions: the model knows none."
+        " collisions: the model does not know obstacles."
     ]
     if found.assumed:
         axes = join_names(found.assumed, _MOST_NAMED)
         said.append(
-            f"No acceleration is stated of {axes} ([limits]): the highest seen in these trials is"
-            " the limit."
+            f"No acceleration limit is stated for {axes} ([limits]); the highest in these trials is"
+            " used."
         )
     return said
 
@@ -79,24 +79,24 @@ def explain_proposal(
         why += " Add it to session.toml as a viscous trial."
     if best.farther or best.faster:
         expected += (
-            " This forecast takes the model to hold beyond what the trials at hand have shown."
+            " This forecast assumes that the model holds beyond the range of the present trials."
         )
     if best.parts > 1:
         why += (
-            " It takes more than one trial, because each is judged by what the others say and none"
-            " at hand is like it."
+            " It takes more than one trial: each is judged by parameters fitted to the others, and"
+            " no present trial resembles it."
         )
     if best.sd and missing:
         why = (
-            f"By the diagnosis the model lacks {join_names(missing, _MOST_NAMED)}: add that first"
-            f" (`bampipe extend`), and ask again. {why}"
+            f"According to the diagnosis, the model lacks {join_names(missing, _MOST_NAMED)}."
+            f" Extend the model first (`bampipe extend`), then ask again. {why}"
         )
         expected += " These are the uncertainties of a model that lacks something."
     elif best.sd and lacking:
         error = f"The error of {join_names(lacking, _MOST_NAMED)} is above the noise floor:"
         if missing is None:
-            why = f"{error} ask first what the model lacks (`bampipe diagnose`). {why}"
-        expected += f" {error} what the model lacks there counts as noise in these uncertainties."
+            why = f"{error} find the missing effect first (`bampipe diagnose`). {why}"
+        expected += f" {error} the missing effect counts as noise in these uncertainties."
     return why, expected
 
 
@@ -106,11 +106,8 @@ def _explain_purpose(
     """Why, and what is expected as far as the model goes."""
     if found.purpose == "decision":
         return _explain_decision(found, unlimited)
-    most = (
-        f"says most of `{found.parameter}`"
-        if found.parameter
-        else "adds most to what is known of all parameters together"
-    )
+    about = f"`{found.parameter}`" if found.parameter else "all parameters together"
+    most = f"adds most information on {about}"
     if found.purpose == "precision":
         return f"Of the motions tried, this one {most}.", _say_uncertainties(found)
     why = _say_unseen(found, unbraked)
@@ -140,15 +137,15 @@ def _say_unseen(found: NextResult, unbraked: Sequence[str]) -> str:
     if never:
         one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
         names = join_names(never, _MOST_NAMED)
-        why += f" In trials like these {one} out of sight at any size ({names})."
+        why += f" In trials like these, {one} invisible at any size ({names})."
     if unbraked:
         names = join_names(unbraked, _MOST_NAMED)
-        why += f" What brakes do ({names}) shows in viscous trials, of which there are none."
+        why += f" Effects of brakes ({names}) show in viscous trials only, and there are none."
     if unpromised:
         names = join_names(unpromised, _MOST_NAMED)
         why += (
-            f" Of {names} no size is promised: large enough to show, it changes how the motion"
-            " turns round."
+            f" No size is given for {names}: an effect large enough to show would change how the"
+            " motion reverses."
         )
     return why
 
@@ -166,12 +163,12 @@ def _explain_decision(found: NextResult, unlimited: Sequence[str]) -> tuple[str,
             f"The chance of confusing them is expected to fall from {before} to {after}.",
         )
     remedy = (
-        f", or a wider motion: the device file states no [limits] of"
-        f" {join_names(unlimited, _MOST_NAMED)}, so that none was tried."
+        f", as may a wider motion: none was tried, because the device file states no [limits] of"
+        f" {join_names(unlimited, _MOST_NAMED)}."
     )
     return why, (
-        f"No trial tried tells them apart: the chance would be {after} after this one. Another load"
-        f" may{remedy if unlimited else '.'}"
+        f"None of the trials that were tried distinguishes them: the chance would be {after} after"
+        f" this one. Another load may help{remedy if unlimited else '.'}"
     )
 
 
@@ -189,7 +186,7 @@ def _say_uncertainties(found: NextResult) -> str:
     names = [found.parameter] if found.parameter else sorted(falls, key=lambda name: falls[name])
     shown = {name: sds[name] for name in names[:_MOST_NAMED] if name in sds}
     if not shown:
-        return "No uncertainties are forecast: the model is not fitted to such a trial."
+        return "No uncertainties are forecast, because the model is not fitted to such a trial."
     parts = [
         f"`{name}` ± {sd.number} {sd.unit}".rstrip() + f", now ± {sd.before:.2g}"
         for name, sd in shown.items()

@@ -69,15 +69,15 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
 
 
 def _list_warnings(results: Results) -> tuple[Block, ...]:
-    """Return the mistakes of the set-up, and which results are outdated."""
+    """Return the mistakes in the set-up, and the outdated results."""
     blocks: list[Block] = []
     setup = results.read(SetupResult)
     for mistake in setup.mistakes if setup else ():
-        text = f"Set right, {mistake.evidence}."
+        text = f"Once this is corrected, {mistake.evidence}."
         if mistake.alternatives:
             others = "; ".join(other.sentence for other in mistake.alternatives)
-            text += f" The trials cannot tell it from: {others}."
-        text += " Nothing below counts before the session file is corrected."
+            text += f" The trials cannot distinguish it from: {others}."
+        text += " No result below is valid before the session file is corrected."
         blocks.append(Callout("attention", f"Set-up: {mistake.sentence}", text))
     if setup and setup.warnings:
         text = " ".join(f"{line}." for line in setup.warnings)
@@ -85,7 +85,7 @@ def _list_warnings(results: Results) -> tuple[Block, ...]:
     if results.outdated:
         steps = ", ".join(f"`{step}`" for step in results.outdated)
         text = f"Run these again before relying on their results: {steps}."
-        title = "Some results are older than what they were made from"
+        title = "Some results are older than their inputs"
         blocks.append(Callout("attention", title, text))
     return tuple(blocks)
 

@@ -73,7 +73,7 @@ class Bullets:
 
 @dataclass(frozen=True)
 class Formulas:
-    """Lines of formulas, each as it is."""
+    """Lines of formulas, printed verbatim."""
 
     lines: tuple[str, ...]
 
@@ -83,8 +83,8 @@ class Callout:
     """A verdict in a box.
 
     Attributes:
-        tone: "good" (nothing to do), "attention" (something is missing), "unknown" (something
-            that nothing explains) or "note" (not done yet).
+        tone: "good" (nothing to do), "attention" (something is missing), "unknown" (an
+            unexplained residual) or "note" (not done yet).
         title: the verdict in a few words.
         text: one to three sentences, or a line for each axis.
     """

@@ -87,10 +87,10 @@ def _summarise(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
         for one in trends.sessions
     ]
     columns = (
-        "Session | Recorded (UTC) | Model that counts ~1.2 | >Error / floor, worst axis"
+        "Session | Recorded (UTC) | Best confirmed model ~1.2 | >Error / floor, worst axis"
         " | Beyond its limits ~1 | Verdict ~0.8"
     )
-    note = "Error of that model on unseen trials, over the error that sensors and filters leave."
+    note = "Error of that model on unseen trials over the noise floor of sensors and filters."
     blocks.append(Table("Sessions in the order of recording", columns, rows, note))
     return Section("Summary", tuple(blocks))
 
@@ -249,7 +249,7 @@ def _show_errors(folder: Path, trends: TrendsResult) -> list[Section]:
         panel.axhspan(0.0, AT_FLOOR, color=style.GREEN, alpha=0.12, lw=0)
         for chosen, colour, mark, name in (
             (frame["model"] == "base", style.BLUE, "o", "base model"),
-            (counts, style.VERMILLION, "D", "model that counts, where extended"),
+            (counts, style.VERMILLION, "D", "best confirmed model, if extended"),
         ):
             part = frame[chosen & (frame["axis"] == axis)]
             x = [sessions.index(session) for session in part["session_id"]]
@@ -267,8 +267,7 @@ def _show_errors(folder: Path, trends: TrendsResult) -> list[Section]:
     caption = "Error on unseen trials over the noise floor, session by session."
     text = (
         "The noise floor is the error that sensors and filters leave if the model is exactly "
-        f"right. In the green band, below {AT_FLOOR:g}, a model leaves nothing that the session "
-        "could show."
+        f"right. In the green band, below {AT_FLOOR:g}, the session shows no further effect."
     )
     picture = style.finish(figure, "errors", caption, panels[:1])
     return [Section("Prediction", (Paragraph(text), picture))]

@@ -164,7 +164,7 @@ class Results:
 
     def state_undone(self, said: str, stage: str) -> Paragraph:
         """Return the paragraph on a stage that has not run, with the command that runs it."""
-        return Paragraph(f"{said}: `bampipe {stage} {self.root.name}` does it.")
+        return Paragraph(f"{said}: run `bampipe {stage} {self.root.name}`.")
 
     def state_next(self, advice: str) -> Paragraph:
         """Return the paragraph on what to do next: a command for ``RUN``, or words."""

@@ -1,4 +1,4 @@
-"""How figures look: size, colours that colour-blind readers tell apart, and the SVG they become.
+"""Style of figures: size, colours that colour-blind readers can distinguish, and SVG output.
 
 Colours are those of Okabe and Ito (2008). Lines that matter also differ in dash or width.
 """

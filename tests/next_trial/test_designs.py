@@ -395,11 +395,13 @@ def test_what_a_model_lacks_is_said_to_count_as_noise():
     assert "The error of yaw and pitch is above the noise floor" in said
     # What the diagnosis found comes before any trial; where effects compete, nothing need be said.
     reasons = explain("precision", best, {}, (), ("yaw",), ["lag:x"])
-    assert reasons.why.startswith("By the diagnosis the model lacks lag:x: add that first")
+    assert reasons.why.startswith("According to the diagnosis, the model lacks lag:x. Ext")
     assert reasons.expected.endswith("of a model that lacks something.")
     assert "noise floor" not in reasons.expected
     why = explain("precision", best, {}, (), ("yaw",), None).why
-    assert why.startswith("The error of yaw is above the noise floor: ask first what")
+    assert why.startswith(
+        "The error of yaw is above the noise floor: find the missing effect first"
+    )
     said = explain("decision", made_proposal(0.01), {}, (), ("yaw",)).expected
     assert "noise floor" not in said
 
@@ -410,12 +412,15 @@ def test_effects_of_brakes_are_said_to_need_viscous_trials():
     )
     best, table = made_proposal(0.1), {"brake_lag": entry}
     reasons = explain("sensitivity", best, table, (), (), unbraked=["brake_lag"])
-    assert "every other effect of the library at its typical size. What brakes do" in reasons.why
-    assert "(brake_lag) shows in viscous trials, of which there are none" in reasons.why
-    assert "out of sight" not in reasons.why
-    assert "promised" not in reasons.why
+    assert "every other effect of the library at its typical size. Effects of brakes" in reasons.why
+    assert "(brake_lag) show in viscous trials only, and there are none" in reasons.why
+    assert "invisible" not in reasons.why
+    assert "No size" not in reasons.why
     unpromised = explain("sensitivity", best, {}, (), (), unpromised=["stribeck:yaw"])
-    assert "every other effect of the library at its typical size. Of stri" in unpromised.why
+    assert (
+        "every other effect of the library at its typical size. No size is given for stri"
+        in unpromised.why
+    )
     braked = best.model_copy(update={"brakes": 1.0})
     why = explain("sensitivity", braked, table, (), ()).why
     assert why.endswith("Add it to session.toml as a viscous trial.")
@@ -624,7 +629,5 @@ def test_sets_that_were_to_be_told_apart_are_held_against_the_diagnosis(selected
     axis = SimpleNamespace(verdict="undecided", probabilities=dict.fromkeys(undecided, 0.5))
     diagnosed = SimpleNamespace(trials=("t2",), selected=selected, axes={"x": axis})
     (line,) = compare_forecast(proposed, identified, diagnosed)
-    assert line.startswith(
-        "a:x or a:x + b:x: a probability of 2 % was forecast of confusing them; "
-    )
+    assert line.startswith("a:x or a:x + b:x: the forecast chance of confusion was 2 %; ")
     assert line.endswith(f"{said}.")

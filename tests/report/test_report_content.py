@@ -157,7 +157,7 @@ def test_each_effect_found_is_explained(full: Report) -> None:
     assert "torque = -force*exp(-qd**2)" in words
     assert "Q[θ] = -1.086 sgn(θ') - 4.171 θ'" in text_of(full.html)
     assert "On the machine. Grease the joint." in words
-    assert "Its probability is 0.97. In its place: presliding:yaw (0.03)." in words
+    assert "Its probability is 0.97. Alternatives: presliding:yaw (0.03)." in words
     assert "Right: the worst window of yaw without stribeck:yaw (reversing slowly" in words
     assert "the residual falls from 0.2" in words
     assert {"friction", "effect-stribeck-yaw"} <= full.figures.keys()
@@ -251,7 +251,7 @@ def test_settings_that_all_models_share_stand_once(full_run: Path, tmp_path: Pat
 def test_results_older_than_their_inputs_are_named_first(
     full: Report, full_run: Path, tmp_path: Path
 ) -> None:
-    assert "older than what they were made from" not in full.html
+    assert "older than their inputs" not in full.html
     root = tmp_path / "run"
     shutil.copytree(full_run, root)
     record = json.loads((root / "run.json").read_text())
@@ -264,7 +264,7 @@ def test_results_older_than_their_inputs_are_named_first(
     (root / "run.json").write_text(json.dumps(record))
     assert Results(root).outdated == ("filter", "identify:base", "stiffness")
     page = page_of(root)
-    place = page.index("older than what they were made from")
+    place = page.index("older than their inputs")
     assert place < page.index("<table") and "identify:base" in page[place:][:400]
 
 

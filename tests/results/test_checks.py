@@ -16,11 +16,13 @@ SOUND: dict[str, Any] = {
         "force": {"noise_sd": {"force_x": 0.05}},
     },
     "fit": {
-        "convergence": {"converged": True}, "input_timing": {"estimate": 5e-4, "sd": 1e-4},
+        "convergence": {"converged": True},
+        "input_timing": {"estimate": 5e-4, "sd": 1e-4, "limit": 1e-3},
         "innovations": {"yaw": {"whiteness": {"white": True}, "inputs": {"independent": True}}},
     },
     "yaw": {"standing": "above_floor", "estimate": "accepted"},
 }  # fmt: skip
+TIMING = {"estimate": -9.9e-4, "limit": 1e-3}
 COUNTS = {"noise_sd": {"force_x": 0.5}, "unit": "N", "look_like_counts": ["force_x"]}
 NOT_WHITE = {"yaw": {"sentence": "Not white", "whiteness": {"white": False}}}
 DRIVEN = {"yaw": {"sentence": "Not so", "inputs": {"independent": False}}}
@@ -48,7 +50,7 @@ def test_a_sound_model_fails_none() -> None:
         ("session", {"force": COUNTS}, "force_x: its readings look like counts of a converter"),
         ("fit", {"methods": {"ukf": {"doubts": ["lost"]}}}, "by the unscented filter: lost"),
         ("fit", {"convergence": {"converged": False}}, "not converged"),
-        ("fit", {"input_timing": {"estimate": -9.9e-4, "sd": 1e-4}}, "input timing: -0.99 ± 0.10"),
+        ("fit", {"input_timing": TIMING | {"sd": 1e-4}}, "input timing: -0.99 ± 0.10 ms"),
         ("fit", {"innovations": NOT_WHITE}, "yaw, innovations: Not white"),
         ("fit", {"innovations": DRIVEN}, "yaw, innovations: Not so"),
         ("yaw", {"estimate": "refused"}, "yaw: the published parameters are refused"),
@@ -68,6 +70,8 @@ def test_a_filter_that_is_not_published_says_nothing_against_a_model(
     assert len(failed(fit={"innovations": NOT_WHITE, "method": method})) == heard
 
 
-@pytest.mark.parametrize("sd", [0.0, 6e-4])
-def test_a_timing_that_was_not_estimated_or_determined_is_at_no_limit(sd: float) -> None:
-    assert failed(fit={"input_timing": {"estimate": 1e-3, "sd": sd}}) == []
+@pytest.mark.parametrize(("sd", "limit"), [(0.0, 0.0), (6e-4, 1e-3)])
+def test_a_timing_that_was_not_estimated_or_determined_is_at_no_limit(
+    sd: float, limit: float
+) -> None:
+    assert failed(fit={"input_timing": {"estimate": 1e-3, "sd": sd, "limit": limit}}) == []

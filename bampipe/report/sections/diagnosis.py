@@ -58,7 +58,7 @@ def section(results: Results) -> Section:
         if (content := results.read(DiagnoseResult, model)) is not None
     ]
     if not found:
-        text = f"No model has been diagnosed yet: `{results.diagnose_command}` does it."
+        text = f"No model has been diagnosed yet: run `{results.diagnose_command}`."
         return Section(TITLE, (Paragraph(text),))
     blocks: list[Block] = []
     last, after = found[-1]
@@ -96,19 +96,19 @@ def _show_model(
 
 
 def _tell_sensitivity(results: Results, model: str) -> Paragraph:
-    """Say which effects these trials would not have revealed, where nothing is missing."""
+    """Name the effects that these trials would not have revealed, if nothing is missing."""
     proposed = results.read(NextResult, model)
     if proposed is not None and proposed.sensitivity:
         return Paragraph(f"{proposed.why} The table under {next_trial.TITLE} lists every effect.")
     option = f" --model {model}" if len(results.models) > 1 else ""
     return Paragraph(
-        f"`bampipe next {results.root.name}{option}` computes how large an effect could be and go"
-        " unnoticed in these trials, and which trial would reveal it."
+        f"`bampipe next {results.root.name}{option}` computes the size up to which an effect would"
+        " go unnoticed in these trials, and the trial that would reveal it."
     )
 
 
 def _advise(results: Results, model: str, found: DiagnoseResult) -> list[Block]:
-    """Return the command that follows; where it has been run, the model that it made."""
+    """Return the next command, or its result if it has been run."""
     compared = results.read(CompareResult)
     wanted = set(found.selected)
     for rung in compared.ladder if compared else ():

@@ -40,8 +40,7 @@ def section(results: Results) -> Section | None:
         blocks.append(Paragraph(f"Model `{results.model}` is the device without effects."))
     if curves := [term.curves[0] for term in friction if term.curves]:
         caption = (
-            "Friction as identified: the force that it takes, with its 95 % band, over the motion "
-            "of the trials."
+            "Identified friction of each axis with its 95 % band, over the motion of the trials."
         )
         blocks.append(_draw_curves("friction", curves, caption))
     shown: set[str] = set()
@@ -54,7 +53,7 @@ def section(results: Results) -> Section | None:
 def _show_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
     """Return the blocks of one effect; ``shown``: versions whose worst window is drawn already."""
     text = term.text
-    words = [f"**Alternatives.** {_tell_alternatives(results, term.name)}"]
+    words = [f"**Diagnosis.** {_tell_alternatives(results, term.name)}"]
     if text.on_the_machine:
         words.insert(0, f"**On the machine.** {text.on_the_machine}.")
     if text.source:
@@ -94,7 +93,7 @@ def _draw_curve(panel: Axes, curve: TermCurve) -> None:
     panel.set_title(curve.axis)
     panel.set_xlabel(style.label_axis(split_name(curve.variable), unit))
     kind = "torque" if curve.unit.startswith("N.m") else "force"
-    panel.set_ylabel(style.label_axis(f"{kind} it takes", curve.unit))
+    panel.set_ylabel(style.label_axis(f"{kind} taken", curve.unit))
 
 
 def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
@@ -103,7 +102,7 @@ def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Blo
     curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_CURVE_SHARE]
     blocks: list[Block] = []
     if term.curves and not curves:
-        words = "No single variable carries a fifth of its force, so that no curve is drawn."
+        words = "No curve is drawn: no single variable accounts for a fifth of its force."
         blocks.append(Paragraph(words))
     found = _find_window(results, term)
     if found is None or found.added in shown:
@@ -146,8 +145,8 @@ def _draw_contribution(name: str, term: ModelTerm, curves: Sequence[TermCurve]) 
 def _describe_curves(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
     variables = join_names(dict.fromkeys(curve.variable for curve in curves))
     return (
-        f"the force that `{term.name}` takes, with its 95 % band, against the variable that it "
-        f"follows most ({variables}), over the motion of the trials."
+        f"the force taken by `{term.name}`, with its 95 % band, against its main variable "
+        f"({variables}), over the motion of the trials."
     )
 
 
@@ -223,16 +222,16 @@ def _read_diagnoses(results: Results) -> Iterable[DiagnoseResult]:
 
 
 def _tell_alternatives(results: Results, effect: str) -> str:
-    """Say how probable ``effect`` is, and which effects could stand in its place."""
+    """Return the probability of ``effect``, and its alternatives."""
     for diagnosis in _read_diagnoses(results):
         if effect not in diagnosis.selected:
             continue
         known = {n: p for one in diagnosis.axes.values() for n, p in one.probabilities.items()}
         others = diagnosis.alternatives[effect][:_ALTERNATIVES]
         named = (f"`{n}` ({phrases.probability(known.get(n, 0.0))})" for n in others)
-        place = f"In its place: {join_names(named)}" if others else "Nothing else takes its place"
+        place = f"Alternatives: {join_names(named)}" if others else "It has no alternative"
         return f"Its probability is {phrases.probability(known[effect])}. {place}."
-    return "No diagnosis of this run has weighed it against others."
+    return "No diagnosis of this run has compared it with other effects."
 
 
 def _tabulate_weighed(results: Results, added: set[str]) -> list[Table]:
