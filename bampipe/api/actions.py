@@ -37,8 +37,8 @@ def run_session(
         session: folder of the session.
         runs: folder that holds the run folders.
         pipeline: name of a pipeline, or a file of your own.
-        first: stage to start from; the first one where empty.
-        last: stage to stop after; the last one where empty.
+        first: stage to start from; the first one if empty.
+        last: stage to stop after; the last one if empty.
         force: run unchanged stages, too.
         settings: by stage, then by name: ``{"identify": {"method": "least-squares"}}``.
 
@@ -121,10 +121,10 @@ def extend(run: Run | Path_, effect: str | Sequence[str], model: str = "") -> Ru
     Args:
         run: a run, or its folder.
         effect: ``name[:target]``, or ``file.toml[:target]`` for one of your own; or several.
-        model: the parent; the best confirmed one where empty.
+        model: the parent; the best confirmed one if empty.
 
     Returns:
-        The run; its `Run.model` is the child where that lowers the held-out error.
+        The run; its `Run.model` is the child if it lowers the held-out error.
 
     Raises:
         InputError: no such effect or parent, or one that the device cannot have.

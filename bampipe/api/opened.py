@@ -37,7 +37,7 @@ class Picture:
 
 
 class Run:
-    """The results of one session. Nothing here writes; each result is read once, on first use.
+    """The results of one session, for reading only; each result is read once, on first use.
 
     All values are in SI units. Models are named as in the run folder: ``base``,
     ``base+stribeck.yaw``; where a method takes a model, the default is the best confirmed one.

@@ -114,7 +114,7 @@ def _write_report(folder: Path, pages: Mapping[str, str]) -> None:
 
 @contextmanager
 def _lock(folder: Path) -> Iterator[None]:
-    """Hold the lab's folder: two collections at once take turns."""
+    """Lock the lab's folder, so that simultaneous collections take turns."""
     with ExitStack() as stack:
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
 """Control charts of estimates that each come with a standard deviation of their own.
 
-An individuals chart (Shewhart) whose scatter is estimated from moving ranges, after which a slow
+An individuals chart (Shewhart) whose scatter is estimated from moving ranges, so that a slow
 drift or a step between two values hardly widens the limits. The moving range holds both the
 scatter between sessions, tau, and the uncertainty within each, s_i; limits of session i are
 
@@ -38,7 +38,7 @@ _LIMIT_FACTORS = (
     (22, 3.75), (24, 3.69), (26, 3.63), (28, 3.58), (30, 3.53), (40, 3.40), (60, 3.26),
     (100, 3.15),
 )  # fmt: skip
-"""Number of sessions and factor for FALSE_ALARM: quantiles of |x - median| / sigma_MR over 1.2e7
+"""Numbers of sessions, and factors for FALSE_ALARM: quantiles of |x - median| / sigma_MR over 1.2e7
 normal numbers; the test suite draws some of them again. Three only for very many sessions."""
 
 

@@ -217,7 +217,7 @@ def _refit_outside(
 
 
 def _is_within(chart: ControlChart, point: ChartPoint, value: float, sd: float) -> bool:
-    """Whether ``value``, in place of the estimate at ``point``, lies inside the limits."""
+    """Return whether ``value``, in place of the estimate at ``point``, lies inside the limits."""
     between, upper = chart.between_sd or 0.0, point.upper or 0.0
     variance = between**2 + point.sd**2
     ratio = (between**2 + sd**2) / variance if variance > 0.0 else 1.0

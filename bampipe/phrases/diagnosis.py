@@ -13,7 +13,7 @@ from bampipe.results.floor import FLOOR_WRONG
 from bampipe.results.rounding import significant
 
 _MOST_ALTERNATIVES = 3
-"""Sets of effects that a phrase names."""
+"""Most sets of effects that a phrase names."""
 _NO_SHAPES: Mapping[str, str] = MappingProxyType({})
 _PROBABILITY = "probability "
 
@@ -25,7 +25,7 @@ def probability(value: float) -> str:
 
 
 def percent_of_force(share: float) -> str:
-    """Return a share of the force in per cent, with enough decimals to tell it from all of it."""
+    """Return a share of the force in per cent, with enough decimals to differ from 100."""
     left = 100.0 * abs(1.0 - share)
     decimals = 1 if left == 0.0 else max(1, math.ceil(-math.log10(left)))
     return f"{100.0 * share:.{min(decimals, 6)}f} %"

@@ -20,8 +20,8 @@ _MOST_NAMED = 3
 def read_forecasts(root: Path, model: str) -> tuple[NextResult, ...]:
     """Return the forecasts of a model's trials: that of the last proposal first, then earlier ones.
 
-    A forecast that another version of bampipe made in other terms cannot be compared and is left
-    out: a new proposal replaces it.
+    A forecast that another version of bampipe stored in another form is left out: a new proposal
+    replaces it.
     """
     last, folder = root / NextResult.file(model), root / NextResult.EARLIER.format(model=model)
     paths = [*([last] if last.is_file() else []), *sorted(folder.glob("*.json"))]
@@ -33,7 +33,7 @@ def read_forecasts(root: Path, model: str) -> tuple[NextResult, ...]:
 
 
 def find_open(forecasts: Sequence[NextResult], proposed: NextResult) -> tuple[NextResult, ...]:
-    """Return those of ``forecasts`` whose trial may still come, without the one now ``proposed``.
+    """Return those of ``forecasts`` that are still open, without the one now ``proposed``.
 
     A forecast is open until a trial is recorded that it did not know; `bampipe run` and `bampipe
     next` compare the two before a new proposal closes it.
@@ -69,10 +69,10 @@ def compare_forecast(
 
     Args:
         proposed: made before the new trials; identified: with them.
-        diagnosed: the last diagnosis, None without one; used where it includes the new trials.
+        diagnosed: the last diagnosis, None without one; used if it includes the new trials.
 
     Returns:
-        Nothing where there is no new trial.
+        Nothing without a new trial.
     """
     new = [trial for trial in identified.trials if trial not in proposed.trials]
     if not new:
@@ -119,7 +119,7 @@ def _name_alternative(first: str, second: str, diagnosed: DiagnoseResult) -> str
 
 
 def _compare_revealed(proposed: NextResult, diagnosed: DiagnoseResult | None) -> Iterator[str]:
-    """Say of the effects that a trial was to reveal whether they are there."""
+    """Say whether the effects that a trial was to reveal are present."""
     if not proposed.shows:
         return
 

@@ -8,7 +8,7 @@ from bampipe.lists import join_names
 from bampipe.results.next import AS_FORECAST, Detectable, NextResult, Trajectory
 
 _MOST_NAMED = 3
-"""Parameters or effects that a sentence names."""
+"""Most parameters or effects that a sentence names."""
 
 
 def say_chance(value: float) -> str:
@@ -17,7 +17,7 @@ def say_chance(value: float) -> str:
 
 
 def say_sizes(table: Mapping[str, Detectable], names: Iterable[str]) -> str:
-    """Return effects with the sizes from which on a proposed trial shows them."""
+    """Return effects with the sizes from which a proposed trial shows them."""
     sizes = (f"{name} from {table[name].with_proposal:.2g} {table[name].unit}" for name in names)
     return f"{join_names((size.rstrip() for size in sizes), _MOST_NAMED)} on"
 
@@ -45,7 +45,7 @@ def say_trajectory(found: Trajectory) -> list[str]:
 
 
 def find_shown(table: Mapping[str, Detectable]) -> tuple[str, ...]:
-    """Return what the trials at hand do not show and the proposed one would, the smallest first."""
+    """Return the effects that only the proposed trial would show, the smallest first."""
     hidden = _find_hidden(table)
     sizes = {
         name: entry.with_proposal / entry.typical
@@ -68,10 +68,10 @@ def explain_proposal(
 
     Args:
         found: the proposal, without these sentences.
-        unlimited: axes of which the device states no range, so that nothing wider was tried.
+        unlimited: axes without a stated range, for which no wider motion was tried.
         lacking: axes whose held-out error is above the noise floor.
-        missing: effects that the diagnosis found and the model does not have; None without one.
-        unbraked: effects of brakes that no trial at hand has on.
+        missing: effects that the model lacks by the diagnosis; None without a diagnosis.
+        unbraked: effects of brakes, if no present trial uses brakes.
     """
     best = found.proposals[0]
     why, expected = _explain_purpose(found, unlimited, unbraked)
@@ -103,26 +103,26 @@ def explain_proposal(
 def _explain_purpose(
     found: NextResult, unlimited: Sequence[str], unbraked: Sequence[str]
 ) -> tuple[str, str]:
-    """Why, and what is expected as far as the model goes."""
+    """Return the reason, and the gain that the model predicts."""
     if found.purpose == "decision":
         return _explain_decision(found, unlimited)
     about = f"`{found.parameter}`" if found.parameter else "all parameters together"
     most = f"adds most information on {about}"
     if found.purpose == "precision":
-        return f"Of the motions tried, this one {most}.", _say_uncertainties(found)
+        return f"Of all motions tried, this one {most}.", _say_uncertainties(found)
     why = _say_unseen(found, unbraked)
     if shown := find_shown(found.sensitivity):
         sizes = say_sizes(found.sensitivity, shown)
         return why, f"It would show {sizes} with 90 % probability."
-    # Nothing tried shows more: then it is for the parameters.
+    # No trial would show more: the proposal is for the parameters.
     return f"{why} This one {most}.", _say_uncertainties(found)
 
 
 def _say_unseen(found: NextResult, unbraked: Sequence[str]) -> str:
-    """Which effects the trials at hand would not have shown."""
+    """Name the effects that the present trials would not have shown."""
     table, unpromised = found.sensitivity, found.unpromised
     hidden = list(dict.fromkeys([*find_shown(table), *_find_hidden(table)]))
-    # Neither the trials at hand nor the one proposed show these, whatever their size.
+    # Neither the present trials nor the proposed one show these at any size.
     never = [
         name
         for name, entry in table.items()
@@ -173,14 +173,14 @@ def _explain_decision(found: NextResult, unlimited: Sequence[str]) -> tuple[str,
 
 
 def _say_size(name: str, entry: Detectable) -> str:
-    """An effect, and the size at which trials do not show it."""
+    """Return an effect and the size up to which trials do not show it."""
     if entry.smallest is None:
         return f"{name} at any size"
     return f"{name} below {entry.smallest:.2g} {entry.unit}".rstrip()
 
 
 def _say_uncertainties(found: NextResult) -> str:
-    """By how much the uncertainty of parameters falls."""
+    """Return the expected uncertainties of parameters, with the present ones."""
     sds = found.proposals[0].sd
     falls = {name: sd.after / sd.before for name, sd in sds.items() if sd.before > 0.0}
     names = [found.parameter] if found.parameter else sorted(falls, key=lambda name: falls[name])
@@ -196,7 +196,7 @@ def _say_uncertainties(found: NextResult) -> str:
 
 
 def _find_hidden(table: Mapping[str, Detectable]) -> list[str]:
-    """Effects that go unnoticed at their typical size though trials can show them, worst first."""
+    """Return effects that trials can show, but not at their typical size, worst first."""
     factors = {
         name: float("inf") if entry.smallest is None else entry.smallest / entry.typical
         for name, entry in table.items()

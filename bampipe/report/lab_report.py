@@ -194,7 +194,7 @@ def _draw_chart(panel: Axes, chart: ControlChart) -> None:
 
 
 def _name_sessions(panel: Axes, names: list[str]) -> None:
-    """Name every n-th session below a panel, upright where names are long."""
+    """Name every n-th session below a panel, vertically if names are long."""
     places = range(0, len(names), -(-len(names) // _MOST_NAMES))
     shown = [names[place] for place in places]
     panel.set_xlim(-0.5, len(names) - 0.5)

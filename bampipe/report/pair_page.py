@@ -13,7 +13,7 @@ from bampipe.results.pair import PairResult
 
 
 def tabulate_pair(pair: PairResult) -> list[Table]:
-    """Return parameters, verdicts, predictions and refits; tables without rows left out."""
+    """Return parameters, verdicts, predictions and refits; empty tables are left out."""
     sides, axes = (pair.first, pair.second), list(pair.journeys[0].axes)
     parameters = [
         (

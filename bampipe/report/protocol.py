@@ -28,7 +28,7 @@ def protocol_sheet(plan: Plan, session: str, model: str, by_hand: bool) -> bytes
     """Return the PDF of a plan: the same plan gives the same bytes.
 
     Args:
-        plan: what to record; session, model: that it is for.
+        plan: what to record; session, model: of the plan.
         by_hand: whether a person moves the device, or else its drives.
     """
     versions = [_sheet(plan, session, model, by_hand, listed) for _, listed in _VERSIONS]
@@ -67,7 +67,7 @@ def _sheet(plan: Plan, session: str, model: str, by_hand: bool, listed: int) -> 
 
 
 def _tabulate_uncertainties(plan: Plan, model: str, listed: int) -> Table:
-    """Tabulate the standard deviations farthest above the limit that is asked."""
+    """Tabulate the standard deviations farthest above the required limit."""
 
     def left(entry: PlannedSd) -> float:
         return entry.after / entry.asked if entry.asked > 0.0 else 0.0

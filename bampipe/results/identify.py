@@ -109,11 +109,11 @@ class EffectEstimate(Record):
 
 
 NEAR_LIMIT = 0.95
-"""Share of its limit from which on a timing counts as at the limit."""
+"""Share of its limit from which a timing counts as at the limit."""
 
 
 class InputTiming(Record):
-    """Time by which forces were sampled after positions, within half a sample."""
+    """Delay of the force samples behind the positions, at most half a sample."""
 
     estimate: float
     sd: Size = Field(description="0 where it was not estimated")
@@ -142,7 +142,7 @@ class StateBound(Record):
 
 
 class Consistency(Record):
-    """Normalised innovation squared; 1 where the noise levels are right."""
+    """Normalised innovation squared; 1 if the noise levels are right."""
 
     mean: Size
     by_trial: dict[str, Size]

@@ -140,13 +140,13 @@ class PlannedTrial(Record):
 
 
 class PlannedSd(ExpectedSd):
-    """Standard deviation with the trials of a plan, beside the limit asked for."""
+    """Standard deviation with the trials of a plan, and the required limit."""
 
     asked: Size
 
 
 class PlannedConfusion(Record):
-    """Chance of taking one effect for another, without and with the trials of a plan."""
+    """Chance of confusing two effects, without and with the trials of a plan."""
 
     between: Names
     before: Share

@@ -1,4 +1,4 @@
-"""The page for exploring in one file that asks for nothing: records, channels, style, scripts."""
+"""The page for exploring as one self-contained file: records, channels, style, scripts."""
 
 from __future__ import annotations
 

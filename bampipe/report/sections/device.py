@@ -44,7 +44,7 @@ def _tabulate_constants(
 
 
 def _tabulate_numbers(numbers: Iterable[DeviceNumber]) -> Table:
-    """Tabulate what the trials say of these numbers, and which estimates depend on them."""
+    """Tabulate the numbers as tested by the trials, and the estimates that depend on them."""
     rows = []
     for one in numbers:
         moved = sorted(one.moves_percent.items(), key=lambda item: -abs(item[1]))[:2]

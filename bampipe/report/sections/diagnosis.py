@@ -47,7 +47,7 @@ TITLE = "Diagnosis"
 _MOST_RANKED = 8
 _MOST_WINDOWS = 6
 _MOST_MAPS = 6
-"""Most maps of one axis: those that explain most, best first."""
+"""Most maps shown of one axis: those that explain most, best first."""
 
 
 def section(results: Results) -> Section:
@@ -241,7 +241,7 @@ def draw_map(panel: Any, name: str, shown: ResidualMap, colour: str, title: str)
 
 
 def _name_values(name: str, centre: Sequence[float]) -> list[str] | None:
-    """Return the values of a variable that counts or sorts by name, else None."""
+    """Return the names of the values of a discrete variable, else None."""
     if not all(value.is_integer() for value in centre):
         return None
     first = 1 if name == "trial" else 0

@@ -1,4 +1,4 @@
-"""Drafts: formulas for what no effect explains, over the residual and the null distribution."""
+"""Drafts: formulas over residuals that no effect explains, and over the null distribution."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _DRAWN_AT = {
 
 
 def section(results: Results) -> Section | None:
-    """Return the section; None where no formula was looked for."""
+    """Return the section; None if no formula was searched for."""
     blocks: list[Block] = []
     for model in results.models:
         found = results.read(DraftResult, model)

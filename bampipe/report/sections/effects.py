@@ -51,7 +51,7 @@ def section(results: Results) -> Section | None:
 
 
 def _show_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
-    """Return the blocks of one effect; ``shown``: versions whose worst window is drawn already."""
+    """Return the blocks of one effect; ``shown``: versions whose worst window is already drawn."""
     text = term.text
     words = [f"**Diagnosis.** {_tell_alternatives(results, term.name)}"]
     if text.on_the_machine:
@@ -97,7 +97,7 @@ def _draw_curve(panel: Axes, curve: TermCurve) -> None:
 
 
 def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
-    """Draw the curves of an effect and, once a version, its worst window without and with it."""
+    """Draw the curves of an effect and, once per version, its worst window without and with it."""
     name = f"effect-{term.name.replace(':', '-')}"
     curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_CURVE_SHARE]
     blocks: list[Block] = []
@@ -152,7 +152,7 @@ def _describe_curves(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
 
 @dataclass(frozen=True)
 class _Window:
-    """A window that was worst before effects were ``added``: residuals without and with them."""
+    """The worst window before effects were ``added``: residuals without and with them."""
 
     window: WorstWindow
     added: str

@@ -24,7 +24,7 @@ from bampipe.results.compare import CompareResult, Rung, Value, horizons_of
 
 _MOST_COLUMNS = 3
 _MOST_NUMBERS = 4
-"""Versions of which each can have its number below a panel."""
+"""Most versions for which every number fits below a panel."""
 
 
 def section(results: Results) -> Section | None:
@@ -151,7 +151,7 @@ def _draw(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Figur
 
 
 def _name_ticks(first: str, error: np.ndarray) -> list[str]:
-    """Return each version with its error below, of many versions the first and last alone."""
+    """Return each version with its error below; of many versions only the first and the last."""
     names = [first, *(str(number) for number in range(1, len(error)))]
     shown = range(len(error)) if len(error) <= _MOST_NUMBERS else (0, len(error) - 1)
     return [

@@ -65,7 +65,7 @@ def _order_stages(stages: Mapping[str, StepRecord]) -> list[tuple[str, StepRecor
 
     def rank(step: str) -> int:
         if step not in ranks:
-            ranks[step] = 0  # a record that was tampered with may go round in circles
+            ranks[step] = 0  # a record that was tampered with may be circular
             before = {made_by.get(name, step) for name in stages[step].inputs} - {step}
             ranks[step] = 1 + max(map(rank, before), default=0)
         return ranks[step]

@@ -1,4 +1,4 @@
-"""How far the estimates can be trusted: weak directions, trials, tests of the innovations."""
+"""Trust in the estimates: weak directions, trials, tests of the innovations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TITLE = "Trust in the estimates"
 
 
 def section(results: Results) -> Section | None:
-    """Return the section; None where nothing of it is stored."""
+    """Return the section; None if nothing is stored for it."""
     identified = results.read(IdentifyResult)
     if identified is None:
         return None
