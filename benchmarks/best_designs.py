@@ -117,11 +117,11 @@ def report(title: str, session: Session) -> None:
         acceleration=np.maximum(reach.acceleration, seen.acceleration / 0.25),
         wider=None,
     )
-    own = list_primitives(seen, seconds, seen.movable, with_rests=True)
+    own = list_primitives(seen, seconds, seen.moved_axes, with_rests=True)
     hard_ones = [
-        *list_primitives(hard, seconds, seen.movable, with_rests=True),
+        *list_primitives(hard, seconds, seen.moved_axes, with_rests=True),
         *list_primitives(
-            replace(hard, low=seen.low, high=seen.high), seconds, seen.movable, with_rests=True
+            replace(hard, low=seen.low, high=seen.high), seconds, seen.moved_axes, with_rests=True
         ),
     ]
     by_own, every = session.of_designs(own), [*own, *hard_ones]

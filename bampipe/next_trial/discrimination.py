@@ -69,7 +69,7 @@ class Sums:
     def __add__(self, other: Sums) -> Sums:
         return Sums(*map(add, vars(self).values(), vars(other).values()))
 
-    def scaled(self, factor: float) -> Sums:
+    def scale_by(self, factor: float) -> Sums:
         """Return the sums of trials that are ``factor`` times as long."""
         return Sums(*(factor * values for values in vars(self).values()))
 
@@ -145,7 +145,7 @@ class Comparison:
         return np.array([ours.independent / max(all_.independent, 1e-300) for ours, all_ in pairs])
 
     @cached_property
-    def at_hand(self) -> Sums:
+    def sums_now(self) -> Sums:
         """The sums over the trials at hand."""
         return self._sums_of(self.fit.evidence, self.fit.likelihood)
 
@@ -323,33 +323,33 @@ class Comparison:
         return {pair: product / total for pair, product in zip(pairs, products, strict=True)}
 
     @cached_property
-    def now(self) -> dict[tuple[int, int], Contrast]:
+    def contrasts_now(self) -> dict[tuple[int, int], Contrast]:
         """The contrast of each pair of alternatives on the trials at hand."""
-        return self.contrasts(self.at_hand)
+        return self.contrasts(self.sums_now)
 
     def confusions(
         self, contrasts: Mapping[tuple[int, int], Contrast]
     ) -> dict[tuple[int, int], float]:
         """Return the chance of confusing each pair of alternatives, with more trials."""
-        odds = [alternative.odds for alternative in self.alternatives]
+        odds, now = [one.odds for one in self.alternatives], self.contrasts_now
         return {
-            (i, j): chance_of_confusion(odds[i], odds[j], found.distance - self.now[i, j].distance)
+            (i, j): chance_of_confusion(odds[i], odds[j], found.distance - now[i, j].distance)
             for (i, j), found in contrasts.items()
         }
 
     def confusion_with(self, motion: Motion) -> float:
         """Return the weighted chance over all pairs once ``motion`` is recorded too."""
-        found = self.confusions(self.contrasts(self.at_hand + self.sums([motion])))
+        found = self.confusions(self.contrasts(self.sums_now + self.sums([motion])))
         return sum(weight * found[pair] for pair, weight in self.weights().items())
 
     def expect(self, motions: Sequence[Motion]) -> tuple[ExpectedConfusion, ...]:
         """Return the expected confusion of each pair: the median over versions of a trial."""
         sums = [self.sums([motion]) for motion in motions]
-        then = [self.contrasts(self.at_hand + new, new) for new in sums]
+        then = [self.contrasts(self.sums_now + new, new) for new in sums]
         chances, weights = [self.confusions(found) for found in then], self.weights()
-        before, axes = self.confusions(self.now), self.fit.evidence.system.coordinates
+        before, axes = self.confusions(self.contrasts_now), self.fit.evidence.system.coordinates
         expected = []
-        for pair, now in self.now.items():
+        for pair, now in self.contrasts_now.items():
             left = np.median([found[pair].left for found in then], axis=0).tolist()
             expected.append(
                 ExpectedConfusion(

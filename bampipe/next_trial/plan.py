@@ -54,7 +54,7 @@ class _Option:
         return _Option(
             replace(self.design, seconds=seconds),
             share * self.information,
-            self.sums.scaled(share) if self.sums is not None else None,
+            self.sums.scale_by(share) if self.sums is not None else None,
         )
 
 
@@ -159,7 +159,7 @@ def _find_confusion(forecast: Forecast, chosen: Sequence[_Option]) -> dict[tuple
     comparison = forecast.comparison
     if comparison is None:
         return {}
-    sums = reduce(add, (one.sums for one in chosen if one.sums is not None), comparison.at_hand)
+    sums = reduce(add, (one.sums for one in chosen if one.sums is not None), comparison.sums_now)
     return comparison.confusions(comparison.contrasts(sums))
 
 
@@ -178,7 +178,7 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
     confusion: tuple[PlannedConfusion, ...] = ()
     sd: dict[str, PlannedSd] = {}
     if (comparison := forecast.comparison) is not None:
-        now, names = comparison.confusions(comparison.now), comparison.alternatives
+        now, names = comparison.confusions(comparison.contrasts_now), comparison.alternatives
         confusion = tuple(
             PlannedConfusion(between=(names[i].name, names[j].name), before=now[i, j], after=after)
             for (i, j), after in found.confusion.items()

@@ -104,9 +104,9 @@ class Envelope:
             np.array([_brake_gain(motions, device.brakes.get(a), i) for i, a in enumerate(axes)]),
             levels,
         )  # fmt: skip
-        return seen.within(bounds, _find_speed_limits(motions, system, p))
+        return seen.widen(bounds, _find_speed_limits(motions, system, p))
 
-    def within(self, bounds: Array, speeds: Array) -> Envelope:
+    def widen(self, bounds: Array, speeds: Array) -> Envelope:
         """Return the envelope with a wider one within the limits of the device.
 
         The acceleration stays that of the trials, also for faster motion.
@@ -143,7 +143,7 @@ class Envelope:
         return farthest.low, farthest.high
 
     @property
-    def movable(self) -> list[int]:
+    def moved_axes(self) -> list[int]:
         """Axes that the trials have moved."""
         return [i for i in range(len(self.low)) if self.high[i] > self.low[i] and self.speed[i] > 0]
 
@@ -261,7 +261,7 @@ class Series:
             size * a + 2.0 * rate * v + bend * x,
         )
 
-    def scaled(self, share: Array | float) -> Series:
+    def scale_by(self, share: Array | float) -> Series:
         """Return the series with all amplitudes times ``share``, a number or one for each axis."""
         return replace(self, sine=share * self.sine, cosine=share * self.cosine)
 
@@ -375,10 +375,10 @@ def _list_within(
 
     whole = _SPANS["whole"]
     designs = [
-        {axis: stroke(axis, span, pace) for axis in seen.movable}
+        {axis: stroke(axis, span, pace) for axis in seen.moved_axes}
         for pace in _SPEEDS
         for span in (whole, _SMALL_SPAN)
-        if len(seen.movable) > 1
+        if len(seen.moved_axes) > 1
     ]
     for axis in axes:
         own = [stroke(axis, span, pace) for span in _SPANS.values() for pace in _SPEEDS]
@@ -386,7 +386,7 @@ def _list_within(
         if with_rests:
             wide = (stroke(axis, whole, pace) for pace in ("moderate", "fast"))
             own += [replace(one, rest_s=_REST_S) for one in wide]
-        others = [i for i in seen.movable if i != axis]
+        others = [i for i in seen.moved_axes if i != axis]
         gentle = {i: _make_gentle(seen, seconds, i, seen.usual[i]) for i in others}
         designs += [{axis: one, **gentle} for one in own]
         # One further axis over its whole range.

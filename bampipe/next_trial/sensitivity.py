@@ -238,8 +238,8 @@ class Detectability:
 
     def factors_with(self, motion: Motion) -> Array:
         """Return the factor from which on each effect is found once ``motion`` is recorded."""
-        now, before = np.array([one.factor for one in self.limits]), self._factors_at_hand
-        after = self._factors(self.comparison.at_hand + self.comparison.sums([motion]))
+        now, before = np.array([one.factor for one in self.limits]), self._factors_now
+        after = self._factors(self.comparison.sums_now + self.comparison.sums([motion]))
         # An effect that is not linear in its strength is assumed to change by the same ratio.
         ratio = np.ones(len(now))
         known = np.isfinite(before) & np.isfinite(now)
@@ -247,8 +247,8 @@ class Detectability:
         return np.array([_cap_factor(factor) for factor in after * ratio])
 
     @cached_property
-    def _factors_at_hand(self) -> Array:
-        return self._factors(self.comparison.at_hand)
+    def _factors_now(self) -> Array:
+        return self._factors(self.comparison.sums_now)
 
     def _factors(self, sums: Sums) -> Array:
         found = find_limits(self.comparison, sums, self.needed)
@@ -269,7 +269,7 @@ def find_detectability(
     alternatives = tuple(alternative for alternative in typical if alternative is not None)
     comparison = Comparison(session, fit, fit, alternatives)
     needed = find_needed(session.criteria, len(names), by_chance)
-    limits = find_limits(comparison, comparison.at_hand, needed)
+    limits = find_limits(comparison, comparison.sums_now, needed)
     limits = [
         replace(one, factor=_bound_factor(one, scale), growth=find_jump_growth(comparison, one))
         for one in _refine_limits(comparison, limits, needed)
@@ -293,7 +293,7 @@ def _refine_limits(
         probe = replace(
             comparison, alternatives=tuple(_set_found_strength(refined[k]) for k in chosen)
         )
-        again = find_limits(probe, probe.at_hand, needed)
+        again = find_limits(probe, probe.sums_now, needed)
         for k, one in zip(chosen, again, strict=True):
             refined[k] = replace(refined[k], factor=refined[k].factor * one.factor, axis=one.axis)
     return refined

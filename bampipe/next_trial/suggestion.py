@@ -122,10 +122,11 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
 
     # Only the axes on which alternatives act: on others they all leave the same residual.
     acts = {axis for one in comparison.alternatives for i in one.items for axis in i.system.touched}
-    axes = [axis for axis in seen.movable if axis in acts] or seen.movable
+    axes = [axis for axis in seen.moved_axes if axis in acts] or seen.moved_axes
     space = DesignSpace(rehearsal, _SUGGESTED_S, axes, with_rests=True, with_brakes=True)
     best = rank_designs(space, lambda motion: -comparison.confusion_with(motion))[0]
-    pairs = zip(comparison.expect(best.expected_motions), comparison.now.values(), strict=True)
+    confusions, contrasts = comparison.expect(best.expected_motions), comparison.contrasts_now
+    pairs = zip(confusions, contrasts.values(), strict=True)
     expected, now = max(pairs, key=lambda pair: pair[0].weight * pair[0].before)
     if expected.after > min(1.0 - session.criteria.probability, expected.before / AS_FORECAST):
         return None
@@ -137,6 +138,6 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
         between=expected.between, axis=axis, design=design, separation=expected.left[axis],
         separation_now=float(now.left[e.system.coordinates.index(axis)]),
         confusion=after, confusion_now=before,
-        sentence=f"To tell {first} from {second}, record this: {design} The chance of confusing"
-        f" them would fall from {say_chance(before)} to {say_chance(after)}.",
+        sentence=f"To distinguish {first} from {second}, record this trial: {design} The chance of"
+        f" confusing them would fall from {say_chance(before)} to {say_chance(after)}.",
     )  # fmt: skip

@@ -99,7 +99,7 @@ def list_trajectories(
         beyond = number % 2 == 0
         parts = PARTS if beyond and seconds >= PARTS * SHORTEST_PART_S else 1
         reach, most = (seen.wider or seen, usable) if beyond else (seen, known)
-        series = _draw_series(reach, most, seen.movable, seconds / parts, rng)
+        series = _draw_series(reach, most, seen.moved_axes, seconds / parts, rng)
         fitting = _scale_to_effort(rehearsal, usable[4], series)
         if fitting is not None:
             found.append(Primitive({}, fitting.middle, seconds, parts=parts, series=fitting))
@@ -114,14 +114,14 @@ def list_trajectories(
 
 
 def _draw_series(
-    reach: Envelope, limits: Array, movable: Sequence[int], seconds: float, rng: np.random.Generator
+    reach: Envelope, limits: Array, axes: Sequence[int], seconds: float, rng: np.random.Generator
 ) -> Series:
     """Return a random series that reaches one bound of each axis: position, speed, acceleration.
 
     A random power law for the amplitudes of the harmonics gives slow wide or quick short motion.
 
     Args:
-        reach: ends of each axis; limits: (5, n_q), as in `Extent`; movable: axes that move.
+        reach: ends of each axis; limits: (5, n_q), as in `Extent`; axes: axes that move.
         seconds: its length; rng: draws the amplitudes.
     """
     n = len(reach.low)
@@ -134,14 +134,14 @@ def _draw_series(
     room = np.array([middle - low, high - middle, limits[2], limits[3]])
     taken = np.array([middle - lowest, highest - middle, speed, acceleration])
     share = np.min(room / np.maximum(taken, _SMALLEST_EXTENT), axis=0)
-    return unit.scaled(share * np.isin(np.arange(n), movable))
+    return unit.scale_by(share * np.isin(np.arange(n), axes))
 
 
 def _scale_to_effort(rehearsal: Rehearsal, most: Array, series: Series) -> Series | None:
     """Return the series scaled to the effort ``most``, (n_q,); None if no scale fits."""
 
     def fits(share: float) -> bool:
-        _, effort = rehearsal.effort(series.scaled(share))
+        _, effort = rehearsal.effort(series.scale_by(share))
         return bool((np.abs(effort).max(axis=0) <= most).all())
 
     if fits(1.0):
@@ -150,7 +150,7 @@ def _scale_to_effort(rehearsal: Rehearsal, most: Array, series: Series) -> Serie
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if fits(middle) else (low, middle)
-    return series.scaled(low) if low > 0.0 else None
+    return series.scale_by(low) if low > 0.0 else None
 
 
 @dataclass(frozen=True)

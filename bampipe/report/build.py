@@ -33,8 +33,8 @@ class Report:
     sections: tuple[str, ...]
 
     @classmethod
-    def of(cls, document: Document, recorded: int, explorer: str = "") -> Report:
-        """Return the files of ``document``; see `typeset.pdf` for ``recorded``."""
+    def from_document(cls, document: Document, recorded: int, explorer: str = "") -> Report:
+        """Return the files of ``document``; see `typeset.render_pdf` for ``recorded``."""
         figures = {
             block.name: block.svg
             for section in document.sections
@@ -42,11 +42,11 @@ class Report:
             if isinstance(block, Figure)
         }
         titles = tuple(section.title for section in document.sections)
-        html = page.page(document, "explore.html" if explorer else "")
-        return cls(typeset.pdf(document, recorded), html, explorer, figures, titles)
+        html = page.render_page(document, "explore.html" if explorer else "")
+        return cls(typeset.render_pdf(document, recorded), html, explorer, figures, titles)
 
 
-def build(results: Results, progress: Callable[[float, str], None]) -> Report:
+def build_run_report(results: Results, progress: Callable[[float, str], None]) -> Report:
     """Return the report of ``results``; ``progress``: called with the share done."""
     sections = []
     for number, name in enumerate(SECTIONS):
@@ -65,7 +65,7 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
     when = _read_moment(results)
     if when is not None and when.tzinfo is None:
         when = when.replace(tzinfo=datetime.UTC)
-    return Report.of(document, max(0, int(when.timestamp())) if when else 0, explorer)
+    return Report.from_document(document, max(0, int(when.timestamp())) if when else 0, explorer)
 
 
 def _list_warnings(results: Results) -> tuple[Block, ...]:

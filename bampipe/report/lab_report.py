@@ -37,7 +37,7 @@ _MOST_TRIALS = 40
 _TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100)
 
 
-def build_report(folder: Path, pages: Mapping[str, str]) -> Report:
+def build_lab_report(folder: Path, pages: Mapping[str, str]) -> Report:
     """Return the report of the lab's folder.
 
     Args:
@@ -51,7 +51,7 @@ def build_report(folder: Path, pages: Mapping[str, str]) -> Report:
     moments = [one.recorded for one in trends.sessions if one.recorded]
     document = Document("All sessions", _make_subtitle(trends, moments), tuple(sections))
     stamps = (int(datetime.fromisoformat(moment).timestamp()) for moment in moments)
-    return Report.of(document, max(0, *stamps, 0))
+    return Report.from_document(document, max(0, *stamps, 0))
 
 
 def _make_subtitle(trends: TrendsResult, moments: Sequence[str]) -> str:

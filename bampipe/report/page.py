@@ -26,7 +26,7 @@ _TEMPLATE = Path(__file__).parent / "templates" / "page.html"
 _TAGS = {"strong": "strong", "code": "code"}
 
 
-def page(document: Document, beside: str = "") -> str:
+def render_page(document: Document, beside: str = "") -> str:
     """Return ``document`` as HTML with its figures inside.
 
     Args:

@@ -32,7 +32,7 @@ def protocol_sheet(plan: Plan, session: str, model: str, by_hand: bool) -> bytes
         by_hand: whether a person moves the device, or else its drives.
     """
     versions = [_sheet(plan, session, model, by_hand, listed) for _, listed in _VERSIONS]
-    return typeset.sheet(
+    return typeset.render_sheet(
         [replace(one, scale=scale) for one, (scale, _) in zip(versions, _VERSIONS, strict=True)], 0
     )
 

@@ -35,7 +35,7 @@ _VERBATIM = ("name", "tone", "lines", "columns")
 """Fields of blocks without inline marks."""
 
 
-def pdf(document: Document, recorded: int) -> bytes:
+def render_pdf(document: Document, recorded: int) -> bytes:
     """Return ``document`` as PDF: the same document gives the same bytes.
 
     Args:
@@ -47,11 +47,11 @@ def pdf(document: Document, recorded: int) -> bytes:
     return _print(document, recorded)[0]
 
 
-def sheet(versions: Sequence[Document], recorded: int) -> bytes:
+def render_sheet(versions: Sequence[Document], recorded: int) -> bytes:
     """Return the first of ``versions`` that fits on one page as PDF, or the last of them.
 
     Args:
-        versions: of one document, the fullest first; recorded: as for `pdf`.
+        versions: of one document, the fullest first; recorded: as for `render_pdf`.
     """
     printed = b""
     for document in versions:

@@ -95,12 +95,12 @@ def _sensed_force(specimen: Specimen, true: TrueTrial) -> Array:
     p, no_states = specimen.p(system), np.zeros((len(late), 0))
     still, names = np.zeros_like(true.q), specimen.device.forces
 
-    def corrected(u: Array) -> Array:
+    def correct_reading(u: Array) -> Array:
         applied = system.applied(true.q, true.qd, still, no_states, u, p)
         return system.least_force(true.q, applied)
 
     zero = _sensor_inputs(system, true, np.zeros_like(late))
-    constant = corrected(zero)
+    constant = correct_reading(zero)
     if any(find_input_column(system, derivative(f, k)) >= 0 for f in names for k in _TOO_HIGH):
         raise InputError("an input effect with a third derivative cannot be simulated")
     response = np.zeros((3, len(late), nf, nf))
@@ -110,11 +110,11 @@ def _sensed_force(specimen: Specimen, true: TrueTrial) -> Array:
             if column >= 0:
                 u = zero.copy()
                 u[:, column] = 1.0
-                response[order, :, :, j] = corrected(u) - constant
+                response[order, :, :, j] = correct_reading(u) - constant
     side = late - constant
     if not response[1:].any():
         reading = np.linalg.solve(response[0], side[:, :, None])[:, :, 0]
-        if not np.allclose(corrected(_sensor_inputs(system, true, reading)), late, atol=1e-6):
+        if not np.allclose(correct_reading(_sensor_inputs(system, true, reading)), late, atol=1e-6):
             raise InputError("an input effect is not linear in the force and cannot be simulated")
         return np.asarray(reading)
     h = true.t[1] - true.t[0]

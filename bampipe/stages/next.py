@@ -200,7 +200,7 @@ def _read_case(
     trials = replace(trials, motions=tuple(trials.motions))
     session = Session(trials, config, config.jobs or os.cpu_count() or 1, config.seed)
     seen = Envelope.of_trials(trials.motions, system, p)
-    if not seen.movable:
+    if not seen.moved_axes:
         raise InputError("no axis moves in the trials at hand", where=str(run.root))
     limits = read_limits(model.device, seen) if config.trajectory else {}
     recipe = read_recipe(run, config.model, model)
@@ -256,7 +256,7 @@ def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
     # No parameters are fitted to what has the brakes on, but for those of brakes.
     brakes_on = of_effects or case.system.braked
     return DesignSpace(
-        forecast.rehearsal, seconds, case.seen.movable, examples, of_effects, brakes_on
+        forecast.rehearsal, seconds, case.seen.moved_axes, examples, of_effects, brakes_on
     )
 
 

@@ -71,7 +71,7 @@ def every_design(seen: Envelope) -> list[Primitive]:
 
 
 def test_where_the_device_states_nothing_no_design_leaves_what_the_trials_have_shown():
-    assert SEEN.within(*NOTHING_STATED) is SEEN
+    assert SEEN.widen(*NOTHING_STATED) is SEEN
     designs = every_design(SEEN)
     assert len(designs) > 100
     for design in designs:
@@ -85,7 +85,7 @@ def test_where_the_device_states_nothing_no_design_leaves_what_the_trials_have_s
 
 def test_designs_go_beyond_as_far_as_the_device_allows_and_no_farther():
     speeds = np.array([20.0, 1.0, np.nan])
-    seen = TIMID.within(LIMITS, speeds)
+    seen = TIMID.widen(LIMITS, speeds)
     designs = every_design(seen)
     fastest = np.zeros(3)
     for design in designs:
@@ -110,7 +110,7 @@ def test_designs_go_beyond_as_far_as_the_device_allows_and_no_farther():
 
 @pytest.mark.parametrize(("pays", "first_is_beyond"), [(1.5, True), (1.02, False)])
 def test_going_beyond_what_has_been_seen_has_to_pay(pays, first_is_beyond):
-    seen = TIMID.within(LIMITS, np.full(3, 20.0))
+    seen = TIMID.widen(LIMITS, np.full(3, 20.0))
 
     def worth(recorded: tuple[Primitive, int]) -> float:
         return pays if any(find_beyond(recorded[0], seen)) else 1.0
@@ -181,7 +181,7 @@ def test_each_parameter_gets_the_design_that_is_best_for_it():
 
 
 def test_what_leaves_what_has_been_seen_is_recorded_in_two_trials():
-    seen = TIMID.within(LIMITS, np.full(3, 20.0))
+    seen = TIMID.widen(LIMITS, np.full(3, 20.0))
     beyond = [design for design in every_design(seen) if any(find_beyond(design, seen))]
     assert {design.parts for design in beyond} == {2}
     for design in list_primitives(seen, 20.0, [0], with_rests=False):
@@ -232,7 +232,7 @@ def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
 
 def test_who_follows_roughly_stays_within_the_device_too():
     system = SimpleNamespace(coordinates=("a", "b", "c"))
-    seen = TIMID.within(LIMITS, np.full(3, np.nan))
+    seen = TIMID.widen(LIMITS, np.full(3, np.nan))
     rehearsal = Rehearsal(system, np.zeros(0), None, None, seen, 0)
     lowest, highest = seen.reach
     for design in list_primitives(seen, 20.0, [0], with_rests=False)[-8:]:
@@ -272,7 +272,7 @@ def test_no_axis_rests_unless_the_design_says_so():
 
 @pytest.mark.parametrize("axes", [[0], [0, 1, 2]])
 def test_no_design_is_tried_twice(axes):
-    for seen in (SEEN, SEEN.within(LIMITS, np.full(3, 3.0))):
+    for seen in (SEEN, SEEN.widen(LIMITS, np.full(3, 3.0))):
         listed = list_primitives(seen, 20.0, axes, with_rests=True)
         said = [
             (design.parts, [(axis, f"{stroke}") for axis, stroke in design.strokes.items()])
@@ -325,7 +325,7 @@ def test_a_sentence_says_where_how_fast_and_how_long():
 
 
 def test_a_sentence_says_what_goes_beyond_the_trials_at_hand():
-    device, seen = registry.device("bam"), TIMID.within(LIMITS, np.full(3, 20.0))
+    device, seen = registry.device("bam"), TIMID.widen(LIMITS, np.full(3, 20.0))
     far, fast = Stroke(-1.0, 1.0, 0.5, 1.0), Stroke(0.1, 0.4, 3.0, 4.0)
     gentle = {1: Stroke(0.05, 0.1, 0.1, 0.2, gentle=True), 2: Stroke(0.9, 1.0, 0.1, 0.2)}
     for stroke, ending in (

@@ -69,7 +69,7 @@ def rehearse(device: Device) -> Rehearsal:
     bounds = np.array([device.limits[axis] for axis in AXES])
     speeds = np.array([device.speed_limits[axis] for axis in AXES])
     kinematics = Kinematics("kalman", 200.0, filters, 25.0)
-    return Rehearsal(system, p, sensors, kinematics, SEEN.within(bounds, speeds), 0)
+    return Rehearsal(system, p, sensors, kinematics, SEEN.widen(bounds, speeds), 0)
 
 
 @dataclass(frozen=True)

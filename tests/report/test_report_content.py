@@ -16,7 +16,7 @@ from made_results import diagnosis, write_result
 from bampipe.data.store import write_parquet
 from bampipe.errors import InputError
 from bampipe.report import style, typeset
-from bampipe.report.build import Report, build
+from bampipe.report.build import Report, build_run_report
 from bampipe.report.run_results import Results
 from bampipe.report.sections import identification, validation
 from bampipe.report.wording import name_parameter
@@ -33,9 +33,9 @@ def quiet(fraction: float, message: str) -> None:
 def page_of(root: Path) -> str:
     """The page of a run's report without its figures; those and the print take nearly all time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(typeset, "pdf", lambda *_: b"")
+        patch.setattr(typeset, "render_pdf", lambda *_: b"")
         patch.setattr(style, "render_svg", lambda _: "<svg></svg>")
-        return build(Results(root), quiet).html
+        return build_run_report(Results(root), quiet).html
 
 
 def text_of(page: str) -> str:
@@ -62,14 +62,14 @@ def full_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def full(full_run: Path) -> Report:
-    return build(Results(full_run), quiet)
+    return build_run_report(Results(full_run), quiet)
 
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory: pytest.TempPathFactory) -> Report:
     root = tmp_path_factory.mktemp("runs") / "s02"
     synthetic_run.write_ingest(root)
-    return build(Results(root), quiet)
+    return build_run_report(Results(root), quiet)
 
 
 def test_sections_in_order_summary_first_provenance_last(full: Report) -> None:
@@ -330,7 +330,7 @@ def test_page_is_self_contained_with_unique_ids(full: Report) -> None:
 
 
 def test_same_results_same_bytes(full: Report, full_run: Path) -> None:
-    again = build(Results(full_run), quiet)
+    again = build_run_report(Results(full_run), quiet)
     assert again == full
 
 
@@ -382,23 +382,23 @@ def test_one_model_in_detail_can_be_chosen(full_run: Path) -> None:
 
 def test_missing_and_damaged_results_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"is missing.*bampipe ingest"):
-        build(Results(tmp_path), quiet)
+        build_run_report(Results(tmp_path), quiet)
     synthetic_run.write_ingest(tmp_path)
     (tmp_path / "stiffness").mkdir()
     (tmp_path / "stiffness/stiffness.json").write_text("{")
     with pytest.raises(InputError, match=r"stiffness\.json"):
-        build(Results(tmp_path), quiet)
+        build_run_report(Results(tmp_path), quiet)
     (tmp_path / "stiffness/stiffness.json").unlink()
     (tmp_path / "ingest/trials.parquet").write_bytes(b"PAR1")
     with pytest.raises(InputError, match=r"trials\.parquet"):
-        build(Results(tmp_path), quiet)
+        build_run_report(Results(tmp_path), quiet)
 
 
 def test_bad_source_date_epoch_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     synthetic_run.write_ingest(tmp_path)
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
     with pytest.raises(InputError, match=r"SOURCE_DATE_EPOCH"):
-        build(Results(tmp_path), quiet)
+        build_run_report(Results(tmp_path), quiet)
 
 
 def test_text_from_files_cannot_break_the_page_or_the_print(tmp_path: Path) -> None:
@@ -407,7 +407,7 @@ def test_text_from_files_cannot_break_the_page_or_the_print(tmp_path: Path) -> N
     frame = pd.read_parquet(tmp_path / "ingest/trials.parquet")
     frame["reason"] = nasty
     frame.to_parquet(tmp_path / "ingest/trials.parquet")
-    report = build(Results(tmp_path), quiet)
+    report = build_run_report(Results(tmp_path), quiet)
     assert "<script>" not in report.html
     assert nasty in text_of(report.html)
     assert report.pdf.startswith(b"%PDF")
@@ -448,7 +448,7 @@ def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(
     write_result(
         tmp_path / "s01", DraftResult, axes={"yaw": axis}, effects={name: effect}, selected=[name]
     )
-    report = build(Results(tmp_path / "s01"), quiet)
+    report = build_run_report(Results(tmp_path / "s01"), quiet)
     assert "Drafts" in report.sections
     words = text_of(report.html)
     assert "Yaw: a force on the axis that has a bump at one position." in words
