@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
 from bampipe.results.compare import CompareResult
 from bampipe.results.run import GateVerdict
-from bampipe.run import batch, gates, junit, models, record
+from bampipe.run import batch, gates, models, record
 from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome
 from bampipe.run.runner import run_session
@@ -79,17 +78,6 @@ def test_white_space_and_comments_in_toml_rerun_nothing(toy: Toy) -> None:
     assert toy.ran() == []
 
 
-def test_changed_session_file_reruns(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    path = toy.session / "session.toml"
-    path.write_text(path.read_text() + 'note = "new"\n')
-    outcome = toy.run()
-    assert outcome.steps[0].reason == "session.toml changed"
-    assert toy.ran() == ["toy_read"]
-    assert states(outcome) == ["done", "unchanged", "unchanged", "unchanged"]
-
-
 def test_changed_trial_reruns_what_depends_on_it(toy: Toy) -> None:
     toy.run()
     toy.ran()
@@ -98,6 +86,11 @@ def test_changed_trial_reruns_what_depends_on_it(toy: Toy) -> None:
     assert toy.ran() == ALL
     assert outcome.steps[0].reason == "numbers.txt changed"
     assert outcome.steps[1].reason == "toy/numbers.json changed"
+    path = toy.session / "session.toml"
+    path.write_text(path.read_text() + 'note = "new"\n')
+    outcome = toy.run()
+    assert outcome.steps[0].reason == "session.toml changed"
+    assert states(outcome) == ["done", "unchanged", "unchanged", "unchanged"]
 
 
 def test_fewer_outputs_leave_no_stale_files(toy: Toy) -> None:
@@ -116,12 +109,7 @@ def test_changed_setting_reruns_from_there(toy: Toy) -> None:
     assert outcome.steps[1].reason == "settings changed"
     toy.run(settings={"toy_double": {"factor": 3.0}})
     assert toy.ran() == [], "3 and 3.0 are the same factor"
-
-
-def test_setting_without_effect_on_the_result_stops_there(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    toy.run(settings={"toy_double": {"label": "new"}})
+    toy.run(settings={"toy_double": {"factor": 3.0, "label": "new"}})
     assert toy.ran() == ["toy_double"], "its outputs are the same bytes"
 
 
@@ -213,17 +201,6 @@ def test_a_session_that_is_refused_changes_nothing(toy: Toy) -> None:
     toy.ran()
     assert states(toy.run()) == ["unchanged"] * 4
     assert [s.state for s in status(toy.root, pipeline)] == ["current"] * 4
-
-
-def test_wrong_setting_keeps_the_result_current(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    with pytest.raises(InputError, match="did you mean 'factor'"):
-        toy.run(settings={"toy_double": {"factr": 3}})
-    with pytest.raises(InputError, match=r'toy_double.factor: found "many", expected a number'):
-        toy.run(settings={"toy_double": {"factor": "many"}})
-    toy.run()
-    assert toy.ran() == []
 
 
 def test_stage_must_write_what_it_declares(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -473,18 +450,6 @@ def test_gate_divides(tmp_path: Path) -> None:
 def test_gate_without_a_number(tmp_path: Path, content: object, optional: bool) -> None:
     found = judged(tmp_path, content, optional=optional)
     assert [v.state for v in found] == ["absent" if optional else "failed"]
-
-
-def test_junit_counts(tmp_path: Path) -> None:
-    verdicts = judged(tmp_path, {"axes": {"yaw": {"a": 1.0}, "pitch": {"a": 3}}})
-    outcomes = [
-        Outcome(Path("s1"), "done", verdicts=tuple(verdicts)),
-        Outcome(Path("s2"), "refused", error="no\x07 session"),
-    ]
-    top = ElementTree.fromstring(junit.junit(outcomes))
-    assert [s.get("failures") for s in top] == ["1", "0"]
-    assert [s.get("errors") for s in top] == ["0", "1"]
-    assert top.find(".//failure") is not None
 
 
 # Pipelines

@@ -27,8 +27,7 @@ class Record(Declaration):
     """Part of a result.
 
     A field of another type, one that is not declared, and a number that is not finite are
-    refused; numbers of numpy are taken. A field that holds its
-    default is left out of the file.
+    refused; numbers of numpy are taken. A field that holds its default is left out of the file.
     """
 
     model_config = ConfigDict(strict=False, serialize_by_alias=True)

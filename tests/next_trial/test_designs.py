@@ -453,10 +453,7 @@ def test_twice_the_information_narrows_an_uncertainty_by_the_root_of_two():
     after = known.expect(known.information, 20.0).median
     assert after[0] == pytest.approx(0.01 / np.sqrt(2.0), rel=1e-3)
     assert known.gain(known.information) == pytest.approx(0.5 * np.log(2.0))
-
-
-def test_what_trials_are_worth_for_one_parameter_is_the_fall_of_its_logarithm():
-    known = made_precision(0.01, 0.01, 10_000)
+    # For one parameter, trials are worth the fall of the logarithm of its uncertainty.
     much = 3.0 * known.information
     assert known.worth(much, 20.0, "mass") == pytest.approx(np.log(2.0), rel=1e-3)
     assert known.worth(much, 20.0) == known.gain(much)

@@ -457,10 +457,6 @@ SOUND: dict[str, tuple[Damage, str]] = {
 }
 
 
-def test_the_corpus_is_large():
-    assert len(REFUSED) + len(ASIDE) >= 60
-
-
 def test_all_that_a_session_has_wrong_for_its_device_is_said_at_once(tmp_path):
     damage = both(
         drop("encoders.pitch"),
