@@ -266,7 +266,7 @@ def test_a_region_of_a_map_marks_its_samples_and_a_view_shows_in_maps(
     )
     assert inside.sum() == count
     before = figure(page, "residual yaw ").first.locator("canvas").screenshot()
-    page.get_by_role("button", name="Take the mark off").click()
+    page.get_by_role("button", name="Remove the mark").click()
     assert not page.locator("#marked").is_visible()
     assert figure(page, "residual yaw ").first.locator("canvas").screenshot() != before
     canvas = figure(page, "residual yaw by velocity").locator("canvas")
