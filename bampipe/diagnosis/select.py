@@ -239,10 +239,9 @@ def gain_when_fitted(before: Fit, after: Fit, search: Search, keys: Sequence[Key
             ]
             ratio = max(squares[1], 1e-300) / max(squares[0], 1e-300)
             gained -= 0.5 * before.problem.independent[axis] * float(np.log(ratio))
-    promised, taken = search.solve(keys), search.volume_where_fitted(keys, after.evidence)
-    # What a fit ends at may take more off the measured quantity than its linear problem promised.
-    volume = -np.inf if taken is None else float(np.minimum(promised.volume, taken).sum())
-    return gained + volume - promised.penalty
+    volume = search.volume_where_fitted(keys, after.evidence)
+    taken = -np.inf if volume is None else float(volume.sum())
+    return gained + taken - search.solve(keys).penalty
 
 
 def _explore(search: Search, room: int, deep: int) -> Pool:
