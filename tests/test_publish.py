@@ -176,10 +176,7 @@ def test_another_run_is_replaced_only_when_told(tmp_path: Path, url: str) -> Non
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["s1"]
 
 
-def test_bad_places_are_one_line(tmp_path: Path) -> None:
-    root = make_run(tmp_path / "runs/s1")
-    with pytest.raises(InputError, match="no such file system"):
-        publish(root, "nowhere://x")
+def test_a_session_that_is_not_published_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no session 's1' is published"):
         fetch(f"file://{tmp_path / 'empty'}", "s1", tmp_path / "runs")
 
