@@ -345,8 +345,8 @@ class Search:
     def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
         """`Solution.volume` of a set with the parameters of a model that was fitted with it."""
         known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
-        each = [self.dictionary.scale_left(name, known) for name, _ in added(keys)]
-        gains = [gain for _, gain in [*each, *map(self._without, gone(keys))]]
+        gains = [self.dictionary.gain_with(name, known) for name, _ in added(keys)]
+        gains += [self._without(name)[1] for name in gone(keys)]
         filters: list[tuple[dict[int, Array], Array]] = [({}, gain) for gain in gains]
         scale = evidence.log_scale[0] - self.dictionary.evidence.log_scale[0]
         rows = self._log_of_slopes(filters, self.solve(keys).scale)
