@@ -15,6 +15,9 @@ _DERIVATIVE = 0.98
 """Correlation of a column with the integral of another, both without a line, to be that of it."""
 _DRIVEN = 0.5
 """Share of a column that the motion must explain for it to pass as what drives it."""
+_MOVED, _CLEARLY = 0.8, 0.5
+"""Of two columns, the share of one that the motion of the other must explain, and how much less it
+may leave than the other way round."""
 _STEADY = 50.0
 """Of the median step: the longest one of a time."""
 
@@ -64,6 +67,12 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
             found[names[best]] = "force"
     elif positions and len(left) == len(positions):
         found |= {names[k]: "force" for k in left}
+    elif not positions and len(left) == 2:
+        seconds = (t - t[0]) * SECONDS.get(guesses.time_unit(t, ""), 1.0)
+        share = [guesses.driven(seconds, matrix[:, k], matrix[:, 1 - k]).share for k in left]
+        moved = int(np.argmax(share))
+        if share[moved] >= _MOVED and 1.0 - share[moved] < _CLEARLY * (1.0 - share[1 - moved]):
+            found |= {names[moved]: "position", names[1 - moved]: "force"}
     return found
 
 

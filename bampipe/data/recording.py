@@ -18,6 +18,10 @@ MOST_APART = 0.01
 """Share of samples that one part may have more than another to be joined row by row."""
 _LEAST = 20
 """Samples of a recording: time that falls sooner has not started again."""
+_SPARSE = 0.95
+"""Share of rows in which a column has a reading, the most of one that stands in rows of its own."""
+_LOST = 5.0
+"""Of the usual step between readings: a longer one has lost some."""
 _BACK = 0.02
 """Of the time that has passed: how close to its beginning a clock that starts again comes."""
 
@@ -84,7 +88,53 @@ def read_recording(
             ticks = SECONDS.get(clock.unit, 1.0), SECONDS.get(unit, 1.0)
             raw = _by_time(raw, other, entry.file, part, kept, (clock.column, time), ticks)
     raw = replace(raw, columns={column: raw.columns[column] for column in columns})
-    return _one_of(raw, entry, clock)
+    return _at_one_rate(_one_of(raw, entry, clock), clock)
+
+
+def _at_one_rate(raw: RawTrial, clock: Clock) -> RawTrial:
+    """The rows with a reading of the first column; others between theirs, if in rows of their own.
+
+    So are logs of several rates: sensors write rows in turn, and leave the cells of others empty.
+    """
+    t = raw.columns.get(clock.column)
+    known = {
+        name: np.isfinite(values)
+        for name, values in raw.columns.items()
+        if name not in (clock.column, clock.nanoseconds)
+    }
+    some = np.any(list(known.values()), axis=0) if known else np.empty(0)
+    sparse = [name for name, mask in known.items() if _is_sparse(mask[some])]
+    empty = 1.0 - some.mean() if len(some) else 0.0
+    if t is None or clock.nanoseconds or raw.begun or not (sparse or 0.01 < empty < 0.5):
+        return raw
+    first = next(iter(known))
+    rows = known[first] if sparse else some
+    columns = {name: values[rows] for name, values in raw.columns.items()}
+    remarks = [f"{empty:.0%} of the rows hold nothing of these columns"] if empty > 0.0 else []
+    for name in sparse:
+        if name != first:
+            stamps = t[known[name]]
+            columns[name] = interpolated(t[rows], stamps, raw.columns[name][known[name]])
+            # Between readings that are lost, there is nothing to go by.
+            steps = np.diff(stamps)
+            after = np.clip(np.searchsorted(stamps, t[rows]), 1, len(steps))
+            columns[name][steps[after - 1] > _LOST * np.median(steps)] = np.nan
+            remarks.append(
+                f"'{name}' stands in rows of its own: interpolated linearly at the times of"
+                f" '{first}' (at most {np.max(steps):.3g} s apart)"
+            )
+    return replace(
+        raw, columns=columns, kept=raw.rows[rows], remarks=(*raw.remarks, *remarks), resumed=()
+    )
+
+
+def _is_sparse(known: np.ndarray) -> bool:
+    """Whether readings (T,) come in some rows at steady intervals, and not in the others."""
+    at = np.flatnonzero(known)
+    if len(at) < _LEAST or len(at) > _SPARSE * len(known):
+        return False
+    steps = np.diff(at)
+    return float(np.quantile(steps, _SPARSE)) <= 3.0 * float(np.median(steps)) + 1.0
 
 
 def starts_of(raw: RawTrial, clock: str) -> list[int]:

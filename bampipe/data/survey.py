@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from unicodedata import combining, normalize
 
 import numpy as np
 
@@ -41,20 +42,34 @@ _RISES = 0.95
 _GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
 """Words in the name of a column that say less of it than the name of its file."""
 _WORDS = {
-    "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
-    " nanoseconds millis micros milliseconds microseconds",
+    "time": "t ts time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
+    " nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
-    " wanted con ctrl action",
+    " wanted con ctrl action ziel consigne consigna referencia riferimento",
     "brake": "brake bremse",
-    "acceleration": "acc accel acceleration qdd ddq beschleunigung",
-    "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate",
+    "acceleration": "acc accel acceleration qdd ddq beschleunigung aceleracion accelerazione",
+    "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate vitesse"
+    " velocidad velocidade velocita snelheid",
     "force": "force forc f fx fy fz torque tau trq kraft moment drehmoment loadcell wrench effort"
-    " eff",
-    "current": "current curr cur i iq amp amps ampere strom spulenstrom coil",
-    "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung",
+    " eff couple fuerza forza forca par coppia momento koppel",
+    "current": "current curr cur i iq amp amps ampere strom coil courant corriente corrente stroom",
+    "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung tension"
+    " voltaje tensao tensione",
     "position": "pos position ang angle theta phi psi q enc encoder disp displacement dist x stroke"
-    " winkel weg lage hub joint deflection yaw pitch extension carriage counts",
+    " winkel weg lage hub joint deflection yaw pitch extension carriage counts posicion posicao"
+    " posizione angulo angolo hoek",
 }
+_SIGNS = {
+    "加速度": "acc", "速度": "velocity", "力矩": "torque", "扭矩": "torque", "转矩": "torque",
+    "トルク": "torque", "时间": "time", "時間": "time", "角度": "angle", "位置": "position",
+    "位移": "displacement", "电流": "current", "電流": "current", "电压": "voltage", "電圧": "voltage",
+    "目标": "target", "目標": "target", "期望": "desired", "指令": "command", "力": "force",
+    "время": "time", "угол": "angle", "скорость": "velocity", "момент": "torque", "ток": "current",
+}  # fmt: skip
+"""Words of other scripts; of those inside others the longer comes first."""
+_ALL_WORDS = frozenset(word for text in _WORDS.values() for word in text.split())
+_ENDS = sorted((word for word in _ALL_WORDS if len(word) > 4 or word in ("time", "zeit")), key=len)
+_RUN_TOGETHER = re.compile(r"(q|dq|tau|trq|pos|vel)(des|ref|cmd|meas|msr|act)")
 REFERENCE_WORDS = frozenset(_WORDS["reference"].split())
 """Words for what a controller asks for rather than what was measured."""
 DRIVERS = ("force", "current", "voltage")
@@ -352,7 +367,9 @@ class _Logs:
             column = (moments or times)[0]
             said = "datetime" if moments else spelled(labels[column], CLOCK_UNITS)
             clock = Clock(column=column, unit=next((u for u in CLOCK_UNITS if u == said), "s"))
-        raw = read_recording(self.folder, trial, ordered, clock, self.dialect)
+        # Of several rates, that of the positions counts.
+        first = sorted(ordered, key=lambda c: (c not in times, _role(c, labels[c]) != "position"))
+        raw = read_recording(self.folder, trial, first, clock, self.dialect)
         sound = _complete_rows(raw.columns, clock.column)
         self.first = trial.file
         if not (trial.parts or trial.recording or trial.file.lower().endswith(TEXTS)):
@@ -495,10 +512,22 @@ def _role_apart(column: SurveyedColumn) -> str:
 
 
 def words(name: str) -> list[str]:
-    """The words in the name of a column, in lower case."""
-    bare = re.sub(r"[\[(].*?[\])]", " ", name)
+    """The words in the name of a column, in lower case and without accents; of compounds, each."""
+    bare = re.sub(r"[\[(（].*?[\])）]", " ", name)
+    for foreign, english in _SIGNS.items():
+        bare = bare.lower().replace(foreign, f" {english} ") if foreign in bare.lower() else bare
+    bare = "".join(c for c in normalize("NFKD", bare) if not combining(c))
     parts = re.split(r"[^A-Za-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare))
-    return [part.lower() for part in parts if part]
+    return [word for part in parts if part for word in _parts_of(part.lower())]
+
+
+def _parts_of(word: str) -> list[str]:
+    """A word, or the two that it is put together from, such as ``motorstrom`` and ``qdes``."""
+    if match := _RUN_TOGETHER.fullmatch(word):
+        return [*match.groups()]
+    end = next((end for end in reversed(_ENDS) if word.endswith(end)), word)
+    start = word.removesuffix(end)
+    return [start, end] if len(start) > 1 and word not in _ALL_WORDS else [word]
 
 
 def _role(name: str, stated: str) -> str:
@@ -508,7 +537,7 @@ def _role(name: str, stated: str) -> str:
         alone = _role(bare, stated)
         vague = set(words(bare)) <= _GENERAL or not alone
         return (vague and _role(part, "")) or alone
-    if stated == "datetime" or name.strip().lower() in _UNIT_WORDS["time"]:
+    if stated == "datetime" or name.strip().lower() in (*_UNIT_WORDS["time"], "x_value"):
         return "time"
     said = set(words(name))
     said |= {word.removesuffix("s") for word in said if len(word) > 3}

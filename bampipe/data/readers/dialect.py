@@ -12,6 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import Dialect, check_columns
@@ -35,8 +36,11 @@ _NO_ANGLE = re.compile(
     r"(?i)force|moment|torque|power|activation|excitation|fiber|length|[_.][tpv][xyz]\Z|\Atime\Z"
 )
 _NUMBERED = "column_"
+_NAME_KEYS = frozenset(["name", "names", "signal", "channel", "kanal", "signalname"])
 _SEARCHED = 200
 _TRIED = 400
+_LEAST_FILLED = 0.04
+"""Share of the first lines in which a column holds something, the least."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,11 @@ class TableLayout:
     def is_header(self, text: str) -> bool:
         """Whether a line among the samples is the header once more."""
         return bool(self.title) and self.cells(text) == self.cells(self.title)
+
+    def is_remark(self, text: str) -> bool:
+        """Whether a line begins with a word, where samples begin with a number or a time."""
+        first = next(iter(self.cells(text)), "")
+        return _is_remark(text) or bool(re.match(r"[^\W\d_]{2}", first))
 
     def is_chatter(self, text: str) -> bool:
         """Whether a line among the samples is text without a number in any cell."""
@@ -126,19 +135,24 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     if above:
         remarks.append(f"{above} lines above the header passed over")
     passed = index
-    for line in body:
+    first = _guess(body, [delimiter])[0][0]
+    for at, line in enumerate(body):
         remark = _is_remark(line.text)
         row = cells(_REMARK.sub("", line.text, count=1) if remark else line.text, delimiter)
+        row, property_row = _of_properties(row)
+        property_row &= at < first < len(body)
         if (
             _is_unit_row(row, header, columns)
             and not dialect.names
-            and not (remark and not _are_units(row))
+            and not ((remark or property_row) and not _are_units(list(filter(None, row))))
         ):
             units |= {h: bare(u) for h, u in zip(header, row, strict=False) if bare(u)}
             remarks.append(f"row {line.number} gives units")
             passed += 1
-            break
-        if line.text.strip() and not remark:
+            if not property_row:
+                break
+            continue
+        if line.text.strip() and not remark and not property_row:
             break
         passed += 1
     body = lines[passed + 1 :]
@@ -155,13 +169,16 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
 
 
 def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
-    """Columns that hold numbers, or dates and times, in most of the first lines.
+    """Columns that hold numbers, or dates and times, where the first lines hold anything.
+
+    A log of two rates has the readings of each in rows of their own.
 
     Returns:
         Their names, and whether it is dates and times.
     """
     numbers: Counter[int] = Counter()
     moments: Counter[int] = Counter()
+    filled: Counter[int] = Counter()
     rows = 0
     for line in _lines(head, "")[: layout.first_line + _TRIED]:
         if line.number < layout.first_line or not line.text.strip():
@@ -170,12 +187,13 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
         row = layout.cells(line.text)
         numbers.update(n for n, cell in enumerate(row) if _is_number(cell, layout.decimal))
         moments.update(n for n, cell in enumerate(row) if is_moment(cell))
+        filled.update(n for n, cell in enumerate(row) if cell not in NULLS)
     return {
         name: moments[n] > numbers[n]
         for n, name in enumerate(layout.header)
         if name
         and rows
-        and max(numbers[n], moments[n]) > 0.5 * rows
+        and max(numbers[n], moments[n]) > max(0.5 * filled[n], _LEAST_FILLED * rows)
         and layout.header.count(name) == 1
     }
 
@@ -224,7 +242,7 @@ def _header(
         return max(_filled(lines[:first]), default=-1), delimiter, list(dialect.names)
     for index, line in enumerate(lines[:_SEARCHED]) if columns else ():
         for delimiter in delimiters:
-            row = _names(line.text, delimiter, lines[index + 1 :])
+            row = _names(line.text, delimiter, lines[index + 1 :], lines[:index])
             if set(columns) <= set(row):
                 check_columns(row, columns, f"{name}, row {line.number}")
                 first, below = _guess(lines[index + 1 :], delimiters)[0]
@@ -246,7 +264,7 @@ def _header(
             f" columns are {row[0]} to {row[-1]}",
         )
     width = len(cells(lines[guesses[0][0]].text, delimiter)) if guesses[0][0] < len(lines) else 0
-    row = _names(lines[index].text, delimiter, lines[index + 1 :])
+    row = _names(lines[index].text, delimiter, lines[index + 1 :], lines[:index])
     if len(row) not in (width, width - 1):  # the header is written otherwise than the samples
         row = next(iter(_otherwise(lines[index].text, width)), row)
     check_columns(row, columns, f"{name}, row {lines[index].number}")
@@ -264,7 +282,7 @@ def _otherwise(text: str, width: int) -> list[list[str]]:
     return [row for row in split if len(row) == width > 1]
 
 
-def _names(text: str, delimiter: str, below: list[Line]) -> list[str]:
+def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> list[str]:
     """Names in a header, which may be written as a remark: ``# t x`` has two names or three."""
     plain, bare = (cells(t, delimiter) for t in (text, _REMARK.sub("", text, count=1)))
     rows = [line.text for line in below if line.text.strip() and not _is_remark(line.text)]
@@ -274,7 +292,22 @@ def _names(text: str, delimiter: str, below: list[Line]) -> list[str]:
         row = plain if rows and len(cells(rows[0], delimiter)) == len(plain) else bare
     if delimiter == " ":
         row = [name.rstrip(",;") or name for name in row]
-    return _named_items(row, [cells(text, delimiter) for text in rows[:_SEARCHED]])
+    if row and row.count(row[0]) > 1 and row[0].lower() in _NAME_KEYS:
+        row = ["Time" if name == row[0] else name for name in row]  # in pairs with a reading
+    row = _named_items(row, [cells(text, delimiter) for text in rows[:_SEARCHED]])
+    return _told_apart(row, cells(above[-1].text, delimiter) if above else [])
+
+
+def _told_apart(header: list[str], above: list[str]) -> list[str]:
+    """The header with names that stand more than once below those of groups, else with a number."""
+    count = Counter(name for name in header if name)
+    if len(above) == len(header) and not any(map(_POINT.match, above)):
+        groups = accumulate(above, lambda group, cell: cell or group)
+        pairs = zip(groups, header, strict=True)
+        header = [f"{group} {name}".strip() if count[name] > 1 else name for group, name in pairs]
+        count = Counter(name for name in header if name)
+    seen = [header[: n + 1].count(name) for n, name in enumerate(header)]
+    return [f"{x} ({n})" if count[x] > 1 else x for x, n in zip(header, seen, strict=True)]
 
 
 def _named_items(header: list[str], rows: list[list[str]]) -> list[str]:
@@ -352,6 +385,14 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
         if not width - 1 <= len(row) <= width:
             rows[n] = next(iter(_otherwise(lines[n].text, width)), row)
     fitting = [n for n, row in rows.items() if width - 1 <= len(row) <= width]
+    while len(fitting) > 1 and any(re.match(r"[A-Za-z ]+:\s+\S", c) for c in rows[fitting[-1]]):
+        fitting.pop()  # Type: double
+    for n in reversed(_filled(lines[:first])):
+        row = cells(lines[n].text, delimiter)
+        if len(row) != width:
+            break
+        if row[0].lower() in _NAME_KEYS and row.count(row[0]) > 1:
+            return n
     if len(fitting) > 1 and _are_units(rows[fitting[-1]]) and len(rows[fitting[-2]]) == width:
         return fitting[-2]
     return fitting[-1] if fitting else -1
@@ -414,6 +455,23 @@ def _decimal(
 
 def _is_remark(text: str) -> bool:
     return bool(_REMARK.match(text))
+
+
+def _of_properties(row: list[str]) -> tuple[list[str], bool]:
+    """A row below the header without its keys, and whether it has such: ``Unit``, ``Type: double``.
+
+    Programs for measurements write what they know of a channel there.
+    """
+    said = [cell for cell in row if cell]
+    keys = [match for cell in said if (match := re.match(r"([A-Za-z ]+):\s+\S", cell))]
+    if len(keys) >= 0.5 * len(said) > 0:
+        return [re.sub(r"^[A-Za-z ]+:\s+", "", cell) for cell in row], True
+    key = row[0] if row else ""
+    listed = re.match(r"[A-Za-z]{3}", key) is not None and key.lower() not in ("sec", "rad", "deg")
+    alone = row.count(key) > 1 or unit(key) is None
+    if not (listed and alone):
+        return row, False
+    return ["" if cell == key else cell for cell in row], True
 
 
 def _is_unit_row(row: list[str], header: list[str], columns: Sequence[str]) -> bool:

@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 
 from bampipe.data.readers import dialect as dialects
-from bampipe.data.readers import moments
+from bampipe.data.readers import moments, rewriting
 from bampipe.data.readers.dialect import HEAD, NULLS, Line, TableLayout
 from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size
 from bampipe.errors import InputError
@@ -73,8 +73,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     Raises:
         InputError: binary data, a wrong layout, or a cell that is not a number; names the row.
     """
-    with _opened(path, wanted.dialect, name) as (stream, said):
-        layout = dialects.find_layout(_head(stream, name), wanted.columns, wanted.dialect, name)
+    with _opened(path, wanted.dialect, name) as (stream, dialect, said):
+        layout = dialects.find_layout(_head(stream, name), wanted.columns, dialect, name)
         end, notes = _sound_end(stream, layout)
         samples = _Samples(wanted)
         _read_samples(stream, layout, end, samples, name)
@@ -95,8 +95,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
 
 def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, str]:
     """Names and units of the columns of numbers, or of moments (unit "datetime")."""
-    dialect = dialect or Dialect()
-    with _opened(path, dialect, name) as (stream, _):
+    with _opened(path, dialect or Dialect(), name) as (stream, dialect, _):
         head = _head(stream, name)
     layout = dialects.find_layout(head, (), dialect, name)
     return {
@@ -106,8 +105,10 @@ def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, 
 
 
 @contextmanager
-def _opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO, tuple[str, ...]]]:
-    """The file as UTF-8, itself or a copy of it in memory; and what to say of it.
+def _opened(
+    path: Path, dialect: Dialect, name: str
+) -> Iterator[tuple[BinaryIO, Dialect, tuple[str, ...]]]:
+    """The file as a table in UTF-8, itself or a copy in memory; its dialect, and what to say of it.
 
     Raises:
         InputError: it is not in the encoding that it claims.
@@ -116,8 +117,10 @@ def _opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO,
         head = stream.read(HEAD)
         stream.seek(0)
         encoding = dialect.encoding or _encoding(head)
-        if encoding == "utf-8":
-            yield stream, ()
+        whole = head[: head.rfind(b"\n") + 1] or head
+        form = rewriting.find_form(whole.decode(encoding, "ignore"))
+        if encoding == "utf-8" and form is None:
+            yield stream, dialect, ()
             return
         try:
             text = stream.read().decode(encoding)
@@ -128,7 +131,12 @@ def _opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO,
                 remedy="save it as UTF-8, or say another encoding under [csv]",
             ) from error
         said = (_TAKEN_AS,) if encoding == _WESTERN and not dialect.encoding else ()
-        yield io.BytesIO(text.encode("utf-8", "replace")), said
+        if form is not None:
+            text = re.sub(r"[^\r\n]+", lambda line: form.rewrite(line[0]), text)
+            said = (*said, form.said)
+            if form.names and not dialect.names:
+                dialect = dialect.model_copy(update={"names": form.names})
+        yield io.BytesIO(text.encode("utf-8", "replace")), dialect, said
 
 
 def _encoding(head: bytes) -> str:
@@ -171,6 +179,7 @@ class _Samples:
     """
 
     wanted: Wanted
+    nothing: list[str] = field(default_factory=list)
     parts: dict[str, list[np.ndarray]] = field(default_factory=dict)
     rows: int = 0
     notes: list[str] = field(default_factory=list)
@@ -190,6 +199,19 @@ class _Samples:
             self.parts.setdefault(column, []).append(part)
         self.rows += batch.num_rows
         check_size(self.rows, self.wanted, name)
+
+    def passes_over(self, message: str, line: Line, layout: TableLayout) -> bool:
+        """Whether a word stands where a number is expected: no reading, as "OVERLOAD" says."""
+        cell = _CELL.search(message)
+        word = cell[3] if cell else ""
+        if not _NO_READING.fullmatch(word) or len(self.nothing) == _MOST_WORDS:
+            return False
+        self.nothing.append(word)
+        column = layout.header[int(cell[1])] if cell else ""
+        self.notes.append(
+            f"column '{column}' says '{word}' from row {line.number} on: taken as no reading"
+        )
+        return True
 
     def cut(self, rows: int, parts: int) -> None:
         """Forget all but the first ``rows``, which the first ``parts`` hold."""
@@ -225,9 +247,15 @@ def _read_samples(
                 return
             line = _faulty_line(stream, str(error), layout)
             again = line is not None and layout.is_header(line.text)
-            if line is None or not (again or layout.is_chatter(line.text)):
-                raise _fault(str(error), layout, line, name) from error
             samples.cut(rows, parts)
+            if line is not None and not again and _is_end(stream, line, end, layout):
+                samples.notes.append(f"row {line.number} and what follows are no samples: left out")
+                end = line.start
+                continue
+            if line is None or not (again or layout.is_chatter(line.text)):
+                if line is not None and samples.passes_over(str(error), line, layout):
+                    continue
+                raise _fault(str(error), layout, line, name) from error
             _read_samples(stream, layout, line.start, samples, name)
             if again:
                 samples.begun += [samples.rows] if samples.rows else []
@@ -262,13 +290,22 @@ def _read_stretch(
         convert_options=pa_csv.ConvertOptions(
             column_types=kinds,
             include_columns=list(kinds),
-            null_values=[*NULLS, *wanted.dialect.missing],
+            null_values=[*NULLS, *wanted.dialect.missing, *samples.nothing],
             strings_can_be_null=True,
             decimal_point=layout.decimal,
         ),
     )
     for batch in reader:
         samples.add(batch, layout.first_line + samples.rows - before, name)
+
+
+def _is_end(stream: BinaryIO, line: Line, end: int, layout: TableLayout) -> bool:
+    """Whether this line and all that follow are words about the log, as a summary at its end."""
+    if line.start <= layout.start or end - line.start > HEAD:
+        return False
+    stream.seek(line.start)
+    rest = stream.read(end - line.start).decode("utf-8", "replace").splitlines()
+    return all(layout.is_remark(text) for text in rest if text.strip())
 
 
 def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, ...]]:
@@ -285,7 +322,7 @@ def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, .
     ended = len(content) < len(tail)
     cut = max(content.rfind(b"\n"), content.rfind(b"\r"))
     last = content[cut + 1 :]
-    if not last:
+    if not last or layout.is_remark(last.decode("utf-8", "replace")):
         return size, ()
     row = _split(last, layout)
     short = len(row) < len(layout.header)
@@ -304,6 +341,9 @@ def _split(line: bytes, layout: TableLayout) -> list[bytes]:
     return line.split() if layout.delimiter == " " else line.split(layout.delimiter.encode())
 
 
+_NO_READING = re.compile(r"[^\d\s\"\\][^\d\"\\]{0,19}|[-+]?1\.#\w+|#[A-Z]+[/\d!?]*")
+"""Words for no reading, numbers of old C libraries among them."""
+_MOST_WORDS = 8
 _TORN = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+): (.*?)(?: \.\.\.)?$", re.DOTALL)
 _CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*invalid value '(.*)'", re.DOTALL)
 

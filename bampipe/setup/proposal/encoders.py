@@ -13,8 +13,9 @@ from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
 from bampipe.setup.proposal.positions import in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
-_SURE = 2.0
-"""Standard errors within which a power of two, as most encoders count, is what a turn counts."""
+_SURE, _NEAR = 2.0, 0.025
+"""Standard errors, and share, within which a power of two, as most encoders count, is what a turn
+counts."""
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
 
 
@@ -117,7 +118,7 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: No
     zero = worth.zero if worth is not None else float(np.median(column.values))
     turn, sd = (2.0 * np.pi * x for x in ((worth.size, worth.sd) if worth is not None else (0, 0)))
     power = 2.0 ** round(np.log2(turn)) if turn > 0.0 else 0.0
-    is_power = abs(turn - power) < _SURE * sd
+    is_power = abs(turn - power) < max(_SURE * sd, _NEAR * power)
     size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}" if turn > 0.0 else "0.0"
     counting = f"counts_per_unit = {size}, zero_counts = {zero:.0f}"
     table = f'{{ column = {quoted(column.name)}, {counting}, unit = "{axis.unit}" }}'

@@ -126,7 +126,8 @@ def _is_force(column: SurveyedColumn) -> bool:
 def _needs_gain(column: SurveyedColumn) -> bool:
     """Whether the column of a force is a share or a count, by its name or by whole numbers."""
     counts = column.is_integer and float(np.ptp(column.values)) > _FEWEST_COUNTS
-    return not column.unit and (counts or not _SHARES.isdisjoint(words(column.name)))
+    shares = not _SHARES.isdisjoint(words(column.name))
+    return column.si == "" or (not column.unit and (counts or shares))
 
 
 def _brakes_table(device: Device, match: Matcher, notes: Notes) -> list[str]:
