@@ -69,7 +69,7 @@ def likely_unit(si: str, values: np.ndarray) -> str:
 
 def interval_of(name: str, value: float) -> float:
     """Sampling interval, s, that a number beside the samples gives (``Ts``, ``fs``), else 0."""
-    plain = re.sub(r"[\W_]|hz$", "", name.lower())
+    plain = re.sub(r"[\W_]|hz$", "", name.lower().rpartition(".")[2])
     if value > 0.0 and plain in ("ts", "dt", "tsample", "sampletime", "samplingtime"):
         return value
     if value > 0.0 and re.fullmatch("fs(ample)?|sampl(e|ing)(rate|freq|frequency)", plain):

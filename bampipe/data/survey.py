@@ -31,6 +31,19 @@ from bampipe.errors import InputError
 from bampipe.lists import join_names
 
 MOST_FILES = 500
+_MOST_COLUMNS = 500
+"""Of a table of samples, unless it has many rows."""
+_OTHER_DATA = {
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "export the sheet as CSV"),
+    **dict.fromkeys((".pkl", ".pickle", ".joblib"), "it may run any program; save with np.savez"),
+    **dict.fromkeys((".feather", ".arrow", ".orc", ".rds"), "save it as Parquet or CSV"),
+    **dict.fromkeys((".zip", ".gz", ".7z", ".tar", ".bz2", ".xz", ".rar"), "unpack it"),
+    **dict.fromkeys(
+        (".c3d", ".mf4", ".mdf", ".blf", ".bin", ".ulg", ".tlog", ".trc", ".r64", ".fig", ".slx"),
+        "export its channels as CSV, a sample a row",
+    ),
+}
+"""Files of data that are not read, and what to do."""
 _SMALL = 1 << 16
 """Bytes below which a text may be no log but a line of results."""
 _MOST_SCANNED = 1 << 30
@@ -42,7 +55,7 @@ _RISES = 0.95
 _GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
 """Words in the name of a column that say less of it than the name of its file."""
 _WORDS = {
-    "time": "t ts time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
+    "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
     " nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
     " wanted con ctrl action ziel consigne consigna referencia riferimento",
@@ -75,7 +88,7 @@ REFERENCE_WORDS = frozenset(_WORDS["reference"].split())
 DRIVERS = ("force", "current", "voltage")
 """Roles of what may drive an axis."""
 _BY_UNIT = {
-    "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
+    "kg": "force", "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
     "m/s": "velocity", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
 }  # fmt: skip
 _SHORT_UNITS = frozenset(["mm", "Nm", "kN", "mA", "mV"])
@@ -183,7 +196,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     """
     dataset = lerobot.open_dataset(folder, episodes)
     logs = _Logs(folder, Dialect(names=tuple(names)), dataset)
-    logs.look_through([folder / file for file in dataset.episodes] if dataset else _paths(folder))
+    logs.look_through([folder / file for file in dataset.episodes] if dataset else logs.paths())
     trials, common = logs.choose()
     read: tuple[SurveyedColumn, ...] = ()
     sound = []
@@ -207,27 +220,6 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     return Survey(tuple(sound), columns, (*logs.remarks, *guessed), tuple(logs.passed))
 
 
-def _paths(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise InputError("no such folder", where=str(folder))
-    paths = sorted(
-        path
-        for path in folder.rglob("*")
-        if path.suffix.lower() in EXTENSIONS
-        and path.is_file()
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    )
-    if not paths:
-        raise InputError(
-            "no log in this folder",
-            where=str(folder),
-            remedy=f"supported file extensions are {', '.join(EXTENSIONS)}",
-        )
-    if len(paths) > MOST_FILES:
-        raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
-    return paths
-
-
 @dataclass
 class _Logs:
     """The files of a folder while it is found out which are logs, and which belong together.
@@ -245,6 +237,35 @@ class _Logs:
     first: str = ""
     scanned: int = 0
 
+    def paths(self) -> list[Path]:
+        """The files that may be logs; others that hold data are left out by name."""
+        folder = self.folder
+        if not folder.is_dir():
+            raise InputError("no such folder", where=str(folder))
+        files = sorted(
+            path
+            for path in folder.rglob("*")
+            if path.is_file()
+            and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        )
+        paths = [path for path in files if path.suffix.lower() in EXTENSIONS]
+        for path in files:
+            if path.suffix.lower() in _OTHER_DATA:
+                why = f"*{path.suffix} is not read: {_OTHER_DATA[path.suffix.lower()]}"
+                self.passed.append((path.relative_to(folder).as_posix(), why))
+        if not paths:
+            names = join_names([name for name, _ in self.passed], 4)
+            raise InputError(
+                f"no log in this folder{names and f' that can be read, but {names}'}",
+                where=str(folder),
+                remedy=self.passed[0][1]
+                if self.passed
+                else f"supported file extensions are {', '.join(EXTENSIONS)}",
+            )
+        if len(paths) > MOST_FILES:
+            raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
+        return paths
+
     def look_through(self, paths: Sequence[Path]) -> None:
         """Find the columns of every file; what is no log is left out, with the reason."""
         for path in paths:
@@ -253,7 +274,17 @@ class _Logs:
                 lexically_inside(name, where="")
                 columns = columns_of(path, name=name, dialect=self.dialect)
                 if not columns:
-                    raise InputError("no column of numbers in it")
+                    raise InputError(f"no column of numbers in it{_like(path)}")
+                rows = (
+                    len(self._read_one(name, columns, next(iter(columns))))
+                    if (len(columns) > _MOST_COLUMNS)
+                    else 0
+                )
+                if 0 < 10 * rows < len(columns):
+                    raise InputError(
+                        f"{rows} rows of {len(columns)} columns are no log",
+                        remedy="has it a channel a row? write a sample a row",
+                    )
                 small = path.stat().st_size < _SMALL and path.suffix.lower() in TEXTS
                 if small and len(self._read_one(name, columns, next(iter(columns)))) < 2:
                     raise InputError("one row of numbers is no log")
@@ -271,8 +302,10 @@ class _Logs:
 
     def fault(self) -> InputError:
         """That no log can be read, with the reason of the first."""
-        why = self.passed[0][1]
-        remedy = why if self.passed[0][0] in why else ": ".join(self.passed[0])
+        # What is no log anyway says least.
+        idle = ("no column of numbers", "one row", "has other columns")
+        name, why = next((p for p in self.passed if not p[1].startswith(idle)), self.passed[0])
+        remedy = why if name in why else f"{name}: {why}"
         return InputError("no log that can be read", where=str(self.folder), remedy=remedy)
 
     def choose(self) -> tuple[list[TrialEntry], list[str]]:
@@ -424,6 +457,21 @@ class _Logs:
         ]
 
 
+def _like(path: Path) -> str:
+    """What the lines of a text that is no table look like, in a few words."""
+    if path.suffix.lower() not in TEXTS:
+        return ""
+    with path.open("rb") as stream:
+        head = stream.read(1 << 12).decode("utf-8", "replace")
+    line = next((x.strip() for x in reversed(head.splitlines()[:20]) if x.strip()), "")
+    shown = f"{line[:48]}..." if len(line) > 48 else line
+    return (
+        f"; a line reads '{shown}': export a line of names with rows of numbers below"
+        if (re.search(r"\d", shown) and shown.isprintable())
+        else ""
+    )
+
+
 def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
     """Rows (T,) in which no column lacks a number, those columns apart that mostly lack one.
 
@@ -538,6 +586,8 @@ def _role(name: str, stated: str) -> str:
         vague = set(words(bare)) <= _GENERAL or not alone
         return (vague and _role(part, "")) or alone
     if stated == "datetime" or name.strip().lower() in (*_UNIT_WORDS["time"], "x_value"):
+        return "time"
+    if name.strip().rpartition(".")[2] == "ts":  # Ts is rather an interval
         return "time"
     said = set(words(name))
     said |= {word.removesuffix("s") for word in said if len(word) > 3}

@@ -26,6 +26,8 @@ def refuse_other_units(table: TrialTable, stated: Mapping[str, str]) -> None:
         found, expected = unit(text), unit(declared.get(column, ""))
         if found is None or expected is None or "" in (found.si, expected.si):
             continue
+        if found.si == "kg":  # the weight of a mass
+            found = unit(f"{text.strip('[]() ')}f") or found
         if (found.si, found.scale) != (expected.si, expected.scale):
             raise table.fault(
                 f"the file gives the unit {text}, session.toml {declared[column]}",

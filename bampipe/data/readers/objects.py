@@ -58,7 +58,11 @@ def columns(path: Path, name: str) -> dict[str, str]:
     """Names of the values that are numbers, or moments (unit "datetime"), in the first sample."""
     samples, constants, _ = _samples(path, name)
     if isinstance(samples, dict):
-        return columns_of_arrays(samples) | dict.fromkeys(constants, "")
+        content = _parsed(path.read_text(encoding="utf-8-sig"), name)
+        beside = {label: find(content, f"{label.rpartition('.')[0]}.unit") for label in samples}
+        units = {label: unit for label, unit in beside.items() if isinstance(unit, str)}
+        found = columns_of_arrays(samples) | dict.fromkeys(constants, "")
+        return {column: units.get(column, stated) for column, stated in found.items()}
     found = {}
     for column, cell in leaves(samples[0]):
         if isinstance(cell, int | float):
@@ -93,8 +97,10 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
                     yield label, array
     elif isinstance(value, list) and len(value) > 1:
         if isinstance(value[0], dict):
+            names = [next((x.get(key) for key in _CALLED if key in x), None) for x in value]
+            called = all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
             for k, item in enumerate(value):
-                yield from _arrays(item, f"{path}[{k}]")
+                yield from _arrays(item, f"{path}[{names[k] if called else k}]")
             return
         if isinstance(value[0], str):
             if moments.is_moment(value[0]) and all(isinstance(x, str | None) for x in value):
@@ -106,6 +112,10 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
             return
         if array.ndim <= 2 and array.size:
             yield path or "data", array
+
+
+_CALLED = ("name", "label", "signal", "channel")
+"""Keys of what an object is called."""
 
 
 def _are_names(values: list[object]) -> bool:
@@ -184,5 +194,5 @@ def _is_sample(value: object) -> bool:
 
 def _numbers(content: object) -> dict[str, object]:
     """The numbers beside the samples of a parsed file."""
-    items = content.items() if isinstance(content, dict) else ()
-    return {str(key): value for key, value in items if isinstance(value, int | float)}
+    found = leaves(content) if isinstance(content, dict) else ()
+    return {key: value for key, value in found if isinstance(value, int | float) and "[" not in key}

@@ -29,7 +29,14 @@ _MOST_CHATTER = 50
 """Lines of text among the samples, messages of a logger, that are left out."""
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _WESTERN = "cp1252"
-_TAKEN_AS = "not UTF-8: names and units are taken as Windows-1252"
+_TAKEN_AS = {
+    encoding: f"not UTF-8: names and units are taken as {what}"
+    for encoding, what in (
+        (_WESTERN, "Windows-1252"),
+        ("gb18030", "GBK"),
+        ("shift_jis", "Shift-JIS"),
+    )
+}
 
 
 class _Stretch(io.RawIOBase):
@@ -130,7 +137,7 @@ def _opened(
                 where=name,
                 remedy="save it as UTF-8, or say another encoding under [csv]",
             ) from error
-        said = (_TAKEN_AS,) if encoding == _WESTERN and not dialect.encoding else ()
+        said = () if dialect.encoding or encoding not in _TAKEN_AS else (_TAKEN_AS[encoding],)
         if form is not None:
             text = re.sub(r"[^\r\n]+", lambda line: form.rewrite(line[0]), text)
             said = (*said, form.said)
@@ -147,16 +154,33 @@ def _encoding(head: bytes) -> str:
     """
     if head.startswith(_UTF16):
         return "utf-16"
+    asian = _asian(head)
+    if asian:
+        return asian
     even, odd = head[0::2].count(0), head[1::2].count(0)
     if min(even, odd) == 0 and max(even, odd) > 0.4 * len(head):
         return "utf-16-be" if even else "utf-16-le"
-    for encoding in ("utf-8", _WESTERN):
-        try:
-            codecs.getincrementaldecoder(encoding)().decode(head)
-        except UnicodeDecodeError:
-            continue
-        return encoding
-    return "utf-8"
+    return _WESTERN if not _sound(head, "utf-8") and _sound(head, _WESTERN) else "utf-8"
+
+
+def _asian(head: bytes) -> str:
+    """The encoding of Chinese or Japanese in which all letters beyond ASCII are, "" where not."""
+    runs = re.findall(rb"[\x80-\xff]+", head)
+    if not runs or _sound(head, "utf-8"):
+        return ""
+    # Letters of Western Europe stand alone among others.
+    if all(len(run) % 2 == 0 for run in runs) and _sound(head, "gb2312"):
+        return "gb18030"
+    japanese = re.findall(rb"[\x82\x83\x88-\x9f][\x40-\xfc]", head)
+    return "shift_jis" if len(japanese) > 2 and _sound(head, "shift_jis") else ""
+
+
+def _sound(head: bytes, encoding: str) -> bool:
+    try:
+        codecs.getincrementaldecoder(encoding)().decode(head)
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def _head(stream: BinaryIO, name: str) -> bytes:

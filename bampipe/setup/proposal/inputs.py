@@ -105,6 +105,9 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
         return [f'unit = "{UNKNOWN}"{note}']
     if device.force_unit == "N.m" and any(_is_force(column) for column in columns):
         note = "" if common else notes.guess(f"{names} is a force in N")
+        if any(column.si == "kg" for column in columns):
+            common = next(unit for unit in ("kgf", "gf") if columns[0].unit.startswith(unit[:-1]))
+            note = notes.guess(f"{names} is the weight of a mass: a force in {common}")
         ask = notes.ask(
             f"lever_m, how far from the axis {names} acts, m",
             "measure it on the machine, or take it from the drawing; if the column is a torque"
@@ -119,7 +122,7 @@ def _is_force(column: SurveyedColumn) -> bool:
     """Whether the column of a drive is a force rather than a torque, by its unit or its name."""
     said = set(words(column.name))
     if column.si is not None:
-        return column.si == "N"
+        return column.si in ("N", "kg")
     return bool(said & _FORCES) and not said & _TORQUES
 
 
