@@ -35,7 +35,7 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
     found: dict[str, str] = {}
     sound = {name: v[:_MOST_ROWS] for name, v in values.items() if np.all(np.isfinite(v))}
     if t is None:
-        clock = next((name for name, v in sound.items() if _is_time(v)), "")
+        clock = next((name for name, v in sound.items() if is_time(v)), "")
         found |= {clock: "time"} if clock else {}
         t = sound.pop(clock, None)
     if len(sound) < 2:
@@ -79,12 +79,13 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
 def describe(name: str, values: Array) -> str:
     """What is seen of a column, for a person who knows what was logged."""
     known = values[np.isfinite(values)]
-    if _is_time(known):
+    if is_time(known):
         return f"{name} increases as a time does"
     return f"{name} from {known.min():.4g} to {known.max():.4g}" if len(known) else f"{name} empty"
 
 
-def _is_time(values: Array) -> bool:
+def is_time(values: Array) -> bool:
+    """Whether readings (T,) rise evenly."""
     steps = np.diff(values)
     rises = len(steps) > 3 and bool(np.all(steps > 0))
     return rises and float(steps.max()) < _STEADY * float(np.median(steps))

@@ -22,6 +22,8 @@ _SPARSE = 0.95
 """Share of rows in which a column has a reading, the most of one that stands in rows of its own."""
 _LOST = 5.0
 """Of the usual step between readings: a longer one has lost some."""
+_PAGE = 3.0
+"""Steps that a clock goes on by where the header stands again on a new page."""
 _BACK = 0.02
 """Of the time that has passed: how close to its beginning a clock that starts again comes."""
 
@@ -142,6 +144,10 @@ def starts_of(raw: RawTrial, clock: str) -> list[int]:
     starts = {0, *raw.begun}
     t = raw.columns.get(clock)
     if t is not None:
+        # Where time goes on across a header, it is that of a page.
+        ahead = {at: float(t[at] - t[at - 1]) for at in raw.begun}
+        usual = float(np.nanmedian(np.diff(t))) if len(t) > 1 else 0.0
+        starts -= {at for at, step in ahead.items() if 0.0 < step < _PAGE * usual}
         begin = 0
         for at in np.flatnonzero(np.diff(t) < 0.0) + 1:
             begin = max([start for start in starts if start <= at], default=begin)

@@ -10,7 +10,7 @@ from unicodedata import combining, normalize
 
 import numpy as np
 
-from bampipe.data.looks import describe, find_roles
+from bampipe.data.looks import describe, find_roles, is_time
 from bampipe.data.parts import are_axes, join_parts
 from bampipe.data.readers import (
     EXTENSIONS,
@@ -75,7 +75,8 @@ _WORDS = {
 _SIGNS = {
     "加速度": "acc", "速度": "velocity", "力矩": "torque", "扭矩": "torque", "转矩": "torque",
     "トルク": "torque", "时间": "time", "時間": "time", "角度": "angle", "位置": "position",
-    "位移": "displacement", "电流": "current", "電流": "current", "电压": "voltage", "電圧": "voltage",
+    "位移": "displacement", "电流": "current", "電流": "current", "电压": "voltage",
+    "電圧": "voltage",
     "目标": "target", "目標": "target", "期望": "desired", "指令": "command", "力": "force",
     "время": "time", "угол": "angle", "скорость": "velocity", "момент": "torque", "ток": "current",
 }  # fmt: skip
@@ -88,8 +89,8 @@ REFERENCE_WORDS = frozenset(_WORDS["reference"].split())
 DRIVERS = ("force", "current", "voltage")
 """Roles of what may drive an axis."""
 _BY_UNIT = {
-    "kg": "force", "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
-    "m/s": "velocity", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
+    "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
+    "m/s": "velocity", "kg": "force", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
 }  # fmt: skip
 _SHORT_UNITS = frozenset(["mm", "Nm", "kN", "mA", "mV"])
 _PLAIN_WORDS = frozenset(["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano"])
@@ -148,6 +149,11 @@ class SurveyedColumn:
     def scale(self) -> float:
         """What makes SI of its values, 1 where that is not known."""
         return self.conversion.scale if self.conversion is not None else 1.0
+
+    @property
+    def is_foreign(self) -> bool:
+        """Whether the file states a unit that is not known."""
+        return bool(self.stated) and self.conversion is None
 
     @property
     def is_integer(self) -> bool:
@@ -254,7 +260,8 @@ class _Logs:
                 why = f"*{path.suffix} is not read: {_OTHER_DATA[path.suffix.lower()]}"
                 self.passed.append((path.relative_to(folder).as_posix(), why))
         if not paths:
-            names = join_names([name for name, _ in self.passed], 4)
+            others = [p.relative_to(folder).as_posix() for p in files]
+            names = join_names([name for name, _ in self.passed] or others, 4)
             raise InputError(
                 f"no log in this folder{names and f' that can be read, but {names}'}",
                 where=str(folder),
@@ -411,6 +418,9 @@ class _Logs:
         for column in ordered:
             said = raw.units.get(column, labels[column])
             role = _role(column, said)
+            if role and clock.column != column and re.search(r":column_\d+$", column):
+                # Of files without a header, named for what the rest of their columns is.
+                role = "time" if is_time(raw.columns[column][sound]) else role
             unit = _unit(column, said, role)
             found.append(SurveyedColumn(column, said, role, unit, raw.columns[column][sound]))
         return tuple(found)
@@ -441,7 +451,7 @@ class _Logs:
         several = path.suffix.lower() in TEXTS or any("[:]." in column for column in columns)
         if trial.parts or not several or self.scanned > _MOST_SCANNED:
             return [trial]
-        times = [c for c, u in columns.items() if _role(c, u) == "time" and u != "datetime"]
+        times = [c for c, u in columns.items() if _role(c, u) == "time"]
         column = (times or [next(iter(columns))])[0]
         raw = self._read_one(trial.file, columns, column)
         starts = starts_of(raw, column if times else "")
@@ -600,7 +610,10 @@ def _role(name: str, stated: str) -> str:
         said -= _PRESENT  # the position that is current, and no current
     roles = [role for role, text in _WORDS.items() if said & set(text.split())]
     if len(roles) > 1 and max(map(len, said)) == 1:
-        return ""  # x_F: letters that stand for several quantities
+        # x_F: letters that stand for several quantities
+        return next(
+            (_role_by_unit(x) for x in re.split(r"[_\W]+", name)[1:] if x in "AV" and x), ""
+        )
     named = next(iter(roles), "")
     return named or lerobot.role_of(name) or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
 

@@ -292,6 +292,7 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
         row = plain if rows and len(cells(rows[0], delimiter)) == len(plain) else bare
     if delimiter == " ":
         row = [name.rstrip(",;") or name for name in row]
+    row = [name.strip("\"'") for name in row]
     if row and row.count(row[0]) > 1 and row[0].lower() in _NAME_KEYS:
         row = ["Time" if name == row[0] else name for name in row]  # in pairs with a reading
     row = _named_items(row, [cells(text, delimiter) for text in rows[:_SEARCHED]])
@@ -393,16 +394,25 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
             break
         if row[0].lower() in _NAME_KEYS and row.count(row[0]) > 1:
             return n
+    bare = [n for n in fitting if not any(map(_POINT.match, rows[n]))]
+    if bare and bare[-1] != fitting[-1]:
+        return bare[-1]  # what is below has numbers, and cells that are empty
     if len(fitting) > 1 and _are_units(rows[fitting[-1]]) and len(rows[fitting[-2]]) == width:
         return fitting[-2]
     return fitting[-1] if fitting else -1
 
 
 def _padded(header: list[str], body: list[Line], delimiter: str) -> list[str]:
-    """The header with one more, nameless column where every line ends with a delimiter."""
+    """The header with a nameless column: lines end with a delimiter, or begin with their number."""
     rows = [cells(line.text, delimiter) for line in body[:_TRIED] if line.text.strip()]
-    longer = rows and all(len(row) == len(header) + 1 and not row[-1] for row in rows)
-    return [*header, ""] if longer else header
+    longer = [row for row in rows if len(row) == len(header) + 1]
+    if not rows or len(longer) < len(rows):
+        return header
+    if not any(row[-1] for row in longer):
+        return [*header, ""]
+    numbers = [row[0].strip('"') for row in longer]  # of the rows, as R writes them
+    counted = all(map(str.isdigit, numbers)) and int(numbers[-1]) - int(numbers[0]) == len(rows) - 1
+    return ["", *header] if counted else header
 
 
 def _decimal(

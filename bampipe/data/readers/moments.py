@@ -22,7 +22,7 @@ _LOCAL = re.compile(
     r"(?P<hour>\d{1,2})(?P<rest>:\d\d(?::\d\d(?:[.,:]\d+)?)?)(?P<half> ?[AaPp]\.?[Mm]\.?)?\s*\Z"
 )
 """Date and time as people write them: the date may be left out beside AM or PM."""
-_MONTHS = "jan feb mar apr may jun jul aug sep oct nov dec".split()
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 
 
 def is_moment(cell: str) -> bool:

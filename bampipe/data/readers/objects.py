@@ -58,7 +58,8 @@ def columns(path: Path, name: str) -> dict[str, str]:
     """Names of the values that are numbers, or moments (unit "datetime"), in the first sample."""
     samples, constants, _ = _samples(path, name)
     if isinstance(samples, dict):
-        content = _parsed(path.read_text(encoding="utf-8-sig"), name)
+        lines = path.suffix.lower() != ".json"
+        content = {} if lines else _parsed(path.read_text(encoding="utf-8-sig"), name)
         beside = {label: find(content, f"{label.rpartition('.')[0]}.unit") for label in samples}
         units = {label: unit for label, unit in beside.items() if isinstance(unit, str)}
         found = columns_of_arrays(samples) | dict.fromkeys(constants, "")

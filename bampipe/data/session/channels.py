@@ -412,7 +412,7 @@ class Force(Declaration):
                 yield InputError(
                     "the matrix is singular: some force gives no voltage",
                     where="calibration_n_per_v",
-                    remedy="give what each column reads under a known force; no row is zero, none like another",
+                    remedy="no row is zero, none like another: fill in what a known force reads",
                 )
 
 

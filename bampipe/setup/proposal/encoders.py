@@ -61,9 +61,11 @@ def _encoder(
             " the angle; put in the ratio of the gear"
         )
     right, geared = column.si == axis.unit, axis.name in match.robot.gears
-    if column.by_looks and not right:
+    if (column.by_looks or column.is_foreign) and not right:
+        stated = f"stated as '{column.stated}'" if column.is_foreign else ""
         note = notes.ask(
-            f"the unit of {column.name}, which looks like the position of {axis.name}",
+            f"the unit of {column.name}, "
+            + (stated or f"which looks like the position of {axis.name}"),
             "who wrote the logger, or by how far the machine moves; rad, deg, m and mm are usual",
         )
         return entry(column.name, UNKNOWN, _velocity_beside(axis, alone, match, notes)) + note
@@ -106,6 +108,12 @@ def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -
 
 def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
     si = f"{axis.unit}/s"
+    if column.is_foreign:
+        note = notes.ask(
+            f"the unit of {column.name}, stated as '{column.stated}', which is integrated",
+            "who wrote the logger; rad/s, rev/min and mm/s are usual",
+        )
+        return entry(column.name, UNKNOWN) + note
     said = spelled(column.unit, _SPEED_UNITS) if column.si == si else ""
     return entry(column.name, said or si) + notes.guess(
         f"no position was recorded: that of {axis.name} is the integral of {column.name}"

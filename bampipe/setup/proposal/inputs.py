@@ -19,6 +19,7 @@ _FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "
 _SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])
 _FORCES = frozenset(["force", "forc", "kraft", "loadcell", "fx", "fy", "fz"])
 _TORQUES = frozenset(["torque", "tau", "trq", "moment", "effort", "drehmoment"])
+_LOGGER = "who wrote the logger, or its manual"
 _QUANTITY = {"N": "force", "N.m": "torque", "A": "current", "V": "voltage"}
 _FEWEST_COUNTS = 100
 _MOST_VOLTS = 60.0
@@ -97,9 +98,11 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             volts = notes.guess("the force channels are volts, by their names")
             zero = notes.ask("zero_v, the volts without force", "a log of the unloaded sensor")
         return [f'unit = "V"{volts}', f"calibration_n_per_v = {rows}{ask}", f"zero_v = {row}{zero}"]
-    if any(column.by_looks for column in columns):
+    odd = next((column for column in columns if column.is_foreign), None)
+    if odd is not None or any(column.by_looks for column in columns):
+        looks = "which looks like what drives the motion"
         note = notes.ask(
-            f"the unit of {names}, which looks like what drives the motion",
+            f"the unit of {names}, " + (f"stated as '{odd.stated}'" if odd is not None else looks),
             "who wrote the logger; N.m or N of a sensor, V with calibration_n_per_v of counts",
         )
         return [f'unit = "{UNKNOWN}"{note}']
@@ -178,6 +181,9 @@ def _channel(
         if column.stated and not why and register is None:
             return table
         return table + notes.guess(f"{column.name} is {name}{why}{_unscaled(si, column, register)}")
+    if column.is_foreign and si and not register:
+        note = notes.ask(f"the unit of {column.name}, stated as '{column.stated}'", _LOGGER)
+        return entry(column.name, UNKNOWN, fields) + note
     likely = si if register else guesses.likely_unit(si, column.values) or si
     if name == "supply" and column.is_integer and float(np.nanmedian(column.values)) > _MOST_VOLTS:
         likely = "0.1V"
