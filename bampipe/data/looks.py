@@ -69,9 +69,10 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
         found |= {names[k]: "force" for k in left}
     elif not positions and len(left) == 2:
         seconds = (t - t[0]) * SECONDS.get(guesses.time_unit(t, ""), 1.0)
-        share = [guesses.driven(seconds, matrix[:, k], matrix[:, 1 - k]).share for k in left]
-        moved = int(np.argmax(share))
-        if share[moved] >= _MOVED and 1.0 - share[moved] < _CLEARLY * (1.0 - share[1 - moved]):
+        explained = [guesses.driven(seconds, matrix[:, k], matrix[:, 1 - k]).share for k in left]
+        moved = int(explained[1] > explained[0])
+        least, most = sorted(explained)
+        if most >= _MOVED and 1.0 - most < _CLEARLY * (1.0 - least):
             found |= {names[moved]: "position", names[1 - moved]: "force"}
     return found
 

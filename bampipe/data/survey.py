@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from unicodedata import combining, normalize
 
@@ -310,9 +311,14 @@ class _Logs:
     def fault(self) -> InputError:
         """That no log can be read, with the reason of the first."""
         # What is no log anyway says least.
-        idle = ("no column of numbers", "one row", "has other columns")
-        name, why = next((p for p in self.passed if not p[1].startswith(idle)), self.passed[0])
+        idle = ("*", "no column of numbers", "one row", "has other columns")
+        name, why = min(
+            self.passed,
+            key=lambda p: next((k for k, x in enumerate(idle) if p[1].startswith(x)), -1),
+        )
         remedy = why if name in why else f"{name}: {why}"
+        if "a line reads" in why:
+            remedy += "; export rows of numbers below a line of names"
         return InputError("no log that can be read", where=str(self.folder), remedy=remedy)
 
     def choose(self) -> tuple[list[TrialEntry], list[str]]:
@@ -414,6 +420,15 @@ class _Logs:
         self.first = trial.file
         if not (trial.parts or trial.recording or trial.file.lower().endswith(TEXTS)):
             self.remarks += raw.remarks
+        numbered = [c for c in times if re.search(r" \(\d+\)$", c)]
+        for one, other in pairwise(numbered):
+            here, there = (raw.columns[c][sound] for c in (one, other))
+            if np.nanmax(np.abs(here - there)) > 0.5 * abs(np.nanmedian(np.diff(here))):
+                raise InputError(
+                    f"columns have times of their own, which differ, as {one} and {other} do",
+                    where=trial.file,
+                    remedy="export all at one rate, or each with its time to a file of its own",
+                )
         found = []
         for column in ordered:
             said = raw.units.get(column, labels[column])
@@ -475,11 +490,7 @@ def _like(path: Path) -> str:
         head = stream.read(1 << 12).decode("utf-8", "replace")
     line = next((x.strip() for x in reversed(head.splitlines()[:20]) if x.strip()), "")
     shown = f"{line[:48]}..." if len(line) > 48 else line
-    return (
-        f"; a line reads '{shown}': export a line of names with rows of numbers below"
-        if (re.search(r"\d", shown) and shown.isprintable())
-        else ""
-    )
+    return f"; a line reads '{shown}'" if shown.isprintable() and re.search(r"\d", shown) else ""
 
 
 def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
@@ -601,6 +612,8 @@ def _role(name: str, stated: str) -> str:
         return "time"
     said = set(words(name))
     said |= {word.removesuffix("s") for word in said if len(word) > 3}
+    if {"load", "cell"} <= said:
+        return "force"
     first = [role for role in ("reference", "brake") if said & set(_WORDS[role].split())]
     if first:
         return first[0]

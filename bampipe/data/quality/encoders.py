@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bampipe.arrays import Array
+from bampipe.arrays import Array, Indices
 from bampipe.data.quality.channels import fill_missing, take_out
 from bampipe.data.quality.table import TrialTable, in_times
 from bampipe.data.session import Encoder
@@ -65,7 +65,7 @@ def unwrap(table: TrialTable, encoder: Encoder) -> None:
         )
 
 
-def unwrapped(values: Array, turn: float, counts: bool) -> tuple[Array, Array, str]:
+def unwrapped(values: Array, turn: float, counts: bool) -> tuple[Array, Indices, str]:
     """Readings that go on where they start anew: at a full turn, or at the bits of a counter.
 
     Args:
@@ -87,8 +87,8 @@ def unwrapped(values: Array, turn: float, counts: bool) -> tuple[Array, Array, s
             turns, found = np.zeros(len(known)), values.copy()
             turns[1:][wraps] = -np.sign(steps[wraps]) * period
             found[known] += np.cumsum(turns)
-            return found, known[np.flatnonzero(wraps) + 1], words
-    return values, np.empty(0, dtype=int), ""
+            return found, (known[np.flatnonzero(wraps) + 1]).astype(np.int64), words
+    return values, np.empty(0, dtype=np.int64), ""
 
 
 def interpolate_jumps(table: TrialTable, encoder: Encoder) -> None:

@@ -67,9 +67,9 @@ _KINDS = (
     (b"#ROSBAG", (".bag",), "a ROS bag"),
     (b"\x89MCAP0", (".mcap",), "an MCAP file"),
     (b"SQLite format 3", (".db3",), "an SQLite file"),
-    (b"PK\x03\x04", (".npz",), "a zip archive or spreadsheet"),
+    (b"PK\x03\x04", ("", ".npz"), "a zip archive or spreadsheet"),
     (b"\x93NUMPY", (".npy",), "an array of NumPy"),
-    (b"\x1f\x8b", (), "a gzip archive"),
+    (b"\x1f\x8b", ("",), "a gzip archive"),
     (hdf5.SIGNATURE, (".h5", ".hdf5", ".hdf", ".mat"), "an HDF5 file"),
 )
 
@@ -196,7 +196,6 @@ def _checked_extension(path: Path, name: str) -> str:
     kinds += [(b"", (".mat",), "a MATLAB file")] if matlab else []
     for _, right, words in kinds:
         if extension not in right:
-            packed = right in ((), (".npz",))
-            remedy = "unpack it, or export it as CSV" if packed else f"name it *{right[0]}"
+            remedy = f"name it *{right[0]}" if right[0] else "unpack it, or export it as CSV"
             raise InputError(f"this is {words}, not *{extension}", where=name, remedy=remedy)
     return extension

@@ -12,7 +12,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import accumulate
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import Dialect, check_columns
@@ -303,7 +302,7 @@ def _told_apart(header: list[str], above: list[str]) -> list[str]:
     """The header with names that stand more than once below those of groups, else with a number."""
     count = Counter(name for name in header if name)
     if len(above) == len(header) and not any(map(_POINT.match, above)):
-        groups = accumulate(above, lambda group, cell: cell or group)
+        groups = [next(filter(None, above[n::-1]), "") for n in range(len(above))]
         pairs = zip(groups, header, strict=True)
         header = [f"{group} {name}".strip() if count[name] > 1 else name for group, name in pairs]
         count = Counter(name for name in header if name)

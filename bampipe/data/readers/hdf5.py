@@ -142,11 +142,12 @@ def _found(
 def _names(data: Any) -> list[str]:
     """Names that the file gives to the columns of a matrix: beside it, or as pandas stores them."""
     items = data.name.removesuffix("_values") + "_items"
-    found = next((data.attrs[key] for key in _COLUMNS if key in data.attrs), None)
-    if found is None and items != data.name + "_items" and items in data.file:
-        found = data.file[items][()]
-    texts = [x.decode("utf-8", "replace") if isinstance(x, bytes) else x for x in np.ravel(found)]
     width = min((extent for extent in data.shape if extent != 1), default=0)
+    found = next((data.attrs[key] for key in _COLUMNS if key in data.attrs), ())
+    beside = dict(_datasets(data.parent)).get(items.rpartition("/")[2])
+    if not len(found) and beside is not None and beside.shape == (width,):
+        found = beside[()]
+    texts = [x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in found]
     return texts if data.ndim == 2 and len(texts) == width and len(set(texts)) == width else []
 
 

@@ -106,7 +106,7 @@ def _called(
     found: dict[str, np.ndarray | str | None],
 ) -> tuple[dict[str, np.ndarray | None], dict[str, str], str]:
     texts = {label: text for label, text in found.items() if isinstance(text, str) and text}
-    names, units = {}, {}
+    names, units = dict[str, str](), dict[str, str]()
     for label, text in texts.items():
         owner, _, key = label.rpartition(".")
         if key.lower() in _NAMES and owner.endswith("]"):

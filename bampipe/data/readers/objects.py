@@ -98,10 +98,10 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
                     yield label, array
     elif isinstance(value, list) and len(value) > 1:
         if isinstance(value[0], dict):
-            names = [next((x.get(key) for key in _CALLED if key in x), None) for x in value]
-            called = all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
-            for k, item in enumerate(value):
-                yield from _arrays(item, f"{path}[{names[k] if called else k}]")
+            own = [next((str(x[key]) for key in _CALLED if key in x), "") for x in value]
+            places = own if all(own) and len(set(own)) == len(own) else range(len(value))
+            for place, item in zip(places, value, strict=True):
+                yield from _arrays(item, f"{path}[{place}]")
             return
         if isinstance(value[0], str):
             if moments.is_moment(value[0]) and all(isinstance(x, str | None) for x in value):

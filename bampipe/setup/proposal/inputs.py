@@ -99,7 +99,7 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             zero = notes.ask("zero_v, the volts without force", "a log of the unloaded sensor")
         return [f'unit = "V"{volts}', f"calibration_n_per_v = {rows}{ask}", f"zero_v = {row}{zero}"]
     odd = next((column for column in columns if column.is_foreign), None)
-    if odd is not None or any(column.by_looks for column in columns):
+    if odd is not None or any(c.by_looks or not (c.role or c.unit or why) for c in columns):
         looks = "which looks like what drives the motion"
         note = notes.ask(
             f"the unit of {names}, " + (f"stated as '{odd.stated}'" if odd is not None else looks),
