@@ -343,11 +343,16 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
     found = []
     best = max(score for score, _, _ in ranked)
     for _, width, delimiter in (each for each in ranked if each[0] == best):
-        split = (cells(line.text, delimiter) for line in lines)
-        numeric = (
-            len(row) == width and _number_cells(row, delimiter) > 0.5 * width for row in split
-        )
-        first = next((n for n, is_sample in enumerate(numeric) if is_sample), len(lines))
+        split = [cells(line.text, delimiter) for line in lines]
+        samples = [
+            [
+                n
+                for n, row in enumerate(split)
+                if len(row) == width and _number_cells(row, delimiter) > 0.5 * of(row)
+            ]
+            for of in (len, lambda row: sum(map(bool, row)))  # of cells, or of those with something
+        ]
+        first = next((found[0] for found in samples if found), len(lines))
         # What was logged before all sensors had answered are samples with empty cells.
         while 0 < first < len(lines) and _is_sparse(cells(lines[first - 1].text, delimiter), width):
             first -= 1
@@ -370,9 +375,9 @@ def _end_in_semicolons(lines: list[Line]) -> bool:
 
 
 def _number_cells(row: list[str], delimiter: str) -> int:
-    """How many cells of a line are numbers; a comma inside one is a decimal sign."""
+    """How many cells of a line are numbers or moments; a comma inside one is a decimal sign."""
     signs = (_POINT,) if delimiter == "," else (_POINT, _COMMA)
-    return sum(any(sign.match(cell) for sign in signs) for cell in row)
+    return sum(any(sign.match(cell) for sign in signs) or is_moment(cell) for cell in row)
 
 
 def _above(lines: list[Line], first: int, delimiter: str) -> int:

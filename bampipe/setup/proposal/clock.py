@@ -12,6 +12,7 @@ from bampipe.data.quality.stamps import spread_stamps, unroll
 from bampipe.data.session import SECONDS
 from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import spelled
+from bampipe.errors import InputError
 from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted
 
 _RECORDED = ":@time"
@@ -20,6 +21,8 @@ _LIKELY_RATE_HZ = 100.0
 """Assumed for the other guesses where nothing shows the rate."""
 _COUNTERS = frozenset(["tick", "ticks", "cycle", "cycles", "timestep", "timesteps", "cyccnt"])
 """Words in the name of a clock that counts at a rate of its own."""
+_FALLING = 0.9
+"""Share of steps at which the time of a log that is written backwards falls, the least."""
 _SLOW_HZ = 40.0
 """Below, accelerations of a joint that stops within a tenth of a second are not seen."""
 _OF_ROWS = (
@@ -133,6 +136,12 @@ def _counted(found: Survey, notes: Notes) -> ProposedClock:
         rate = f"sample_rate_hz = {1.0 / step_s:g}"
         return ProposedClock(step_s * samples, (name,), _table(f'unit = "samples"{note}'), rate)
     stamps = next((column for column in found.of("time") if not column.is_constant), None)
+    if stamps is not None and _FALLING < np.mean(np.diff(stamps.values) < 0.0):
+        raise InputError(
+            f"{stamps.name} falls from row to row: the log is written backwards",
+            where=found.trials[0].file,
+            remedy="turn the order of its rows round",
+        )
     why = "no column increases like a time" if stamps is None else _describe_stamps(stamps)
     note = notes.guess(f"samples are counted: {why}")
     rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, rows a second", _OF_ROWS)

@@ -184,6 +184,12 @@ def _channel(
     if column.is_foreign and si and not register:
         note = notes.ask(f"the unit of {column.name}, stated as '{column.stated}'", _LOGGER)
         return entry(column.name, UNKNOWN, fields) + note
+    if register and si and not column.unit:
+        note = notes.ask(
+            f"the unit of {column.name}, what one count is, such as 2.69mA; {register.words}",
+            "the drive's table of registers",
+        )
+        return entry(column.name, UNKNOWN, fields) + note
     likely = si if register else guesses.likely_unit(si, column.values) or si
     if name == "supply" and column.is_integer and float(np.nanmedian(column.values)) > _MOST_VOLTS:
         likely = "0.1V"
