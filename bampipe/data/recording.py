@@ -18,8 +18,8 @@ MOST_APART = 0.01
 """Share of samples that one part may have more than another to be joined row by row."""
 _LEAST = 20
 """Samples of a recording: time that falls sooner has not started again."""
-_SPARSE = 0.95
-"""Share of rows in which a column has a reading, the most of one that stands in rows of its own."""
+_MOSTLY = 0.95
+"""Share of rows in which a column that is of the same rows has a reading."""
 _LOST = 5.0
 """Of the usual step between readings: a longer one has lost some."""
 _PAGE = 3.0
@@ -105,7 +105,7 @@ def _at_one_rate(raw: RawTrial, clock: Clock) -> RawTrial:
         if name not in (clock.column, clock.nanoseconds)
     }
     some = np.any(list(known.values()), axis=0) if known else np.empty(0)
-    sparse = [name for name, mask in known.items() if _is_sparse(mask[some])]
+    sparse = any(_is_sparse(mask[some]) for mask in known.values())
     empty = 1.0 - some.mean() if len(some) else 0.0
     if t is None or clock.nanoseconds or raw.begun or not (sparse or 0.01 < empty < 0.5):
         return raw
@@ -113,10 +113,10 @@ def _at_one_rate(raw: RawTrial, clock: Clock) -> RawTrial:
     rows = known[first] if sparse else some
     columns = {name: values[rows] for name, values in raw.columns.items()}
     remarks = [f"{empty:.0%} of the rows hold nothing of these columns"] if empty > 0.0 else []
-    for name in sparse:
-        if name != first:
-            stamps = t[known[name]]
-            columns[name] = interpolated(t[rows], stamps, raw.columns[name][known[name]])
+    for name, mask in known.items():
+        if sparse and mask[rows].mean() < _MOSTLY:
+            stamps = t[mask]
+            columns[name] = interpolated(t[rows], stamps, raw.columns[name][mask])
             # Between readings that are lost, there is nothing to go by.
             steps = np.diff(stamps)
             after = np.clip(np.searchsorted(stamps, t[rows]), 1, len(steps))
@@ -125,18 +125,15 @@ def _at_one_rate(raw: RawTrial, clock: Clock) -> RawTrial:
                 f"'{name}' stands in rows of its own: interpolated linearly at the times of"
                 f" '{first}' (at most {np.max(steps):.3g} s apart)"
             )
-    return replace(
-        raw, columns=columns, kept=raw.rows[rows], remarks=(*raw.remarks, *remarks), resumed=()
-    )
+    remarks = [*raw.remarks, *remarks]
+    return replace(raw, columns=columns, kept=raw.rows[rows], remarks=tuple(remarks), resumed=())
 
 
 def _is_sparse(known: np.ndarray) -> bool:
-    """Whether readings (T,) come in some rows at steady intervals, and not in the others."""
-    at = np.flatnonzero(known)
-    if len(at) < _LEAST or len(at) > _SPARSE * len(known):
-        return False
-    steps = np.diff(at)
-    return float(np.quantile(steps, _SPARSE)) <= 3.0 * float(np.median(steps)) + 1.0
+    """Whether readings (T,) come every few rows, steadily."""
+    steps = np.diff(np.flatnonzero(known))
+    usual = float(np.median(steps)) if len(steps) >= _LEAST else 0.0
+    return usual >= 2.0 and float(np.quantile(steps, _MOSTLY)) <= 3.0 * usual
 
 
 def starts_of(raw: RawTrial, clock: str) -> list[int]:

@@ -228,11 +228,7 @@ def _lines(head: bytes, name: str) -> list[Line]:
 
 
 def _header(
-    lines: list[Line],
-    columns: Sequence[str],
-    dialect: Dialect,
-    delimiters: list[str],
-    name: str,
+    lines: list[Line], columns: Sequence[str], dialect: Dialect, delimiters: list[str], name: str
 ) -> tuple[int, str, list[str]]:
     """Place of the header among the lines (-1 where the session gives the names), and its cells."""
     if dialect.names:

@@ -408,9 +408,7 @@ def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> I
                 " columns, or a point before the fraction of a second"
             )
         return InputError(
-            f"{actual} cells, where the header has {expected}",
-            where=f"{name}{at}",
-            remedy=remedy,
+            f"{actual} cells, where the header has {expected}", where=f"{name}{at}", remedy=remedy
         )
     cell = _CELL.search(message)
     if cell is None:
@@ -430,7 +428,5 @@ def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> I
     elif re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?\s+[^\d\s]\S*", value.strip(), re.IGNORECASE):
         remedy = "export numbers without their units"
     return InputError(
-        f"found '{shown}', expected a number",
-        where=f"{name}{at}, column '{column}'",
-        remedy=remedy,
+        f"found '{shown}', expected a number", where=f"{name}{at}, column '{column}'", remedy=remedy
     )

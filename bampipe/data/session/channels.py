@@ -43,9 +43,7 @@ def _name(text: str) -> str:
 
 
 ChannelName = Annotated[
-    str,
-    AfterValidator(_name),
-    Field(json_schema_extra={"pattern": "^[A-Za-z][A-Za-z0-9_]*$"}),
+    str, AfterValidator(_name), Field(json_schema_extra={"pattern": "^[A-Za-z][A-Za-z0-9_]*$"})
 ]
 
 
@@ -125,9 +123,7 @@ class Clock(Declaration):
     def cross_faults(self) -> Iterator[InputError]:
         if self.unit == "samples" and self.column:
             yield InputError(
-                'given although unit = "samples" counts them',
-                where="column",
-                remedy="leave it out",
+                'given although unit = "samples" counts them', where="column", remedy="leave it out"
             )
         if self.unit != "samples" and not self.column:
             yield InputError(
