@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import combinations
 from pathlib import Path
 from unicodedata import combining, normalize
 
@@ -420,10 +420,13 @@ class _Logs:
         self.first = trial.file
         if not (trial.parts or trial.recording or trial.file.lower().endswith(TEXTS)):
             self.remarks += raw.remarks
-        numbered = [c for c in times if re.search(r" \(\d+\)$", c)]
-        for one, other in pairwise(numbered):
+        # Times of one name, beside the readings that each is of.
+        ends = [re.sub(r" \(\d+\)$", "", c).rpartition(".")[2] for c in times]
+        for one, other in combinations(times if times and times[0][:1] != "/" else (), 2):
             here, there = (raw.columns[c][sound] for c in (one, other))
-            if np.nanmax(np.abs(here - there)) > 0.5 * abs(np.nanmedian(np.diff(here))):
+            alike = ends[times.index(one)] == ends[times.index(other)]
+            step = abs(np.nanmedian(np.diff(here))) if len(here) > 1 else 0.0
+            if alike and step and np.nanmax(np.abs(here - there)) > step:
                 raise InputError(
                     f"columns have times of their own, which differ, as {one} and {other} do",
                     where=trial.file,

@@ -35,7 +35,9 @@ _NO_ANGLE = re.compile(
     r"(?i)force|moment|torque|power|activation|excitation|fiber|length|[_.][tpv][xyz]\Z|\Atime\Z"
 )
 _NUMBERED = "column_"
-_NAME_KEYS = frozenset(["name", "names", "signal", "channel", "kanal", "signalname"])
+_NAME_KEYS = frozenset(
+    ["name", "names", "signal", "channel", "kanal", "signalname", "channeltitle"]
+)
 _SEARCHED = 200
 _TRIED = 400
 _LEAST_FILLED = 0.04
@@ -143,7 +145,8 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
         if (
             _is_unit_row(row, header, columns)
             and not dialect.names
-            and not ((remark or property_row) and not _are_units(list(filter(None, row))))
+            and not (remark and not _are_units(row))
+            and not (property_row and not all(unit(x) for x in row if x and not x[0].isdigit()))
         ):
             units |= {h: bare(u) for h, u in zip(header, row, strict=False) if bare(u)}
             remarks.append(f"row {line.number} gives units")
@@ -235,16 +238,26 @@ def _header(
         check_columns(dialect.names, columns, f"{name}: csv.names")
         first, delimiter = _guess(lines, delimiters)[0]
         return max(_filled(lines[:first]), default=-1), delimiter, list(dialect.names)
+    guesses = _guess(lines, delimiters)
+    width = (
+        len(cells(lines[guesses[0][0]].text, guesses[0][1])) if guesses[0][0] < len(lines) else 0
+    )
+
+    def names(index: int, delimiter: str) -> list[str]:
+        row = _names(lines[index].text, delimiter, lines[index + 1 :], lines[:index])
+        # It may be written otherwise than the samples.
+        fits = len(row) in (width, width - 1)
+        return row if fits else next(iter(_otherwise(lines[index].text, width)), row)
+
     for index, line in enumerate(lines[:_SEARCHED]) if columns else ():
         for delimiter in delimiters:
-            row = _names(line.text, delimiter, lines[index + 1 :], lines[:index])
+            row = names(index, delimiter)
             if set(columns) <= set(row):
                 check_columns(row, columns, f"{name}, row {line.number}")
                 first, below = _guess(lines[index + 1 :], delimiters)[0]
                 rows = lines[index + 1 + first :]  # may be separated otherwise than the header
                 fits = len(row) > 1 and rows and len(cells(rows[0].text, below)) == len(row)
                 return index, below if fits else delimiter, row
-    guesses = _guess(lines, delimiters)
     found = [(_above(lines, first, delimiter), delimiter) for first, delimiter in guesses]
     index, delimiter = next((each for each in found if each[0] >= 0), (-1, ""))
     if index < 0:
@@ -258,10 +271,7 @@ def _header(
             remedy=f"add a line {','.join(columns)}, or give names under [csv]; without names, the"
             f" columns are {row[0]} to {row[-1]}",
         )
-    width = len(cells(lines[guesses[0][0]].text, delimiter)) if guesses[0][0] < len(lines) else 0
-    row = _names(lines[index].text, delimiter, lines[index + 1 :], lines[:index])
-    if len(row) not in (width, width - 1):  # the header is written otherwise than the samples
-        row = next(iter(_otherwise(lines[index].text, width)), row)
+    row = names(index, delimiter)
     check_columns(row, columns, f"{name}, row {lines[index].number}")
     return index, delimiter, row
 
@@ -273,7 +283,8 @@ def _filled(lines: list[Line]) -> list[int]:
 
 def _otherwise(text: str, width: int) -> list[list[str]]:
     """The names in a header of ``width`` cells, by each delimiter that separates so many."""
-    split = [cells(_REMARK.sub("", text, count=1), delimiter) for delimiter in DELIMITERS]
+    plain = _REMARK.sub("", text, count=1).strip()
+    split = [cells(plain, delimiter) for delimiter in DELIMITERS] + [re.split(r"\s{2,}", plain)]
     return [row for row in split if len(row) == width > 1]
 
 
@@ -288,10 +299,16 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
     if delimiter == " ":
         row = [name.rstrip(",;") or name for name in row]
     row = [name.strip("\"'") for name in row]
-    if row and row.count(row[0]) > 1 and row[0].lower() in _NAME_KEYS:
-        row = ["Time" if name == row[0] else name for name in row]  # in pairs with a reading
+    if _is_key_of_names(row):
+        row = ["Time" if name == row[0] else name for name in row]
     row = _named_items(row, [cells(text, delimiter) for text in rows[:_SEARCHED]])
     return _told_apart(row, cells(above[-1].text, delimiter) if above else [])
+
+
+def _is_key_of_names(row: list[str]) -> bool:
+    """Whether a line says of itself that it holds names: before each of them, or once."""
+    key = row[0].lower() if row else ""
+    return key.rstrip("=:") in _NAME_KEYS and (row.count(row[0]) > 1 or key[-1] in "=:")
 
 
 def _told_apart(header: list[str], above: list[str]) -> list[str]:
@@ -392,7 +409,7 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
         row = cells(lines[n].text, delimiter)
         if len(row) != width:
             break
-        if row[0].lower() in _NAME_KEYS and row.count(row[0]) > 1:
+        if _is_key_of_names(row):
             return n
     bare = [n for n in fitting if not any(map(_POINT.match, rows[n]))]
     if bare and bare[-1] != fitting[-1]:
@@ -464,7 +481,7 @@ def _decimal(
 
 
 def _is_remark(text: str) -> bool:
-    return bool(_REMARK.match(text))
+    return bool(_REMARK.match(text) or re.fullmatch(r"\s*[-=_*~]{3,}[-=_*~+|\s]*", text))
 
 
 def _of_properties(row: list[str]) -> tuple[list[str], bool]:

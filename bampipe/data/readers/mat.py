@@ -113,6 +113,19 @@ def _called(
             names.setdefault(owner, re.sub(r"[^\w ./+-]|[\[\]]", "", text))
         elif key.lower() in ("unit", "units"):
             units[owner] = text
+    lists: dict[str, dict[int, str]] = {}
+    for label, text in texts.items():
+        if item := re.fullmatch(r"(.+)\[(\d+)\]", label):
+            lists.setdefault(item[1], {})[int(item[2])] = text
+    for label, value in [*found.items()]:
+        sides = value.shape if isinstance(value, np.ndarray) and value.ndim == 2 else (0,)
+        inner = label.rpartition(".")[0]
+        fitting = (own for x, own in lists.items() if x.rpartition(".")[0] == inner)
+        own = next((own for own in fitting if len(set(own.values())) == min(sides) > 1), {})
+        if own and isinstance(value, np.ndarray):  # as of importdata
+            del found[label]
+            table = value if sides[0] >= sides[1] else value.T
+            found |= {f"{label}.{own[k]}": table[:, k] for k in sorted(own)}
     several = Counter((owner.rpartition("[")[0], name) for owner, name in names.items())
     whole = {label.partition(".")[0] for label in found}
     root = f"{whole.pop()}." if len(whole) == 1 else ""

@@ -17,7 +17,7 @@ import numpy as np
 
 from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import columns_of_arrays, read_arrays
-from bampipe.data.readers.nested import MISSING, as_number, find, leaves
+from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns
 from bampipe.errors import InputError
 
@@ -66,7 +66,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
         return {column: units.get(column, stated) for column, stated in found.items()}
     found = {}
     for column, cell in leaves(samples[0]):
-        if isinstance(cell, int | float):
+        if isinstance(cell, int | float) or (isinstance(cell, str) and is_number(cell)):
             found[column] = ""
         elif isinstance(cell, str) and moments.is_moment(cell):
             found[column] = "datetime"
@@ -190,7 +190,8 @@ def _lists_of_samples(content: object) -> dict[str, list[object]]:
 
 def _is_sample(value: object) -> bool:
     """Whether an object is a sample rather than a recording, whose values are long lists."""
-    return any(isinstance(cell, int | float) for _, cell in leaves(value))
+    cells = (cell for _, cell in leaves(value))
+    return any(isinstance(x, int | float) or (isinstance(x, str) and is_number(x)) for x in cells)
 
 
 def _numbers(content: object) -> dict[str, object]:

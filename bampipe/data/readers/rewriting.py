@@ -21,6 +21,7 @@ _PAIR = re.compile(rf"""["']?([A-Za-z_][\w./]*)["']?\s*[=:]\s*({_NUMBER})(?![\w.
 _STAMPED = re.compile(r"\s*(\d{1,2}:\d\d:\d\d[.,]\d+)\s*->\s*(.*)")
 _WITH_UNIT = re.compile(rf"({_NUMBER})[ \u00a0]?([^\W\d_]\S*|[%°]\S*)")
 _FORTRAN = re.compile(r"(\d\.?\d*)[Dd]([-+]\d)")
+_GROUPED = re.compile(r"(?<=\d)['’](?=\d{3}(?!\d))")
 _TYPESET = {"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2009": " "}
 """Minus and blanks of typesetters."""
 _MOST = 0.8
@@ -57,6 +58,8 @@ def find_form(head: str) -> Form | None:
             filter(None, ("typeset minus signs and blanks are plain ones", inner.said))
         )
         return Form(said, lambda line: inner.rewrite(line.translate(plain)), inner.names)
+    if any(map(_GROUPED.search, lines)):
+        return Form("apostrophes in numbers left out", lambda line: _GROUPED.sub("", line))
     if _are(_STAMPED, lines):
         return _stamped(lines)
     if _are(_FORTRAN, lines):

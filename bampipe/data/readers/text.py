@@ -267,8 +267,6 @@ def _read_samples(
             _read_stretch(stream, layout, end, samples, name)
             return
         except pa.ArrowInvalid as error:
-            if "Empty CSV file" in str(error):
-                return
             line = _faulty_line(stream, str(error), layout)
             again = line is not None and layout.is_header(line.text)
             samples.cut(rows, parts)
@@ -300,27 +298,40 @@ def _read_stretch(
 ) -> None:
     wanted = samples.wanted
     kinds = {c: pa.string() if c in wanted.datetimes else pa.float64() for c in wanted.columns}
+    # Names that are not wanted may be repeated or empty: a number stands for them.
+    names = [c if c in kinds else f"\0{n}" for n, c in enumerate(layout.header)]
     seen = _SingleBlanks if layout.delimiter == " " else _Stretch
-    before = samples.rows
-    reader = pa_csv.open_csv(
-        pa.PythonFile(seen(stream, layout.start, end, layout.ended), mode="r"),
-        read_options=pa_csv.ReadOptions(
-            use_threads=False,
-            block_size=BLOCK,
-            # Names that are not wanted may be repeated or empty: a number stands for them.
-            column_names=[c if c in kinds else f"\0{n}" for n, c in enumerate(layout.header)],
-        ),
-        parse_options=pa_csv.ParseOptions(delimiter=layout.delimiter),
-        convert_options=pa_csv.ConvertOptions(
-            column_types=kinds,
-            include_columns=list(kinds),
-            null_values=[*NULLS, *wanted.dialect.missing, *samples.nothing],
-            strings_can_be_null=True,
-            decimal_point=layout.decimal,
-        ),
-    )
-    for batch in reader:
-        samples.add(batch, layout.first_line + samples.rows - before, name)
+    blocks, before, held = seen(stream, layout.start, end, layout.ended), samples.rows, b""
+    # Block by block: Arrow's own reader of streams keeps a thread that a faulty row leaves waiting
+    # for itself, and then the process never ends.
+    while block := blocks.read(BLOCK) or held:
+        held = held + block if block is not held else held + b"\n"
+        cut = max(held.rfind(b"\n"), held.rfind(b"\r")) + 1
+        whole, held = held[:cut], held[cut:]
+        if len(held) > BLOCK:
+            raise InputError("a line is far too long", where=name)
+        if not whole.strip():
+            continue
+        try:
+            table = pa_csv.read_csv(
+                pa.BufferReader(whole),
+                pa_csv.ReadOptions(use_threads=False, block_size=cut + 1, column_names=names),
+                pa_csv.ParseOptions(delimiter=layout.delimiter),
+                pa_csv.ConvertOptions(
+                    column_types=kinds,
+                    include_columns=list(kinds),
+                    null_values=[*NULLS, *wanted.dialect.missing, *samples.nothing],
+                    strings_can_be_null=True,
+                    decimal_point=layout.decimal,
+                ),
+            )
+        except pa.ArrowInvalid as error:
+            number = re.compile(r"(?<=Row #)\d+").search(str(error))
+            row = f"{int(number[0]) + samples.rows - before}" if number else ""
+            message = re.sub(r"(?<=Row #)\d+", row, str(error), count=1)
+            raise pa.ArrowInvalid(message) from error
+        for batch in table.to_batches():
+            samples.add(batch, layout.first_line + samples.rows - before, name)
 
 
 def _is_end(stream: BinaryIO, line: Line, end: int, layout: TableLayout) -> bool:
@@ -412,8 +423,7 @@ def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> I
         )
     cell = _CELL.search(message)
     if cell is None:
-        what = "a line is far too long" if "straddl" in message else message
-        return InputError(what, where=name)
+        return InputError(message, where=name)
     column, value = layout.header[int(cell[1])], cell[3]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
     other = "," if layout.decimal == "." else "."
