@@ -11,7 +11,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import Dialect, check_columns
@@ -56,7 +56,6 @@ class TableLayout:
         start: bytes before that line.
         remarks: what is unlike a plain table with commas, a sentence each.
         units: units that the header or a line below it gives, by column.
-        ended: whether every line ends with a semicolon that separates nothing.
         title: the line that is the header, "" where there is none.
     """
 
@@ -67,12 +66,11 @@ class TableLayout:
     start: int
     remarks: tuple[str, ...] = ()
     units: dict[str, str] = field(default_factory=dict)
-    ended: bool = False
     title: str = ""
 
     def cells(self, text: str) -> list[str]:
         """The cells of one line."""
-        return cells(text.removesuffix(";") if self.ended else text, self.delimiter)
+        return cells(text, self.delimiter)
 
     def is_header(self, text: str) -> bool:
         """Whether a line among the samples is the header once more."""
@@ -122,9 +120,6 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     lines = _lines(head, name)
     if not _filled(lines):
         raise InputError("the file holds no text", where=name)
-    ended = _end_in_semicolons(lines)
-    if ended:
-        lines = [replace(line, text=line.text.removesuffix(";")) for line in lines]
     delimiters: list[str] = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
     index, delimiter, header = _header(lines, columns, dialect, delimiters, name)
     body = lines[index + 1 :]
@@ -166,7 +161,7 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     number = lines[passed].number + 1 if passed >= 0 else 1
     title = lines[index].text if index >= 0 and not dialect.names else ""
     return TableLayout(
-        delimiter, decimal, tuple(header), number, start, tuple(remarks), units, ended, title
+        delimiter, decimal, tuple(header), number, start, tuple(remarks), units, title
     )
 
 
@@ -378,13 +373,6 @@ def _is_sparse(row: list[str], width: int) -> bool:
     return len(row) == width > 1 and all(
         cell in NULLS or _POINT.match(cell) or _COMMA.match(cell) or is_moment(cell) for cell in row
     )
-
-
-def _end_in_semicolons(lines: list[Line]) -> bool:
-    """Whether lines end with a semicolon, and have other delimiters in them."""
-    tried = [line.text for line in lines[-_TRIED:] if line.text.strip()]
-    ended = [text for text in tried if text.endswith(";") and text.count(";") == 1]
-    return 2 * len(ended) > len(tried) and all(re.search(r"[,\t |]", text) for text in ended)
 
 
 def _number_cells(row: list[str], delimiter: str) -> int:

@@ -58,6 +58,9 @@ def find_form(head: str) -> Form | None:
             filter(None, ("typeset minus signs and blanks are plain ones", inner.said))
         )
         return Form(said, lambda line: inner.rewrite(line.translate(plain)), inner.names)
+    ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
+    if 2 * len(ended) > len(lines) and all(re.search(r"[,\t |]", line) for line in ended):
+        return Form("", lambda line: line.removesuffix(";"))
     if any(map(_GROUPED.search, lines)):
         return Form("apostrophes in numbers left out", lambda line: _GROUPED.sub("", line))
     if _are(_STAMPED, lines):

@@ -39,41 +39,6 @@ _TAKEN_AS = {
 }
 
 
-class _Stretch(io.RawIOBase):
-    """A binary file of which only the bytes from ``start`` to ``end`` are seen."""
-
-    def __init__(self, stream: BinaryIO, start: int, end: int, ended: bool = False) -> None:
-        stream.seek(start)
-        self._stream = stream
-        self._left = max(end - start, 0)
-        self._ended = ended
-
-    def readable(self) -> bool:
-        return True
-
-    def read(self, size: int = -1, /) -> bytes:
-        size = self._left if size < 0 else min(size, self._left)
-        data = self._stream.read(size)
-        self._left -= len(data)
-        return data.replace(b";", b" ") if self._ended else data
-
-
-class _SingleBlanks(_Stretch):
-    """The same with one blank in place of several, and none at the ends of a line."""
-
-    _held = b"\n"
-
-    def read(self, size: int = -1, /) -> bytes:
-        while True:
-            data = super().read(size)
-            text = self._held + data
-            body = text.rstrip(b" \t\r\n") if data else text.rstrip(b" \t")
-            self._held = text[len(body) :]
-            body = re.sub(rb"[ \t]*([\r\n]+)[ \t]*", rb"\1", re.sub(rb"[ \t]+", b" ", body))
-            if body or not data:
-                return body
-
-
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     """The wanted columns of a text file.
 
@@ -140,7 +105,7 @@ def _opened(
         said = () if dialect.encoding or encoding not in _TAKEN_AS else (_TAKEN_AS[encoding],)
         if form is not None:
             text = re.sub(r"[^\r\n]+", lambda line: form.rewrite(line[0]), text)
-            said = (*said, form.said)
+            said = (*said, form.said) if form.said else said
             if form.names and not dialect.names:
                 dialect = dialect.model_copy(update={"names": form.names})
         yield io.BytesIO(text.encode("utf-8", "replace")), dialect, said
@@ -300,22 +265,30 @@ def _read_stretch(
     kinds = {c: pa.string() if c in wanted.datetimes else pa.float64() for c in wanted.columns}
     # Names that are not wanted may be repeated or empty: a number stands for them.
     names = [c if c in kinds else f"\0{n}" for n, c in enumerate(layout.header)]
-    seen = _SingleBlanks if layout.delimiter == " " else _Stretch
-    blocks, before, held = seen(stream, layout.start, end, layout.ended), samples.rows, b""
+    at, before, held = layout.start, samples.rows, b""
     # Block by block: Arrow's own reader of streams keeps a thread that a faulty row leaves waiting
     # for itself, and then the process never ends.
-    while block := blocks.read(BLOCK) or held:
-        held = held + block if block is not held else held + b"\n"
+    while at < end or held:
+        stream.seek(at)
+        block = stream.read(min(BLOCK, end - at))
+        held += block or b"\n"
+        at, end = at + len(block), end if block else at  # the file may have become shorter
         cut = max(held.rfind(b"\n"), held.rfind(b"\r")) + 1
         whole, held = held[:cut], held[cut:]
         if len(held) > BLOCK:
             raise InputError("a line is far too long", where=name)
+        if layout.delimiter == " ":
+            whole = re.sub(
+                rb"[ \t]*([\r\n]+)[ \t]*", rb"\1", re.sub(rb"[ \t]+", b" ", whole)
+            ).strip(b" ")
         if not whole.strip():
             continue
         try:
             table = pa_csv.read_csv(
                 pa.BufferReader(whole),
-                pa_csv.ReadOptions(use_threads=False, block_size=cut + 1, column_names=names),
+                pa_csv.ReadOptions(
+                    use_threads=False, block_size=len(whole) + 1, column_names=names
+                ),
                 pa_csv.ParseOptions(delimiter=layout.delimiter),
                 pa_csv.ConvertOptions(
                     column_types=kinds,
@@ -372,7 +345,6 @@ def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, .
 
 
 def _split(line: bytes, layout: TableLayout) -> list[bytes]:
-    line = line.rstrip(b";") if layout.ended else line
     return line.split() if layout.delimiter == " " else line.split(layout.delimiter.encode())
 
 
@@ -433,8 +405,6 @@ def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> I
         remedy = f"export with one decimal sign; '{layout.decimal}' was taken from the first rows"
     elif moments.is_moment(value):
         remedy = 'is it the time? then say unit = "datetime" under [time]'
-    elif shown == value and re.fullmatch(r"[^\d\"\\]+", value.strip()):
-        remedy = f'if that means no reading, say missing = ["{value.strip()}"] under [csv]'
     elif re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?\s+[^\d\s]\S*", value.strip(), re.IGNORECASE):
         remedy = "export numbers without their units"
     return InputError(
