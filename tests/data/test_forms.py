@@ -63,6 +63,18 @@ FORMS = {
         lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n,Type: a,Type: b\ns,Units: rad,Units: N*m\n"),
         ("t", "q", "u"),
     ),
+    "keys once a line": (
+        lines(
+            "{t:.3f}\t{q:.4f}\t{u:.4f}",
+            "Interval=\t0.01 s\nChannelTitle=\tq\tu\nRange=\t10 V\t10 V\nUnitName=\tdeg\tNm\n",
+        ),
+        ("Time", "q", "u"),
+    ),
+    "a rule below names": (
+        lines("  {t:.3f}  {q:.4f}  {u:.4f}", "  time s   POS (ANAT)   u\n ------------------\n"),
+        ("time s", "POS (ANAT)", "u"),
+    ),
+    "apostrophes": (lines("1'00{t:.3f};{q:.4f};{u:.4f}", "t;q;u\n"), ("t", "q", "u")),
     "a first row with holes": (
         "t,q,u,note\n" + lines("{t:.3f},{q:.4f},{u:.4f},").replace("1.0000,", ",start", 1),
         ("t", "q", "u"),
@@ -82,6 +94,7 @@ def test_texts_that_are_no_plain_tables(tmp_path: Path, name: str):
     assert set(columns) <= set(columns_of(path))
     trial = read_trial(path, columns)
     for column, values in zip(columns, (T, Q, U), strict=True):
+        values = values + 1000.0 * (name == "apostrophes" and column == "t")
         known = np.isfinite(trial.columns[column])
         assert known.sum() >= 59
         np.testing.assert_allclose(trial.columns[column][known], values[known], atol=1e-9)
@@ -207,6 +220,11 @@ def test_channels_go_by_the_names_beside_them(tmp_path: Path):
     content = {"log": [{"name": n, "values": [*v, *v]} for n, v in (("q", Q), ("u", U))]}
     (tmp_path / "d.json").write_text(json.dumps(content | {"meta": {"fs": 100}}))
     assert set(columns_of(tmp_path / "d.json")) == {"log[q].values", "log[u].values", "meta.fs"}
+    (tmp_path / "d.json").write_text(json.dumps([{"q": f"{q:.4f}"} for q in Q]))
+    np.testing.assert_array_equal(read_trial(tmp_path / "d.json", ("q",)).columns["q"], Q)
+    heads = np.array(["t", "q", "u"], dtype=object)
+    scipy.io.savemat(tmp_path / "g.mat", {"data": np.column_stack([T, Q, U]), "colheaders": heads})
+    assert list(columns_of(tmp_path / "g.mat")) == ["data.t", "data.q", "data.u"]
     np.savez(tmp_path / "e.npz", t=T, q=np.column_stack([Q, U]))
     np.testing.assert_array_equal(read_trial(tmp_path / "e.npz", ("q[1]",)).columns["q[1]"], U)
     np.save(tmp_path / "f.npy", np.array([{"t": 1}], dtype=object))
@@ -245,6 +263,16 @@ def test_a_unit_that_is_not_known_is_asked_for(tmp_path: Path, header: str, aske
     u = 0.3 * np.gradient(np.gradient(q, t), t) + 40.0 * np.sin(q / 57.3)
     np.savetxt(tmp_path / "a.csv", np.c_[t, q, u], delimiter=",", header=header, comments="")
     assert any(asked in line for line in propose(tmp_path).fill_in)
+
+
+def test_a_log_that_is_written_backwards_is_refused(tmp_path: Path):
+    t = np.arange(2000)[::-1] / 200.0
+    table = np.c_[t, np.sin(3 * t), np.cos(3 * t)]
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="time_s,q,torque", comments="")
+    with pytest.raises(
+        InputError, match=r"time_s falls from row to row.*turn the order of its rows"
+    ):
+        propose(tmp_path)
 
 
 def test_units_that_labs_write():

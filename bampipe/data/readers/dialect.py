@@ -40,6 +40,8 @@ _NAME_KEYS = frozenset(
 )
 _SEARCHED = 200
 _TRIED = 400
+_ALIKE = 0.97
+"""Of the most numbers in cells, what is as good: words above the samples may hold a number."""
 _LEAST_FILLED = 0.04
 """Share of the first lines in which a column holds something, the least."""
 
@@ -350,7 +352,7 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
         ranked.append((share * width if width > 1 else 0.0, width, delimiter))
     found = []
     best = max(score for score, _, _ in ranked)
-    for _, width, delimiter in (each for each in ranked if each[0] == best):
+    for _, width, delimiter in (each for each in ranked if each[0] >= _ALIKE * best):
         split = [cells(line.text, delimiter) for line in lines]
         samples = [
             [
