@@ -433,6 +433,15 @@ class Search:
                 left[axis] = left[axis] + x @ strength
         return left
 
+    def size_of_own(self, name: str) -> float:
+        """What an effect of the model adds as far as the model without it does not.
+
+        Root mean square over that of the applied force, of the axis where that is largest.
+        """
+        rows = zip(self.residual_rows(((f"-{name}", ()),)), self.residual_rows(()), strict=True)
+        moved = [(a - b) / r for (a, b), r in zip(rows, self.p.likelihood.root, strict=True)]
+        return max(float(np.sqrt(x @ x / f)) for x, f in zip(moved, self.applied, strict=True))
+
     def volume_rows(self, keys: Sequence[Key]) -> list[Array]:
         """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
         solved = self.solve(keys)
