@@ -87,7 +87,7 @@ class TableLayout:
         """Whether a line among the samples is text without a number in any cell."""
         row = [cell for cell in self.cells(text) if cell not in NULLS]
         plain = not any(_is_number(cell, self.decimal) or is_moment(cell) for cell in row)
-        return plain and any(map(str.isalpha, text)) and text.isprintable()
+        return plain and text.isprintable() and (any(map(str.isalpha, text)) or _is_remark(text))
 
 
 @dataclass(frozen=True)
