@@ -13,6 +13,7 @@ from bampipe.identification.filter_run import FilterRun, Pass
 from bampipe.physics import System
 from bampipe.results.identify import Consistency, Convergence, StateBound
 from bampipe.trials.motion import Motion, trial_names
+from bampipe.trials.residuals import ModelOnTrial
 
 
 def tabulate_nis(found: FilterRun, motions: Sequence[Motion]) -> Consistency:
@@ -105,11 +106,9 @@ def with_torques(
     Args:
         t: (K,) times of the rows; columns: each (K,); p: (n_p,) parameters.
     """
-    u = motion.inputs(system.inputs)
-    true = motion.of_mechanism(system, u, p)
-    z = system.memory(*true.kinematics, u, p, true.t)
-    hand = system.applied(*true.kinematics, z, u, p)
-    gravity = system.compensation(true.q, true.qd, z, u, p)
+    found = ModelOnTrial(system, p, [motion])
+    true, hand = found.mechanism, found.applied
+    gravity = system.compensation(true.q, true.qd, found.memory, found.inputs, p)
     frame = pd.DataFrame({"trial_id": motion.trial_id, "t": t, **columns})
     for i, axis in enumerate(system.coordinates):
         frame[f"torque_user_{axis}"] = np.interp(t, motion.t, hand[:, i])

@@ -15,8 +15,8 @@ from bampipe.physics.effect import Effect
 from bampipe.results.identify import Covariance
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
-from bampipe.trials.draw import draw_trials
 from bampipe.trials.evidence import Evidence
+from bampipe.trials.noise_floor import draw_trials
 
 _BINS = 24
 _FEWEST = 8

@@ -45,7 +45,6 @@ from bampipe.trials.comparison import (
     published_rmse,
     rms,
 )
-from bampipe.trials.draw import draw_trials
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import (
     MeasuredTrials,
@@ -54,7 +53,7 @@ from bampipe.trials.measured import (
     trial_of_block,
 )
 from bampipe.trials.motion import Motion
-from bampipe.trials.noise_floor import NoiseFloor, floor_replays
+from bampipe.trials.noise_floor import NoiseFloor, draw_trials, floor_replays
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
 
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"

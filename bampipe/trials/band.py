@@ -12,6 +12,7 @@ from bampipe.physics import System
 from bampipe.results.filter import ResidualBand
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.sensors import Sensors
 
 LEAST_HZ = 8.0
@@ -71,10 +72,8 @@ def find_band(
 def _covered_hz(system: System, motion: Motion, sensors: Sensors) -> Array:
     """Frequency below which the applied force of each axis has its power, (n_q,)."""
     rate, p = sensors.rate_hz, system.prior
-    u = motion.inputs(system.inputs)
-    z = system.memory(*motion.kinematics, u, p, motion.t)
-    applied = system.applied(*motion.kinematics, z, u, p)
-    gain = system.input_map(motion.q, u, p)
+    device = ModelOnTrial(system, p, [motion])
+    applied, gain = device.applied, system.input_map(motion.q, device.inputs, p)
     noise = np.sqrt(np.mean(np.square(gain) @ np.square(sensors.force_sd), axis=0))
     size = min(len(applied), max(32, int(_SEGMENT_S * rate)))
     frequency, density = welch(applied, fs=rate, nperseg=size, axis=0, detrend="constant")

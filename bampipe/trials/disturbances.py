@@ -15,15 +15,14 @@ from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
 from bampipe.arrays import Array, Flags, Indices
-from bampipe.errors import InputError
-from bampipe.estimate.least_squares import Stacked, as_measured, minimise, stacked_residual
+from bampipe.estimate.least_squares import Stacked, as_measured
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_runs
 from bampipe.physics import System
 from bampipe.results.filter import Disturbance
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.motion import Motion, n_samples, trial_names, trial_sizes
-from bampipe.trials.residuals import applied_rms, problem_of
+from bampipe.trials.residuals import applied_rms, fit_device
 
 _BLOCK_S = 0.2
 """Length of the blocks of which the errors are compared, s."""
@@ -182,28 +181,23 @@ def _gather(
     system: System, motions: Sequence[Motion], band: Band, fitted: Sequence[int]
 ) -> _Samples | None:
     """The errors of the device on all trials; None where it cannot be fitted: others say why."""
-    problem = problem_of(system, motions, band)
-    try:
-        found = minimise(problem, np.append(system.prior, 0.0), fitted, 12, tolerance=1e-6)
-    except (ValueError, InputError):
+    found = fit_device(system, motions, band, fitted)
+    if found is None:
         return None
-    by_trial = dict(zip(fitted, found.stacked, strict=True))
-    order = range(len(motions))
-    by_trial |= {k: stacked_residual(problem, k, found.p) for k in order if k not in by_trial}
-    measured = as_measured(problem, found.p, [by_trial[k] for k in order])
+    problem, p, by_trial = found
+    measured = as_measured(problem, p, by_trial)
     stacked = Stacked(
         np.concatenate([trial.residual for trial in measured]),
         np.concatenate([trial.slope for trial in measured]),
         np.concatenate([trial.used for trial in measured]),
     )
-    kept = [_thinned(system, motion, band) for motion in motions]  # one pass: of many, few are held
-    blocks = _cut([trial.t for trial in kept], [trial.end_s for trial in kept], band)
-    t, state, inputs, turning = (
-        np.concatenate([getattr(trial, name) for trial in kept])
-        for name in ("t", "motion", "inputs", "turning")
-    )
+    # One pass: of many trials, few are held.
+    kept = [_thin(system, motion, band) for motion in motions]
+    times, states, others, turns, ends = zip(*kept, strict=True)
+    blocks = _cut(times, ends, band)
+    t, state, inputs, turning = map(np.concatenate, (times, states, others, turns))
     error = _robust_residual(stacked, blocks)
-    force = applied_rms(system, motions, band, found.p[:-1], [by_trial[k].used for k in order])
+    force = applied_rms(system, motions, band, p[:-1], [one.used for one in by_trial])
     beyond = np.sign(error) * np.maximum(np.abs(error) - _FRICTION * force, 0.0)
     excess = np.where(turning, beyond, error)
     return _Samples(system, blocks, t, state, inputs, error, excess, stacked.used)
@@ -220,31 +214,20 @@ def _turning(motion: Motion, band: Band) -> Flags:
     return near
 
 
-@dataclass(frozen=True)
-class _Thinned:
-    """Samples of one trial that the residual keeps, as those of all in `_Samples`.
+def _thin(system: System, motion: Motion, band: Band) -> tuple[Array, Array, Array, Flags, float]:
+    """Samples of one trial that the residual keeps.
 
-    Attributes:
-        turning: (K, n_q) near a turn or a halt; end_s: of the trial.
+    Returns:
+        Time, motion and inputs as in `_Samples`; which are near a turn or a halt, (K, n_q); and the
+        end of the trial, s.
     """
-
-    t: Array
-    motion: Array
-    inputs: Array
-    turning: Flags
-    end_s: float
-
-
-def _thinned(system: System, motion: Motion, band: Band) -> _Thinned:
-    """What is kept of one trial."""
     rows = band.thinned_rows(len(motion.t))
     forces = system.model.device.forces
     u = motion.inputs([name for name in system.inputs if name != "t" and name not in forces])
     before = np.maximum(rows - round(_BEFORE_S * band.rate_hz), 0)
     state = np.stack([motion.q[rows], motion.qd[rows], motion.qdd[rows]], axis=2)
     inputs = np.hstack([u[rows], u[rows] - u[before]])
-    turning = _turning(motion, band)[rows]
-    return _Thinned(motion.t[rows], state, inputs, turning, float(motion.t[-1]))
+    return motion.t[rows], state, inputs, _turning(motion, band)[rows], float(motion.t[-1])
 
 
 def _rms(values: Array) -> float:

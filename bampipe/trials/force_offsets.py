@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.arrays import Array, Indices
-from bampipe.errors import InputError
-from bampipe.estimate.least_squares import Stacked, minimise, stacked_residual
+from bampipe.estimate.least_squares import Stacked
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.trials.motion import Motion, trial_names
-from bampipe.trials.residuals import problem_of
+from bampipe.trials.residuals import fit_device
 
 _PARTS = 6
 """Of a trial, from which its offset is found once more each: they tell its standard error."""
@@ -45,25 +44,14 @@ def find_force_offsets(
     Returns:
         N or N.m by force, by trial; empty where offsets by trial are not plain.
     """
-    problem = problem_of(system, motions, band)
-    if len(fitted) < 2 or not system.model.device.forces:
+    forces = system.model.device.forces
+    if len(fitted) < 2 or not forces or not (found := fit_device(system, motions, band, fitted)):
         return {}
-    try:
-        found = minimise(problem, np.append(system.prior, 0.0), fitted, 12, tolerance=1e-6)
-    except (ValueError, InputError):
-        return {}
-    stacked = dict(zip(fitted, found.stacked, strict=True))
-    size = _root_mean_square(found.stacked)
+    _, p, stacked = found
+    size = _root_mean_square([stacked[number] for number in fitted])
     trials = [
-        _Trial.of(
-            system,
-            motion,
-            band,
-            stacked.get(number) or stacked_residual(problem, number, found.p),
-            found.p[:-1],
-            size,
-        )
-        for number, motion in enumerate(motions)
+        _Trial.of(system, motion, band, one, p[:-1], size)
+        for motion, one in zip(motions, stacked, strict=True)
     ]
     seen = [trials[number] for number in fitted]
     own = np.sum([one.own for one in seen], axis=0)
@@ -77,7 +65,6 @@ def find_force_offsets(
     chosen = np.median(plain[list(fitted)], axis=0) > _PLAIN
     if step @ own @ step > _LEAVES * whole[-1, -1] or not chosen.any():
         return {}
-    forces = system.model.device.forces
     return {
         name: {
             force: float(value)

@@ -40,7 +40,7 @@ from bampipe.trials.motion import (
     n_samples,
     trial_sizes,
 )
-from bampipe.trials.residuals import ModelOnTrial, residual_and_memory, standstill_of
+from bampipe.trials.residuals import ModelOnTrial, standstill_of
 from bampipe.trials.sensors import Sensors
 
 UNLIKE = 3.0
@@ -308,14 +308,15 @@ def _cancel_residual(fitted: ModelOnTrial) -> Array:
     columns = [system.inputs.index(name) for name in system.model.device.forces]
     u, first = motion.inputs(system.inputs).copy(), 0.0
     for number in range(_CORRECTIONS):
-        left, z = residual_and_memory(system, motion, u, p)
+        at = motion.of_mechanism(system, u, p).kinematics
+        z = system.memory(*at, u, p, motion.t)
+        left = system.residual(*at, z, u, p)
         size = float(np.sqrt(np.mean(left**2)))
         first = first or size
         if number and size <= _CANCELLED * first:
             break
         moved = u.copy()
         moved[:, columns] -= _SMALL * system.least_force(motion.q, left, u, p)
-        at = motion.of_mechanism(system, u, p).kinematics
         slope = (left - system.residual(*at, z, moved, p)) / _SMALL
         steep = np.abs(slope) > _LEAST_SLOPE * np.abs(left)
         share = np.divide(left, slope, out=np.ones_like(left), where=steep)

@@ -16,9 +16,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from bampipe.arrays import Array, Flags, Indices
-from bampipe.estimate.least_squares import (
-    Problem,
-)
+from bampipe.errors import InputError
+from bampipe.estimate.least_squares import Problem, Stacked, minimise, stacked_residual
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_standstill, find_turns
 from bampipe.physics import System
@@ -138,6 +137,25 @@ def problem_of(
     )
 
 
+def fit_device(
+    system: System, motions: Sequence[Motion], band: Band, fitted: Sequence[int]
+) -> tuple[Problem, Array, list[Stacked]] | None:
+    """Fit a bare device to the trials numbered ``fitted``.
+
+    Returns:
+        Its problem, the parameters (n_p + 1,), and residual and slopes of every trial there; None
+        where it cannot be fitted.
+    """
+    problem = problem_of(system, motions, band)
+    try:
+        found = minimise(problem, np.append(system.prior, 0.0), fitted, 12, tolerance=1e-6)
+    except (ValueError, InputError):
+        return None
+    known = dict(zip(fitted, found.stacked, strict=True))
+    order = range(len(motions))
+    return problem, found.p, [known.get(k) or stacked_residual(problem, k, found.p) for k in order]
+
+
 def _multiplied(system: System, free: Sequence[int]) -> Indices | None:
     """Axes whose inputs free parameters multiply, (n_free,), as torque constants of a robot do.
 
@@ -198,13 +216,6 @@ def standstill_of(motion: Motion, system: System, rate_hz: float) -> Flags:
     return still if motion.left_out is None else still | motion.left_out
 
 
-def residual_and_memory(system: System, motion: Motion, u: Array, p: Array) -> tuple[Array, Array]:
-    """Residual (T, n_q) of a trial under inputs ``u`` (T, n_u), unfiltered, and states (T, n_z)."""
-    at = motion.of_mechanism(system, u, p).kinematics
-    z = system.memory(*at, u, p, motion.t)
-    return system.residual(*at, z, u, p), z
-
-
 def applied_rms(
     system: System,
     motions: Sequence[Motion],
@@ -220,10 +231,7 @@ def applied_rms(
     """
     square, count = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
     for motion, moves in zip(motions, used, strict=True):
-        u = motion.inputs(system.inputs)
-        at = motion.of_mechanism(system, u, p).kinematics
-        z = system.memory(*at, u, p, motion.t)
-        applied = band.thin(system.applied(*at, z, u, p))
+        applied = band.thin(ModelOnTrial(system, p, [motion]).applied)
         square += np.sum(applied**2 * moves, axis=0)
         count += moves.sum(axis=0)
     return np.asarray(np.sqrt(square / np.maximum(count, 1)))
@@ -266,18 +274,16 @@ class ModelOnTrial:
         return self.motion.of_mechanism(self.system, self.inputs, self.p).kinematics
 
     @cached_property
-    def _residual_and_memory(self) -> tuple[Array, Array]:
-        return residual_and_memory(self.system, self.motion, self.inputs, self.p)
-
-    @property
-    def residual(self) -> Array:
-        """The residual before the low-pass, (T, n_q), N.m or N."""
-        return self._residual_and_memory[0]
-
-    @property
     def memory(self) -> Array:
         """Internal states, (T, n_z)."""
-        return self._residual_and_memory[1]
+        at = self.mechanism
+        return self.system.memory(*at.kinematics, self.inputs, self.p, at.t)
+
+    @cached_property
+    def residual(self) -> Array:
+        """The residual before the low-pass, (T, n_q), N.m or N."""
+        at = self.mechanism.kinematics
+        return self.system.residual(*at, self.memory, self.inputs, self.p)
 
     @property
     def applied(self) -> Array:

@@ -18,7 +18,7 @@ from bampipe.diagnosis.session import Session, candidates_of, system_of
 from bampipe.diagnosis.start import search_start
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
-from bampipe.trials.residuals import residual_and_memory
+from bampipe.trials.residuals import ModelOnTrial
 
 DAMPER = registry.device("magnetic_damper")
 LAG, SATURATION = "channel_lag:current", "channel_saturation:current"
@@ -57,9 +57,7 @@ def test_what_a_candidate_adds_beside_others_is_what_the_whole_residual_changes_
     base = session.linearise(recipe, search_start(trials, recipe)).fitted[0]
     item = compile_candidate(build_candidate_model(DAMPER, second, (), recipe.effects))
     p = np.concatenate([base.p, 0.3 + np.array([q.prior for q in item.parameters])])
-    whole, _ = residual_and_memory(
-        item.system, base.motion, base.motion.inputs(item.system.inputs), p
-    )
+    whole = ModelOnTrial(item.system, p, [base.motion]).residual
     np.testing.assert_allclose(added_residual(item, p, base), whole - base.residual, atol=1e-9)
 
 
