@@ -7,7 +7,7 @@
 Each session of an independent simulator hides nothing or one effect of its own. The bare device is
 fitted by least squares with several widths, times that of the device file; printed is by how much
 the log of the error on trials left out falls. `identify` takes a narrower width on a test bench
-where an eighth lowers it by `WORTH` of `bampipe.diagnosis.sign_width`.
+where an eighth lowers it by `WORTH` of `bampipe.diagnosis.start`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model_file import load_model, read_recipe
 from bampipe.diagnosis.session import system_of
-from bampipe.diagnosis.sign_width import fit_width
+from bampipe.diagnosis.start import fit_width
 from bampipe.trials.measured import read_measured_trials
 
 WIDTHS = (1.0 / 3.0, 1.0 / 8.0, 1.0 / 32.0)

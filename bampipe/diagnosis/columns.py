@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from bampipe.arrays import Array
@@ -47,11 +45,7 @@ def added_columns(
 def parameters_with(
     evidence: Evidence, item: Candidate, searched: Array, strengths: Array | float = 0.0
 ) -> Array:
-    """The parameters of a candidate's system beside a fitted model, (n_p,).
-
-    Args:
-        searched, strengths: values of its searched parameters, and of its linear strengths.
-    """
+    """The parameters of a candidate's system beside a fitted model, (n_p,)."""
     e, system = evidence, item.system
     count = len(system.parameters) - len(item.parameters)
     p = np.array([q.prior for q in system.parameters])
@@ -66,8 +60,10 @@ def parameters_with(
 
 
 def _added_rows(item: Candidate, p: Array, count: int, base: ModelOnTrial) -> list[Array]:
-    """`added_residual` on one trial, for each of `_probes`."""
-    probes = _probes(p, count, item.linear_indices)
+    """`added_residual` on one trial, with each linear strength at one; by ``p`` without any."""
+    probes = [p.copy() for _ in item.linear_indices or (None,)]
+    for probe, i in zip(probes, item.linear_indices, strict=False):
+        probe[count + i] = 1.0
     if _moves(item):
         return [added_residual(item, probe, base) for probe in probes]
     motion = base.mechanism
@@ -75,21 +71,10 @@ def _added_rows(item: Candidate, p: Array, count: int, base: ModelOnTrial) -> li
     return [_added_along(item, probe, base, motion, z) for probe in probes]
 
 
-def _probes(p: Array, count: int, linear: Sequence[int]) -> list[Array]:
-    """``p`` with each of the ``linear`` strengths, numbered from ``count``, at one; or as it is."""
-    probes = [p.copy() for _ in linear or (None,)]
-    for probe, i in zip(probes, linear, strict=False):
-        probe[count + i] = 1.0
-    return probes
-
-
 def added_residual(item: Candidate, p: Array, base: ModelOnTrial) -> Array:
     """What a candidate adds to the residual of a model along a motion, (T, n_q), N.m or N.
 
-    Args:
-        item: the candidate.
-        p: parameters of its system, its own last.
-        base: the model without it on a trial.
+    ``p`` are the parameters of its system, its own last; ``base`` is the model without it.
     """
     if not _moves(item):
         motion = base.mechanism
@@ -111,11 +96,7 @@ def _moves(item: Candidate) -> bool:
 
 
 def _added_along(item: Candidate, p: Array, base: ModelOnTrial, motion: Motion, z: Array) -> Array:
-    """`added_residual` where the mechanism moves as by the model without the candidate.
-
-    Args:
-        motion: that motion; z: internal states (T, n_z) of the candidate's system.
-    """
+    """`added_residual` along the motion of the model without the candidate, with states ``z``."""
     system, at = item.system, motion.kinematics
     added = system.contribution(*at, z, motion.inputs(system.inputs), p)
     return added - base.contribution if item.is_joint else added

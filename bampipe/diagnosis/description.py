@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import gamma
 
 from bampipe.arrays import Array
-from bampipe.diagnosis.shape import BINS, Map, Variable, residual_map, variables
+from bampipe.diagnosis.shape import BINS, Map, Variable, number_bins, residual_map, variables
 from bampipe.results.rounding import significant
 from bampipe.trials.evidence import Evidence
 
@@ -154,10 +154,9 @@ def _by_direction(evidence: Evidence, axis: int, variable: Variable, alike: floa
     v = np.concatenate(variable.values)
     kept = [evidence.band.thinned_rows(len(m.t)) for m in evidence.motions]
     rate = np.concatenate([m.qd[k, axis] for m, k in zip(evidence.motions, kept, strict=True)])
-    edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, 3 * BINS + 1)))
-    which = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)
+    which = number_bins(v, 3 * BINS)
     means = []
-    for b in range(len(edges) - 1):
+    for b in np.unique(which):
         up, down = r[(which == b) & (rate > 0.0)], r[(which == b) & (rate < 0.0)]
         if len(up) >= 4 and len(down) >= 4:
             means.append((up.mean(), down.mean()))

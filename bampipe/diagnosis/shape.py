@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -98,22 +97,23 @@ def since_reversal(motion: Motion, axis: int) -> tuple[Array, Array]:
     return motion.t - motion.t[last], np.abs(motion.q[:, axis] - motion.q[last, axis])
 
 
+def number_bins(values: Array, bins: int) -> Indices:
+    """Number of the bin of each value, (T,); bins hold equal counts."""
+    edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, bins + 1)))
+    found = np.searchsorted(edges, values, side="right") - 1
+    return np.clip(found, 0, max(len(edges) - 2, 0)).astype(np.int64)
+
+
 def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = BINS) -> Map:
     """Bin the residual of ``axis`` by ``variable`` into ``bins`` parts of equal count."""
     use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
     r = np.concatenate([x[:, axis] for x in evidence.residual])[use]
     v = np.concatenate(variable.values)[use]
     levels = np.unique(v)
-    if len(levels) <= bins:
-        which = np.searchsorted(levels, v)
-        count = len(levels)
-    else:
-        edges = np.unique(np.quantile(v, np.linspace(0.0, 1.0, bins + 1)))
-        which = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)
-        count = len(edges) - 1
+    which = np.searchsorted(levels, v) if len(levels) <= bins else number_bins(v, bins)
     rows = [
         (v[which == b].mean(), r[which == b].mean(), r[which == b].std(), np.sum(which == b))
-        for b in range(count)
+        for b in np.unique(which)
         if np.sum(which == b) >= _LEAST
     ]
     if not rows:
@@ -134,7 +134,7 @@ def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> 
     band, system = evidence.band, evidence.system
     length = max(2, int(width_s * band.rate_hz / band.step))
     typical = evidence.rmse()
-    found: list[tuple[float, dict[str, Any]]] = []
+    found: list[tuple[float, WorstWindow]] = []
     for k, motion in enumerate(evidence.motions):
         kept = band.thinned_rows(len(motion.t))
         for start in range(0, len(kept) - length + 1, length):
@@ -145,19 +145,18 @@ def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> 
                     continue
                 rmse = float(np.sqrt(np.sum(evidence.residual[k][rows, axis] ** 2) / n))
                 t = motion.t[kept[rows]]
-                doing = _doing(motion, kept[rows], axis, system.coordinate_units[axis])
-                window = {
-                    "axis": name,
-                    "trial_id": trial_of_block(motion.trial_id),
-                    "t_start": t[0],
-                    "t_end": t[-1],
-                    "rmse": rmse,
-                    "unit": system.torque_units[axis],
-                    "doing": doing,
-                }
+                window = WorstWindow(
+                    axis=name,
+                    trial_id=trial_of_block(motion.trial_id),
+                    t_start=t[0],
+                    t_end=t[-1],
+                    rmse=rmse,
+                    unit=system.torque_units[axis],
+                    doing=_doing(motion, kept[rows], axis, system.coordinate_units[axis]),
+                )
                 found.append((rmse / max(typical[axis], 1e-12), window))
     found.sort(key=lambda pair: -pair[0])
-    windows = [WorstWindow(**window) for _, window in found]
+    windows = [window for _, window in found]
     listed = windows[:count]
     for other in windows[count:]:
         if all(other.axis != one.axis for one in listed):

@@ -11,7 +11,6 @@ from bampipe.arrays import Array
 from bampipe.physics import Model, compile_model
 from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.effect import Effect
-from bampipe.physics.parameter import Parameter
 from bampipe.physics.system import System
 
 DURATION_S, RATE_HZ = 16.0, 250.0
@@ -54,13 +53,10 @@ def signature(device: Device, effect: Effect, target: str) -> Signature | None:
     The motion is three sinusoids an axis, 0.1 to 1 Hz, over the middle of the axis' range, with
     the hand force that the device needs for it, smoothed as a hand's is.
 
-    Args:
-        device: the device.
-        effect: the effect.
-        target: what it acts on, "" for a device-wide effect.
+    ``target`` is what it acts on, "" for a device-wide effect.
 
     Returns:
-        The signature; None where the effect leaves nothing.
+        None where the effect leaves nothing.
     """
     name = f"{effect.name}:{target}" if target else effect.name
     bare = compile_model(Model(device))
@@ -85,8 +81,8 @@ def _compute_signature(
     channels |= {name: np.ones_like(t) for name in device.channels}
     p = bare.prior
     u = _inputs(bare, channels, t)
-    needed = bare.required(q, qd, qdd, bare.memory(q, qd, qdd, u, p, t), u, p)
-    applied = bare.applied(q, qd, qdd, bare.memory(q, qd, qdd, u, p, t), u, p)
+    z = bare.memory(q, qd, qdd, u, p, t)
+    needed, applied = bare.required(q, qd, qdd, z, u, p), bare.applied(q, qd, qdd, z, u, p)
     force = _smooth(bare.least_force(q, needed - applied, u, p))
     for number, label in enumerate(device.forces):
         channels[label] = force[:, number]
@@ -94,10 +90,17 @@ def _compute_signature(
         for order in range(1, len(INPUT_ORDERS)):
             rate = np.gradient(rate, t)
             channels[derivative(label, order)] = rate
-    left = _residual(bare, q, qd, qdd, channels, t, p)
-    values = np.array([_typical(item) for item in full.parameters])
+
+    def leave(system: System, p: Array) -> Array:
+        u = _inputs(system, channels, t)
+        z = system.memory(q, qd, qdd, u, p, t)
+        return system.applied(q, qd, qdd, z, u, p) - system.required(q, qd, qdd, z, u, p)
+
+    by_size = [item.sd if item.strength else item.prior for item in full.parameters]
+    pairs = zip(full.parameters, by_size, strict=True)
+    values = np.array([size if item.typical is None else item.typical for item, size in pairs])
     values[: len(p)] = p
-    residual = left - _residual(full, q, qd, qdd, channels, t, values)
+    residual = leave(bare, p) - leave(full, values)
     rms = np.sqrt(np.mean(residual**2, axis=0))
     scale = np.sqrt(np.mean(needed**2, axis=0)) + 1e-12
     worst = int(np.argmax(rms / scale))
@@ -164,26 +167,6 @@ def _smooth(force: Array) -> Array:
 
 def _inputs(system: System, channels: Mapping[str, Array], t: Array) -> Array:
     return np.column_stack([channels.get(name, np.zeros_like(t)) for name in system.inputs])
-
-
-def _residual(
-    system: System,
-    q: Array,
-    qd: Array,
-    qdd: Array,
-    channels: Mapping[str, Array],
-    t: Array,
-    p: Array,
-) -> Array:
-    u = _inputs(system, channels, t)
-    z = system.memory(q, qd, qdd, u, p, t)
-    return system.applied(q, qd, qdd, z, u, p) - system.required(q, qd, qdd, z, u, p)
-
-
-def _typical(parameter: Parameter) -> float:
-    if parameter.typical is not None:
-        return parameter.typical
-    return parameter.sd if parameter.strength else parameter.prior
 
 
 def _explained(abscissa: Array, residual: Array) -> float:

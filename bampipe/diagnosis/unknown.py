@@ -92,9 +92,7 @@ def weigh_unknown(
 ) -> Unknown | None:
     """The evidence of an unknown function on an axis beside a set; None if the axis has no samples.
 
-    Args:
-        search: over sets beside a fitted model; axis: its number.
-        columns: `spline_columns` of it; keys: the set, of effects of the model taken away.
+    ``columns`` are its `spline_columns`; ``keys`` the set, of effects of the model taken away.
     """
     p, nb = search.p, search.bb.shape[1]
     if len(p.y[axis]) <= nb:

@@ -137,7 +137,11 @@ def collect_result(
     unknown = [name for name, found in effects.items() if not found.identified]
     warning = f"not identified: {', '.join(unknown)}; " if unknown else ""
     timing = estimate.report["input_timing"]
-    timing = timing.model_copy(update={"of_residual": _timing_of_residual(timing, *late)})
+    # Nothing is taken off the trials where that may as well be none.
+    taken = 0.0
+    if timing.limit > 0.0 and abs(late[0]) >= NORMAL_95 * late[1]:
+        taken = float(np.clip(late[0], -timing.limit, timing.limit))
+    timing = timing.model_copy(update={"of_residual": taken})
     influence = _assess_influence(names, estimate, trials, worst)
     notes = further.pop("notes")
     return IdentifyResult(
@@ -240,13 +244,6 @@ def _fault(name: str, entry: ParameterEstimate) -> str:
             + ", an interval larger than itself"
         )
     return ""
-
-
-def _timing_of_residual(timing: InputTiming, late_s: float, sd: float) -> float:
-    """The timing that is taken off the trials, s; 0 where that may as well be none."""
-    if timing.limit == 0.0 or abs(late_s) < NORMAL_95 * sd:
-        return 0.0
-    return float(np.clip(late_s, -timing.limit, timing.limit))
 
 
 def _describe_limit(timing: InputTiming) -> str:

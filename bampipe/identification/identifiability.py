@@ -60,10 +60,8 @@ def assess_identifiability(
     """Say what sensor noise alone leaves open about the parameters at ``p``.
 
     Args:
-        system: the model; motions: the trials; problem: their inverse dynamics, the timing of
-            the inputs last where it is estimated.
-        p: (n_p + 1,) estimates, the timing last.
-        noise: of the sensors.
+        problem: the inverse dynamics of the trials; p: (n_p + 1,) estimates, the timing of the
+            inputs last.
 
     Returns:
         The report, and the covariance (n_parameters, n_parameters) that their priors leave where
@@ -147,10 +145,8 @@ def find_information(
     """Return the information of one trial on the estimated parameters, by sensor noise alone.
 
     Args:
-        system: the model; motion: the trial; problem: its inverse dynamics, in which it has the
-            number ``trial``.
+        problem: inverse dynamics in which the motion has the number ``trial``.
         p: (n_p + 1,) parameters, the timing of the inputs last.
-        noise: of the sensors.
         further: slopes (T, n_q, m) of the residual by further numbers at a motion, internal states,
             inputs and parameters.
 
@@ -205,16 +201,16 @@ def _finite(value: float) -> float | None:
 
 def _entry(own: Array, covariance: Array, i: int, names: Sequence[str]) -> ParameterBound:
     """Return bound, bound were all others known, and the parameter that most looks alike."""
-    partner, correlation = _partner(covariance, i)
+    partner, correlation = _partner(covariance, i, names)
     return ParameterBound(
         bound_sd=_finite(np.sqrt(covariance[i, i])),
         alone_sd=_finite(1.0 / np.sqrt(own[i, i])) if own[i, i] > 0.0 else None,
-        partner=None if partner is None else names[partner],
+        partner=partner,
         correlation=None if partner is None else correlation,
     )
 
 
-def _partner(covariance: Array, i: int) -> tuple[int | None, float]:
+def _partner(covariance: Array, i: int, names: Sequence[str]) -> tuple[str | None, float]:
     """Return the other number whose error goes most with that of ``i``, and the correlation."""
     sd = np.sqrt(np.diag(covariance))
     usable = np.isfinite(sd) & (sd > 0.0)
@@ -224,7 +220,7 @@ def _partner(covariance: Array, i: int) -> tuple[int | None, float]:
     correlation[usable] = covariance[i, usable] / (sd[i] * sd[usable])
     correlation[i] = 0.0
     place = int(np.argmax(np.abs(correlation)))
-    return place, float(correlation[place])
+    return names[place], float(correlation[place])
 
 
 def _number(
@@ -239,7 +235,7 @@ def _number(
     """Return what the trials say of one number of the device, were it estimated too."""
     rows = [*range(n), place]
     covariance = cramer_rao_bound(total[np.ix_(rows, rows)])
-    partner, correlation = _partner(covariance, n)
+    partner, correlation = _partner(covariance, n, names)
     shift = -np.linalg.lstsq(total[:n, :n], total[:n, place], rcond=1e-12)[0]
     # A share of what may as well be zero would be large and mean nothing.
     sd = np.sqrt(np.diag(cramer_rao_bound(total[:n, :n])))
@@ -253,7 +249,7 @@ def _number(
         value=number.value,
         unit=number.unit,
         bound_sd=_finite(np.sqrt(covariance[n, n])),
-        partner=None if partner is None else names[partner],
+        partner=partner,
         correlation=correlation,
         moves_percent=per_cent,
     )
@@ -298,10 +294,8 @@ def _unsaid(names: Sequence[str], sd: Array, prior: Array) -> list[str]:
 
 
 def _idle(trials: Mapping[str, TrialGrowth]) -> list[str]:
-    if len(trials) < 2:
-        return []
     idle = [name for name, entry in trials.items() if entry.growth < _NOTHING]
-    if not idle:
+    if len(trials) < 2 or not idle:
         return []
     growth = max(trials[name].growth for name in idle)
     alone = f"no bound would grow by more than {100.0 * growth:.1g} %."

@@ -58,9 +58,7 @@ def sensor_noise(
     1 m. Where the load moves the encoder against the handle, the noise of a force adds to what
     the model says that the encoder reads.
 
-    Args:
-        p: (n_p,) parameters near the answer.
-        choice: fixes levels that are not to be found.
+    ``p`` (n_p,) are parameters near the answer; ``choice`` may fix levels.
     """
     reading = sensors.reading_sd.copy()
     if choice.reading_noise > 0.0:
@@ -115,9 +113,6 @@ def choose_tuning_trials(sizes: Sequence[int]) -> tuple[list[int], int]:
 
     A filter can start where a trial does, at rest and cold; in the middle of one, nobody knows the
     internal states of friction.
-
-    Args:
-        sizes: number of samples of each trial.
 
     Returns:
         Numbers of the trials, spread over all, and how many samples of each.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.arrays import Array, Indices
-from bampipe.diagnosis.shape import Variable, variables
+from bampipe.diagnosis.shape import Variable, number_bins, variables
 from bampipe.errors import InputError
 from bampipe.physics import System
 from bampipe.physics.effect import Effect
@@ -56,9 +56,7 @@ def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: 
     measured forces cancel in the difference, and filtering the force alone would distort the curve.
     Of a long session, trials drawn from all are binned (`draw_trials`).
 
-    Args:
-        evidence: of the model on its trials; p: its parameters as published, (n_p,).
-        covariance: of the estimates; model: its name.
+    ``p`` (n_p,) and ``covariance`` are those published for the model of that name.
     """
     system = evidence.system
     error = evidence.rmse()
@@ -150,7 +148,7 @@ def _curves(
             continue
         best: tuple[float, Variable, Indices] | None = None
         for variable in known[axis]:
-            which = _bin(np.concatenate(variable.values)[use])
+            which = number_bins(np.concatenate(variable.values)[use], _BINS)
             share = _explained(own, which)
             if best is None or share > best[0]:
                 best = share, variable, which
@@ -176,13 +174,6 @@ def _curves(
             high=tuple(mean + half),
             variance_share=share,
         )
-
-
-def _bin(values: Array) -> Indices:
-    """Return the number of the bin of each value; bins hold equal counts."""
-    edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, _BINS + 1)))
-    found = np.searchsorted(edges, values, side="right") - 1
-    return np.clip(found, 0, max(len(edges) - 2, 0)).astype(np.int64)
 
 
 def _means(values: Array, which: Indices, bins: Sequence[int]) -> Array:

@@ -78,11 +78,7 @@ class TrialPlan:
 
 
 def plan_trials(forecast: Forecast, ranked: Sequence[RankedDesign], goal: Goal) -> TrialPlan:
-    """Choose trials greedily until the goal is reached, then drop or shorten superfluous ones.
-
-    Args:
-        forecast: of the gain of trials; ranked: designs to choose from; goal: to be reached.
-    """
+    """Choose trials greedily until the goal is reached, then drop or shorten superfluous ones."""
     options = [_make_option(forecast, one) for one in ranked]
     chosen: list[_Option] = []
     now = forecast.precision.sd
@@ -220,10 +216,9 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
 
 def _say_plan(found: TrialPlan, seconds: float, what: str) -> str:
     count = sum(design.parts for design in found.designs)
-    asked = {
-        "uncertainties": "uncertainty is expected to fall below the limit asked for",
-        "confusion": "chance of confusing two effects is expected to fall below the limit",
-    }[what]
+    asked = "chance of confusing two effects is expected to fall below the limit"
+    if what == "uncertainties":
+        asked = "uncertainty is expected to fall below the limit asked for"
     if not count:
         if found.is_enough:
             return "The trials at hand are enough: nothing needs to be recorded."

@@ -193,10 +193,6 @@ class Precision:
         taken = max(blocks, 2 * self._free_count)
         return float(np.sqrt(taken / (taken - self._free_count)))
 
-    def worth_of(self, motion: Motion, parameter: str) -> float:
-        """Return `worth` of one trial."""
-        return self.worth(self.of_motion(motion), float(motion.t[-1]), parameter)
-
     def worth(self, added: Array, seconds: float, parameter: str = "") -> float:
         """Return the worth of trials in nats, for one parameter or for all together.
 

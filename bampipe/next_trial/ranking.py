@@ -169,9 +169,7 @@ def find_best_of_each(
 ) -> list[RankedDesign]:
     """Return the best design for each of several utilities, without repetition.
 
-    Args:
-        inform: gives the information (m, m) of a motion; utilities: of that, larger is better.
-        space: the designs.
+    ``inform`` gives the information (m, m) of a motion; of the utilities of that, larger is better.
     """
     designs, is_quick = space.list_designs()
     informed = [inform(space.rehearsal.record(design, 0)) for design in designs]

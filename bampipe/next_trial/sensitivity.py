@@ -12,7 +12,6 @@ from scipy.stats import norm
 from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_residual
-from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.probability import least_gain
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import log_prior, penalise
@@ -75,11 +74,6 @@ class DetectionLimit:
         """
         return np.isinf(self.factor) or self.factor * self.growth <= _MOST_JUMP_GROWTH
 
-    @property
-    def is_hidden(self) -> bool:
-        """Whether the effect would go unnoticed at its typical size."""
-        return self.factor > 1.0
-
 
 def _find_strengths(item: Candidate) -> list[int]:
     return [i for i, q in enumerate(item.parameters) if q.strength and not q.fixed]
@@ -112,12 +106,10 @@ def make_typical_alternative(item: Candidate, scale: MachineScale) -> Alternativ
 def find_limits(comparison: Comparison, sums: Sums, needed: float) -> list[DetectionLimit]:
     """Return the strength from which on each alternative of ``comparison`` is called missing.
 
-    Its log evidence, less the penalties of `Search`, must reach ``needed`` with the probability
-    that the criteria ask for, and its size must matter.
+    Its log evidence, nats, less the penalties of `Search`, must reach ``needed`` with the
+    probability that the criteria ask for, and its size must matter.
 
-    Args:
-        comparison: effects at their typical strengths; sums: of the trials.
-        needed: log evidence, nats, see `find_needed`.
+    The alternatives are effects at their typical strengths.
     """
     criteria, found = comparison.session.criteria, []
     sure = norm.ppf(criteria.probability)
@@ -163,16 +155,6 @@ def _find_penalty(comparison: Comparison, sums: Sums, number: int) -> Array:
     return penalise(information, spread, strengths, len(item.searched_indices))
 
 
-def find_needed(criteria: Criteria, candidates: int, by_chance: Sequence[float] = ()) -> float:
-    """Return the log evidence, before penalties, that makes an effect probable enough, nats.
-
-    Args:
-        criteria: of the diagnosis; candidates: how many are weighed.
-        by_chance: largest gain of any candidate on each replay of a model, nats.
-    """
-    return least_gain(criteria, by_chance) - log_prior(criteria, candidates)
-
-
 @dataclass(frozen=True)
 class Detectability:
     """The effects of the library that the trials at hand would have shown.
@@ -180,32 +162,17 @@ class Detectability:
     Attributes:
         comparison: every effect at its typical strength.
         limits: the strength from which on each would have been found.
-        needed: log evidence, nats.
+        needed: log evidence, before penalties, that makes an effect probable enough, nats.
     """
 
     comparison: Comparison
     limits: tuple[DetectionLimit, ...]
     needed: float
 
-    @property
-    def hidden_numbers(self) -> list[int]:
-        """Indices of the effects that would go unnoticed at their typical size, worst first."""
-        order = sorted(range(len(self.limits)), key=lambda k: -self.limits[k].factor)
-        return [k for k in order if self.limits[k].is_hidden]
-
-    @property
-    def unpromised_names(self) -> tuple[str, ...]:
-        """Names of the effects without a promised size; see `DetectionLimit.is_promised`."""
-        return tuple(one.alternative.name for one in self.limits if not one.is_promised)
-
-    @property
-    def brake_effects(self) -> tuple[str, ...]:
-        """Names of the effects that show only with brakes on."""
-        return tuple(one.alternative.name for one in self.limits if one.item.system.braked)
-
-    def restrict(self, chosen: Sequence[int]) -> Detectability:
-        """Return the same for the effects numbered ``chosen``."""
-        limits = tuple(self.limits[k] for k in chosen)
+    def keep_hidden(self, most: int) -> Detectability:
+        """Return the same for the effects that go unnoticed at their typical size, worst first."""
+        hidden = [one for one in self.limits if one.factor > 1.0]
+        limits = tuple(sorted(hidden, key=lambda one: -one.factor)[:most])
         comparison = replace(self.comparison, alternatives=tuple(one.alternative for one in limits))
         return Detectability(comparison, limits, self.needed)
 
@@ -218,8 +185,7 @@ class Detectability:
     def tabulate(self, motions: Sequence[Motion]) -> dict[str, Detectable]:
         """Return the smallest strength of each effect that shows, without and with a trial.
 
-        Args:
-            motions: versions of the trial; their median counts.
+        Of the versions of the trial the median counts.
         """
         after = np.median([self.factors_with(motion) for motion in motions], axis=0)
         axes = self.comparison.fit.evidence.system.coordinates
@@ -260,15 +226,13 @@ def find_detectability(
 ) -> Detectability:
     """Return the detection limits of every effect of the library that the model lacks.
 
-    Args:
-        session: the trials; fit: the model.
-        by_chance: largest gain of any candidate on each replay, nats.
+    ``by_chance`` are the largest gains of any candidate on each replay, nats.
     """
     scale, names = MachineScale.of_trials(fit.evidence), session.candidate_names(fit.recipe)
     typical = (make_typical_alternative(item, scale) for item in candidates_of(fit.recipe, names))
     alternatives = tuple(alternative for alternative in typical if alternative is not None)
     comparison = Comparison(session, fit, fit, alternatives)
-    needed = find_needed(session.criteria, len(names), by_chance)
+    needed = least_gain(session.criteria, by_chance) - log_prior(session.criteria, len(names))
     limits = find_limits(comparison, comparison.sums_now, needed)
     limits = [
         replace(one, factor=_bound_factor(one, scale), growth=find_jump_growth(comparison, one))
@@ -319,9 +283,6 @@ def find_jump_growth(comparison: Comparison, found: DetectionLimit) -> float:
     """Return the relative growth of the jump of friction at a reversal, at typical strength.
 
     It is 0 for an effect with internal states, whose force does not jump.
-
-    Args:
-        comparison: of the effect; found: the effect on the trials at hand.
     """
     item, values, e = found.item, found.alternative.values[0], comparison.fit.evidence
     if item.system.memory_names != e.system.memory_names or item.replaces_motion:

@@ -61,8 +61,7 @@ def find_ambiguity(found: DiagnoseResult, criteria: Criteria) -> Ambiguity | Non
 def compare_alternatives(session: Session, final: Fit, asked: Ambiguity) -> Comparison | None:
     """Fit the alternatives of ``asked`` to the trials; None if fewer than two explain anything.
 
-    Args:
-        session: the trials; final: the model with its most probable set, fitted.
+    ``final`` is the model with its most probable set, fitted.
     """
     members = {name for one in asked.odds for name in one}
     recipe, e = without_members(final.recipe, members), final.evidence
@@ -107,10 +106,8 @@ def _fit_alternative(
 def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> SuggestedTrial | None:
     """Return the trial that would decide between the alternatives; None if there is none.
 
-    With it, a wrong choice must be as improbable as a verdict demands.
-
-    Args:
-        session: the trials; final: the model with its most probable set, fitted.
+    With it, a wrong choice must be as improbable as a verdict demands. ``final`` is the model with
+    its most probable set, fitted.
     """
     asked = find_ambiguity(result, session.criteria)
     comparison = compare_alternatives(session, final, asked) if asked is not None else None

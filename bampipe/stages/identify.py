@@ -14,8 +14,7 @@ from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
 from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recipe
-from bampipe.diagnosis.sign_width import SignWidth, choose_sign_width
-from bampipe.diagnosis.start import search_start
+from bampipe.diagnosis.start import SignWidth, choose_sign_width, search_start
 from bampipe.errors import InputError
 from bampipe.identification.bodies import base_estimates, make_possible, summarise_bases
 from bampipe.identification.calibration import (

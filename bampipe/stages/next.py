@@ -274,7 +274,7 @@ def _rank(
             space, lambda motion: -comparison.confusion_with(motion), partial(report, 0.2)
         )
     if detectability is not None:
-        watched = detectability.restrict(detectability.hidden_numbers[:_WATCHED])
+        watched = detectability.keep_hidden(_WATCHED)
         ranked = (
             rank_designs(space, watched.gain, partial(report, 0.2), _LITTLE)
             if watched.limits
@@ -284,7 +284,11 @@ def _rank(
             return ranked
         # Nothing that a person could do here shows more: then for the parameters.
         space = replace(space, with_rests=False, with_brakes=forecast.rehearsal.system.braked)
-    utility = partial(forecast.precision.worth_of, parameter=parameter)
+    precision = forecast.precision
+
+    def utility(motion: Motion) -> float:
+        return precision.worth(precision.of_motion(motion), float(motion.t[-1]), parameter)
+
     return rank_designs(space, utility, partial(report, 0.5))
 
 
@@ -298,8 +302,10 @@ def _record(
     unpromised: tuple[str, ...] = ()
     if (found := forecast.detectability) is not None:
         table = found.tabulate(ranked[0].expected_motions)
-        unpromised = found.unpromised_names
-        unbraked = found.brake_effects if not case.seen.field.any() else ()
+        unpromised = tuple(one.alternative.name for one in found.limits if not one.is_promised)
+        if not case.seen.field.any():  # some effects show with brakes on only
+            braked = (one for one in found.limits if one.item.system.braked)
+            unbraked = tuple(one.alternative.name for one in braked)
     motions, limits = case.session.trials.motions, case.system.model.device.limits
     result = NextResult(
         model=case.config.model,

@@ -34,10 +34,14 @@ class ChannelRecords:
         self._counts: dict[str, list[tuple[float, float] | None]] = defaultdict(list)
 
     def note(self, trial: CleanTrial) -> None:
-        """Note one trial and take mains hum off its inputs."""
+        """Note one trial and take mains hum off its inputs; encoders have none."""
         for name, unit in self._units.items():
             self._counts[name].append(_counts(trial.columns[name] / unit))
-        self._remove_hum(trial)
+        moving = [column for name, column in trial.columns.items() if name.startswith("q_")]
+        for name, values in trial.columns.items():
+            if not name.startswith(("q_", "brake_")) and np.isfinite(values).all():
+                trial.columns[name], found = remove_mains(values, trial.t, moving)
+                self._hum[name].append(found)
 
     def measure_noise(self, trial: CleanTrial) -> None:
         """Note what a trial says of the noise of its encoders (``q_<axis>``) and inputs."""
@@ -103,14 +107,6 @@ class ChannelRecords:
             )
         return said
 
-    def _remove_hum(self, trial: CleanTrial) -> None:
-        """Take mains hum off the inputs of a trial, and note it; encoders have none."""
-        moving = [column for name, column in trial.columns.items() if name.startswith("q_")]
-        for name, values in trial.columns.items():
-            if not name.startswith(("q_", "brake_")) and np.isfinite(values).all():
-                trial.columns[name], found = remove_mains(values, trial.t, moving)
-                self._hum[name].append(found)
-
 
 def _force_units(session: Session, device: Device) -> dict[str, float]:
     """One raw unit, in SI, of the forces that are logged in a unit in which none counts whole."""
@@ -122,24 +118,17 @@ def _force_units(session: Session, device: Device) -> dict[str, float]:
     return {name: unit for name, unit in units.items() if name in device.forces and unit >= 1.0}
 
 
-def _counts(readings: np.ndarray) -> tuple[float, float] | None:
-    """The range of readings that look like counts of a converter; None for others."""
-    if not _look_like_counts(readings):
-        return None
-    return float(readings.min()), float(readings.max())
-
-
-def _look_like_counts(readings: Array) -> bool:
-    """Whether readings of a force (T,) are rather counts of a converter than in their unit.
+def _counts(readings: Array) -> tuple[float, float] | None:
+    """The range of readings of a force (T,) if they are rather counts of a converter, else None.
 
     Whole numbers, none negative, that stay farther from zero than they span or about the middle of
     a converter's range: a force that a machine is moved by comes near zero, and is no whole number.
     """
     known = readings[np.isfinite(readings)]
     if not known.size or np.mean(np.abs(known - np.rint(known)) < 1e-6) < 0.95:
-        return False
+        return None
     low, middle, high = float(known.min()), float(np.median(known)), float(known.max())
     if low < 0.0 or high - low < _COUNTS_SPAN:
-        return False
+        return None
     about = any(abs(middle / m - 1.0) < _NEAR_MIDDLE and high < 2.0 * m for m in _MIDDLES)
-    return about or middle > high - low
+    return (low, high) if about or middle > high - low else None

@@ -43,9 +43,7 @@ class ComparedTrial:
 def compare_trial(evidence: Evidence, number: int, p: Array, late_s: float = 0.0) -> ComparedTrial:
     """Compare one trial with the model as published, held out, and without friction.
 
-    Args:
-        evidence: the model, fitted; number: of the trial; p: the published parameters.
-        late_s: published timing of the inputs, as far as it is not taken off the trials.
+    ``p`` (n_p,) and ``late_s`` are published; the latter as far as it is not taken off the trials.
     """
     system, motion = evidence.system, evidence.motions[number]
     timed = [motion.with_input_timing(late_s)]

@@ -117,8 +117,7 @@ class _Samples:
     def judge(self, axis: int, first: int, last: int, undisturbed: Flags) -> _Stretch | None:
         """Blocks ``first`` to ``last`` as a stretch to leave out; None if its error comes back.
 
-        Args:
-            undisturbed: (B,) blocks outside all such stretches of the axis.
+        ``undisturbed`` (B,) are the blocks outside all such stretches of the axis.
         """
         blocks, excess = self.blocks, self.excess[:, axis]
         start, end = float(blocks.starts[first]), float(blocks.ends[last])
@@ -151,12 +150,7 @@ def find_disturbances(
 ) -> dict[str, tuple[Disturbance, ...]]:
     """Find stretches with an error that nothing repeats, by trial.
 
-    Args:
-        system: the bare device; motions: the free trials; band: of the residual.
-        fitted: numbers of the trials that a fit may see.
-
-    Returns:
-        The stretches of each trial that has some, in the order of time.
+    The bare device is fitted to the trials numbered ``fitted``. Stretches are in the order of time.
     """
     samples = _gather(system, motions, band, fitted)
     stretches: dict[str, list[_Stretch]] = {}
@@ -264,9 +258,6 @@ def disturbed_samples(t: Array, stretches: Sequence[Disturbance]) -> Flags:
 def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Motion], list[int]]:
     """Part trials at their disturbances, for what follows a motion from sample to sample.
 
-    Args:
-        motions: measured trials; rate_hz: of their samples.
-
     Returns:
         The parts that are long enough, or the trials where nothing disturbs them, and the number
         of the trial that each is of.
@@ -299,12 +290,9 @@ def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Mot
 
 
 def _cut(times: Sequence[Array], ends_s: Sequence[float], band: Band) -> _Blocks:
-    """Thinned samples in blocks of `_BLOCK_S`.
+    """Thinned samples at ``times``, by trial, each (K,), s, in blocks of `_BLOCK_S`.
 
     The margins of the low-pass belong to the blocks beside them.
-
-    Args:
-        times: of the samples, by trial, each (K,), s; ends_s: of the trials.
     """
     rows = max(1, round(_BLOCK_S * band.rate_hz / band.step))
     block, trial, starts, ends = [], [], [], []

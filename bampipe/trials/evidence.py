@@ -231,9 +231,7 @@ def gather_evidence(
     """Fit a model to the fitted trials by least squares and linearise it there on all.
 
     Args:
-        system: the model; motions: the trials; band: the low-pass.
-        start: parameters to start from, (n_p,); folds: which trials are fitted.
-        most_iterations: the most Gauss-Newton steps.
+        start: parameters to start from, (n_p,).
         like: a model with some more effects or some less, where that has been fitted: slopes that
             are the same for both are taken from it.
         timing: least and largest change of the inputs' timing, s, that may be weighed beside it.

@@ -68,20 +68,14 @@ class Folds:
         return len(set(self.groups)) == 1
 
     def solve(
-        self,
-        sums: NormalEquations,
-        weight: Array,
-        lower: Array,
-        upper: Array,
+        self, sums: NormalEquations, weight: Array, lower: Array, upper: Array
     ) -> tuple[Array, ...]:
         """Coefficients (P,) for each trial, fitted to the other groups.
 
         Where there is but one group, or no other trial to fit, nothing is left out: zeros, the
         coefficients of the fit to all.
 
-        Args:
-            sums: of all trials, linearised at the fit to the fitted ones.
-            weight: of each axis, (n_q,); lower, upper: bounds of the coefficients, (P,).
+        ``sums`` are linearised at the fit to the fitted trials; ``weight`` (n_q,) is by axis.
         """
         found: dict[int, Array] = {}
         for group in sorted(set(self.groups)):
@@ -93,11 +87,7 @@ class Folds:
         return tuple(found[group] for group in self.groups)
 
     def error(self, sums: NormalEquations, values: Sequence[Array]) -> Array:
-        """Root mean square by axis over the judged trials, (n_q,).
-
-        Args:
-            sums: of all trials; values: coefficients for each trial, each (P,).
-        """
+        """Root mean square by axis over the judged trials, (n_q,); ``values`` (P,) by trial."""
         squares, count = np.zeros(sums.yy.shape[1]), np.zeros(sums.yy.shape[1])
         for k, judged in enumerate(self.judged):
             if judged:

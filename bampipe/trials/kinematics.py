@@ -60,12 +60,10 @@ class Kinematics:
         return cls(found.method, found.sample_rate_hz, axes, found.force.derivative_cutoff_hz)
 
     def differentiate(self, axis: str, position: Array, seen: Flags | None = None) -> Derivatives:
-        """Return the motion behind the readings of one axis.
+        """Return the motion behind the readings (T,) of one axis.
 
-        Args:
-            axis: its name; position: (T,) readings on the uniform grid.
-            seen: (T,) false where a reading is a guess across a gap; the Kalman smoother alone
-                leaves those out.
+        ``seen`` (T,) is false where a reading is a guess across a gap; the Kalman smoother alone
+        leaves those out.
         """
         if self.method == "kalman":
             return kalman_smoother.smooth(position, self._motion_model(axis), seen)
@@ -74,11 +72,7 @@ class Kinematics:
         return smooth(position, self.rate_hz, chosen.bandwidth_hz, chosen.noise_sd)
 
     def derivatives_of(self, axis: int, signal: Array) -> tuple[Array, Array, Array]:
-        """What `differentiate` adds for a signal (T,) that is added to the readings.
-
-        Args:
-            axis: its number; signal: known at every sample.
-        """
+        """What `differentiate` adds for a signal (T,) that is added to the readings."""
         name = list(self.axes)[axis]
         if self.method == "kalman":
             return kalman_smoother.smooth_mean(signal, self._motion_model(name))
@@ -105,7 +99,6 @@ class Kinematics:
         """Filter a recording the way every recording, measured or replayed, is filtered.
 
         Args:
-            recording: the readings.
             smooth_inputs: the channels that have time derivatives.
             wanted: inputs of the only model that sees the motion: of the derivatives, those that it
                 takes and some more, by which they are moved in time; all by default.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -119,10 +119,8 @@ def read_measured_trials(
     in a viscous field, but judged by them.
 
     Args:
-        run: the run folder; system: the model.
-        every_input: as in `read_motion`.
-        timing: time by which inputs were sampled after positions, as identified. It is taken off
-            as far as it leaves the least residual.
+        every_input: as in `read_motion`; timing: as identified, taken off as far as it leaves the
+            least residual.
 
     Raises:
         InputError: there is no free trial, or a file or column is missing.
@@ -143,32 +141,18 @@ def read_measured_trials(
         timed=timing is not None and timing.limit > 0.0,
     )
     alone = [k for k, name in enumerate(names) if name not in held_out]
-    return _with_blocks(trials, alone[0], held_out) if len(alone) == 1 else trials
-
-
-def _with_blocks(trials: MeasuredTrials, alone: int, held_out: Collection[str]) -> MeasuredTrials:
-    """The same with the only trial that is not held out, number ``alone``, in blocks."""
-    blocks = cut_blocks(trials.motions[alone], trials.band)
-    if len(blocks) == 1:
+    blocks = cut_blocks(motions[alone[0]], band) if len(alone) == 1 else []
+    if len(blocks) < 2:
         return trials
-    motions = [*trials.motions]
-    motions[alone : alone + 1] = blocks
-    every = [motion.trial_id for motion in motions]
-    fitted = [block.trial_id for block in blocks] if trials.folds.fitted[alone] else []
-    return replace(
-        trials,
-        motions=motions,
-        folds=Folds.of_trials(every, held_out, fitted),
-        blocks=len(blocks),
-    )
+    parted = [*motions]
+    parted[alone[0] : alone[0] + 1] = blocks
+    may_fit = [block.trial_id for block in blocks] if trials.folds.fitted[alone[0]] else []
+    folds = Folds.of_trials([motion.trial_id for motion in parted], held_out, may_fit)
+    return replace(trials, motions=parted, folds=folds, blocks=len(blocks))
 
 
 def folds_by_channel(run: RunFolder, trials: MeasuredTrials, channel: str, where: str) -> Folds:
     """Return folds that leave out together the trials at one value of a channel.
-
-    Args:
-        run: the run folder; trials: of it; channel: recorded in them.
-        where: for messages, what asks for this.
 
     Raises:
         InputError: there is one trial, or the channel is not recorded or changes within a trial.

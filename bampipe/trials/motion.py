@@ -89,9 +89,6 @@ class Motion:
 
         The offset goes through the filters of the encoders. Where play is crossed it jumps as the
         readings do, and only what was filtered alike leaves nothing of the two.
-
-        Args:
-            system: the model; u: its inputs, (T, n_u); p: its parameters, (n_p,).
         """
         if not system.moves_sensors:
             return self
@@ -158,17 +155,11 @@ class Motion:
                 orders.append(further)
             for k, order in enumerate(orders[:-1]):
                 if among is None or order in among:
-                    terms = orders[k : k + 1 + TIMING_ORDERS]
-                    yield order, _taylor([self.channels[n] for n in terms], -late_s)
-
-
-def _taylor(terms: Sequence[Array], step: float) -> Array:
-    """A signal ``step`` later, (T,), by itself and its time derivatives."""
-    total, factor = terms[0].copy(), 1.0
-    for order, term in enumerate(terms[1:], start=1):
-        factor *= step / order
-        total += factor * term
-    return total
+                    total, factor = self.channels[order].copy(), 1.0
+                    for power, term in enumerate(orders[k + 1 : k + 1 + TIMING_ORDERS], start=1):
+                        factor *= -late_s / power
+                        total += factor * self.channels[term]
+                    yield order, total
 
 
 def input_derivatives(name: str) -> tuple[str, ...]:

@@ -52,10 +52,7 @@ def floor_replays(motions: Sequence[Motion]) -> int:
 def draw_trials(sizes: Sequence[int]) -> list[int]:
     """Numbers of the trials that stand for all of a long session, in order.
 
-    They hold `ENOUGH_SAMPLES`, and are `LEAST_DRAWN` or more.
-
-    Args:
-        sizes: of the trials, in samples.
+    They hold `ENOUGH_SAMPLES`, and are `LEAST_DRAWN` or more; ``sizes`` are in samples.
     """
     total = sum(sizes)
     if total <= ENOUGH_SAMPLES:

@@ -13,7 +13,6 @@ from bampipe.data.store import column_names, read_arrays, read_parquet, row_coun
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
-from bampipe.physics.device import Device
 from bampipe.physics.soundness import require_sound
 from bampipe.results.filter import Disturbance, FilterResult
 from bampipe.results.ingest import IngestResult
@@ -57,7 +56,6 @@ def free_trials(run: RunFolder, *, fitted: bool = False, braked: bool = False) -
     """Return the free trials that were differentiated, in the order of the session.
 
     Args:
-        run: the run folder.
         fitted: without those that the session holds out.
         braked: those in a viscous field too, after the others: a lag of the brakes, say, shows
             in no other.
@@ -88,7 +86,6 @@ def read_motion(
     """Read one trial of ``filter/kinematics.parquet``.
 
     Args:
-        run: the run folder; trial_id: which trial.
         system: the model, whose inputs and their first time derivatives are read.
         every_input: every input of its device too, with all time derivatives: what an effect
             that is not in the model may need.
@@ -122,12 +119,12 @@ def read_motion_of(
     brakes = {name: f"brake_{axis}" for axis, name in device.brakes.items()}
     needed = [name for name in system.inputs if name != "t"]
     wanted = list(needed)
+    smooth = (*device.forces, *device.channels)
     if every_input:
-        smooth = (*device.forces, *device.channels)
         needed += [name for name in (*smooth, *brakes) if name not in needed]
         wanted = [*needed, *(rate for name in smooth for rate in input_derivatives(name))]
     else:
-        for name in [name for name in needed if _is_smooth(device, name)]:
+        for name in [name for name in needed if name in smooth]:
             wanted += input_derivatives(name)[:TIMING_ORDERS]
     column_of = {name: brakes.get(name, name) for name in dict.fromkeys(wanted)}
     motion = {key: [f"{key}_{axis}" for axis in axes] for key in ("q", "qd", "qdd", "qd_sd")}
@@ -177,8 +174,6 @@ def read_motions(
     """Return the free trials, each read from ``filter/kinematics.parquet`` when it is wanted.
 
     Args:
-        run: the run folder.
-        system: the model.
         fitted, braked: as in :func:`free_trials`; every_input: as in :func:`read_motion`.
         late_s: time by which inputs were sampled after positions, taken off.
 
@@ -214,9 +209,6 @@ def require_sound_motions(system: System, motions: Sequence[Motion]) -> None:
 
 def read_samples(run: RunFolder, trial_id: str, system: System) -> dict[str, Array]:
     """Return raw samples of one trial, each (T,): ``t``, ``q_<axis>``, and the inputs as logged.
-
-    Args:
-        run: the run folder; trial_id: which trial; system: the model, whose inputs are read.
 
     Raises:
         InputError: the file or the trial is missing.
@@ -254,10 +246,6 @@ def input_columns(
         elif name not in column:
             raise _no_column(name, "ingest/samples.parquet")
     return values
-
-
-def _is_smooth(device: Device, name: str) -> bool:
-    return name in device.forces or name in device.channels
 
 
 def _no_column(name: str, where: str) -> InputError:

@@ -124,10 +124,6 @@ class StandIn:
 def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> Course:
     """Simulate one trial of a fitted model.
 
-    Args:
-        system, p, rate_hz: as of a `StandIn`.
-        motion: the measured trial to follow.
-
     Raises:
         Runaway: the simulated motion grows without bounds.
     """
@@ -162,7 +158,8 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
         if not _is_controlled(system):
             raise
         return Course(motion.q, _required_force(fitted, u, rate_hz))
-    if _is_controlled(system) and _strays(x[:, : q.shape[1]], q):
+    strayed = np.abs(x[:, : q.shape[1]] - q).max(axis=0) > _FARTHEST * np.ptp(q, axis=0)
+    if _is_controlled(system) and strayed.any():  # no likeness of a held robot
         return Course(motion.q, _required_force(fitted, u, rate_hz))
     seen = system.encoder_readings(x, total, prompt)[:, : len(system.coordinates)]
     arm = total[:, columns] - acting[:, columns]
@@ -191,11 +188,7 @@ def steps_to_follow(
 
 
 def _lateness(fitted: ModelOnTrial, u: Array) -> Array:
-    """Time by which each force acts after it was logged, (n_f,), s; negative if it acts before.
-
-    Args:
-        fitted: the model on a trial; u: inputs of that, (T, n_u).
-    """
+    """Time by which each force acts after it was logged, (n_f,), s; negative if it acts before."""
     system, p, motion = fitted.system, fitted.p, fitted.motion
     found = np.zeros(len(system.model.device.forces))
     if not system.delays:
@@ -249,12 +242,6 @@ def is_stiff(system: System, p: Array, motion: Motion) -> bool:
 def _is_controlled(system: System) -> bool:
     """Whether each joint of a robot has a drive, which follows the path of its controller."""
     return system.model.device.robot is not None and not system.undriven
-
-
-def _strays(q: Array, measured: Array) -> bool:
-    """Whether a replay (T, n_q) left the measured motion: that is no likeness of a held robot."""
-    farthest = np.abs(q - measured).max(axis=0)
-    return bool(np.any(farthest > _FARTHEST * np.ptp(measured, axis=0)))
 
 
 def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
@@ -377,8 +364,6 @@ def replay_motion(
     Time derivatives are made of the forces alone; other channels are the measured ones.
 
     Args:
-        stand_in: what is replayed; trial: the number of the one.
-        sensors: resolution and noise; kinematics: the filters.
         rng: source of the noise and of where the encoders' counts fall.
         alone: whether no other model is to see the replay, which may need more derivatives.
 
@@ -404,9 +389,7 @@ def replay_motions(
     """Replay every trial; long sessions are stored on disk, so that few trials are in memory.
 
     Args:
-        stand_in, sensors, kinematics, alone: as for `replay_motion`.
-        seed: of the sensor noise; the trial's number is added.
-        force_noise: whether the force sensor is noisy.
+        seed: of the sensor noise; the trial's number is added. alone: as for `replay_motion`.
 
     Raises:
         Runaway: a simulated motion grows without bounds.

@@ -42,7 +42,6 @@ def problem_of(
     positions, s, within half a sample.
 
     Args:
-        system: the model; motions: the trials; band: the low-pass of the residual.
         held: parameters that are not estimated, beside those that the model fixes.
         timing: whether that time is estimated; else it stays as given.
         turning: whether samples count in which an axis turns round.
@@ -217,17 +216,11 @@ def standstill_of(motion: Motion, system: System, rate_hz: float) -> Flags:
 
 
 def applied_rms(
-    system: System,
-    motions: Sequence[Motion],
-    band: Band,
-    p: Array,
-    used: Sequence[Flags],
+    system: System, motions: Sequence[Motion], band: Band, p: Array, used: Sequence[Flags]
 ) -> Array:
     """Root mean square of the applied force by axis, low-passed as the residual is, (n_q,).
 
-    Args:
-        system: the model; motions: the trials; band: the low-pass; p: parameters, (n_p,).
-        used: which samples count, by trial, each (K, n_q).
+    ``p`` are parameters (n_p,); of each trial the samples ``used`` (K, n_q) count.
     """
     square, count = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
     for motion, moves in zip(motions, used, strict=True):

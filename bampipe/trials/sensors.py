@@ -101,12 +101,7 @@ class ChannelNoise:
 def settle_encoder(
     axis: str, unit: str, stated: float | None, records: Sequence[RecordNoise]
 ) -> ChannelNoise:
-    """Settle resolution and noise of an encoder.
-
-    Args:
-        axis, unit: for messages; stated: step by the session file, rad or m, or None.
-        records: of its readings, by trial.
-    """
+    """Settle resolution and noise of an encoder; its step may be ``stated``, rad or m."""
     step = _typical_step(records)
     stated = stated or None
     warning = ""
@@ -133,12 +128,7 @@ def settle_encoder(
 def settle_force(
     name: str, unit: str, stated: float | None, records: Sequence[RecordNoise]
 ) -> ChannelNoise:
-    """Settle the noise of a force channel: as measured, or as stated where too little is recorded.
-
-    Args:
-        name, unit: for messages; stated: by the session file, or None.
-        records: of its samples, by trial.
-    """
+    """Settle the noise of a force channel: as measured; as stated where too little is recorded."""
     stated = stated if stated is not None and stated > 0.0 else None
     measured = _typical_noise(records, stated)
     warning = ""

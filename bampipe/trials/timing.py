@@ -27,9 +27,7 @@ def find_robot_timing(
     there, by milliseconds, and would outweigh the rest of the path. Where the model has a delay of
     its own for a drive, its joint tells nothing, and does not count either.
 
-    Args:
-        system: the robot, fitted; motions: the trials; band: the low-pass of the residual.
-        p: parameters of the fit, (n_p,), at which its residual is linearised.
+    The residual is linearised at the parameters ``p`` (n_p,) of the fit.
 
     Returns:
         Zero and infinity where no joint tells it.

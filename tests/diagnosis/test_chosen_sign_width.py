@@ -5,7 +5,7 @@ from independent_runs import record_run, record_trials
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model_file import load_model
-from bampipe.diagnosis.sign_width import choose_sign_width
+from bampipe.diagnosis.start import choose_sign_width
 from bampipe.progress import silent
 from bampipe.results.identify import IdentifyResult
 from bampipe.stages import identify

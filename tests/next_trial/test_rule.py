@@ -10,9 +10,9 @@ from bampipe.diagnosis.criteria import Criteria, most_probable
 from bampipe.diagnosis.dictionary import Dictionary, Key
 from bampipe.diagnosis.probability import chance_of, least_gain
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.search import Search
+from bampipe.diagnosis.search import Search, log_prior
 from bampipe.diagnosis.session import Fit, Session, candidates_of, system_of
-from bampipe.next_trial.sensitivity import find_detectability, find_needed
+from bampipe.next_trial.sensitivity import find_detectability
 from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity, suggest_trial
 from bampipe.trials.folds import Folds
 from bampipe.trials.measured import MeasuredTrials
@@ -54,7 +54,9 @@ def key_of(dictionary: Dictionary, name: str, values) -> Key:
 def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_it(session, fit):
     detectability = find_detectability(session, fit)
     found = {one.alternative.name: one for one in detectability.limits}
-    assert detectability.needed == find_needed(CRITERIA, len(session.candidate_names(fit.recipe)))
+    assert detectability.needed == least_gain(CRITERIA, ()) - log_prior(
+        CRITERIA, len(session.candidate_names(fit.recipe))
+    )
     noise, scale = fit.likelihood.noise, detectability.comparison.scale
     plain = search_beside(fit, noise.bias)
     # Of the whole library each is less probable beforehand than of these few.
