@@ -57,13 +57,7 @@ class Atom:
 
 @dataclass
 class Dictionary:
-    """The candidates beside one fitted model.
-
-    Attributes:
-        evidence: the model on the trials; samples: of it that count.
-        candidates: by name.
-        scale: sizes of the machine.
-    """
+    """The candidates, by name, beside one fitted model, and its samples that count."""
 
     evidence: Evidence
     samples: Sequence[Samples]
@@ -173,9 +167,7 @@ class Dictionary:
     def _gain(self, item: Candidate, p: Array, slopes: Mapping[int, Array]) -> Array:
         """What a candidate leaves of the noise of the forces, `Atom.gain`.
 
-        Args:
-            item: the candidate; p: parameters of its system, (n_p,).
-            slopes: what it changes of a constant force; a filter passes that.
+        ``slopes`` are what it changes of a constant force; a filter passes that.
         """
         if slopes or item.linear_indices or not item.system.force_fed:
             return np.ones(len(self.samples))
@@ -200,8 +192,7 @@ class Dictionary:
     ) -> tuple[dict[int, Array], Array]:
         """Slopes by the forces that it adds to take one of the model's own effects away, and gain.
 
-        Args:
-            name: of the effect; absence: change of each free parameter that takes it away.
+        ``absence`` is the change of each free parameter that takes it away.
         """
         e, unchanged = self.evidence, np.ones(len(self.samples))
         moved = {e.free[place]: change for place, change in absence.items() if change}

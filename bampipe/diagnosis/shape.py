@@ -20,10 +20,7 @@ _LEAST = 12
 class Variable:
     """One quantity that a residual may depend on, at the kept samples of every trial.
 
-    Attributes:
-        name: ``position``, ``velocity``, ...
-        unit: SI unit as text.
-        values: by trial, each (K,).
+    Its name is ``position``, ``velocity``, ..., its values are (K,) each.
     """
 
     name: str
@@ -36,8 +33,7 @@ class Map:
     """Mean residual in bins of one variable, with 95 % confidence bands over independent samples.
 
     Attributes:
-        variable: its name.
-        unit: its unit.
+        variable, unit: its name and its unit.
         center, mean, low, high: by bin; the residual's are N.m or N.
         count: samples in each bin.
         share: share of the residual's variance that the bin means carry.

@@ -32,6 +32,7 @@ from bampipe.results.identify import Method, MethodTried, MethodValue
 from bampipe.results.rounding import round_with_sd, significant
 from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.replay import steps_to_follow
+from bampipe.trials.residuals import rms
 
 MOST_EVALUATIONS = 2e7
 """Of the model by all sigma points along all trials: some five seconds for each pass."""
@@ -106,11 +107,8 @@ def tabulate_methods(
 def held_out_error(squares: SquaresFit, estimate: Estimate) -> Array:
     """Error (n_q,) of predictions of each trial by parameters that have not seen it, N.m or N."""
     problem, evidence = squares.problem, squares.fit.evidence
-    total, count = 0.0, 0.0
-    for trial, (p, used) in enumerate(zip(estimate.held_out, evidence.used, strict=True)):
-        left = problem.band.thin(problem.residual(trial, p)) * used
-        total, count = total + np.sum(left**2, axis=0), count + used.sum(axis=0)
-    return np.asarray(np.sqrt(total / np.maximum(count, 1)))
+    pairs = enumerate(estimate.held_out)
+    return rms((problem.band.thin(problem.residual(k, p)) for k, p in pairs), evidence.used)
 
 
 def describe_methods(methods: Mapping[Method, MethodTried]) -> list[str]:

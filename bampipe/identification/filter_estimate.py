@@ -32,13 +32,13 @@ from bampipe.identification.filter_run import (
     run_filter,
 )
 from bampipe.identification.filter_tables import (
+    check_innovations,
     convergence,
     state_3sigma,
     tabulate_nis,
     tabulate_states,
     tabulate_trace,
 )
-from bampipe.identification.innovations import innovation_tests
 from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.identification.sensor_noise import (
     Noise,
@@ -252,7 +252,7 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
     nis = tabulate_nis(found, motions)
     report = {
         "nis": nis,
-        "innovations": innovation_tests(system, found, filtering.clear),
+        "innovations": check_innovations(system, found, filtering.clear),
         "noise": noise_levels(system, found.settings, task.noise),
         "input_timing": input_timing(p, problem, scaled),
         "blocks": blocks,
@@ -264,6 +264,10 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
     covariance = (scaled + np.outer(off, off) + np.diag(spread**2))[:count, :count]
     smoothing = np.hypot(off, spread)[:count]
     rows = filtering.choice.trace_rows
+    doubt = (
+        f"its normalised innovations squared are {nis.mean:.2g} on average, 1 where its noise"
+        " levels are right"
+    )
     return Estimate(
         method="ukf",
         p=p,
@@ -277,7 +281,7 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
             tabulate_states(system, motions, found, p[:-1], rows),
             tabulate_trace(names, model, motions, found, rows),
         ),
-        doubts=_doubts(nis.mean),
+        doubts=() if _SOUND_NIS[0] < nis.mean < _SOUND_NIS[1] else (doubt,),
         notes=_describe_smoothing(names, smoothing, np.sqrt(np.diag(covariance)), width),
     )
 
@@ -430,13 +434,3 @@ def _choose_width(
     ]
     spread = np.max(np.abs(np.array(near) - tried[chosen][1]), axis=0)
     return _Width(chosen[0], replace(found.settings, longest_step=step / chosen[1]), spread)
-
-
-def _doubts(nis: float) -> tuple[str, ...]:
-    """Say whether the noise levels speak against the filter."""
-    if _SOUND_NIS[0] < nis < _SOUND_NIS[1]:
-        return ()
-    return (
-        f"its normalised innovations squared are {nis:.2g} on average, 1 where its noise levels"
-        " are right",
-    )

@@ -22,11 +22,8 @@ from bampipe.results.next import ExpectedSd, Move, Proposal, Purpose
 class Forecast:
     """The models from which the gain of a design is forecast.
 
-    Attributes:
-        rehearsal: the fitted model with which designs are tried.
-        precision: uncertainty of its parameters.
-        comparison: alternatives to distinguish, if that is the purpose.
-        detectability: of the effects of the library, if that is the purpose.
+    There are alternatives to distinguish, or effects of the library to detect, if that is the
+    purpose.
     """
 
     rehearsal: Rehearsal

@@ -60,12 +60,10 @@ class _Option:
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """Trials to record, in order.
+    """Trials to record, in order, and what is expected in the end.
 
     Attributes:
-        designs: the designs to record.
-        sd: standard deviations expected in the end.
-        confusion: chance of confusing each pair of alternatives in the end.
+        confusion: chance of confusing each pair of alternatives.
         is_enough: whether the goal is reached.
         is_full: whether the plan has its most designs and further ones would still help.
     """

@@ -85,12 +85,9 @@ def count_affordable(rehearsal: Rehearsal, seconds: float) -> int:
 
 @dataclass(frozen=True)
 class RankedDesign:
-    """A design that has been tried.
+    """A design that has been tried, with the quantile of the utility over its versions.
 
-    Attributes:
-        design: the primitive.
-        utility: quantile of the utility over versions.
-        motions: its versions, the hasty one last.
+    Of the motions the hasty one is last.
     """
 
     design: Primitive

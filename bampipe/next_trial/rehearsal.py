@@ -32,14 +32,7 @@ _FORCE_STEPS = 4
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """The fitted model and the instruments with which designs are tried.
-
-    Attributes:
-        system, p: the fitted model and its parameters.
-        sensors, kinematics: of the session.
-        seen: envelope of the trials.
-        seed: of the versions and of the noise.
-    """
+    """The fitted model with its parameters, and the instruments with which designs are tried."""
 
     system: System
     p: Array

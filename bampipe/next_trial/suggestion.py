@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,20 +27,11 @@ _REFINEMENTS = 4
 _SUGGESTED_S = 20.0
 
 
-@dataclass(frozen=True)
-class Ambiguity:
-    """Sets of effects between which a diagnosis could not decide.
-
-    Attributes:
-        odds: by the effects in which they differ; none if a set has only the common ones.
-        common: effects of all sets.
-    """
-
-    odds: Mapping[tuple[str, ...], float]
-    common: tuple[str, ...]
+Odds = Mapping[tuple[str, ...], float]
+"""Odds of sets between which a diagnosis could not decide, by the effects in which they differ."""
 
 
-def find_ambiguity(found: DiagnoseResult, criteria: Criteria) -> Ambiguity | None:
+def find_ambiguity(found: DiagnoseResult, criteria: Criteria) -> Odds | None:
     """Return the fewest sets that together reach the probability of a verdict; None if one does."""
     if all(axis.verdict != "undecided" for axis in found.axes.values()):
         return None
@@ -55,15 +45,15 @@ def find_ambiguity(found: DiagnoseResult, criteria: Criteria) -> Ambiguity | Non
     for one in sets:
         members = tuple(sorted({*one.effects} - common))
         odds[members] = odds.get(members, 0.0) + one.probability / total
-    return Ambiguity(odds, tuple(sorted(common))) if len(odds) > 1 else None
+    return odds if len(odds) > 1 else None
 
 
-def compare_alternatives(session: Session, final: Fit, asked: Ambiguity) -> Comparison | None:
-    """Fit the alternatives of ``asked`` to the trials; None if fewer than two explain anything.
+def compare_alternatives(session: Session, final: Fit, odds: Odds) -> Comparison | None:
+    """Fit the alternatives to the trials; None if fewer than two explain anything.
 
     ``final`` is the model with its most probable set, fitted.
     """
-    members = {name for one in asked.odds for name in one}
+    members = {name for one in odds for name in one}
     recipe, e = without_members(final.recipe, members), final.evidence
     known = {q.name: v for q, v in zip(e.system.parameters, e.p, strict=True)}
     start = np.array([known[q.name] for q in system_of(recipe).parameters])
@@ -71,7 +61,7 @@ def compare_alternatives(session: Session, final: Fit, asked: Ambiguity) -> Comp
     bare = Fit(recipe, evidence, final.likelihood, final.likelihood.pose(evidence))
     others = {*session.candidate_names(recipe)} - members
     with open_search(session, bare, others) as search:
-        found = [_fit_alternative(search, recipe, *pair) for pair in asked.odds.items()]
+        found = [_fit_alternative(search, recipe, *pair) for pair in odds.items()]
     alternatives = tuple(alternative for alternative in found if alternative is not None)
     return Comparison(session, bare, final, alternatives) if len(alternatives) > 1 else None
 
@@ -109,8 +99,8 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
     With it, a wrong choice must be as improbable as a verdict demands. ``final`` is the model with
     its most probable set, fitted.
     """
-    asked = find_ambiguity(result, session.criteria)
-    comparison = compare_alternatives(session, final, asked) if asked is not None else None
+    odds = find_ambiguity(result, session.criteria)
+    comparison = compare_alternatives(session, final, odds) if odds is not None else None
     if comparison is None:
         return None
     trials, e = session.trials, comparison.fit.evidence

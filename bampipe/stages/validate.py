@@ -43,7 +43,6 @@ from bampipe.trials.comparison import (
     compare_trial,
     expected_published_ratio,
     published_rmse,
-    rms,
 )
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import (
@@ -55,6 +54,7 @@ from bampipe.trials.measured import (
 from bampipe.trials.motion import Motion
 from bampipe.trials.noise_floor import NoiseFloor, draw_trials, floor_replays
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
+from bampipe.trials.residuals import rms
 
 SUMMARY = "Predicted against measured torque and force, on trials that the fit has not seen"
 INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)

@@ -26,7 +26,6 @@ class ChannelRecords:
     """What a session's trials say of its channels: noise, mains hum, readings in counts."""
 
     def __init__(self, session: Session, device: Device) -> None:
-        """Begin with no trial."""
         self._session, self._device = session, device
         self._units = _force_units(session, device)
         self._noise: dict[str, list[RecordNoise]] = defaultdict(list)

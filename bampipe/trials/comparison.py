@@ -14,7 +14,7 @@ from bampipe.results.validate import AxisError
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.replay import UNLIKE, StandIn, replay_motions
-from bampipe.trials.residuals import ModelOnTrial
+from bampipe.trials.residuals import ModelOnTrial, rms
 
 _EXPECTED_SEED = 3
 """After the user's: of the replay that shows how the published parameters would look if true."""
@@ -71,13 +71,6 @@ def compare_trial(evidence: Evidence, number: int, p: Array, late_s: float = 0.0
         force_residual=system.least_force(motion.q[rows], residual, u[rows], p),
         judged=folds.judged[number] and not folds.nothing_held_out,
     )
-
-
-def rms(values: Sequence[Array], used: Sequence[Flags]) -> Array:
-    """Return the root mean square by axis of the samples that count."""
-    square = sum(np.sum(v**2 * keep, axis=0) for v, keep in zip(values, used, strict=True))
-    count = sum(keep.sum(axis=0) for keep in used)
-    return np.asarray(np.sqrt(square / np.maximum(count, 1)))
 
 
 def _percent(error: float, size: float) -> float:

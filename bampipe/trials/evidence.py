@@ -23,7 +23,7 @@ from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import ModelOnTrial, applied_rms, problem_of
+from bampipe.trials.residuals import ModelOnTrial, problem_of, rms
 from bampipe.trials.scale import log_scale, slopes_by_force
 
 _REFITS = 6
@@ -138,11 +138,6 @@ class Evidence:
         mean = fitted.yy.sum(axis=0) / np.maximum(fitted.count.sum(axis=0), 1.0)
         return np.asarray(1.0 / np.maximum(mean, 1e-24))
 
-    @cached_property
-    def applied_rms(self) -> Array:
-        """Root mean square of the applied force by axis; see `applied_rms`, (n_q,), N.m or N."""
-        return applied_rms(self.system, self.motions, self.band, self.p, self.used)
-
     def rmse(self) -> Array:
         """Root mean square of the residual by axis over all trials, (n_q,), N.m or N."""
         count = np.maximum(self.sums.count.sum(axis=0), 1.0)
@@ -181,9 +176,7 @@ class Evidence:
         if self.is_linear:
             return self.folds.error(self.sums, self.held_out_steps)
         judged = [k for k, counts in enumerate(self.folds.judged) if counts]
-        squares = sum(np.sum(self.held_out_residual(k) ** 2, axis=0) for k in judged)
-        count = self.sums.count[judged].sum(axis=0)
-        return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))
+        return rms((self.held_out_residual(k) for k in judged), [self.used[k] for k in judged])
 
     @property
     def is_linear(self) -> bool:

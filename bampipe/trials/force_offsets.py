@@ -16,7 +16,7 @@ from bampipe.estimate.least_squares import Stacked
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.trials.motion import Motion, trial_names
-from bampipe.trials.residuals import fit_device
+from bampipe.trials.residuals import fit_device, rms
 
 _PARTS = 6
 """Of a trial, from which its offset is found once more each: they tell its standard error."""
@@ -48,7 +48,9 @@ def find_force_offsets(
     if len(fitted) < 2 or not forces or not (found := fit_device(system, motions, band, fitted)):
         return {}
     _, p, stacked = found
-    size = _root_mean_square([stacked[number] for number in fitted])
+    some = [stacked[number] for number in fitted]
+    size = rms((one.residual for one in some), [one.used for one in some])
+    size = np.maximum(size, np.sqrt(np.finfo(float).tiny))
     trials = [
         _Trial.of(system, motion, band, one, p[:-1], size)
         for motion, one in zip(motions, stacked, strict=True)
@@ -130,10 +132,3 @@ def _still_told(trials: Sequence[_Trial], own: Array, whole: Array) -> bool:
     common = np.diag(whole - across.T @ np.linalg.lstsq(squared, across, rcond=1e-9)[0])[:-1]
     counts = common > _TOLD * np.diag(whole)[:-1]
     return bool(np.all(np.diag(own)[:-1][counts] > _STILL_TOLD * common[counts]))
-
-
-def _root_mean_square(stacked: Sequence[Stacked]) -> Array:
-    """Of the residuals of each axis, (n_q,)."""
-    total = np.sum([np.sum(one.residual**2, axis=0) for one in stacked], axis=0)
-    count = np.sum([one.used.sum(axis=0) for one in stacked], axis=0)
-    return np.asarray(np.sqrt(np.maximum(total / np.maximum(count, 1), np.finfo(float).tiny)))

@@ -88,13 +88,9 @@ class Course(NamedTuple):
 
 @dataclass(frozen=True)
 class StandIn:
-    """A fitted model in place of the machine, on the trials of a session.
+    """A fitted model in place of the machine, which follows the measured trials of a session.
 
-    Attributes:
-        system: the model; effects of kind ``measurement`` act on what the encoders read.
-        p: its parameters, (n_p,).
-        motions: the measured trials to follow.
-        rate_hz: sampling rate.
+    Its effects of kind ``measurement`` act on what the encoders read.
     """
 
     system: System

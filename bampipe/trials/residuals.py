@@ -179,11 +179,7 @@ def _multiplied(system: System, free: Sequence[int]) -> Indices | None:
 
 
 class _Remembered(Generic[Found]):
-    """The last values of a function of a trial and of some parameters.
-
-    Attributes:
-        uses: numbers of those parameters.
-    """
+    """The last values of a function of a trial and of the parameters numbered ``uses``."""
 
     def __init__(self, uses: Iterable[int]) -> None:
         self.uses = list(uses)
@@ -222,12 +218,15 @@ def applied_rms(
 
     ``p`` are parameters (n_p,); of each trial the samples ``used`` (K, n_q) count.
     """
-    square, count = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
-    for motion, moves in zip(motions, used, strict=True):
-        applied = band.thin(ModelOnTrial(system, p, [motion]).applied)
-        square += np.sum(applied**2 * moves, axis=0)
-        count += moves.sum(axis=0)
-    return np.asarray(np.sqrt(square / np.maximum(count, 1)))
+    return rms((band.thin(ModelOnTrial(system, p, [m]).applied) for m in motions), used)
+
+
+def rms(values: Iterable[Array], used: Iterable[Flags]) -> Array:
+    """Root mean square by axis, (n_q,), of values (K, n_q) by trial over the samples that count."""
+    square, count = np.zeros(1), np.zeros(1)
+    for each, keep in zip(values, used, strict=True):
+        square, count = square + np.sum(each**2 * keep, axis=0), count + keep.sum(axis=0)
+    return np.asarray(np.sqrt(square / np.maximum(count, 1.0)))
 
 
 @dataclass(frozen=True)
