@@ -85,12 +85,8 @@ def compile_candidate(model: Model) -> Candidate:
         judged = compile_model(Model(model.device, (item.name,), (item.effect,)))
     parameters = system.parameters[len(system.parameters) - len(item.parameters) :]
     is_linear = judged.linear[len(judged.linear) - len(parameters) :]
-    linear, searched = [], []
-    for i, parameter in enumerate(parameters):
-        if parameter.fixed:
-            continue
-        if parameter.strength and is_linear[i] and not system.moves_sensors:
-            linear.append(i)
-        else:
-            searched.append(i)
-    return Candidate(item.name, system, is_joint, parameters, tuple(linear), tuple(searched))
+    free = [i for i, parameter in enumerate(parameters) if not parameter.fixed]
+    strengths = () if system.moves_sensors else (i for i in free if parameters[i].strength)
+    linear = tuple(i for i in strengths if is_linear[i])
+    searched = tuple(i for i in free if i not in linear)
+    return Candidate(item.name, system, is_joint, parameters, linear, searched)

@@ -45,7 +45,7 @@ def describe(evidence: Evidence, axis: int) -> str:
     most, variable = maps[best], known[best]
     unit = evidence.system.torque_units[axis]
     if most.share < _VARIABLE or most.variable == "time":
-        vibration = _vibration(evidence, axis, _SIGNIFICANT)
+        vibration = _vibration(evidence, axis)
         if vibration is not None and vibration.share > max(most.share, _VARIABLE):
             return (
                 f"a vibration of {significant(vibration.amplitude, 2)} {unit} at "
@@ -60,7 +60,7 @@ def describe(evidence: Evidence, axis: int) -> str:
             else "scattered over all motions; it follows nothing that the machine does"
         )
     carries = f"{most.variable} carries {100 * most.share:.0f} % of the residual's variance"
-    turning = _by_direction(evidence, axis, variable, _ALIKE)
+    turning = _by_direction(evidence, axis, variable)
     ripple = _ripple(evidence, axis, variable)
     if ripple is not None and ripple.share > _RIPPLE * most.share:
         period = 1.0 / ripple.frequency
@@ -102,7 +102,7 @@ def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:
     return _best_sine([(v, r)], np.arange(2.0, BINS, 0.1) / (high - low))
 
 
-def _vibration(evidence: Evidence, axis: int, significance: float) -> _Sine | None:
+def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
     """A sine in time, of any phase in each trial; None where chance may give one as strong.
 
     Of noise, the share at one frequency is a sum of exponential variates, one a trial (Lomb 1976).
@@ -119,7 +119,7 @@ def _vibration(evidence: Evidence, axis: int, significance: float) -> _Sine | No
     longest = max(float(np.ptp(t)) for t, _ in trials)
     tried = np.arange(2.0 / longest, band.cutoff_hz[axis], 0.25 / longest)
     best = _best_sine(trials, tried)
-    by_chance = gamma.isf(significance / max(len(tried), 1), len(trials))
+    by_chance = gamma.isf(_SIGNIFICANT / max(len(tried), 1), len(trials))
     independent = 0.5 * sum(len(r) for _, r in trials) * band.independent_share[axis]
     return best if best.share * independent > by_chance else None
 
@@ -148,7 +148,7 @@ def _best_sine(trials: Sequence[tuple[Array, Array]], frequencies: Array) -> _Si
     return best
 
 
-def _by_direction(evidence: Evidence, axis: int, variable: Variable, alike: float) -> str:
+def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
     """Whether the residual keeps its sign when the motion turns round, as friction does not."""
     r = np.concatenate([x[:, axis] for x in evidence.residual])
     v = np.concatenate(variable.values)
@@ -164,8 +164,8 @@ def _by_direction(evidence: Evidence, axis: int, variable: Variable, alike: floa
         return "seen in one direction of motion only"
     varied = np.ptp(np.array(means), axis=0).all()
     likeness = float(np.corrcoef(np.array(means).T)[0, 1]) if varied else 0.0
-    if likeness > alike:
+    if likeness > _ALIKE:
         return "the same in both directions of motion, as of a spring"
-    if likeness < -alike:
+    if likeness < -_ALIKE:
         return "opposite in the two directions of motion, as of friction"
     return "different in the two directions of motion"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -63,10 +63,11 @@ class Dictionary:
     samples: Sequence[Samples]
     candidates: Mapping[str, Candidate]
     scale: MachineScale
-    ranges: Mapping[str, tuple[SearchRange, ...]] = field(init=False)
 
-    def __post_init__(self) -> None:
-        self.ranges = {
+    @cached_property
+    def ranges(self) -> Mapping[str, tuple[SearchRange, ...]]:
+        """Where the parameters of each candidate are searched."""
+        return {
             name: tuple(
                 self.scale.range_of(c.system.model.effects[-1], c.parameters[i])
                 for i in c.searched_indices

@@ -190,10 +190,8 @@ class MachineScale:
             found["s"] = (least * self.interval if item.effect.kind == "input" else 0.0, np.inf)
         if not item.axes:
             return found
-        i, (unit, force) = (
-            list(self.coordinates).index(item.axes[0]),
-            self.coordinates[item.axes[0]],
-        )
+        i = list(self.coordinates).index(item.axes[0])
+        unit, force = self.coordinates[item.axes[0]]
         travel = float(self.highest[i] - self.lowest[i])
         speed, load = float(self.speed[i]), float(self.load[i])
         if not travel > 0.0 or not load > 0.0:

@@ -127,9 +127,8 @@ def _judge(
 
 def effect_axes(initial: Fit, final: Fit, effect: str) -> tuple[int, ...]:
     """Axes on which an effect changes the equation."""
-    model = final if effect in final.recipe.effects else None
-    if model is not None:
-        system = model.evidence.system
+    if effect in final.recipe.effects:
+        system = final.evidence.system
         item = next(i for i in system.model.effects if i.name == effect)
     else:
         candidate = candidates_of(initial.recipe, (effect,))[0]
@@ -155,23 +154,18 @@ def rank_effects(
     from the log evidence by the independent samples of the axis.
     """
     initial, final = selection.initial, selection.final
-    values = dict(
-        zip((q.name for q in final.evidence.system.parameters), final.evidence.p, strict=True)
-    )
-    others = sorted(
-        (e for e in selection.gains if e not in selection.effects),
-        key=lambda e: -selection.gains[e],
-    )
+    pairs = zip(final.evidence.system.parameters, final.evidence.p, strict=True)
+    values = {q.name: float(value) for q, value in pairs}
+    unchosen = (e for e in selection.gains if e not in selection.effects)
+    others = sorted(unchosen, key=lambda e: -selection.gains[e])
     chosen = sorted(selection.effects, key=lambda e: -selection.weighed.drops.get(e, 0.0))
-    rows = []
+    left, rows = initial.problem.independent * initial.solved.left, []
     for effect in (*chosen, *others):
         is_chosen = effect in selection.effects
         fit = final if is_chosen else initial
         gain = selection.weighed.drops.get(effect, 0.0) if is_chosen else selection.gains[effect]
         axes = effect_axes(initial, final, effect)
-        axis = max(
-            axes, key=lambda a: float(initial.problem.independent[a] * initial.solved.left[a])
-        )
+        axis = max(axes, key=lambda a: float(left[a]))
         ratio = float(np.exp(-gain / max(fit.problem.independent[axis], 1.0)))
         here = float(fit.held_out_rmse[axis])
         system = fit.evidence.system
@@ -185,7 +179,7 @@ def rank_effects(
                 probability=min(probability.get(effect, 0.0), 1.0),
                 p_value=p_values.get(effect, chance_of(gain, selection.chance)),
                 score=gain,
-                parameters={n: float(v) for n, v in values.items() if n in _own(final, effect)},
+                parameters={n: v for n, v in values.items() if n in _own(final, effect)},
                 indistinguishable_from=_alike(selection, effect, mentioned),
             )
         )

@@ -326,7 +326,14 @@ def run_filter(
         if not _is_lost(passes[-1]):
             return found
     if found is not None:
-        raise _not_followed_error(found, lost_error, axes)
+        worst = int(np.argmax([trial.nis for trial in found.trials]))
+        ratio = found.trials[worst].ratio
+        axis = (*axes, *axes)[int(np.argmax(ratio))]
+        raise lost_error(
+            f"the filter does not follow trial {{}}: its prediction of {axis} one sample ahead errs"
+            f" {ratio.max():.0f} times more than noise explains",
+            found.order[worst],
+        )
     assert failure is not None
     place, error = failure
     t = trials[place].t[min(error.sample, trials[place].t.size - 1)]
@@ -356,18 +363,4 @@ def _summarise_pass(filtered: FilteredTrial, trial: Trial, block_s: float) -> Pa
         stretches=average_stretches(size, samples),
         inputs=average_stretches(trial.u, samples),
         stretch_samples=samples,
-    )
-
-
-def _not_followed_error(
-    found: FilterRun, lost_error: Callable[[str, int], MotionLost], axes: Sequence[str]
-) -> MotionLost:
-    """Say in physical words which trial and axis the filter does not follow."""
-    worst = int(np.argmax([trial.nis for trial in found.trials]))
-    ratio = found.trials[worst].ratio
-    axis = (*axes, *axes)[int(np.argmax(ratio))]
-    return lost_error(
-        f"the filter does not follow trial {{}}: its prediction of {axis} one sample ahead errs "
-        f"{ratio.max():.0f} times more than noise explains",
-        found.order[worst],
     )

@@ -126,7 +126,7 @@ def _closed(run: RunFolder, system: System, motion: Motion, p: Array, law: Contr
     force = [system.inputs.index(name) for name in law.forces]
     _, total, readings = simulate_controlled(
         system.derivative, system.measure, law.command, _start(system, motion, p), u, r,
-        p[: len(system.parameters)], _interval(motion),
+        p[: len(system.parameters)], float(motion.t[1] - motion.t[0]),
         width=system.sign_widths, n_noise=len(system.noise), force=force, rate_hz=law.rate_hz,
         limits=law.limits,
     )  # fmt: skip
@@ -140,7 +140,7 @@ def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -
     if push is not None:
         start[:n] += push
     x = simulate(
-        system.derivative, start, u, p[: len(system.parameters)], _interval(motion),
+        system.derivative, start, u, p[: len(system.parameters)], float(motion.t[1] - motion.t[0]),
         width=system.sign_widths, n_noise=len(system.noise), smooth=system.forced,
     )  # fmt: skip
     readings = np.empty((len(x), 2 * n))
@@ -165,10 +165,6 @@ def _start(system: System, motion: Motion, p: Array) -> Array:
     true = motion.of_mechanism(system, u, p[: len(system.parameters)])
     memory = system.initial_memory(true.q[0], u[0], p)
     return np.concatenate([true.q[0], true.qd[0], memory])
-
-
-def _interval(motion: Motion) -> float:
-    return float(motion.t[1] - motion.t[0])
 
 
 def _axes(system: System, runs: Sequence[_Run]) -> dict[str, FreeRunError]:

@@ -150,20 +150,18 @@ class SquaresFit:
         pose = self.fit.problem
         inverse = invert_scaled(self.normal)
         fitted = float(np.trace(inverse @ (self.normal - pose.precision)))
-        samples = lay_out_samples(self.fit.evidence, self._block_length(fitted))
+        # Shorter blocks where there are fewer than three a parameter.
+        band, seconds = self.trials.band, sum(self.fit.evidence.sizes) / self.trials.band.rate_hz
+        most = max(
+            seconds / (BLOCKS_A_PARAMETER * max(fitted, 1.0)), _PERIODS / min(band.cutoff_hz)
+        )
+        samples = lay_out_samples(self.fit.evidence, min(self.block_s, most))
         tailed = [_TAILED if np.ptp(root) > 0.0 else 1.0 for root in self.fit.likelihood.root]
         rows = [(x, left / by) for (x, left), by in zip(self.rows, tailed, strict=True)]
         independent = [s.independent * by**2 for s, by in zip(samples, tailed, strict=True)]
         found = covariance_by_blocks(rows, pose.precision, [s.block for s in samples], independent)
         to = pose.to_parameters[: self.free.size]
         return np.asarray(to @ found @ to.T)
-
-    def _block_length(self, fitted: float) -> float:
-        """Length of blocks, s: shorter where there are fewer than three a parameter."""
-        band = self.trials.band
-        seconds = sum(self.fit.evidence.sizes) / band.rate_hz
-        least = _PERIODS / min(band.cutoff_hz)
-        return min(self.block_s, max(seconds / (BLOCKS_A_PARAMETER * max(fitted, 1.0)), least))
 
     @cached_property
     def sd(self) -> Array:

@@ -33,10 +33,8 @@ def describe_design(design: Primitive, seen: Envelope, device: Device) -> str:
     strokes = {i: one for i, one in design.strokes.items() if i not in beside}
     names = [axes[i].name for i in strokes]
     ends = [_say_ends(one, axes[i].unit) for i, one in strokes.items()]
-    pace, times = (
-        _say_speed(design.strokes[first], seen, first),
-        [_say_pace(s) for s in strokes.values()],
-    )
+    pace = _say_speed(design.strokes[first], seen, first)
+    times = [_say_pace(stroke) for stroke in strokes.values()]
     if len(strokes) == 1:
         text = f"Move {names[0]} {pace} back and forth {ends[0]}, {times[0]}"
     elif len(set(times)) == 1:

@@ -53,11 +53,8 @@ class Forecast:
 
     def proposal(self, ranked: RankedDesign) -> Proposal:
         """Return the record of a design that has been ranked."""
-        device, seen, design = (
-            self.rehearsal.system.model.device,
-            self.rehearsal.seen,
-            ranked.design,
-        )
+        device, seen = self.rehearsal.system.model.device, self.rehearsal.seen
+        design = ranked.design
         names, added = [axis.name for axis in device.coordinates], self.added_by(ranked)
         moved = set(design.strokes) or range(len(names))
         farther, faster = (tuple(names[i] for i in some) for some in find_beyond(design, seen))

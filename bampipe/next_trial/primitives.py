@@ -121,9 +121,8 @@ class Envelope:
         low = np.minimum(self.low, bounds[:, 0] + margin)
         high = np.maximum(self.high, bounds[:, 1] - margin)
         far = high - low > _LEAST_GAIN * (self.high - self.low)
-        highest = np.fmin(_MOST_SPEED_GAIN * self.speed, _LIMIT_SHARE * speeds) * np.isfinite(
-            speeds
-        )
+        highest = np.fmin(_MOST_SPEED_GAIN * self.speed, _LIMIT_SHARE * speeds)
+        highest = highest * np.isfinite(speeds)
         fast = np.nan_to_num(highest) > _LEAST_GAIN * _FASTEST_SHARE * self.speed
         if not (far | fast).any():
             return self
