@@ -164,12 +164,8 @@ def find_information(
     slope *= ~problem.standstill[trial][:, :, None]
     push = system.input_map(motion.q, u, own) * noise.process_sd[noise.is_force]
     inertia = np.diagonal(system.mass_matrix(motion.q, own), axis1=1, axis2=2).mean(axis=0)
-    damping = np.array(
-        [
-            next((own[i] for i, item in enumerate(system.parameters) if item.name == name), 0.0)
-            for name in (f"viscous.{axis}" for axis in system.coordinates)
-        ]
-    )
+    known = {item.name: value for item, value in zip(system.parameters, own, strict=True)}
+    damping = np.array([known.get(f"viscous.{axis}", 0.0) for axis in system.coordinates])
     stiffness = _stiffness(system, motion, z, u, own)
     spectrum = residual_spectrum(
         len(motion.t),

@@ -146,15 +146,10 @@ def _curves(
         own = force[use, axis]
         if not own.size or np.sqrt(np.mean(own**2)) < _LEAST_SHARE * error[axis]:
             continue
-        best: tuple[float, Variable, Indices] | None = None
-        for variable in known[axis]:
-            which = number_bins(np.concatenate(variable.values)[use], _BINS)
-            share = _explained(own, which)
-            if best is None or share > best[0]:
-                best = share, variable, which
-        if best is None:
-            continue
-        share, variable, which = best
+        binned = [number_bins(np.concatenate(v.values)[use], _BINS) for v in known[axis]]
+        shares = [_explained(own, which) for which in binned]
+        best = int(np.argmax(shares))
+        share, variable, which = shares[best], known[axis][best], binned[best]
         values = np.concatenate(variable.values)[use]
         filled = [b for b in range(which.max() + 1) if np.sum(which == b) >= _FEWEST]
         if len(filled) < 2:

@@ -96,12 +96,8 @@ def problem_of(
         else 1e-4 * max(abs(parameters[i].prior), parameters[i].sd, np.finfo(float).tiny)
         for i in free
     ]
-    weighed = [parameters[i].weighed for i in free]
     known = [parameters[i].prior for i in free]
-    precision = [
-        1.0 / parameters[i].sd ** 2 if counts else 0.0
-        for i, counts in zip(free, weighed, strict=True)
-    ]
+    precision = [1.0 / parameters[i].sd ** 2 if parameters[i].weighed else 0.0 for i in free]
     # Moved in time, inputs change the slopes that they are part of.
     constant = system.unforced if timing else system.constant
     same = [constant[i] and not system.moves_sensors for i in free]

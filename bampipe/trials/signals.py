@@ -95,16 +95,11 @@ class Signals:
             offset[places] = -matrix @ np.array(session.force.zero)[order]
         gain_sd = np.zeros_like(gain)
         gain_sd[np.ix_(places, places)] = force.crosstalk_sd
+        scale_sd = dict.fromkeys(force.columns, force.gain_sd)
+        scale_sd |= {name: one.scale_sd for name, one in session.channels.items()}
+        scale_sd |= {name: one.scale_sd for name, one in session.axes.items()}
         for i, name in enumerate((*axes, *inputs)):
-            gain_sd[i, i] = (
-                session.axes[name].scale_sd
-                if name in session.axes
-                else session.channels[name].scale_sd
-                if name in session.channels
-                else force.gain_sd
-                if name in force.columns
-                else 0.0
-            )
+            gain_sd[i, i] = scale_sd.get(name, 0.0)
         return cls(
             axes, forces, channels, brakes, tuple(units), tuple(stated), gain, offset, gain_sd,
             offset_sd,
