@@ -24,7 +24,7 @@ from numba import boolean, float64, int64, void
 from scipy.optimize import minimize_scalar
 
 from bampipe.arrays import Array, Flags
-from bampipe.compiled import njit, record_type
+from bampipe.compiled import njit, part, record_type
 from bampipe.estimate.differentiation import Derivatives
 
 ORDERS = (3, 4)
@@ -56,7 +56,7 @@ def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
     return float((2.0 * np.pi * bandwidth_hz / rate_hz) ** (2 * order))
 
 
-@njit(void(_V, _M, _M, _M, _M), cache=True)
+@part()
 def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None:
     """Advance state ``x`` (n,) and covariance ``p`` (n, n) by one sample, in place."""
     n = x.shape[0]
@@ -80,10 +80,7 @@ def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None
             p[j, i] = total
 
 
-@njit(
-    "UniTuple(float64, 2)(float64[::1], float64[:, ::1], float64, float64[::1])",
-    cache=True,
-)
+@part()
 def _update(x: Array, p: Array, y: float, gain: Array) -> tuple[float, float]:
     """Take in one sample ``y`` of noise 1, in place; return innovation and its variance."""
     n = x.shape[0]

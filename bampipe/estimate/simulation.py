@@ -18,7 +18,7 @@ from numba import float64, int64, void
 from scipy.interpolate import CubicSpline
 
 from bampipe.arrays import Array, Indices
-from bampipe.compiled import njit, record_type
+from bampipe.compiled import njit, part, record_type
 from bampipe.errors import InputError
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.triangular import cholesky, forward_substitute
@@ -164,7 +164,7 @@ def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-
     return min(int(np.ceil(dt * fastest)), _MOST_STEPS)
 
 
-@njit(void(DERIVATIVE, _V, _V, PLANT, _ARM, _V, _V, _WORKSPACE), cache=True)
+@part()
 def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, work):  # type: ignore[no-untyped-def]
     """Handle force that alone would give the acceleration which the arm demands: ``work.goal``."""
     p, w, force, out = plant.p, plant.w, arm.force, work.goal
