@@ -69,9 +69,10 @@ class Generated:
 def module_title(name: str, source: str) -> str:
     """Name under which the module ``name`` of a model is imported by others of the same model.
 
-    It is named by what is in it: models with the same text share what is compiled from it.
+    It is named by what is in it: models with the same text share what is compiled from it, whatever
+    number the module has in each.
     """
-    return f"bampipe_generated_{name}_{digest_bytes(source.encode())[:24]}"
+    return f"bampipe_generated_{name.rstrip('0123456789')}_{digest_bytes(source.encode())[:24]}"
 
 
 def load(key: str, generate: Callable[[], tuple[dict[str, Any], Mapping[str, str]]]) -> Generated:

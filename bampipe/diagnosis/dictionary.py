@@ -8,17 +8,15 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.signal import csd
 
-from bampipe.arrays import Array, Indices
+from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_columns
 from bampipe.diagnosis.ranges import MachineScale, SearchRange
 from bampipe.physics.system import System
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import Samples, take_samples
-from bampipe.trials.motion import Motion
+from bampipe.trials.scale import NO_SLOPE, gain_of_filter, slopes_by_force
 
 _ALONE, _SEVERAL = 7, 5
 """Values of a shape on the grid: of an effect with one, and of each of an effect with several."""
@@ -30,10 +28,6 @@ _MOST, _MOST_OF_THREE, _MOST_OF_STATES = 60, 120, 300
 happen, not only how large they are; three of them at most, or more."""
 _DIVERGED = 1e30
 """An internal state that is too stiff to be integrated at the sampling rate ends above this."""
-_NO_SLOPE = 1e-3
-"""Slope by a constant force up to which a candidate passes it as it is."""
-_SEGMENT = 128
-"""Thinned samples of a segment from which the gain of a filter is found."""
 
 Key = tuple[str, tuple[float, ...]]
 """A candidate and its shape: each searched parameter as a share, 0 to 1, of its range."""
@@ -142,7 +136,8 @@ class Dictionary:
             for k in range(next(iter(found.values())).shape[1])
         ):
             return None
-        slopes = self._slopes(item, values)
+        one_each = np.eye(len(item.linear_indices)) if item.linear_indices else np.zeros((1, 0))
+        slopes = self._slopes(item, [self._parameters(item, values, b) for b in one_each])
         gain = self._gain(item, self._parameters(item, values), slopes)
         return Atom(found, slopes, gain)
 
@@ -158,8 +153,8 @@ class Dictionary:
         count = len(item.system.parameters) - len(item.parameters)
         own = [parameters[q.name] for q in item.parameters]
         p = np.concatenate([self.evidence.p[:count], own])
-        slopes = self._slopes_at(item, p)
-        return slopes, self._gain(item, p, slopes)
+        slopes = self._slopes(item, [p])
+        return {a: s[:, :, 0] for a, s in slopes.items()}, self._gain(item, p, slopes)
 
     def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
         """`make` each."""
@@ -174,27 +169,23 @@ class Dictionary:
         p[[count + i for i in item.linear_indices]] = strengths
         return p
 
-    def _slopes(self, item: Candidate, searched: Array) -> dict[int, Array]:
-        one_each = np.eye(len(item.linear_indices)) if item.linear_indices else np.zeros((1, 0))
-        each = [self._slopes_at(item, self._parameters(item, searched, b)) for b in one_each]
-        zero = {a: np.zeros_like(slope) for slopes in each for a, slope in slopes.items()}
-        return {a: np.stack([s.get(a, z) for s in each], axis=2) for a, z in zero.items()}
+    def _slopes(self, item: Candidate, probes: Sequence[Array]) -> dict[int, Array]:
+        """Slopes of what a candidate adds by each measured force, by axis, (n, n_forces, m).
 
-    def _slopes_at(self, item: Candidate, p: Array) -> dict[int, Array]:
-        """The same at given parameters, (n_p,), each (n, n_forces)."""
-        e, system, rows = self.evidence, item.system, []
+        At parameters ``probes``, m times (n_p,), that give it the same internal states.
+        """
+        e, system = self.evidence, item.system
         if not (system.driven or system.force_fed):
             return {}
-        for motion in e.motions:
-            kept = e.band.thinned_rows(len(motion.t))
-            slope = _slope_by_force(system, motion, kept, p)
-            if item.is_joint:
-                slope = slope - _slope_by_force(e.system, motion, kept, e.p)
-            rows.append(slope)
+        rows = slopes_by_force(system, e.motions, e.band, probes)
+        if item.is_joint:
+            own = e.slopes_by_force
+            rows = tuple(r - o[..., None] for r, o in zip(rows, own, strict=True))
+        return self._by_axis(rows)
+
+    def _by_axis(self, rows: Sequence[Array]) -> dict[int, Array]:
         found = [take_samples(rows, here, a) for a, here in enumerate(self.samples)]
-        return {
-            axis: slope for axis, slope in enumerate(found) if (np.abs(slope) > _NO_SLOPE).any()
-        }
+        return {axis: slope for axis, slope in enumerate(found) if (np.abs(slope) > NO_SLOPE).any()}
 
     def _gain(self, item: Candidate, p: Array, slopes: Mapping[int, Array]) -> Array:
         """What a candidate leaves of the noise of the forces, `Atom.gain`.
@@ -203,58 +194,46 @@ class Dictionary:
             item: the candidate; p: parameters of its system, (n_p,).
             slopes: what it changes of a constant force; a filter passes that.
         """
-        e, system, through = self.evidence, item.system, []
-        if slopes or item.linear_indices or not system.force_fed:
+        if slopes or item.linear_indices or not item.system.force_fed:
             return np.ones(len(self.samples))
-        for motion in e.motions:
-            u = motion.inputs(system.inputs)
-            z = system.memory(*motion.kinematics, u, p, motion.t)
-            through.append(e.band.thin(system.applied(*motion.kinematics, z, u, p)))
-        found, band = np.ones(len(self.samples)), e.band.passed_power(_SEGMENT // 2)
-        for axis, auto in enumerate(self._power):
-            pairs = [(x[:, axis], y[:, axis]) for x, y in zip(self._plain, through, strict=True)]
-            if any(not np.array_equal(x, y) for x, y in pairs):
-                gain = np.abs(sum(_spectrum(x, y) for x, y in pairs)) / np.maximum(auto, 1e-300)
-                found[axis] = np.average(np.clip(gain, 1e-2, 1.0) ** 2, weights=band[:, axis])
-        return found
+        after = self._applied(item.system, p)
+        return gain_of_filter(self._applied_by_model, after, self.evidence.band)
 
     @cached_property
-    def _plain(self) -> list[Array]:
+    def _applied_by_model(self) -> list[Array]:
         """The applied force by the model, low-passed, by trial, each (K, n_q)."""
         return [self.evidence.band.thin(fitted.applied) for fitted in self.evidence.fitted]
 
-    @cached_property
-    def _power(self) -> list[Array]:
-        """Its power spectrum, by axis."""
-        columns = ([x[:, a] for x in self._plain] for a in range(len(self.samples)))
-        return [np.abs(sum(_spectrum(x, x) for x in each)) for each in columns]
+    def _applied(self, system: System, p: Array) -> list[Array]:
+        found = []
+        for motion in self.evidence.motions:
+            u = motion.inputs(system.inputs)
+            z = system.memory(*motion.kinematics, u, p, motion.t)
+            found.append(self.evidence.band.thin(system.applied(*motion.kinematics, z, u, p)))
+        return found
 
+    def scale_without(
+        self, name: str, absence: Mapping[int, float]
+    ) -> tuple[dict[int, Array], Array]:
+        """`scale_left` where one of the model's own effects is taken away.
 
-def _slope_by_force(system: System, motion: Motion, kept: Indices, p: Array) -> Array:
-    """Derivative of what the effects of a model add by each measured force, (K, n_q, n_forces).
-
-    By a force that is more all the time, so that internal states which follow it have come to rest.
-    """
-    u, forces = motion.inputs(system.inputs), system.model.device.forces
-    motion = motion.of_mechanism(system, u, p)
-    at = motion.q[kept], motion.qd[kept], motion.qdd[kept]
-    z = system.memory(*motion.kinematics, u, p, motion.t)
-    here, slopes = system.contribution(*at, z[kept], u[kept], p), []
-    for force in forces:
-        more, column = u.copy(), system.inputs.index(force)
-        step = 1e-6 * max(float(np.abs(more[:, column]).max()), 1e-6)
-        more[:, column] += step
-        if system.force_fed:
-            z = system.memory(*motion.kinematics, more, p, motion.t)
-        slopes.append((system.contribution(*at, z[kept], more[kept], p) - here) / step)
-    return np.stack(slopes, axis=2)
-
-
-def _spectrum(x: Array, y: Array) -> NDArray[np.complex128]:
-    """Cross spectral density of two series, (_SEGMENT // 2,)."""
-    n = min(_SEGMENT, len(x))
-    found = csd(x, y, nperseg=n, nfft=_SEGMENT, detrend="linear")[1]
-    return np.asarray(found[: _SEGMENT // 2])
+        Args:
+            name: of the effect; absence: change of each free parameter that takes it away.
+        """
+        e, unchanged = self.evidence, np.ones(len(self.samples))
+        moved = {e.free[place]: change for place, change in absence.items() if change}
+        if not (e.system.parameters_by_force & moved.keys()):
+            return {}, unchanged
+        p = e.p.copy()
+        p[list(moved)] += list(moved.values())
+        rows = slopes_by_force(e.system, e.motions, e.band, [p])
+        slopes = self._by_axis(
+            [r[..., 0] - own for r, own in zip(rows, e.slopes_by_force, strict=True)]
+        )
+        if slopes or all(e.system.linear[i] for i in moved):
+            return slopes, unchanged
+        before = self._applied(e.system, p)
+        return slopes, 1.0 / gain_of_filter(before, self._applied_by_model, e.band)
 
 
 _MULTIPLE = (0.5, 2.0)

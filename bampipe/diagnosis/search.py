@@ -26,6 +26,7 @@ from bampipe.trials.likelihood import (
     solve_bounded,
     solve_scaled,
 )
+from bampipe.trials.scale import log_of_share
 
 _STEP = 0.02
 """Of a shape's range: the step of its slope."""
@@ -91,6 +92,7 @@ class Search:
         self._own_penalties: dict[str, float] = {}
         self.least_size = criteria.size
         self._squares: dict[Key, dict[int, Array]] = {}
+        self._scale_without: dict[str, tuple[dict[int, Array], Array]] = {}
         self.applied = [max(float(f @ f), 1e-300) for f in p.likelihood.applied]
         self._weight = p.independent / np.maximum(self.yy, 1e-300)
         grid = [key for name in dictionary.candidates for key in dictionary.grid(name)]
@@ -221,9 +223,13 @@ class Search:
             return Solution(np.inf)
         strengths = tuple(b[nb:][h] for h in held)
         scale = solved.left / p.count
-        volume = self._volume(self._log_slopes(keys, strengths, scale))
+        volume = self._volume(self._log_slopes(all_keys, strengths, scale))
         if volume is None:
             return Solution(np.inf)
+        # The cost has what its own parameters leave of the scale in second order, absent ones, too.
+        places_of, change = list(absent), np.array([*absent.values()])
+        first = self._own_log_scale[:, places_of] @ change
+        volume = volume - p.independent * (first - 0.5 * first**2)
         sizes: tuple[float, ...] = ()
         # What an effect of the model costs is not in the cost of the model as it is.
         penalty = self.penalty_of(all_keys)
@@ -331,11 +337,20 @@ class Search:
             for axis, square in self._squares[key].items()
         )
 
+    @property
+    def _own_log_scale(self) -> Array:
+        """Slopes of the mean log of what the model leaves of the scale, (n_q, n)."""
+        return self.dictionary.evidence.log_scale[1]
+
     def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
         """`Solution.volume` of a set with the parameters of a model that was fitted with it."""
         known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
         each = [self.dictionary.scale_left(name, known) for name, _ in added(keys)]
-        return self._volume(self._log_of_slopes(each, self.solve(keys).scale))
+        gains = [gain for _, gain in [*each, *map(self._without, gone(keys))]]
+        filters: list[tuple[dict[int, Array], Array]] = [({}, gain) for gain in gains]
+        scale = evidence.log_scale[0] - self.dictionary.evidence.log_scale[0]
+        rows = self._log_of_slopes(filters, self.solve(keys).scale)
+        return self._volume([r + here for r, here in zip(rows, scale, strict=True)])
 
     def _volume(self, rows: Sequence[Array]) -> Array | None:
         """By axis, independent samples times the mean log of what is left of what was measured.
@@ -343,18 +358,26 @@ class Search:
         None where so little is left of the force that the equation has no scale.
         """
         means = np.array([float(r.mean()) if len(r) else 0.0 for r in rows])
-        return None if (means < np.log(_LEAST_SLOPE)).any() else self.p.independent * means
+        left = self.dictionary.evidence.log_scale[0] + means
+        return None if (left < np.log(_LEAST_SLOPE)).any() else self.p.independent * means
 
     def _log_slopes(
         self, keys: Sequence[Key], strengths: Sequence[Array], scale: Array
     ) -> list[Array]:
         """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
-        atoms = [self._atom(key) for key in keys]
+        atoms = [self._atom(key) for key in added(keys)]
         each = [
             ({axis: slope @ b for axis, slope in atom.slopes.items()}, atom.gain)
             for atom, b in zip(atoms, strengths, strict=True)
         ]
-        return self._log_of_slopes(each, scale)
+        return self._log_of_slopes([*each, *map(self._without, gone(keys))], scale)
+
+    def _without(self, name: str) -> tuple[dict[int, Array], Array]:
+        """Slopes and gain that it adds to take one of the model's own effects away."""
+        if name not in self._scale_without:
+            absence = self.p.absence[name]
+            self._scale_without[name] = self.dictionary.scale_without(name, absence)
+        return self._scale_without[name]
 
     def _log_of_slopes(
         self, each: Sequence[tuple[Mapping[int, Array], Array]], scale: Array
@@ -369,14 +392,11 @@ class Search:
             gains *= gain
         # A filter takes off the noise of the forces, and what is beyond that of replays; that of
         # the motion stays.
-        for axis in map(int, np.flatnonzero(gains < 1.0)):
+        for axis in map(int, np.flatnonzero(gains != 1.0)):
             kept = (1.0 - self.p.likelihood.force_share[axis]) / max(float(scale[axis]), 1.0)
             found[axis] = found[axis] + 0.5 * np.log(kept + (1.0 - kept) * gains[axis])
         for axis, slope in moved.items():
-            plain = self.p.likelihood.slopes[axis]
-            bare = np.linalg.norm(plain, axis=1)
-            share = np.linalg.norm(plain + slope, axis=1) / np.where(bare > 0.0, bare, 1.0)
-            found[axis] = found[axis] + np.where(bare > 0.0, np.log(np.maximum(share, 1e-3)), 0.0)
+            found[axis] = found[axis] + log_of_share(self.p.likelihood.slopes[axis], slope)
         return found
 
     def penalty_of(self, keys: Sequence[Key]) -> float:
@@ -416,7 +436,7 @@ class Search:
     def volume_rows(self, keys: Sequence[Key]) -> list[Array]:
         """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
         solved = self.solve(keys)
-        return self._log_slopes(added(tuple(sorted(keys))), solved.strengths, solved.scale)
+        return self._log_slopes(tuple(sorted(keys)), solved.strengths, solved.scale)
 
     def cost(self, keys: Sequence[Key]) -> float:
         """Negative log evidence of a set, nats."""

@@ -144,10 +144,10 @@ def select_effects(
     fits: dict[frozenset[str], Fit | None] = {frozenset(recipe.effects): current}
     gains: dict[str, float] = {}
     known: Search | None = None
-    last = False
-    for number in range(_MOST_ROUNDS):
+    last, left_out = False, set[str]()
+    for number in range(_MOST_ROUNDS + 1):
         progress(0.1 + 0.1 * number, "weighing sets of effects")
-        with open_search(session, current, without, known) as search:
+        with open_search(session, current, {*without, *left_out}, known) as search:
             known = search
             none = search.cost(())
             if not gains:
@@ -156,7 +156,7 @@ def select_effects(
             room = session.criteria.most_effects - len(current.recipe.effects) + len(recipe.effects)
             pool = _explore(search, room, deep=room if number == 0 else min(_DEEP, room))
             moved: Fit | None = None
-            last |= number == _MOST_ROUNDS - 1
+            last |= number >= _MOST_ROUNDS - 1
             better = [(c, k) for c, k in sorted(pool.values()) if c < none - _WORTH]
             broken: list[set[Key]] = []
             kept: dict[tuple[str, ...], float] = {}
@@ -197,28 +197,41 @@ def select_effects(
                 )
                 moved = (
                     None
-                    if number == _MOST_ROUNDS - 1
-                    else _leave_out(session, current, weighed, recipe.effects)
+                    if number == _MOST_ROUNDS
+                    else _leave_out(session, search, current, weighed, recipe.effects)
                 )
                 if moved is None:
                     return Selection(
                         initial, current, weighed, chance, search.largest_gain(), gains,
-                        tuple(steps), number == _MOST_ROUNDS - 1 or room <= 0,
+                        tuple(steps), number >= _MOST_ROUNDS - 1 or room <= 0,
                     )  # fmt: skip
-                last = True
+                # A second time, nothing more is added.
+                last |= bool(left_out)
+                left_out |= {*current.recipe.effects} - {*moved.recipe.effects}
         current = moved
         steps.append(current)
     raise AssertionError("the last round returns")
 
 
-def _leave_out(session: Session, fit: Fit, weighed: Weighed, given: Collection[str]) -> Fit | None:
-    """The model without the effects that came out improbable; None where there are none."""
+def _leave_out(
+    session: Session, search: Search, fit: Fit, weighed: Weighed, given: Collection[str]
+) -> Fit | None:
+    """The model without the effects that came out improbable; None where there are none.
+
+    With what the most probable set has in their place.
+    """
     least = 1.0 - session.criteria.probability
-    added = [e for e in fit.recipe.effects if e not in given]
-    out = [e for e in added if weighed.effects.get(e, 0.0) < least]
+    own = [e for e in fit.recipe.effects if e not in given]
+    out = {e for e in own if weighed.effects.get(e, 0.0) < least}
     if not out:
         return None
-    less = without_members(fit.recipe, out)
+    best = weighed.sets[0].keys
+    if not (out & gone(best)):
+        best = ()
+    keys = tuple(sorted({*best, *((f"-{e}", ()) for e in out)}))
+    less = change_set(fit.recipe, keys)
+    if np.isfinite(search.cost(keys)):
+        return session.try_fit(less, start_of(search, keys, less))
     known = {q.name: v for q, v in zip(fit.evidence.system.parameters, fit.evidence.p, strict=True)}
     return session.try_fit(less, np.array([known[q.name] for q in system_of(less).parameters]))
 
@@ -239,10 +252,9 @@ def gain_when_fitted(before: Fit, after: Fit, search: Search, keys: Sequence[Key
             ]
             ratio = max(squares[1], 1e-300) / max(squares[0], 1e-300)
             gained -= 0.5 * before.problem.independent[axis] * float(np.log(ratio))
-    promised, taken = search.solve(keys), search.volume_where_fitted(keys, after.evidence)
-    # What a fit ends at may take more off the measured quantity than its linear problem promised.
-    volume = -np.inf if taken is None else float(np.minimum(promised.volume, taken).sum())
-    return gained + volume - promised.penalty
+    volume = search.volume_where_fitted(keys, after.evidence)
+    taken = -np.inf if volume is None else float(volume.sum())
+    return gained + taken - search.solve(keys).penalty
 
 
 def _explore(search: Search, room: int, deep: int) -> Pool:

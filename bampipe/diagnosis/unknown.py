@@ -129,7 +129,7 @@ def weigh_unknown(
             left[axis] = left[axis] + x @ c
             squares = np.maximum([float(v @ v) for v in left], 1e-300)
             weight = p.independent / squares
-        cost = float(p.independent @ (0.5 * np.log(squares / p.count)))
+        cost = p.fixed_cost + float(p.independent @ (0.5 * np.log(squares / p.count)))
         moved = fixed + free @ b
         cost += 0.5 * float(moved @ p.precision @ moved) - float(p.moment @ moved)
         cost += 0.5 * known * float(c @ c)

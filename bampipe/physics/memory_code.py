@@ -157,39 +157,57 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
 '''
 
 
-def memory_source(e: Equations) -> tuple[str, dict[str, list[int]]]:
-    """Source of the compiled internal states along a motion, and the columns that it takes.
+def group_states(e: Equations) -> list[list[int]]:
+    """Numbers of the internal states, those together whose rates depend on each other.
 
-    It knows its columns by number only: the states of an effect have the same text on every joint,
-    which is compiled once.
+    And those of one effect, which are followed in one loop.
+    """
+    groups: list[set[int]] = []
+    effects = [name.rpartition(".")[0] for name in e.z_names]
+    for rate, effect in zip(e.rates, effects, strict=True):
+        joined = {k for k, z in enumerate(e.z) if z in rate.free_symbols or effects[k] == effect}
+        apart = [g for g in groups if not g & joined]
+        groups = [*apart, joined.union(*(g for g in groups if g & joined))]
+    return sorted(sorted(g) for g in groups)
+
+
+def memory_source(e: Equations, places: Sequence[int]) -> tuple[str, dict[str, list[int]]]:
+    """Source of compiled internal states along a motion, and the columns that it takes.
+
+    It knows its columns by number only: the states of an effect have the same text on every joint
+    and in every model, which is compiled once.
+
+    Args:
+        e: the equations; places: numbers of the states, a group of `group_states`.
 
     Returns:
         The source, and by group (q, qd, u, p) the numbers of the columns that are passed; those of
         qdd are those of qd.
     """
-    slopes = [sp.diff(rate, z) for rate, z in zip(e.rates, e.z, strict=True)]
-    others = [set(e.z) - {z} for z in e.z]
-    coupled = any(r.free_symbols & o for r, o in zip(e.rates, others, strict=True))
+    z_all, rates = [e.z[i] for i in places], [e.rates[i] for i in places]
+    slopes = [sp.diff(rate, z) for rate, z in zip(rates, z_all, strict=True)]
+    others = [set(z_all) - {z} for z in z_all]
+    coupled = any(r.free_symbols & o for r, o in zip(rates, others, strict=True))
     groups = {"q": e.q, "qd": e.qd, "u": e.u, "p": e.p}
-    used_symbols = set().union(*(sp.sympify(rate, strict=True).free_symbols for rate in e.rates))
+    used_symbols = set().union(*(sp.sympify(rate, strict=True).free_symbols for rate in rates))
     uses = {g: [i for i, s in enumerate(some) if s in used_symbols] for g, some in groups.items()}
     column_symbols = {
         groups[g][i]: sp.Symbol(f"{g}_{k:03d}", real=True)
-        for g, places in uses.items()
-        for k, i in enumerate(places)
+        for g, numbers in uses.items()
+        for k, i in enumerate(numbers)
     }
-    column_symbols |= {z: sp.Symbol(f"z_{k:03d}", real=True) for k, z in enumerate(e.z)}
+    column_symbols |= {z: sp.Symbol(f"z_{k:03d}", real=True) for k, z in enumerate(z_all)}
     passed_symbols = {
-        g: [column_symbols[groups[g][i]] for i in places] for g, places in uses.items()
+        g: [column_symbols[groups[g][i]] for i in numbers] for g, numbers in uses.items()
     }
-    states = [column_symbols[z] for z in e.z]
+    states = [column_symbols[z] for z in z_all]
 
     def number_columns(expressions: Sequence[Any]) -> list[Any]:
         return [sp.sympify(x, strict=True).xreplace(column_symbols) for x in expressions]
 
-    if coupled or any(slope.free_symbols & set(e.z) for slope in slopes):
+    if coupled or any(slope.free_symbols & set(z_all) for slope in slopes):
         groups_of = {**passed_symbols, "z": states}
-        rate = _memory_function("memory_rate", groups_of, {"dz": number_columns(e.rates)})
+        rate = _memory_function("memory_rate", groups_of, {"dz": number_columns(rates)})
         fastest = "np.inf" if coupled else repr(STIFF_STEPS * STABLE)
         head = f"import numpy as np\nFASTEST = {fastest}\nACCURATE = {ACCURATE}\n"
         head += f"COUPLED = {coupled}\n"
@@ -198,7 +216,7 @@ def memory_source(e: Equations) -> tuple[str, dict[str, list[int]]]:
             slope = _memory_function("memory_slope", groups_of, {"slope": number_columns(slopes)})
             source += slope + STIFF_MEMORY_LOOP
         return source, uses
-    rates_at_zero = [rate.subs(z, 0) for rate, z in zip(e.rates, e.z, strict=True)]
+    rates_at_zero = [rate.subs(z, 0) for rate, z in zip(rates, z_all, strict=True)]
     terms = _memory_function(
         "memory_terms",
         passed_symbols,

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import sympy as sp
+
 from bampipe import generated_code
 from bampipe.model_functions import ROWS
 from bampipe.physics.codegen import (
@@ -21,7 +23,7 @@ from bampipe.physics.codegen import (
 )
 from bampipe.physics.derivation import derive
 from bampipe.physics.equations import Equations, contribution
-from bampipe.physics.memory_code import memory_source
+from bampipe.physics.memory_code import group_states, memory_source
 from bampipe.physics.model import Model
 
 Generation = tuple[dict[str, Any], dict[str, str]]
@@ -49,25 +51,30 @@ def effects_code(model: Model) -> Generation:
         "moved_by": [
             i for i, p in enumerate(equations.p) if any(e.has(p) for e in equations.offset)
         ],
-        "driven": any(e.has(*forces) for e in added),
+        "driven": any(sp.diff(e, force) != 0 for e in added for force in forces),
         "force_fed": any(e.has(*forces) for e in equations.rates),
         "moved_first": moved_first(equations, forces),
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
         "delays": equations.delays,
-        "memory_uses": {},
-        "commands": [
-            i
-            for i, u in enumerate(equations.u)
-            if u not in forces
-            and equations.inputs[i] != "t"
-            and any(u in e.free_symbols for e in equations.rates)
-        ],
         "braked": any(brakes & e.free_symbols for e in (*added, *equations.rates)),
     }
     sources = {"columns": array_source(equations, added)}
-    if equations.z:
-        sources["memory"], facts["memory_uses"] = memory_source(equations)
-    return facts, sources
+    uncommanded, groups = {*forces, channels.get("t")}, []
+    for k, places in enumerate(group_states(equations)):
+        sources[f"memory{k}"], uses = memory_source(equations, places)
+        commands = [c for c, i in enumerate(uses["u"]) if equations.u[i] not in uncommanded]
+        starts = set().union(*(sp.sympify(equations.initial[i]).free_symbols for i in places))
+        numbers = {i for i, p in enumerate(equations.p) if p in starts} | {*uses["p"]}
+        groups.append(
+            {
+                "module": f"memory{k}",
+                "places": places,
+                "uses": uses,
+                "commands": commands,
+                "parameters": sorted(numbers),
+            }
+        )
+    return facts | {"state_groups": groups}, sources
 
 
 def whole_code(model: Model) -> Generation:

@@ -13,7 +13,7 @@ import numpy as np
 from bampipe import generated_code
 from bampipe.arrays import Array, Indices
 from bampipe.physics.device import INPUT_ORDERS, derivative
-from bampipe.physics.memory import integrate_memory
+from bampipe.physics.memory import StateGroup
 from bampipe.physics.model import Model
 from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.parameter import Parameter
@@ -80,8 +80,7 @@ class System:
         self.compensated: tuple[int, ...] = tuple(meta["compensated"])
         self.delays: tuple[str, ...] = tuple(meta["delays"])
         self.braked: bool = meta["braked"]
-        self._commands: list[int] = meta["commands"]
-        self._memory_uses: dict[str, list[int]] = meta["memory_uses"]
+        self.state_groups = tuple(StateGroup(**group) for group in meta["state_groups"])
 
     @property
     def has_free_delay(self) -> bool:
@@ -102,6 +101,16 @@ class System:
             if any(not p.fixed and p.name in self.delays for p in item.parameters):
                 results |= {forces[item.target]} if item.target in forces else {*device.forces}
         return results
+
+    @cached_property
+    def parameters_by_force(self) -> frozenset[int]:
+        """Numbers of the parameters of effects that alone change how a measured force acts."""
+        names, found = [q.name for q in self.parameters], set[int]()
+        for item in self.model.effects if self.driven or self.force_fed else ():
+            alone = compile_model(Model(self.model.device, (item.name,), (item.effect,)))
+            if alone.driven or alone.force_fed:
+                found |= {names.index(q.name) for q in item.parameters}
+        return frozenset(found)
 
     @cached_property
     def forced(self) -> tuple[int, ...]:
@@ -401,12 +410,21 @@ class System:
             q, qd, qdd, u, p: as in `required`.
             t: time, (T,), s.
         """
-        if not self.memory_names:
-            return np.zeros((len(q), 0))
-        z0, module = self.initial_memory(q[0], u[0], p), self._code.module("memory")
-        return integrate_memory(
-            module, self._memory_uses, self._commands, (q, qd, qdd, u, p, t), z0
-        )
+        out = np.zeros((len(q), len(self.memory_names)))
+        for group in self.state_groups:
+            out[:, group.places] = self.memory_of(group, q, qd, qdd, u, p, t)
+        return out
+
+    def memory_of(
+        self, group: StateGroup, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array
+    ) -> Array:
+        """`memory` of one of `state_groups`, (T, n): it changes with ``group.parameters`` alone."""
+        z0 = self.initial_memory(q[0], u[0], p)[group.places]
+        return group.integrate(self._state_modules[group.module], (q, qd, qdd, u, p, t), z0)
+
+    @cached_property
+    def _state_modules(self) -> dict[str, ModuleType]:
+        return {group.module: self._code.module(group.module) for group in self.state_groups}
 
 
 def _stack(columns: tuple[Any, ...], rows: int) -> Array:

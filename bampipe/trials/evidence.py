@@ -24,6 +24,7 @@ from bampipe.physics import System
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial, applied_rms, problem_of
+from bampipe.trials.scale import log_scale, slopes_by_force
 
 _REFITS = 6
 """Most Gauss-Newton steps of a refit that starts at the fit to all trials."""
@@ -100,6 +101,23 @@ class Evidence:
             return list(self.jacobian)
         pairs = zip(self.jacobian, self.by_timing, strict=True)
         return [np.append(x, by[:, :, None], axis=2) for x, by in pairs]
+
+    @cached_property
+    def slopes_by_force(self) -> tuple[Array, ...]:
+        """What `scale.slopes_by_force` returns of the model, by trial, each (K, n_q, n_forces)."""
+        each = slopes_by_force(self.system, self.motions, self.band, [self.p])
+        return tuple(slope[..., 0] for slope in each)
+
+    @cached_property
+    def log_scale(self) -> tuple[Array, Array]:
+        """Mean log of what the effects leave of the measured quantity, and its slopes.
+
+        See `scale.log_scale`, (n_q,) and (n_q, n), by the same parameters as `slopes`.
+        """
+        value, slopes = log_scale(
+            self.system, self.motions, self.band, self.used, self.p, self.free
+        )
+        return value, np.pad(slopes, ((0, 0), (0, 1 if self.by_timing else 0)))
 
     @property
     def sizes(self) -> list[int]:

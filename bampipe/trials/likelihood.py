@@ -5,11 +5,12 @@ Of the samples of an axis that count, in the words of docs/method_residual:
     y = f(motion; theta) + beta b + gamma c + e
     var e ~ s^2 (v(z) + tau^2 (b^2 + g^2 c^2) + h^2 + (delta F)^2), with the tails of Student's t
 
-y is what the fitted model leaves, low-passed; b the mean of replays of the model (what filters do
-to its residual where friction turns, which the measurement shares); c the residual of a replay
-whose friction truly stops the machine where it turns, and g a first guess of its factor; v what
-single replays leave around b, by speed; h what friction is off because no log says when between two
-samples a machine turns; F the applied force; s a scale of each axis, which is found
+It is that of the measured quantity: with the log of what the model's effects leave of it, see
+`scale`. y is what the fitted model leaves, low-passed; b the mean of replays of the model (what
+filters do to its residual where friction turns, which the measurement shares); c the residual of a
+replay whose friction truly stops the machine where it turns, and g a first guess of its factor; v
+what single replays leave around b, by speed; h what friction is off because no log says when
+between two samples a machine turns; F the applied force; s a scale of each axis, which is found
 with the rest. Parameters have their priors and bounds; so have the nuisance parameters: the factors
 beta and gamma of each axis, and the time by which inputs were sampled late.
 """
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -25,6 +27,7 @@ from bampipe.arrays import Array, Flags, Indices
 from bampipe.physics.effect import BoundEffect
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.motion import Motion
+from bampipe.trials.scale import bare_slopes
 
 _SPEEDS = 12
 """Classes of speed in which the variance of replays is averaged, finer where an axis is slow."""
@@ -170,7 +173,7 @@ class Likelihood:
         root: one over the standard deviation of each sample, by axis, each (n,).
         bias_variance: how far the bias may be off where the machine turns, by axis, each (n,).
         applied: the applied force, by axis, each (n,), N.m or N.
-        slopes: its derivative by each measured force, by axis, each (n, n_forces).
+        slopes: its derivative by each measured force, effects included, by axis, (n, n_forces).
         force_share: share of the noise of each sample that is that of the measured forces, by axis,
             each (n,).
         factors: of what is measured where the weights are those of the residual; see `Evidence`.
@@ -200,14 +203,11 @@ class Likelihood:
         Args:
             force_sd: noise of each measured force, (n_forces,), in its unit.
         """
-        e, system = evidence, evidence.system
+        e = evidence
         axes = range(len(samples))
         applied = e.band.thin_trials([fitted.applied for fitted in e.fitted], axes)
-        plain = [
-            system.input_map(m.q[kept], m.inputs(system.inputs)[kept], e.p)
-            for m in e.motions
-            for kept in [e.band.thinned_rows(len(m.t))]
-        ]
+        bare = bare_slopes(e.system, e.motions, e.band, e.p)
+        total = [a + b for a, b in zip(bare, e.slopes_by_force, strict=True)]
         turning = [np.zeros_like(r) for r in e.residual]
         if bias_error:
             turning = e.band.thin_trials(_error_of_turning(e), axes)
@@ -223,12 +223,12 @@ class Likelihood:
             root.append(1.0 / np.sqrt(np.maximum(variance, least)) if least else np.ones(len(f)))
             force.append(f)
             bias_variance.append(of_bias)
-            slope = take_samples(plain, here, axis)
+            slope = take_samples(total, here, axis)
             of_force = np.sum((slope * force_sd) ** 2, axis=1) * white[axis]
             force_share.append(np.minimum(of_force / np.maximum(variance, 1e-300), 1.0))
         return cls(
             samples, noise, tuple(root), tuple(bias_variance), tuple(force),
-            tuple(take_samples(plain, here, axis) for axis, here in enumerate(samples)),
+            tuple(take_samples(total, here, axis) for axis, here in enumerate(samples)),
             tuple(force_share), e.factors,
         )  # fmt: skip
 
@@ -315,29 +315,33 @@ class Problem:
     Attributes:
         likelihood: weights and samples.
         y: by axis, (n,); base: by axis, (n, P), by the determined combinations of parameters.
-        precision, moment: of what is known of these beforehand, (P, P) and (P,).
+        known_precision, known_moment: of what is known of these beforehand, (P, P) and (P,).
+        log_scale: mean log of what the model's effects leave of the measured quantity, by axis,
+            (n_q,); log_scale_slopes: by the same combinations, (n_q, P).
         to_parameters: (n_all, P) from these to the free parameters, nuisance parameters last.
         lower, upper: bounds of the change of those, (n_all,).
         absence: of each effect of the model, by the place of each of its parameters among the free
             ones, the change that takes it away.
         spread: of each, the standard deviations of these strengths before any data; shapes: the
             places of the parameters that it has beside them.
-        prior_cost: negative log density of what is known beforehand, where nothing changes.
+        cost_of_known: negative log density of what is known beforehand, where nothing changes.
         loose: (n_all, m) directions of the parameters in which nothing measured changes.
     """
 
     likelihood: Likelihood
     y: tuple[Array, ...]
     base: tuple[Array, ...]
-    precision: Array
-    moment: Array
+    known_precision: Array
+    known_moment: Array
+    log_scale: Array
+    log_scale_slopes: Array
     to_parameters: Array
     lower: Array
     upper: Array
     absence: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
     spread: Mapping[str, Array] = field(default_factory=dict)
     shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
-    prior_cost: float = 0.0
+    cost_of_known: float = 0.0
     loose: Array | None = None
 
     @property
@@ -349,6 +353,22 @@ class Problem:
     def count(self) -> Array:
         """Samples of each axis, (n_q,), one at least."""
         return np.array([max(float(len(y)), 1.0) for y in self.y])
+
+    @property
+    def moment(self) -> Array:
+        """Slope of the log density of all but the residual where nothing changes, (P,)."""
+        return np.asarray(self.known_moment + self.independent @ self.log_scale_slopes)
+
+    @cached_property
+    def precision(self) -> Array:
+        """Its curvature, (P, P): a share of the scale is linear in the strength of an effect."""
+        slopes = self.log_scale_slopes
+        return np.asarray(self.known_precision + (self.independent * slopes.T) @ slopes)
+
+    @property
+    def fixed_cost(self) -> float:
+        """Negative log density of all but the residual where nothing changes, nats."""
+        return self.cost_of_known - float(self.independent @ self.log_scale)
 
     def sums(self) -> tuple[Array, Array, Array]:
         """Products of the base with itself, with y, and of y with itself, by axis."""
@@ -489,10 +509,11 @@ def _pose(
     kept = values > _DETERMINED * values[-1]
     to = vectors[:, kept] / np.sqrt(values[kept]) * per_unit[:, None]
     loose = vectors[:, ~kept] * per_unit[:, None]
-    effects = evidence.system.model.effects
+    effects, (log_scale, by_parameters) = evidence.system.model.effects, evidence.log_scale
+    by_parameters = np.pad(by_parameters, ((0, 0), (0, 2 * n_q)))
     return Problem(
-        likelihood, tuple(y), tuple(x @ to for x in full),
-        to.T @ (precision[:, None] * to), to.T @ (precision * known), to, lower, upper,
+        likelihood, tuple(y), tuple(x @ to for x in full), to.T @ (precision[:, None] * to),
+        to.T @ (precision * known), log_scale, by_parameters @ to, to, lower, upper,
         {item.name: _absence(evidence, item) for item in effects},
         {item.name: _spread(item) for item in effects},
         {item.name: _shapes(evidence, item) for item in effects},
@@ -599,7 +620,7 @@ def solve_bounded(
         fixed_at |= {k: float(p.lower[k] if below[k] else p.upper[k]) for k in fresh}
     cost = float(independent @ (0.5 * np.log(left / p.count)))
     off = b[:nb]
-    cost += p.prior_cost + 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
+    cost += p.fixed_cost + 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
     return Solved(b, held & (bound == 0.0), left, weight, cost)
 
 

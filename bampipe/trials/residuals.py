@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -49,11 +49,11 @@ def problem_of(
         turning: whether samples count in which an axis turns round.
     """
     n = len(system.parameters)
-    # Of differences by many parameters few change the internal states or the bodies' forces.
-    states = _Remembered[Array](
-        [i for i, linear in enumerate((*system.linear, False)) if not linear]
-    )
+    # Of differences by many parameters few change some internal states or the bodies' forces.
     by_offset = [*system.moved_by, n] if system.moves_sensors else []
+    states = [
+        _Remembered[Array]([*group.parameters, *by_offset, n]) for group in system.state_groups
+    ]
     bodies = _Remembered[Array]([*system.of_bodies, *by_offset])
     moved = _Remembered[tuple[Array, Array, Array]](by_offset)
 
@@ -71,7 +71,10 @@ def problem_of(
         motion = motions[trial]
         u = inputs_at(motion, p)
         true = mechanism(trial, motion, u, p)
-        z = states.find(trial, p, lambda: system.memory(*true, u, p[:n], motion.t))
+        z = np.empty((len(motion.t), len(system.memory_names)))
+        for group, known in zip(system.state_groups, states, strict=True):
+            follow = partial(system.memory_of, group, *true, u, p[:n], motion.t)
+            z[:, group.places] = known.find(trial, p, follow)
         forces = bodies.find(trial, p, lambda: system.body_forces(*true, p[:n]))
         return system.residual(*true, z, u, p[:n], forces)
 

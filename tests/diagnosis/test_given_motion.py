@@ -17,7 +17,16 @@ from bampipe.diagnosis.select import change_set, gain_when_fitted, open_search
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import device_from
-from bampipe.trials.measured import read_measured_trials
+from bampipe.trials.measured import MeasuredTrials, read_measured_trials
+from bampipe.trials.residuals import ModelOnTrial
+from bampipe.trials.scale import log_scale
+
+
+def plain_trials(trials: MeasuredTrials, recipe: Recipe) -> list[ModelOnTrial]:
+    """The model as given, at its priors, on each trial."""
+    model = system_of(recipe)
+    count = len(trials.motions)
+    return [ModelOnTrial(model, model.prior, trials.motions, k) for k in range(count)]
 
 
 def test_delays_shorter_than_the_true_one_promise_what_they_can_at_their_bounds(
@@ -58,3 +67,30 @@ def test_a_drive_that_hardly_acts_any_more_explains_nothing(tmp_path: Path) -> N
         assert search.volume_where_fitted(keys, same.evidence) == pytest.approx([0.0])
         assert search.volume_where_fitted(keys, weaker.evidence) is None
         assert gain_when_fitted(before, small, search, keys) == -np.inf
+    ends = []
+    for sag in (0.0, 0.02, 1.0):
+        p[-1] = sag
+        ends.append(session.fit_plainly(weak, p))
+    for end in ends:
+        assert end.evidence.p[-1] == pytest.approx(ends[0].evidence.p[-1], rel=1e-3, abs=1e-6)
+        assert end.solved.cost <= before.solved.cost + 0.01
+
+
+def test_a_sagging_drive_leaves_the_scale_that_its_curve_has(tmp_path: Path) -> None:
+    """Of d = f/(1 + sag |f|) the slope is 1/(1 + sag |f|)^2; a smooth load rounds it near zero."""
+    trials, recipe, _ = record_trials(tmp_path, "joint", 3)
+    model = system_of(change_set(recipe, [("drive_sag:joint", ())]))
+    p = np.append(system_of(recipe).prior, 0.01)
+    used = [np.abs(r.applied) > 0.5 * np.abs(r.applied).max() for r in plain_trials(trials, recipe)]
+    used = [u[trials.band.thinned_rows(len(u))] for u in used]
+    place = len(p) - 1
+    scale, slopes = log_scale(model, trials.motions, trials.band, used, p, [0, place])
+    force = np.concatenate(
+        [
+            np.abs(r.applied[trials.band.thinned_rows(len(r.applied))][u])
+            for r, u in zip(plain_trials(trials, recipe), used, strict=True)
+        ]
+    )
+    assert scale == pytest.approx([np.mean(-2.0 * np.log(1.0 + 0.01 * force))], rel=1e-3)
+    by_sag = np.mean(-2.0 * force / (1.0 + 0.01 * force))
+    assert slopes == pytest.approx(np.array([[0.0, by_sag]]), rel=1e-2)

@@ -106,7 +106,10 @@ def problem_of(y, base, *, independent=None, lower=-np.inf, upper=np.inf, absenc
     like = Likelihood((samples,), noise, (ones,), (nothing,), (ones,), slopes, (nothing,))
     bounds = np.broadcast_to(lower, n), np.broadcast_to(upper, n)
     precision = 1e-4 * np.eye(n)
-    return Problem(like, (y,), (base,), precision, np.zeros(n), np.eye(n), *bounds, absence or {})
+    scale = np.zeros(1), np.zeros((1, n))
+    return Problem(
+        like, (y,), (base,), precision, np.zeros(n), *scale, np.eye(n), *bounds, absence or {}
+    )
 
 
 @pytest.fixture

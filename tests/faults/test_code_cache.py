@@ -284,7 +284,15 @@ def test_the_memory_of_an_effect_is_compiled_once_for_all_joints(
         qd[:, k] = 0.3 * np.sin(12.0 * t)
         assert np.ptp(system.memory(still, qd, still, u, system.prior, t)) > 0.0
         assert np.ptp(system.memory(still, np.roll(qd, 1, 1), still, u, system.prior, t)) == 0.0
-    assert len({system._code.sources["memory"] for system in systems}) == 1
+    assert len({system._code.sources["memory0"] for system in systems}) == 1
+    both = compile_model(Model(device, [f"presliding:{axis}" for axis in axes]))
+    assert {both._code.sources[g.module] for g in both.state_groups} == {
+        systems[0]._code.sources["memory0"]
+    }
+    together = both.memory(still, qd, still, u, both.prior, t)
+    np.testing.assert_array_equal(
+        together[:, 1:], systems[1].memory(still, qd, still, u, systems[1].prior, t)
+    )
 
 
 def test_a_cache_that_cannot_be_made_is_said(

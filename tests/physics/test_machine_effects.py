@@ -394,11 +394,12 @@ def test_a_hysteresis_too_stiff_for_runge_kutta_is_given_up_early():
     t = np.arange(0.0, 0.1, 1e-3)
     q, qd = 0.3 * t[:, None], np.full((len(t), 1), 0.3)
     u = np.zeros((len(t), len(system.inputs)))
-    uses = system._memory_uses
+    (group,) = system.state_groups
+    uses = group.uses
     columns = [q[:, uses["q"]], qd[:, uses["qd"]], 0.0 * qd[:, uses["qd"]], u[:, uses["u"]]]
     left = np.full((len(t), 1), np.nan)
     arrays = [np.ascontiguousarray(x) for x in (*columns, p[uses["p"]], t, np.zeros(1))]
-    fastest = system._code.module("memory").memory(*arrays, 3, left)
+    fastest = system._code.module(group.module).memory(*arrays, 3, left)
     assert 3 * fastest > STIFF_STEPS * STABLE
     assert np.isnan(left[5:]).all()
     np.testing.assert_allclose(system.memory(q, qd, 0.0 * qd, u, p, t)[5:], 1.0, atol=1e-6)

@@ -332,8 +332,7 @@ class _AxisSearch:
         for key, term, (wider, _), (cost, held_out, p) in zip(
             keys, terms, tasks, fits, strict=True
         ):
-            solution = search.solve((key,))
-            gain = _cost(search.fit) - cost + float(solution.volume.sum()) - solution.penalty
+            gain = search.fit.solved.cost - cost - search.solve((key,)).penalty
             found.append(Option(term, held_out, current.log_evidence + gain, wider, p))
         return found
 
@@ -342,7 +341,7 @@ def _fit_form(task: tuple[Recipe, Array]) -> tuple[float, float, Array]:
     """Cost and held-out error of a model with a form, and its parameters."""
     search, noise = shared()
     fit = search.session.fit(*task, noise)
-    return _cost(fit), search.held_out(fit), fit.evidence.p
+    return fit.solved.cost, search.held_out(fit), fit.evidence.p
 
 
 def weigh_chance(session: Session, search: FormSearch) -> ChanceOfDraft:
@@ -371,12 +370,6 @@ def weigh_chance(session: Session, search: FormSearch) -> ChanceOfDraft:
     gain = search.gain_of_best_form()
     p_value = (1 + sum(g >= gain for g in gains)) / (1 + len(gains))
     return ChanceOfDraft(gain=gain, gains=tuple(gains), p_value=p_value)
-
-
-def _cost(fit: Fit) -> float:
-    """Negative log likelihood of a fit with what is known of its parameters, nats."""
-    e = fit.evidence
-    return fit.problem.solve().cost + 0.5 * float(e.precision @ e.known**2)
 
 
 def _start(search: FormSearch, wider: Recipe, values: dict[str, float], base: Array) -> Array:

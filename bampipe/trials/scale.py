@@ -1,0 +1,159 @@
+"""What a model leaves of the measured quantity: the change of variables of the likelihood.
+
+The residual is taken on the other side of the equation. Its density is that of what was measured
+where log |d residual / d force| is added to it: nothing is explained by making both sides small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import csd
+
+from bampipe.arrays import Array, Flags, Indices
+from bampipe.estimate.low_pass import Band
+from bampipe.physics import System
+from bampipe.trials.motion import Motion
+
+NO_SLOPE = 1e-3
+"""Slope by a constant force up to which effects pass it as it is."""
+_LEAST_SHARE = 1e-3
+_STEP = 1e-4
+"""Of a parameter's size or uncertainty: the step of a slope."""
+_SEGMENT = 128
+"""Thinned samples of a segment from which the gain of a filter is found."""
+
+
+def bare_slopes(
+    system: System, motions: Sequence[Motion], band: Band, p: Array
+) -> tuple[Array, ...]:
+    """Derivative of the applied force of the device alone by each measured force, by trial.
+
+    Each (K, n_q, n_forces), at the thinned samples.
+    """
+    return tuple(
+        system.input_map(m.q[kept], m.inputs(system.inputs)[kept], p)
+        for m in motions
+        for kept in [band.thinned_rows(len(m.t))]
+    )
+
+
+def slopes_by_force(
+    system: System, motions: Sequence[Motion], band: Band, probes: Sequence[Array]
+) -> tuple[Array, ...]:
+    """Derivative of what the effects of a model add by each measured force, by trial.
+
+    By a force that is more all the time, so that internal states which follow it have come to rest.
+
+    Args:
+        system: the model; motions: the trials; band: the low-pass.
+        probes: parameters, m times (n_p,), that give the same internal states.
+
+    Returns:
+        Each (K, n_q, n_forces, m), at the thinned samples.
+    """
+    shape = len(system.coordinates), len(system.model.device.forces), len(probes)
+    kept = [band.thinned_rows(len(m.t)) for m in motions]
+    if not (system.driven or system.force_fed):
+        return tuple(np.zeros((len(rows), *shape)) for rows in kept)
+    return tuple(_slopes(system, m, rows, probes) for m, rows in zip(motions, kept, strict=True))
+
+
+def _slopes(system: System, motion: Motion, kept: Indices, probes: Sequence[Array]) -> Array:
+    u, forces, p = motion.inputs(system.inputs), system.model.device.forces, probes[0]
+    motion = motion.of_mechanism(system, u, p)
+    at = motion.q[kept], motion.qd[kept], motion.qdd[kept]
+    z = system.memory(*motion.kinematics, u, p, motion.t)
+    here, slopes = [system.contribution(*at, z[kept], u[kept], p) for p in probes], []
+    for force in forces:
+        more, column = u.copy(), system.inputs.index(force)
+        step = 1e-6 * max(float(np.abs(more[:, column]).max()), 1e-6)
+        more[:, column] += step
+        if system.force_fed:
+            z = system.memory(*motion.kinematics, more, p, motion.t)
+        changed = [system.contribution(*at, z[kept], more[kept], p) for p in probes]
+        slopes.append([(new - old) / step for new, old in zip(changed, here, strict=True)])
+    return np.moveaxis(np.array(slopes), (0, 1), (2, 3))
+
+
+def log_of_share(plain: Array, added: Array) -> Array:
+    """The log of what is left of slopes ``plain`` by the forces with ``added`` ones, (n,).
+
+    Both (n, n_forces). Where no force acts nothing is taken.
+    """
+    before, after = (np.linalg.norm(x, axis=-1) for x in (plain, plain + added))
+    share = after / np.where(before > 0.0, before, 1.0)
+    return np.asarray(np.where(before > 0.0, np.log(np.maximum(share, _LEAST_SHARE)), 0.0))
+
+
+def log_scale(
+    system: System,
+    motions: Sequence[Motion],
+    band: Band,
+    used: Sequence[Flags],
+    p: Array,
+    free: Sequence[int],
+) -> tuple[Array, Array]:
+    """The mean log of what a model's effects leave of the measured quantity, and its slopes.
+
+    Args:
+        system, motions, band: the model on its trials.
+        used: which samples count, by trial, each (K, n_q).
+        p: parameters, (n_p,); free: numbers of those by which slopes are taken.
+
+    Returns:
+        By axis, (n_q,), and (n_q, n_free). Filters, which pass a constant force, leave all of it.
+    """
+    nothing = np.zeros(len(system.coordinates)), np.zeros((len(system.coordinates), len(free)))
+    if not system.parameters_by_force:
+        return nothing
+    bare = bare_slopes(system, motions, band, p)
+
+    def mean_log(p: Array) -> Array | None:
+        added = slopes_by_force(system, motions, band, [p])
+        if all((np.abs(slope) <= NO_SLOPE).all() for slope in added):
+            return None
+        logs = [log_of_share(a, b[..., 0]) for a, b in zip(bare, added, strict=True)]
+        total = sum(np.sum(x * moves, axis=0) for x, moves in zip(logs, used, strict=True))
+        return np.asarray(total / np.maximum(sum(moves.sum(axis=0) for moves in used), 1))
+
+    here = mean_log(p)
+    if here is None:
+        return nothing
+    slopes = nothing[1]
+    for k, number in enumerate(free):
+        if number in system.parameters_by_force:
+            q, moved = system.parameters[number], p.copy()
+            step = _STEP * max(abs(p[number]), q.sd)
+            moved[number] += step if p[number] + step <= q.upper else -step
+            there = mean_log(moved)
+            if there is not None:
+                slopes[:, k] = (there - here) / (moved[number] - p[number])
+    return here, slopes
+
+
+def gain_of_filter(before: Sequence[Array], after: Sequence[Array], band: Band) -> Array:
+    """Share of the variance of white noise of a force that a filter leaves in the band, (n_q,).
+
+    Args:
+        before, after: the applied force without and with it, low-passed, by trial, each (K, n_q).
+        band: the low-pass.
+    """
+    passed = band.passed_power(_SEGMENT // 2)
+    found = np.ones(before[0].shape[1])
+    for axis in range(len(found)):
+        pairs = [(x[:, axis], y[:, axis]) for x, y in zip(before, after, strict=True)]
+        if any(not np.array_equal(x, y) for x, y in pairs):
+            power = np.abs(sum(_spectrum(x, x) for x, _ in pairs))
+            gain = np.abs(sum(_spectrum(x, y) for x, y in pairs)) / np.maximum(power, 1e-300)
+            found[axis] = np.average(np.clip(gain, 1e-2, 1.0) ** 2, weights=passed[:, axis])
+    return found
+
+
+def _spectrum(x: Array, y: Array) -> NDArray[np.complex128]:
+    """Cross spectral density of two series, (_SEGMENT // 2,)."""
+    n = min(_SEGMENT, len(x))
+    found = csd(x, y, nperseg=n, nfft=_SEGMENT, detrend="linear")[1]
+    return np.asarray(found[: _SEGMENT // 2])
