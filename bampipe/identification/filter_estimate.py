@@ -274,7 +274,7 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
         details=[{"filter_sd": tight[k], "smoothing_sd": smoothing[k]} for k in range(count)],
         report=report,
         tabulate=lambda: (
-            tabulate_states(system, motions, found, p[:-1], rows),
+            [tabulate_states(system, motions, found, p[:-1], rows)],
             tabulate_trace(names, model, motions, found, rows),
         ),
         doubts=_doubts(nis.mean),
