@@ -20,7 +20,7 @@ from bampipe.errors import InputError
 from bampipe.generated_code import compiled_folder
 
 _PARTS: tuple[tuple[str, ...], ...] = (
-    ("simulation.stable_steps", "simulation._run"),
+    ("simulation._count_steps", "simulation._run"),
     ("square_root.filter_square_root",),
 )
 """Functions of `bampipe.estimate` by process, those that are waited for first in front."""
