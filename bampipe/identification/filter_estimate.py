@@ -128,6 +128,7 @@ class _Filtering:
             ),
             len(self.motions),
             lambda trial: int(trial.t.size),
+            in_all=sum(self.sizes),
         )
         timing = squares.free.size > self.count
         self.model = build_filter_model(task.system, self.trials, task.start, timing, squares.p[-1])
