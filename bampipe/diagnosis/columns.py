@@ -24,15 +24,7 @@ def added_columns(
         change of the residual, each (K, n_q).
     """
     e, system = evidence, item.system
-    count = len(system.parameters) - len(item.parameters)
-    p = np.array([q.prior for q in system.parameters])
-    beside_others = item.is_joint or _moves(item)
-    for k, q in enumerate(system.parameters[:count]):
-        # Where the fit took a parameter away, an effect of it would be none: its prior stands in.
-        if beside_others or k not in e.free or e.p[k] - q.lower > NOTHING * q.sd:
-            p[k] = e.p[k]
-    p[[count + i for i in item.searched_indices]] = searched
-    p[[count + i for i in item.linear_indices]] = 0.0
+    count, p = len(system.parameters) - len(item.parameters), parameters_with(e, item, searched)
     axes = list(range(len(system.coordinates)) if system.moves_sensors else system.touched)
     rows = [
         np.concatenate([r[:, axes] for r in _added_rows(item, p, count, base)], axis=1)
@@ -50,6 +42,27 @@ def added_columns(
             columns.append(np.zeros((*used.shape, 0)))
             changes.append(thin[:, 0])
     return columns, changes
+
+
+def parameters_with(
+    evidence: Evidence, item: Candidate, searched: Array, strengths: Array | float = 0.0
+) -> Array:
+    """The parameters of a candidate's system beside a fitted model, (n_p,).
+
+    Args:
+        searched, strengths: values of its searched parameters, and of its linear strengths.
+    """
+    e, system = evidence, item.system
+    count = len(system.parameters) - len(item.parameters)
+    p = np.array([q.prior for q in system.parameters])
+    beside_others = item.is_joint or _moves(item)
+    for k, q in enumerate(system.parameters[:count]):
+        # Where the fit took a parameter away, an effect of it would be none: its prior stands in.
+        if beside_others or k not in e.free or e.p[k] - q.lower > NOTHING * q.sd:
+            p[k] = e.p[k]
+    p[[count + i for i in item.searched_indices]] = searched
+    p[[count + i for i in item.linear_indices]] = strengths
+    return p
 
 
 def _added_rows(item: Candidate, p: Array, count: int, base: ModelOnTrial) -> list[Array]:

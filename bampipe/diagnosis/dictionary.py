@@ -11,7 +11,7 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
-from bampipe.diagnosis.columns import added_columns
+from bampipe.diagnosis.columns import added_columns, parameters_with
 from bampipe.diagnosis.ranges import MachineScale, SearchRange
 from bampipe.physics.system import System
 from bampipe.trials.evidence import Evidence
@@ -137,37 +137,20 @@ class Dictionary:
         ):
             return None
         one_each = np.eye(len(item.linear_indices)) if item.linear_indices else np.zeros((1, 0))
-        slopes = self._slopes(item, [self._parameters(item, values, b) for b in one_each])
-        gain = self._gain(item, self._parameters(item, values), slopes)
-        return Atom(found, slopes, gain)
+        slopes = self._slopes(item, [parameters_with(e, item, values, b) for b in one_each])
+        return Atom(found, slopes, self._gain(item, parameters_with(e, item, values), slopes))
 
-    def scale_left(
-        self, name: str, parameters: Mapping[str, float]
-    ) -> tuple[dict[int, Array], Array]:
-        """Slopes of what a candidate adds by each measured force, by axis, and its `Atom.gain`.
-
-        Args:
-            name: of the candidate; parameters: values of its own, by name.
-        """
+    def gain_with(self, name: str, parameters: Mapping[str, float]) -> Array:
+        """`Atom.gain` of a candidate with given parameters of its own, by name."""
         item = self.candidates[name]
         count = len(item.system.parameters) - len(item.parameters)
         own = [parameters[q.name] for q in item.parameters]
         p = np.concatenate([self.evidence.p[:count], own])
-        slopes = self._slopes(item, [p])
-        return {a: s[:, :, 0] for a, s in slopes.items()}, self._gain(item, p, slopes)
+        return self._gain(item, p, self._slopes(item, [p]))
 
     def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
         """`make` each."""
         return [(key, self.make(key)) for key in keys]
-
-    def _parameters(
-        self, item: Candidate, searched: Array, strengths: Array | float = 0.0
-    ) -> Array:
-        count = len(item.system.parameters) - len(item.parameters)
-        p = np.concatenate([self.evidence.p[:count], [q.prior for q in item.parameters]])
-        p[[count + i for i in item.searched_indices]] = searched
-        p[[count + i for i in item.linear_indices]] = strengths
-        return p
 
     def _slopes(self, item: Candidate, probes: Sequence[Array]) -> dict[int, Array]:
         """Slopes of what a candidate adds by each measured force, by axis, (n, n_forces, m).
@@ -215,7 +198,7 @@ class Dictionary:
     def scale_without(
         self, name: str, absence: Mapping[int, float]
     ) -> tuple[dict[int, Array], Array]:
-        """`scale_left` where one of the model's own effects is taken away.
+        """Slopes by the forces that it adds to take one of the model's own effects away, and gain.
 
         Args:
             name: of the effect; absence: change of each free parameter that takes it away.

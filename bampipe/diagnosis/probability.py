@@ -99,6 +99,7 @@ def weigh_sets(
     ]  # fmt: skip
     sets = _share(search, named, given, seed)
     effects, drops = _by_effect(sets), _losses(sets)
+    effects |= {e: 0.0 for e in own if by_noise.size_of_own(e) < criteria.size}
     unknown, functions = np.zeros(len(search.p.y)), []
     for axis in range(len(unknown)):
         columns = spline_columns(evidence, axis)

@@ -345,8 +345,8 @@ class Search:
     def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
         """`Solution.volume` of a set with the parameters of a model that was fitted with it."""
         known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
-        each = [self.dictionary.scale_left(name, known) for name, _ in added(keys)]
-        gains = [gain for _, gain in [*each, *map(self._without, gone(keys))]]
+        gains = [self.dictionary.gain_with(name, known) for name, _ in added(keys)]
+        gains += [self._without(name)[1] for name in gone(keys)]
         filters: list[tuple[dict[int, Array], Array]] = [({}, gain) for gain in gains]
         scale = evidence.log_scale[0] - self.dictionary.evidence.log_scale[0]
         rows = self._log_of_slopes(filters, self.solve(keys).scale)
@@ -432,6 +432,15 @@ class Search:
             for axis, (x, _, _) in self._products(key).items():
                 left[axis] = left[axis] + x @ strength
         return left
+
+    def size_of_own(self, name: str) -> float:
+        """What an effect of the model adds as far as the model without it does not.
+
+        Root mean square over that of the applied force, of the axis where that is largest.
+        """
+        rows = zip(self.residual_rows(((f"-{name}", ()),)), self.residual_rows(()), strict=True)
+        moved = [(a - b) / r for (a, b), r in zip(rows, self.p.likelihood.root, strict=True)]
+        return max(float(np.sqrt(x @ x / f)) for x, f in zip(moved, self.applied, strict=True))
 
     def volume_rows(self, keys: Sequence[Key]) -> list[Array]:
         """Of each sample, the log of what a set leaves of the measured quantity, by axis."""

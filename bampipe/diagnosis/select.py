@@ -157,10 +157,11 @@ def select_effects(
             pool = _explore(search, room, deep=room if number == 0 else min(_DEEP, room))
             moved: Fit | None = None
             last |= number >= _MOST_ROUNDS - 1
-            better = [(c, k) for c, k in sorted(pool.values()) if c < none - _WORTH]
+            better = [k for c, k in sorted(pool.values()) if c < none - _WORTH]
+            better += _without_weakest(search, recipe.effects)
             broken: list[set[Key]] = []
             kept: dict[tuple[str, ...], float] = {}
-            for _, keys in [] if last else better:
+            for keys in [] if last else better:
                 if len(broken) == _TRIED:
                     break
                 # A larger set promises no more than the one in it whose fit fell short.
@@ -183,9 +184,9 @@ def select_effects(
                 if fresh:
                     fits[members] = None
             if moved is None:
-                # What promised more by its linear problem counts by what it kept when fitted.
+                # What has been fitted counts by what it kept, not by its linear problem.
                 pool = {
-                    n: (max(c, none - kept[n]) if n in kept else c, k)
+                    n: (none - kept[n] if n in kept else c, k)
                     for n, (c, k) in pool.items()
                     if n in kept or c >= none - _WORTH
                 }
@@ -211,6 +212,17 @@ def select_effects(
         current = moved
         steps.append(current)
     raise AssertionError("the last round returns")
+
+
+def _without_weakest(search: Search, given: Collection[str]) -> list[tuple[Key, ...]]:
+    """The set without the member that adds least, where shapes of others may take its place.
+
+    How far they do a linear problem at the shapes they have beside it does not say.
+    """
+    own = [e for e in search.p.absence if e not in given]
+    weakest = min(own, key=lambda e: search.cost(((f"-{e}", ()),)), default=None)
+    shaped = any(search.p.shapes[e] for e in own if e != weakest)
+    return [((f"-{weakest}", ()),)] if shaped else []
 
 
 def _leave_out(

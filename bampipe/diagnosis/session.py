@@ -228,7 +228,9 @@ class Session:
         likelihood = self.weight_samples(recipe, evidence, noise)
         evidence, problem = self._descend(recipe, evidence, likelihood)
         log_likelihood = problem.log_likelihood()
-        likelihood = likelihood.with_heavy_tails(problem, c.tails)
+        # How far the bias may be off is known once the model is fitted.
+        likelihood = self.weight_samples(recipe, evidence, likelihood.noise)
+        likelihood = likelihood.with_heavy_tails(likelihood.pose(evidence), c.tails)
         likelihood = likelihood.with_equal_weights(problem, lacking)
         evidence, problem = self._descend(recipe, evidence, likelihood)
         return Fit(recipe, evidence, likelihood, problem, log_likelihood)
