@@ -35,7 +35,7 @@ if TYPE_CHECKING:
         write_report,
     )
     from bampipe.api.opened import Picture, Run, open_run
-    from bampipe.api.pair import compare_runs
+    from bampipe.api.session_pair import compare_runs
 
 __version__ = "0.1.0"
 
@@ -62,7 +62,7 @@ __all__ = [
 
 _MODULES = {
     **dict.fromkeys(("Picture", "Run", "open_run"), "bampipe.api.opened"),
-    "compare_runs": "bampipe.api.pair",
+    "compare_runs": "bampipe.api.session_pair",
 }
 
 

@@ -30,13 +30,13 @@ from bampipe.declarations.model_file import identified, load_model
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.identifiability import find_information
 from bampipe.identification.sensor_noise import sensor_noise
-from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.primitives import (
     Envelope,
     Primitive,
     list_primitives,
     vary_surroundings,
 )
+from bampipe.next_trial.rehearsal import Rehearsal
 from bampipe.physics import compile_model
 from bampipe.results.identify import IdentifyResult
 from bampipe.trials.measured import read_measured_trials
@@ -117,11 +117,11 @@ def report(title: str, session: Session) -> None:
         acceleration=np.maximum(reach.acceleration, seen.acceleration / 0.25),
         wider=None,
     )
-    own = list_primitives(seen, seconds, seen.movable, with_rests=True)
+    own = list_primitives(seen, seconds, seen.moved_axes, with_rests=True)
     hard_ones = [
-        *list_primitives(hard, seconds, seen.movable, with_rests=True),
+        *list_primitives(hard, seconds, seen.moved_axes, with_rests=True),
         *list_primitives(
-            replace(hard, low=seen.low, high=seen.high), seconds, seen.movable, with_rests=True
+            replace(hard, low=seen.low, high=seen.high), seconds, seen.moved_axes, with_rests=True
         ),
     ]
     by_own, every = session.of_designs(own), [*own, *hard_ones]

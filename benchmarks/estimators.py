@@ -25,7 +25,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.files import read_json, write_text
 from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
-from bampipe.simulator import session as simulate
+from bampipe.simulator import simulated_session as simulate
 from bampipe.stages import filter as filter_stage
 from bampipe.stages import identify, ingest
 

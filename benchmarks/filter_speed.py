@@ -35,7 +35,7 @@ from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.system import System
 from bampipe.progress import silent
-from bampipe.simulator import session as simulate
+from bampipe.simulator import simulated_session as simulate
 from bampipe.stages import ingest
 
 HERE = Path(__file__).parent / "filter_speed_engines"

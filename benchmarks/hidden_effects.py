@@ -22,7 +22,7 @@ import numpy as np
 import bampipe
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.progress import silent
-from bampipe.simulator import session as simulate
+from bampipe.simulator import simulated_session as simulate
 
 SINGLES = (
     "stribeck:yaw", "stribeck:pitch", "stribeck:extension", "presliding:yaw", "presliding:pitch",

@@ -29,7 +29,7 @@ from bampipe.files import write_text
 from bampipe.progress import silent
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.validate import ValidateResult
-from bampipe.simulator import session as simulate
+from bampipe.simulator import simulated_session as simulate
 from bampipe.stages import identify, validate
 
 

@@ -18,8 +18,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from calibration import USUAL
 from independent import MACHINES, prescribed
+from independent.draws import USUAL
 from independent.sensors import Conditions
 from recovery import PIPELINE
 

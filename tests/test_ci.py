@@ -16,7 +16,7 @@ from bampipe.declarations.model import ModelFile
 from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
 from bampipe.lab.rows import read_run
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.results.compare import CompareResult
 from bampipe.results.floor import compare_with_floor
 from bampipe.results.identify import IdentifyResult

@@ -57,21 +57,13 @@ def test_they_run_beside_a_run_where_nothing_was_compiled_from_these_sources(
         assert len(started.codes) == 1 and not cold
 
 
-def test_without_a_folder_the_run_itself_says_so(
-    started: Started, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("cores", "cache"), [(1, "."), (2, "file")])
+def test_none_run_on_one_core_or_without_a_folder(
+    started: Started, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int, cache: str
 ) -> None:
-    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "file"))
     (tmp_path / "file").touch()
-    with compile_ahead.compiling_ahead(2):
-        pass
-    assert not started.codes
-
-
-def test_one_core_is_left_to_the_run(
-    started: Started, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path))
-    with compile_ahead.compiling_ahead(1):
+    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / cache))
+    with compile_ahead.compiling_ahead(cores):
         pass
     assert not started.codes
 

@@ -12,9 +12,9 @@ from made_results import diagnosis, write_result
 from scipy.stats import norm
 
 import bampipe
-from bampipe.api.pair import correct_p_values
+from bampipe.api.session_pair import correct_p_values
 from bampipe.errors import InputError
-from bampipe.report.pair import build_page
+from bampipe.report.pair_page import build_page
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.pair import PairResult
 

@@ -2,12 +2,10 @@
 
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
 import time
-import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +19,7 @@ from bampipe.declarations.pipeline import Gate
 from bampipe.errors import InputError
 from bampipe.results.compare import CompareResult
 from bampipe.results.run import GateVerdict
-from bampipe.run import batch, gates, junit, models, record
+from bampipe.run import batch, gates, models, record
 from bampipe.run import pipeline as pipelines
 from bampipe.run.request import Outcome
 from bampipe.run.runner import run_session
@@ -80,17 +78,6 @@ def test_white_space_and_comments_in_toml_rerun_nothing(toy: Toy) -> None:
     assert toy.ran() == []
 
 
-def test_changed_session_file_reruns(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    path = toy.session / "session.toml"
-    path.write_text(path.read_text() + 'note = "new"\n')
-    outcome = toy.run()
-    assert outcome.steps[0].reason == "session.toml changed"
-    assert toy.ran() == ["toy_read"]
-    assert states(outcome) == ["done", "unchanged", "unchanged", "unchanged"]
-
-
 def test_changed_trial_reruns_what_depends_on_it(toy: Toy) -> None:
     toy.run()
     toy.ran()
@@ -99,6 +86,11 @@ def test_changed_trial_reruns_what_depends_on_it(toy: Toy) -> None:
     assert toy.ran() == ALL
     assert outcome.steps[0].reason == "numbers.txt changed"
     assert outcome.steps[1].reason == "toy/numbers.json changed"
+    path = toy.session / "session.toml"
+    path.write_text(path.read_text() + 'note = "new"\n')
+    outcome = toy.run()
+    assert outcome.steps[0].reason == "session.toml changed"
+    assert states(outcome) == ["done", "unchanged", "unchanged", "unchanged"]
 
 
 def test_fewer_outputs_leave_no_stale_files(toy: Toy) -> None:
@@ -117,12 +109,7 @@ def test_changed_setting_reruns_from_there(toy: Toy) -> None:
     assert outcome.steps[1].reason == "settings changed"
     toy.run(settings={"toy_double": {"factor": 3.0}})
     assert toy.ran() == [], "3 and 3.0 are the same factor"
-
-
-def test_setting_without_effect_on_the_result_stops_there(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    toy.run(settings={"toy_double": {"label": "new"}})
+    toy.run(settings={"toy_double": {"factor": 3.0, "label": "new"}})
     assert toy.ran() == ["toy_double"], "its outputs are the same bytes"
 
 
@@ -188,12 +175,6 @@ def test_from_after_until_is_refused(toy: Toy) -> None:
         toy.run(first="toy_sum", last="toy_read")
 
 
-def test_unknown_stage_gets_a_suggestion(toy: Toy) -> None:
-    with pytest.raises(InputError, match="did you mean 'toy_double'"):
-        toy.run(first="toy_duoble")
-    assert not toy.root.exists()
-
-
 # Faults
 
 
@@ -220,17 +201,6 @@ def test_a_session_that_is_refused_changes_nothing(toy: Toy) -> None:
     toy.ran()
     assert states(toy.run()) == ["unchanged"] * 4
     assert [s.state for s in status(toy.root, pipeline)] == ["current"] * 4
-
-
-def test_wrong_setting_keeps_the_result_current(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
-    with pytest.raises(InputError, match="did you mean 'factor'"):
-        toy.run(settings={"toy_double": {"factr": 3}})
-    with pytest.raises(InputError, match=r'toy_double.factor: found "many", expected a number'):
-        toy.run(settings={"toy_double": {"factor": "many"}})
-    toy.run()
-    assert toy.ran() == []
 
 
 def test_stage_must_write_what_it_declares(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -313,23 +283,6 @@ def test_kill_in_mid_stage_leaves_the_previous_result(toy: Toy) -> None:
     assert not list((toy.root / ".bampipe" / "staging").iterdir())
 
 
-def test_kill_at_any_moment_then_the_same_bytes(toy: Toy) -> None:
-    draw = random.Random(4)
-    fresh = replace(toy.request(), root=toy.folder / "fresh" / "first")
-    run_session(fresh)
-    for _ in range(8):
-        process = start(toy, *run_arguments(toy), "--force", pause=0.02)
-        time.sleep(draw.uniform(0.1, 0.6))
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-        for path in toy.root.rglob("*.json"):
-            if ".bampipe" not in path.parts:
-                json.loads(path.read_text())
-    toy.run()
-    assert toy.files() == contents(fresh.root)
-    assert verify(toy.root) == []
-
-
 def test_second_run_waits_or_refuses(toy: Toy) -> None:
     process = start(toy, *run_arguments(toy), pause=0.5)
     while not (toy.root / ".bampipe" / "staging" / "toy_double").exists():
@@ -397,12 +350,6 @@ def test_a_new_effect_file_reruns_its_model(toy: Toy) -> None:
     (toy.root / "models/base/effects/own.toml").write_text('name = "own"\n')
     toy.run()
     assert toy.ran() == ["toy_fit:base"]
-
-
-def test_unknown_model_gets_a_suggestion(toy: Toy) -> None:
-    toy.run()
-    with pytest.raises(InputError, match="did you mean 'base'"):
-        toy.run(model="bse")
 
 
 # Provenance
@@ -505,26 +452,6 @@ def test_gate_without_a_number(tmp_path: Path, content: object, optional: bool) 
     assert [v.state for v in found] == ["absent" if optional else "failed"]
 
 
-def test_failed_gate_decides_the_exit_code(toy: Toy) -> None:
-    assert toy.run().exit_code == 0
-    (toy.session / "numbers.txt").write_text("1000")
-    outcome = toy.run()
-    assert outcome.exit_code == 1
-    assert outcome.verdicts[0].message == "2000 is above 100; take smaller numbers"
-
-
-def test_junit_counts(tmp_path: Path) -> None:
-    verdicts = judged(tmp_path, {"axes": {"yaw": {"a": 1.0}, "pitch": {"a": 3}}})
-    outcomes = [
-        Outcome(Path("s1"), "done", verdicts=tuple(verdicts)),
-        Outcome(Path("s2"), "refused", error="no\x07 session"),
-    ]
-    top = ElementTree.fromstring(junit.junit(outcomes))
-    assert [s.get("failures") for s in top] == ["1", "0"]
-    assert [s.get("errors") for s in top] == ["0", "1"]
-    assert top.find(".//failure") is not None
-
-
 # Pipelines
 
 
@@ -557,11 +484,6 @@ def test_wrong_pipelines_are_refused(toy: Toy, old: str, new: str, message: str)
     toy.pipeline_file.write_text(text.replace(old, new))
     with pytest.raises(InputError, match=message):
         pipelines.load(str(toy.pipeline_file))
-
-
-def test_unknown_pipeline_gets_a_suggestion() -> None:
-    with pytest.raises(InputError, match="did you mean 'default'"):
-        pipelines.load("defualt")
 
 
 def test_assignment() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 
@@ -16,9 +16,6 @@ from bampipe.run.events import unheard
 from bampipe.run.request import Request
 from bampipe.run.session_name import session_folder, session_id
 from bampipe.stages import base
-
-if TYPE_CHECKING:
-    pass
 
 Path_ = str | Path
 RUNS = "runs"
@@ -40,8 +37,8 @@ def run_session(
         session: folder of the session.
         runs: folder that holds the run folders.
         pipeline: name of a pipeline, or a file of your own.
-        first: stage to start from; the first one where empty.
-        last: stage to stop after; the last one where empty.
+        first: stage to start from; the first one if empty.
+        last: stage to stop after; the last one if empty.
         force: run unchanged stages, too.
         settings: by stage, then by name: ``{"identify": {"method": "least-squares"}}``.
 
@@ -124,10 +121,10 @@ def extend(run: Run | Path_, effect: str | Sequence[str], model: str = "") -> Ru
     Args:
         run: a run, or its folder.
         effect: ``name[:target]``, or ``file.toml[:target]`` for one of your own; or several.
-        model: the parent; the best confirmed one where empty.
+        model: the parent; the best confirmed one if empty.
 
     Returns:
-        The run; its `Run.model` is the child where that lowers the held-out error.
+        The run; its `Run.model` is the child if it lowers the held-out error.
 
     Raises:
         InputError: no such effect or parent, or one that the device cannot have.
@@ -163,9 +160,9 @@ def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object)
 
     Args:
         run: a run, or its folder.
-        stage: name of the stage, as of its command.
-        model: for stages that run once a model; base and what was run of the others where empty.
-        settings: those that ``bampipe STAGE --settings`` lists.
+        stage: name of the stage, as on the command line.
+        model: for stages that run once a model; if empty, base and the models run before.
+        settings: see ``bampipe STAGE --settings``.
 
     Raises:
         InputError: no such stage, model or setting, or an earlier stage has not run.
@@ -176,7 +173,7 @@ def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object)
 
 
 def _rerun(run: Run | Path_, stage: str, model: str, settings: Mapping[str, object]) -> Run:
-    """Run one stage; the run with its results."""
+    """Run one stage and return the run with its results."""
     root = _open(run).root
     _run_stage(root, stage, model, settings)
     return Run(root)
@@ -185,7 +182,7 @@ def _rerun(run: Run | Path_, stage: str, model: str, settings: Mapping[str, obje
 def _run_stage(
     root: Path, stage: str, model: str, settings: Mapping[str, object]
 ) -> list[dict[str, Any]]:
-    """Run one stage, for one model or each; what it reports."""
+    """Run one stage, for one model or each, and return its summaries."""
     batch.limit_threads(1)
     outcome = runner.run_session(
         Request(

@@ -1,4 +1,4 @@
-"""The loop: add an effect to a model, measure again, follow the diagnosis."""
+"""The loop: extend a model by an effect, validate it, follow the diagnosis."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MOST_ROUNDS = 4
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """Options of every step of the loop, with the meaning that they have in a `Request`."""
+    """Options of every step of the loop, as in `Request`."""
 
     root: Path
     pipeline: Pipeline
@@ -38,7 +38,7 @@ class LoopOptions:
     listen: Listener
 
     def lock(self) -> AbstractContextManager[None]:
-        """Hold the run folder, as a run does; not while one of :meth:`run` is under way."""
+        """Return a lock on the run folder; do not hold it during :meth:`run`."""
         return record.lock(self.root, self.wait, self.listen)
 
     def run(
@@ -68,10 +68,10 @@ class LoopOptions:
 
 
 def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
-    """Settings that each stage was last given for ``model``, else for the model it came from.
+    """Return the settings last given to each stage for ``model``, else for its parent.
 
-    A ladder compares like with like: a child is identified and judged as its parent was, whether
-    a pipeline said how, or a command for one stage.
+    A child is thus identified and judged as its parent was, whether a pipeline or a command gave
+    the settings.
     """
     line = [model]
     while line[-1] in models.names(root) and models.read(root, line[-1]).parent:
@@ -83,7 +83,7 @@ def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
             step = made.get(f"{stage}:{name}")
             if step is not None:
                 used[stage] = {k: value for k, value in step.settings.items() if k != "model"}
-                if name != model:  # what came to nothing in the parent may count in the child
+                if name != model:  # an effect useless in the parent may help the child
                     used[stage].pop("without", None)
     return used
 
@@ -99,11 +99,11 @@ def list_drafts(root: Path, model: str) -> dict[str, Path]:
 
 
 def _find_effect(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | None]:
-    """Return the effect ``name[:target]`` and the file it comes from, if it is not built in.
+    """Return the effect ``name[:target]`` and its file, if it is not built in.
 
     Args:
         text: ``name[:target]``, or ``file.toml[:target]``.
-        drafts: of the model that is extended; their target may be left out.
+        drafts: of the model that is extended; their target may be omitted.
     """
     for name, file in drafts.items():
         if text in (name, name.partition(":")[0]):
@@ -119,7 +119,7 @@ def _find_effect(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | Non
 
 
 def adopt_effect(file: Path, runs: Path) -> Path:
-    """Copy an effect file to where every run of the folder ``runs`` finds it; return the copy."""
+    """Copy an effect file so that every run of the folder ``runs`` finds it; return the copy."""
     from bampipe.declarations.files import read_effect
     from bampipe.physics import registry
 
@@ -134,7 +134,7 @@ def adopt_effect(file: Path, runs: Path) -> Path:
 
 
 def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
-    """Make the child of ``parent`` that has ``effects`` too; identify, validate, compare.
+    """Extend ``parent`` by ``effects``; identify, validate and compare the child.
 
     Args:
         effects: each ``name[:target]`` of the library or of a draft for the parent, or
@@ -144,8 +144,8 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
         The name of the child.
 
     Raises:
-        InputError: no such parent or effect, one the device cannot have, or one that the parent
-            has already; nothing is left behind.
+        InputError: no such parent or effect, one that the device cannot have, or one that the
+            parent has already; nothing is left behind.
     """
     root = options.root
     drafts = list_drafts(root, parent)
@@ -169,7 +169,7 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
 
 
 def _remove(options: LoopOptions, model: str) -> None:
-    """Remove a model that came to nothing."""
+    """Remove a model."""
     folder = options.root / "models" / model
     if folder.exists():
         with options.lock():
@@ -177,10 +177,10 @@ def _remove(options: LoopOptions, model: str) -> None:
 
 
 def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> None:
-    """Write the child of ``parent`` with more effects, its ``model.toml`` last: then it counts.
+    """Write the child of ``parent`` with more effects; its ``model.toml`` comes last.
 
     Args:
-        named: ``name[:target]`` of each effect, and where it comes from if it is a lab's own.
+        named: ``name[:target]`` of each effect, and its file if it is not built in.
     """
     from bampipe.declarations.model import ModelFile
     from bampipe.declarations.model_file import load_model
@@ -208,15 +208,15 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
 def follow(
     options: LoopOptions, model: str, tell: Callable[[str], None], draft: bool = False
 ) -> str:
-    """Diagnose, add all missing effects at once, and confirm that by one more diagnosis.
+    """Diagnose, add all missing effects at once, and confirm the result by another diagnosis.
 
-    Effects drafted for the rest are added with the set if ``draft`` is set. An effect to which the
-    identified model gives no strength is removed again, and effects that did not improve the model
-    are not weighed again. If the confirmation finds more, that is added likewise.
+    With ``draft``, effects drafted for the unexplained rest are added too. An effect whose strength
+    is identified as zero is removed again, and effects that did not improve the model are not
+    weighed again. Effects that the confirmation finds are added likewise.
 
     Args:
         tell: called with a line on each finding and each step.
-        draft: whether to draft a formula where the diagnosis finds no named effect.
+        draft: whether to draft a formula if no known effect explains the residual.
 
     Returns:
         The name of the last model that is better than its parent.
@@ -258,7 +258,7 @@ def follow(
 
 
 def _list_open_questions(diagnosis: DiagnoseResult) -> Iterator[str]:
-    """Say which of several likely effects is added, and which trial would decide."""
+    """Yield which of several likely effects is added, and the trial that would decide."""
     from bampipe.phrases import diagnosis as phrases
 
     trial, open_effects = diagnosis.suggested_trial, phrases.find_open_effects(diagnosis)
@@ -277,7 +277,7 @@ def _list_open_questions(diagnosis: DiagnoseResult) -> Iterator[str]:
 def _add(
     options: LoopOptions, model: str, effects: tuple[str, ...], tell: Callable[[str], None]
 ) -> str:
-    """Extend ``model`` by those of ``effects`` that keep a strength; "" if that is no better."""
+    """Extend ``model`` by the effects with a strength; return "" if that is no better."""
     from bampipe.results.compare import CompareResult
 
     tell(f"adding {', '.join(effects)}")
@@ -292,7 +292,7 @@ def _add(
     ladder = {rung.model: rung for rung in RunFolder(options.root).read(CompareResult).ladder}
     if ladder[child].improves_on(ladder[model]):
         return child
-    why = "the held-out error does not fall after all"
+    why = "the held-out error does not fall"
     if ladder[child].has_lost_its_floor(ladder[model]):
         why = "no noise floor could be computed with it, so that its error cannot be judged"
     tell(f"{', '.join(effects)}: {why}, stopped at {model}")

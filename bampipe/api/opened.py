@@ -1,4 +1,4 @@
-"""A run folder as an object: every result as a table or a plain record, read when asked for."""
+"""A run folder as an object: every result as a table or a plain record, read on demand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pandas as pd
 
 from bampipe.errors import InputError
 from bampipe.files import refuse_links
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.draft import DraftResult
@@ -37,7 +37,7 @@ class Picture:
 
 
 class Run:
-    """The results of one session. Nothing here writes; results are read once, at their first use.
+    """The results of one session, for reading only; each result is read once, on first use.
 
     All values are in SI units. Models are named as in the run folder: ``base``,
     ``base+stribeck.yaw``; where a method takes a model, the default is the best confirmed one.
@@ -47,7 +47,7 @@ class Run:
 
     Raises:
         InputError: there is no run; and from every attribute whose stage has not run, with the
-            command that does.
+            command that runs it.
     """
 
     def __init__(self, root: str | Path) -> None:
@@ -73,7 +73,7 @@ class Run:
 
     @property
     def trials(self) -> pd.DataFrame:
-        """One row a trial: kind, duration, whether it is sound, what was repaired."""
+        """One row per trial: kind, duration, state, repairs."""
         return self._results.trials
 
     @cached_property
@@ -88,7 +88,7 @@ class Run:
 
     @cached_property
     def stiffness(self) -> pd.DataFrame:
-        """One row an axis with a locked trial: stiffness, sd, bandwidth; empty without any."""
+        """One row per axis with a locked trial: stiffness, sd, bandwidth; empty without any."""
         return _make_frame(self._read(StiffnessResult).axes)
 
     @property
@@ -98,7 +98,7 @@ class Run:
 
     @property
     def model(self) -> str:
-        """The best confirmed model, which the methods below take where none is named."""
+        """The best confirmed model, the default of the methods below."""
         return models.counting_model(self.root)
 
     def effects(self, model: str = "") -> tuple[str, ...]:
@@ -106,7 +106,7 @@ class Run:
         return self._results.effects(self._choose_model(model))
 
     def parameters(self, model: str = "") -> pd.DataFrame:
-        """One row a parameter: estimate, sd, unit, and what else identification says."""
+        """One row per parameter: estimate, sd, unit, and further results of identification."""
         frame = _make_frame(self._read(IdentifyResult, model).parameters)
         first = [name for name in ("estimate", "sd", "unit") if name in frame]
         order = self._results.order_parameters(frame.index)
@@ -122,16 +122,16 @@ class Run:
         return self._table(f"models/{self._choose_model(model)}/states.parquet", "identify")
 
     def validation(self, model: str = "") -> pd.DataFrame:
-        """One row an axis: error on all and on unseen trials, noise floor, fit, unit."""
+        """One row per axis: error on all and on unseen trials, noise floor, fit, unit."""
         return _make_frame(self._read(ValidateResult, model).axes)
 
     def free_run(self, model: str = "") -> dict[str, Any]:
-        """How far the model left to itself ends up from the measurement, or why it cannot be."""
+        """Error of the free-running model, or the reason why there is none."""
         found = self._read(ValidateResult, model).free_run
         return {} if found is None else found.model_dump(mode="json")
 
     def residuals(self, model: str = "") -> pd.DataFrame:
-        """Measured and predicted torque and force, by parameters that have not seen the trial."""
+        """Measured and predicted torque and force, with parameters from other trials."""
         return self._table(f"models/{self._choose_model(model)}/residuals.parquet", "validate")
 
     def diagnosis(self, model: str = "") -> dict[str, Any]:
@@ -148,7 +148,7 @@ class Run:
 
     @property
     def ladder(self) -> pd.DataFrame:
-        """One row a model: what was added, and per axis the held-out error and noise floor."""
+        """One row per model: added effects, and held-out error and noise floor by axis."""
         rows = []
         for rung in self._read(CompareResult).ladder:
             row: dict[str, object] = {"model": rung.model, "added": rung.added or ""}
@@ -186,7 +186,7 @@ class Run:
 
 
 def _make_frame(entries: Mapping[str, Record]) -> pd.DataFrame:
-    """One row an entry, its fields as columns."""
+    """Return one row per entry, with its fields as columns."""
     plain = {name: entry.model_dump(mode="json") for name, entry in entries.items()}
     return pd.DataFrame.from_dict(plain, orient="index")
 
@@ -195,7 +195,7 @@ def open_run(path: str | Path) -> Run:
     """Open a run folder, or the one in ``runs/`` that has this name.
 
     Args:
-        path: as ``runs/2026-10-03_s01``, or ``2026-10-03_s01``.
+        path: such as ``runs/2026-10-03_s01`` or ``2026-10-03_s01``.
 
     Raises:
         InputError: there is no such run, or it holds a link.

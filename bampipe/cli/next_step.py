@@ -81,7 +81,7 @@ def _after_diagnosis(run: RunFolder, model: str, said: str) -> str:
 
 def print_forecasts(root: Path, model: str) -> None:
     """Print forecasts beside their outcome, if there are trials that the proposals did not have."""
-    from bampipe.phrases.forecast import compare_forecasts, read_forecasts
+    from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts
     from bampipe.results.diagnose import DiagnoseResult
     from bampipe.results.identify import IdentifyResult
 

@@ -50,7 +50,7 @@ def simulate(
     Example: bampipe simulate sessions/trial --effect stribeck:yaw --seed 1
     """
     batch.limit_threads(1)
-    from bampipe.simulator.session import Config, simulate_session
+    from bampipe.simulator.simulated_session import Config, simulate_session
 
     parameters: dict[str, float] = {}
     for key, value in parse_settings(settings).items():

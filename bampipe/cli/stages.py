@@ -230,8 +230,8 @@ def compare(
             f"{useless[0]} has no effect on two runs, which are compared as they are",
             remedy=f"leave {useless[0]} out, or run the stage that it is for",
         )
-    from bampipe.api.pair import compare_runs
-    from bampipe.report.pair import build_page, tabulate_pair
+    from bampipe.api.session_pair import compare_runs
+    from bampipe.report.pair_page import build_page, tabulate_pair
 
     first, second = (places.find_run(one, options.runs) for one in (run, other))
     with show.Watcher(options.quiet or options.json) as watcher:

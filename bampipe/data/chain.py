@@ -79,8 +79,7 @@ def read_tree(path: Path) -> Tree:
     if root.tag == "robot":
         return urdf_tree(root, path)
     raise InputError(
-        f"found <{root.tag}>, expected <robot> of a URDF or <mujoco> of an MJCF",
-        where=str(path),
+        f"found <{root.tag}>, expected <robot> of a URDF or <mujoco> of an MJCF", where=str(path)
     )
 
 

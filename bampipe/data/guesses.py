@@ -18,6 +18,8 @@ from bampipe.data.units import spelled
 RATES_HZ = (4.0, 30_000.0)
 """Sample rates at which motion is logged."""
 
+_DATES = ((30_000.0, 80_000.0), (720_000.0, 760_000.0))
+"""Days since 1900 or 0, as spreadsheets and MATLAB count them."""
 _SPANS, _STEP = (0.5, 4.0 * np.pi), 0.01
 """Angles that a joint spans while it is logged, rad, and a step of their logarithm."""
 _WEIGHT_LEAVES, _SURE_TURNING = 0.5, 0.03
@@ -46,6 +48,10 @@ def time_unit(t: np.ndarray, said: str) -> str:
         return ""
     order = ("us", "ms", "ns", "s") if np.all(t == np.rint(t)) else ("s", "ms", "us", "ns")
     fitting = [u for u in order if RATES_HZ[0] <= 1.0 / (step * SECONDS[u]) <= RATES_HZ[1]]
+    first, last = float(np.nanmin(t)), float(np.nanmax(t))
+    dated = any(low < first <= last < min(high, first + 2.0) for low, high in _DATES)
+    if not fitting and dated and RATES_HZ[0] <= 1.0 / (step * SECONDS["days"]) <= RATES_HZ[1]:
+        return "days"
     return fitting[0] if fitting else ""
 
 
@@ -63,7 +69,7 @@ def likely_unit(si: str, values: np.ndarray) -> str:
 
 def interval_of(name: str, value: float) -> float:
     """Sampling interval, s, that a number beside the samples gives (``Ts``, ``fs``), else 0."""
-    plain = re.sub(r"[\W_]|hz$", "", name.lower())
+    plain = re.sub(r"[\W_]|hz$", "", name.lower().rpartition(".")[2])
     if value > 0.0 and plain in ("ts", "dt", "tsample", "sampletime", "samplingtime"):
         return value
     if value > 0.0 and re.fullmatch("fs(ample)?|sampl(e|ing)(rate|freq|frequency)", plain):
@@ -245,7 +251,7 @@ def find_register(values: np.ndarray) -> Register | None:
     leaps, steps = (np.abs(np.diff(v)) for v in (known, register.signed(known)))
     # A gap below the bit that no reading crosses; or, of what fills it, no leap.
     empty = max(above.max(), below.max()) < _SIGN_GAP * half
-    return register if empty or steps.max() < 0.5 * leaps.max() else None
+    return register if empty or steps.max() < 0.25 * leaps.max() else None
 
 
 def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:

@@ -15,6 +15,9 @@ _DERIVATIVE = 0.98
 """Correlation of a column with the integral of another, both without a line, to be that of it."""
 _DRIVEN = 0.5
 """Share of a column that the motion must explain for it to pass as what drives it."""
+_MOVED, _CLEARLY = 0.8, 0.5
+"""Of two columns, the share of one that the motion of the other must explain, and how much less it
+may leave than the other way round."""
 _STEADY = 50.0
 """Of the median step: the longest one of a time."""
 
@@ -32,7 +35,7 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
     found: dict[str, str] = {}
     sound = {name: v[:_MOST_ROWS] for name, v in values.items() if np.all(np.isfinite(v))}
     if t is None:
-        clock = next((name for name, v in sound.items() if _is_time(v)), "")
+        clock = next((name for name, v in sound.items() if is_time(v)), "")
         found |= {clock: "time"} if clock else {}
         t = sound.pop(clock, None)
     if len(sound) < 2:
@@ -64,18 +67,26 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
             found[names[best]] = "force"
     elif positions and len(left) == len(positions):
         found |= {names[k]: "force" for k in left}
+    elif not positions and len(left) == 2:
+        seconds = (t - t[0]) * SECONDS.get(guesses.time_unit(t, ""), 1.0)
+        explained = [guesses.driven(seconds, matrix[:, k], matrix[:, 1 - k]).share for k in left]
+        moved = int(explained[1] > explained[0])
+        least, most = sorted(explained)
+        if most >= _MOVED and 1.0 - most < _CLEARLY * (1.0 - least):
+            found |= {names[moved]: "position", names[1 - moved]: "force"}
     return found
 
 
 def describe(name: str, values: Array) -> str:
     """What is seen of a column, for a person who knows what was logged."""
     known = values[np.isfinite(values)]
-    if _is_time(known):
+    if is_time(known):
         return f"{name} increases as a time does"
     return f"{name} from {known.min():.4g} to {known.max():.4g}" if len(known) else f"{name} empty"
 
 
-def _is_time(values: Array) -> bool:
+def is_time(values: Array) -> bool:
+    """Whether readings (T,) rise evenly."""
     steps = np.diff(values)
     rises = len(steps) > 3 and bool(np.all(steps > 0))
     return rises and float(steps.max()) < _STEADY * float(np.median(steps))

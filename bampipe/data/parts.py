@@ -60,10 +60,7 @@ class FileClock:
 
 
 def join_parts(
-    folder: Path,
-    found: Mapping[str, Columns],
-    role: Callable[[str, str], str],
-    dialect: Dialect,
+    folder: Path, found: Mapping[str, Columns], role: Callable[[str, str], str], dialect: Dialect
 ) -> tuple[list[TrialEntry], list[str]]:
     """Put together the files that are one recording.
 
@@ -185,11 +182,7 @@ def _part(main: str, other: str, called: str, first: FileClock, second: FileCloc
 
 
 def _read_clock(
-    folder: Path,
-    name: str,
-    columns: Columns,
-    role: Callable[[str, str], str],
-    dialect: Dialect,
+    folder: Path, name: str, columns: Columns, role: Callable[[str, str], str], dialect: Dialect
 ) -> FileClock:
     times = [column for column, unit in columns.items() if role(column, unit) == "time"]
     datetimes = {column: "" for column in times if columns[column] == "datetime"}

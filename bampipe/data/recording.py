@@ -18,6 +18,12 @@ MOST_APART = 0.01
 """Share of samples that one part may have more than another to be joined row by row."""
 _LEAST = 20
 """Samples of a recording: time that falls sooner has not started again."""
+_MOSTLY = 0.95
+"""Share of rows in which a column that is of the same rows has a reading."""
+_LOST = 5.0
+"""Of the usual step between readings: a longer one has lost some."""
+_PAGE = 3.0
+"""Steps that a clock goes on by where the header stands again on a new page."""
 _BACK = 0.02
 """Of the time that has passed: how close to its beginning a clock that starts again comes."""
 
@@ -84,7 +90,50 @@ def read_recording(
             ticks = SECONDS.get(clock.unit, 1.0), SECONDS.get(unit, 1.0)
             raw = _by_time(raw, other, entry.file, part, kept, (clock.column, time), ticks)
     raw = replace(raw, columns={column: raw.columns[column] for column in columns})
-    return _one_of(raw, entry, clock)
+    return _at_one_rate(_one_of(raw, entry, clock), clock)
+
+
+def _at_one_rate(raw: RawTrial, clock: Clock) -> RawTrial:
+    """The rows with a reading of the first column; others between theirs, if in rows of their own.
+
+    So are logs of several rates: sensors write rows in turn, and leave the cells of others empty.
+    """
+    t = raw.columns.get(clock.column)
+    known = {
+        name: np.isfinite(values)
+        for name, values in raw.columns.items()
+        if name not in (clock.column, clock.nanoseconds)
+    }
+    some = np.any(list(known.values()), axis=0) if known else np.empty(0)
+    sparse = any(_is_sparse(mask[some]) for mask in known.values())
+    empty = 1.0 - some.mean() if len(some) else 0.0
+    if t is None or clock.nanoseconds or raw.begun or not (sparse or 0.01 < empty < 0.5):
+        return raw
+    first = next(iter(known))
+    rows = known[first] if sparse else some
+    columns = {name: values[rows] for name, values in raw.columns.items()}
+    remarks = [f"{empty:.0%} of the rows hold nothing of these columns"] if empty > 0.0 else []
+    for name, mask in known.items():
+        if sparse and mask[rows].mean() < _MOSTLY:
+            stamps = t[mask]
+            columns[name] = interpolated(t[rows], stamps, raw.columns[name][mask])
+            # Between readings that are lost, there is nothing to go by.
+            steps = np.diff(stamps)
+            after = np.clip(np.searchsorted(stamps, t[rows]), 1, len(steps))
+            columns[name][steps[after - 1] > _LOST * np.median(steps)] = np.nan
+            remarks.append(
+                f"'{name}' stands in rows of its own: interpolated linearly at the times of"
+                f" '{first}' (at most {np.max(steps):.3g} s apart)"
+            )
+    remarks = [*raw.remarks, *remarks]
+    return replace(raw, columns=columns, kept=raw.rows[rows], remarks=tuple(remarks), resumed=())
+
+
+def _is_sparse(known: np.ndarray) -> bool:
+    """Whether readings (T,) come every few rows, steadily."""
+    steps = np.diff(np.flatnonzero(known))
+    usual = float(np.median(steps)) if len(steps) >= _LEAST else 0.0
+    return usual >= 2.0 and float(np.quantile(steps, _MOSTLY)) <= 3.0 * usual
 
 
 def starts_of(raw: RawTrial, clock: str) -> list[int]:
@@ -92,6 +141,10 @@ def starts_of(raw: RawTrial, clock: str) -> list[int]:
     starts = {0, *raw.begun}
     t = raw.columns.get(clock)
     if t is not None:
+        # Where time goes on across a header, it is that of a page.
+        ahead = {at: float(t[at] - t[at - 1]) for at in raw.begun}
+        usual = float(np.nanmedian(np.diff(t))) if len(t) > 1 else 0.0
+        starts -= {at for at, step in ahead.items() if 0.0 < step < _PAGE * usual}
         begin = 0
         for at in np.flatnonzero(np.diff(t) < 0.0) + 1:
             begin = max([start for start in starts if start <= at], default=begin)

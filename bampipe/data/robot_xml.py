@@ -38,9 +38,7 @@ def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
     except ElementTree.ParseError as error:
         line = error.position[0]
         raise InputError(
-            f"not XML: {str(error).partition(':')[0]}",
-            where=f"{where}, line {line}",
-            remedy=_MEND,
+            f"not XML: {str(error).partition(':')[0]}", where=f"{where}, line {line}", remedy=_MEND
         ) from error
     if to_write:  # namespaces have the prefixes that they have in the text
         for _, (prefix, name) in ElementTree.iterparse(BytesIO(text), events=("start-ns",)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -41,6 +42,28 @@ def find_copies(session: Session) -> list[str]:
                 ": used once" if alike else f", which is declared {other.kind}"
             )
     return reasons
+
+
+def describe_spans(spans: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Sentences on trials in which an axis goes as much farther as another unit would make it.
+
+    Args:
+        spans: what each axis covers, by name of the trial and of the axis.
+    """
+    said = []
+    for name, own in spans.items():
+        for axis, span in own.items():
+            others = [other[axis] for trial, other in spans.items() if trial != name]
+            ratio = span / max(float(np.median(others)), 1e-300) if len(others) > 1 else 1.0
+            size = max(ratio, 1.0 / max(ratio, 1e-300))
+            if any(low < size < 2.0 * low for low in (40.0, 700.0)):
+                much = (
+                    f"{ratio:.3g} times as far as" if ratio > 1.0 else f"{size:.3g} times less than"
+                )
+                said.append(
+                    f"{name}: {axis} goes {much} in the others: is it logged in another unit?"
+                )
+    return said
 
 
 def read_sound_trial(

@@ -121,10 +121,7 @@ def read_arrays(path: Path, columns: Sequence[str], trial: str) -> dict[str, np.
 def _read_table(path: Path, columns: Sequence[str] | None, trial: str | None) -> pa.Table:
     path = Path(path)
     metadata, by_trial = _footer(path)
-    with (
-        _damage_named(path),
-        pq.ParquetFile(path, metadata=metadata, memory_map=False) as file,
-    ):
+    with _damage_named(path), pq.ParquetFile(path, metadata=metadata, memory_map=False) as file:
         names = file.schema_arrow.names
         wanted = list(columns) if columns is not None else names
         for name in [*wanted, *(["trial_id"] if trial is not None else [])]:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
+from unicodedata import combining, normalize
 
 import numpy as np
 
-from bampipe.data.looks import describe, find_roles
+from bampipe.data.looks import describe, find_roles, is_time
 from bampipe.data.parts import are_axes, join_parts
 from bampipe.data.readers import (
     EXTENSIONS,
@@ -30,6 +32,19 @@ from bampipe.errors import InputError
 from bampipe.lists import join_names
 
 MOST_FILES = 500
+_MOST_COLUMNS = 500
+"""Of a table of samples, unless it has many rows."""
+_OTHER_DATA = {
+    **dict.fromkeys((".xlsx", ".xls", ".ods"), "export the sheet as CSV"),
+    **dict.fromkeys((".pkl", ".pickle", ".joblib"), "it may run any program; save with np.savez"),
+    **dict.fromkeys((".feather", ".arrow", ".orc", ".rds"), "save it as Parquet or CSV"),
+    **dict.fromkeys((".zip", ".gz", ".7z", ".tar", ".bz2", ".xz", ".rar"), "unpack it"),
+    **dict.fromkeys(
+        (".c3d", ".mf4", ".mdf", ".blf", ".bin", ".ulg", ".tlog", ".trc", ".r64", ".fig", ".slx"),
+        "export its channels as CSV, a sample a row",
+    ),
+}
+"""Files of data that are not read, and what to do."""
 _SMALL = 1 << 16
 """Bytes below which a text may be no log but a line of results."""
 _MOST_SCANNED = 1 << 30
@@ -42,26 +57,41 @@ _GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
 """Words in the name of a column that say less of it than the name of its file."""
 _WORDS = {
     "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
-    " nanoseconds millis micros milliseconds microseconds",
+    " nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
-    " wanted con ctrl action",
+    " wanted con ctrl action ziel consigne consigna referencia riferimento",
     "brake": "brake bremse",
-    "acceleration": "acc accel acceleration qdd ddq beschleunigung",
-    "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate",
+    "acceleration": "acc accel acceleration qdd ddq beschleunigung aceleracion accelerazione",
+    "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate vitesse"
+    " velocidad velocidade velocita snelheid",
     "force": "force forc f fx fy fz torque tau trq kraft moment drehmoment loadcell wrench effort"
-    " eff",
-    "current": "current curr cur i iq amp amps ampere strom spulenstrom coil",
-    "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung",
+    " eff couple fuerza forza forca par coppia momento koppel",
+    "current": "current curr cur i iq amp amps ampere strom coil courant corriente corrente stroom",
+    "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung tension"
+    " voltaje tensao tensione",
     "position": "pos position ang angle theta phi psi q enc encoder disp displacement dist x stroke"
-    " winkel weg lage hub joint deflection yaw pitch extension carriage counts",
+    " winkel weg lage hub joint deflection yaw pitch extension carriage counts posicion posicao"
+    " posizione angulo angolo hoek",
 }
+_SIGNS = {
+    "加速度": "acc", "速度": "velocity", "力矩": "torque", "扭矩": "torque", "转矩": "torque",
+    "トルク": "torque", "时间": "time", "時間": "time", "角度": "angle", "位置": "position",
+    "位移": "displacement", "电流": "current", "電流": "current", "电压": "voltage",
+    "電圧": "voltage",
+    "目标": "target", "目標": "target", "期望": "desired", "指令": "command", "力": "force",
+    "время": "time", "угол": "angle", "скорость": "velocity", "момент": "torque", "ток": "current",
+}  # fmt: skip
+"""Words of other scripts; of those inside others the longer comes first."""
+_ALL_WORDS = frozenset(word for text in _WORDS.values() for word in text.split())
+_ENDS = sorted((word for word in _ALL_WORDS if len(word) > 4 or word in ("time", "zeit")), key=len)
+_RUN_TOGETHER = re.compile(r"(q|dq|tau|trq|pos|vel)(des|ref|cmd|meas|msr|act)")
 REFERENCE_WORDS = frozenset(_WORDS["reference"].split())
 """Words for what a controller asks for rather than what was measured."""
 DRIVERS = ("force", "current", "voltage")
 """Roles of what may drive an axis."""
 _BY_UNIT = {
     "s": "time", "datetime": "time", "rad": "position", "m": "position", "rad/s": "velocity",
-    "m/s": "velocity", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
+    "m/s": "velocity", "kg": "force", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
 }  # fmt: skip
 _SHORT_UNITS = frozenset(["mm", "Nm", "kN", "mA", "mV"])
 _PLAIN_WORDS = frozenset(["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano"])
@@ -122,6 +152,11 @@ class SurveyedColumn:
         return self.conversion.scale if self.conversion is not None else 1.0
 
     @property
+    def is_foreign(self) -> bool:
+        """Whether the file states a unit that is not known."""
+        return bool(self.stated) and self.conversion is None
+
+    @property
     def is_integer(self) -> bool:
         """Whether all values are integers, as counts are."""
         known = self.values[np.isfinite(self.values)]
@@ -168,7 +203,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     """
     dataset = lerobot.open_dataset(folder, episodes)
     logs = _Logs(folder, Dialect(names=tuple(names)), dataset)
-    logs.look_through([folder / file for file in dataset.episodes] if dataset else _paths(folder))
+    logs.look_through([folder / file for file in dataset.episodes] if dataset else logs.paths())
     trials, common = logs.choose()
     read: tuple[SurveyedColumn, ...] = ()
     sound = []
@@ -192,27 +227,6 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     return Survey(tuple(sound), columns, (*logs.remarks, *guessed), tuple(logs.passed))
 
 
-def _paths(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise InputError("no such folder", where=str(folder))
-    paths = sorted(
-        path
-        for path in folder.rglob("*")
-        if path.suffix.lower() in EXTENSIONS
-        and path.is_file()
-        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    )
-    if not paths:
-        raise InputError(
-            "no log in this folder",
-            where=str(folder),
-            remedy=f"supported file extensions are {', '.join(EXTENSIONS)}",
-        )
-    if len(paths) > MOST_FILES:
-        raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
-    return paths
-
-
 @dataclass
 class _Logs:
     """The files of a folder while it is found out which are logs, and which belong together.
@@ -230,6 +244,36 @@ class _Logs:
     first: str = ""
     scanned: int = 0
 
+    def paths(self) -> list[Path]:
+        """The files that may be logs; others that hold data are left out by name."""
+        folder = self.folder
+        if not folder.is_dir():
+            raise InputError("no such folder", where=str(folder))
+        files = sorted(
+            path
+            for path in folder.rglob("*")
+            if path.is_file()
+            and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        )
+        paths = [path for path in files if path.suffix.lower() in EXTENSIONS]
+        for path in files:
+            if path.suffix.lower() in _OTHER_DATA:
+                why = f"*{path.suffix} is not read: {_OTHER_DATA[path.suffix.lower()]}"
+                self.passed.append((path.relative_to(folder).as_posix(), why))
+        if not paths:
+            others = [p.relative_to(folder).as_posix() for p in files]
+            names = join_names([name for name, _ in self.passed] or others, 4)
+            raise InputError(
+                f"no log in this folder{names and f' that can be read, but {names}'}",
+                where=str(folder),
+                remedy=self.passed[0][1]
+                if self.passed
+                else f"supported file extensions are {', '.join(EXTENSIONS)}",
+            )
+        if len(paths) > MOST_FILES:
+            raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
+        return paths
+
     def look_through(self, paths: Sequence[Path]) -> None:
         """Find the columns of every file; what is no log is left out, with the reason."""
         for path in paths:
@@ -238,7 +282,17 @@ class _Logs:
                 lexically_inside(name, where="")
                 columns = columns_of(path, name=name, dialect=self.dialect)
                 if not columns:
-                    raise InputError("no column of numbers in it")
+                    raise InputError(f"no column of numbers in it{_like(path)}")
+                rows = (
+                    len(self._read_one(name, columns, next(iter(columns))))
+                    if (len(columns) > _MOST_COLUMNS)
+                    else 0
+                )
+                if 0 < 10 * rows < len(columns):
+                    raise InputError(
+                        f"{rows} rows of {len(columns)} columns are no log",
+                        remedy="has it a channel a row? write a sample a row",
+                    )
                 small = path.stat().st_size < _SMALL and path.suffix.lower() in TEXTS
                 if small and len(self._read_one(name, columns, next(iter(columns)))) < 2:
                     raise InputError("one row of numbers is no log")
@@ -256,8 +310,15 @@ class _Logs:
 
     def fault(self) -> InputError:
         """That no log can be read, with the reason of the first."""
-        why = self.passed[0][1]
-        remedy = why if self.passed[0][0] in why else ": ".join(self.passed[0])
+        # What is no log anyway says least.
+        idle = ("*", "no column of numbers", "one row", "has other columns")
+        name, why = min(
+            self.passed,
+            key=lambda p: next((k for k, x in enumerate(idle) if p[1].startswith(x)), -1),
+        )
+        remedy = why if name in why else f"{name}: {why}"
+        if "a line reads" in why:
+            remedy += "; export rows of numbers below a line of names"
         return InputError("no log that can be read", where=str(self.folder), remedy=remedy)
 
     def choose(self) -> tuple[list[TrialEntry], list[str]]:
@@ -352,15 +413,32 @@ class _Logs:
             column = (moments or times)[0]
             said = "datetime" if moments else spelled(labels[column], CLOCK_UNITS)
             clock = Clock(column=column, unit=next((u for u in CLOCK_UNITS if u == said), "s"))
-        raw = read_recording(self.folder, trial, ordered, clock, self.dialect)
+        # Of several rates, that of the positions counts.
+        first = sorted(ordered, key=lambda c: (c not in times, _role(c, labels[c]) != "position"))
+        raw = read_recording(self.folder, trial, first, clock, self.dialect)
         sound = _complete_rows(raw.columns, clock.column)
         self.first = trial.file
         if not (trial.parts or trial.recording or trial.file.lower().endswith(TEXTS)):
             self.remarks += raw.remarks
+        # Times of one name, beside the readings that each is of.
+        ends = [re.sub(r" \(\d+\)$", "", c).rpartition(".")[2] for c in times]
+        for one, other in combinations(times if times and times[0][:1] != "/" else (), 2):
+            here, there = (raw.columns[c][sound] for c in (one, other))
+            alike = ends[times.index(one)] == ends[times.index(other)]
+            step = abs(np.nanmedian(np.diff(here))) if len(here) > 1 else 0.0
+            if alike and step and np.nanmax(np.abs(here - there)) > step:
+                raise InputError(
+                    f"columns have times of their own, which differ, as {one} and {other} do",
+                    where=trial.file,
+                    remedy="export all at one rate, or each with its time to a file of its own",
+                )
         found = []
         for column in ordered:
             said = raw.units.get(column, labels[column])
             role = _role(column, said)
+            if role and clock.column != column and re.search(r":column_\d+$", column):
+                # Of files without a header, named for what the rest of their columns is.
+                role = "time" if is_time(raw.columns[column][sound]) else role
             unit = _unit(column, said, role)
             found.append(SurveyedColumn(column, said, role, unit, raw.columns[column][sound]))
         return tuple(found)
@@ -391,7 +469,7 @@ class _Logs:
         several = path.suffix.lower() in TEXTS or any("[:]." in column for column in columns)
         if trial.parts or not several or self.scanned > _MOST_SCANNED:
             return [trial]
-        times = [c for c, u in columns.items() if _role(c, u) == "time" and u != "datetime"]
+        times = [c for c, u in columns.items() if _role(c, u) == "time"]
         column = (times or [next(iter(columns))])[0]
         raw = self._read_one(trial.file, columns, column)
         starts = starts_of(raw, column if times else "")
@@ -405,6 +483,17 @@ class _Logs:
         return [
             TrialEntry(file=trial.file, kind="free", recording=n) for n, _ in enumerate(starts, 1)
         ]
+
+
+def _like(path: Path) -> str:
+    """What the lines of a text that is no table look like, in a few words."""
+    if path.suffix.lower() not in TEXTS:
+        return ""
+    with path.open("rb") as stream:
+        head = stream.read(1 << 12).decode("utf-8", "replace")
+    line = next((x.strip() for x in reversed(head.splitlines()[:20]) if x.strip()), "")
+    shown = f"{line[:48]}..." if len(line) > 48 else line
+    return f"; a line reads '{shown}'" if shown.isprintable() and re.search(r"\d", shown) else ""
 
 
 def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
@@ -495,10 +584,22 @@ def _role_apart(column: SurveyedColumn) -> str:
 
 
 def words(name: str) -> list[str]:
-    """The words in the name of a column, in lower case."""
-    bare = re.sub(r"[\[(].*?[\])]", " ", name)
+    """The words in the name of a column, in lower case and without accents; of compounds, each."""
+    bare = re.sub(r"[\[(（].*?[\])）]", " ", name)
+    for foreign, english in _SIGNS.items():
+        bare = bare.lower().replace(foreign, f" {english} ") if foreign in bare.lower() else bare
+    bare = "".join(c for c in normalize("NFKD", bare) if not combining(c))
     parts = re.split(r"[^A-Za-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare))
-    return [part.lower() for part in parts if part]
+    return [word for part in parts if part for word in _parts_of(part.lower())]
+
+
+def _parts_of(word: str) -> list[str]:
+    """A word, or the two that it is put together from, such as ``motorstrom`` and ``qdes``."""
+    if match := _RUN_TOGETHER.fullmatch(word):
+        return [*match.groups()]
+    end = next((end for end in reversed(_ENDS) if word.endswith(end)), word)
+    start = word.removesuffix(end)
+    return [start, end] if len(start) > 1 and word not in _ALL_WORDS else [word]
 
 
 def _role(name: str, stated: str) -> str:
@@ -508,10 +609,14 @@ def _role(name: str, stated: str) -> str:
         alone = _role(bare, stated)
         vague = set(words(bare)) <= _GENERAL or not alone
         return (vague and _role(part, "")) or alone
-    if stated == "datetime" or name.strip().lower() in _UNIT_WORDS["time"]:
+    if stated == "datetime" or name.strip().lower() in (*_UNIT_WORDS["time"], "x_value"):
+        return "time"
+    if name.strip().rpartition(".")[2] == "ts":  # Ts is rather an interval
         return "time"
     said = set(words(name))
     said |= {word.removesuffix("s") for word in said if len(word) > 3}
+    if {"load", "cell"} <= said:
+        return "force"
     first = [role for role in ("reference", "brake") if said & set(_WORDS[role].split())]
     if first:
         return first[0]
@@ -521,7 +626,10 @@ def _role(name: str, stated: str) -> str:
         said -= _PRESENT  # the position that is current, and no current
     roles = [role for role, text in _WORDS.items() if said & set(text.split())]
     if len(roles) > 1 and max(map(len, said)) == 1:
-        return ""  # x_F: letters that stand for several quantities
+        # x_F: letters that stand for several quantities
+        return next(
+            (_role_by_unit(x) for x in re.split(r"[_\W]+", name)[1:] if x in "AV" and x), ""
+        )
     named = next(iter(roles), "")
     return named or lerobot.role_of(name) or _role_by_suffix(re.split(r"[_\W]+", name)[-1])
 

@@ -25,7 +25,8 @@ _FACTORS: dict[str, tuple[str, float]] = {
     "min": ("s", 60.0), "h": ("s", 3600.0), "g": ("kg", 1e-3), "%": ("", 1e-2),
     "deg": ("rad", math.pi / 180), "rev": ("rad", _TURN), "arcmin": ("rad", math.pi / 10_800),
     "arcsec": ("rad", math.pi / 648_000), "in": ("m", 0.0254), "ft": ("m", 0.3048),
-    "kgf": ("N", _GRAVITY), "gf": ("N", 1e-3 * _GRAVITY), "lbf": ("N", _POUND),
+    "gon": ("rad", math.pi / 200), "kgf": ("N", _GRAVITY), "gf": ("N", 1e-3 * _GRAVITY),
+    "lbf": ("N", _POUND),
     "ozf": ("N", _POUND / 16), "kip": ("N", 1e3 * _POUND), "bar": ("Pa", 1e5),
     "psi": ("Pa", _POUND / 0.0254**2),
 }  # fmt: skip
@@ -51,7 +52,8 @@ _SPELLINGS = {
     "newtonmeter": "Nm", "kn": "kN", "milliamp": "mA", "meter": "m", "metre": "m",
     "millimeter": "mm", "millimetre": "mm", "centimeter": "cm", "inch": "in", "inche": "in",
     "foot": "ft", "feet": "ft", "lb": "lbf", "pound": "lbf", "oz": "ozf", "hz": "Hz",
-    "percent": "%", "pct": "%",
+    "percent": "%", "pct": "%", "Arms": "A", "Vdc": "V", "Vrms": "V", "U": "rev", "Umdr": "rev",
+    "tr": "rev", "grado": "deg", "grados": "deg", "degré": "deg",
 }  # fmt: skip
 """Of single factors; those in the plural are found without their s."""
 _CELSIUS = frozenset(["degc", "°c", "c", "celsius"])

@@ -99,9 +99,9 @@ def _find_pages(folder: Path, roots: Sequence[Path]) -> dict[str, str]:
 
 def _write_report(folder: Path, pages: Mapping[str, str]) -> None:
     # matplotlib is slow to import: only here
-    from bampipe.report.lab import build_report
+    from bampipe.report.lab_report import build_lab_report
 
-    made = build_report(folder, pages)
+    made = build_lab_report(folder, pages)
     with atomic_writer(folder / "report.pdf") as stream:
         stream.write(made.pdf)
     write_text(folder / "report.html", made.html)
@@ -114,7 +114,7 @@ def _write_report(folder: Path, pages: Mapping[str, str]) -> None:
 
 @contextmanager
 def _lock(folder: Path) -> Iterator[None]:
-    """Hold the lab's folder: two collections at once take turns."""
+    """Lock the lab's folder, so that simultaneous collections take turns."""
     with ExitStack() as stack:
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
 """Control charts of estimates that each come with a standard deviation of their own.
 
-An individuals chart (Shewhart) whose scatter is estimated from moving ranges, after which a slow
+An individuals chart (Shewhart) whose scatter is estimated from moving ranges, so that a slow
 drift or a step between two values hardly widens the limits. The moving range holds both the
 scatter between sessions, tau, and the uncertainty within each, s_i; limits of session i are
 
@@ -20,7 +20,7 @@ import numpy as np
 from bampipe.arrays import Array
 from bampipe.results.lab import ChartPoint, ControlChart
 
-FEWEST = 6
+FEWEST_SESSIONS = 6
 """With fewer sessions their scatter is not known well enough for limits."""
 
 RUN_LENGTH = 9
@@ -32,19 +32,19 @@ FALSE_ALARM = 0.0027
 MEDIAN_RANGE = 0.9539
 """Median of the range of two standard normal numbers, sqrt(2) * 0.6745."""
 
-_FACTORS = (
+_LIMIT_FACTORS = (
     (6, 6.95), (7, 5.30), (8, 5.63), (9, 4.80), (10, 4.95), (11, 4.46), (12, 4.54), (13, 4.21),
     (14, 4.27), (15, 4.05), (16, 4.09), (17, 3.92), (18, 3.94), (19, 3.81), (20, 3.83),
     (22, 3.75), (24, 3.69), (26, 3.63), (28, 3.58), (30, 3.53), (40, 3.40), (60, 3.26),
     (100, 3.15),
 )  # fmt: skip
-"""Number of sessions and factor for FALSE_ALARM: quantiles of |x - median| / sigma_MR over 1.2e7
+"""Numbers of sessions, and factors for FALSE_ALARM: quantiles of |x - median| / sigma_MR over 1.2e7
 normal numbers; the test suite draws some of them again. Three only for very many sessions."""
 
 
 def find_factor(sessions: int) -> float:
     """Return half the width of the limits in standard deviations, for so many sessions."""
-    counts, values = zip(*_FACTORS, strict=True)
+    counts, values = zip(*_LIMIT_FACTORS, strict=True)
     if sessions > counts[-1]:
         return float(3.0 + (values[-1] - 3.0) * counts[-1] / sessions)
     return float(np.interp(sessions, counts, values))
@@ -63,7 +63,7 @@ def make_chart(
     x, s = np.array(estimates, dtype=float), np.array(sds, dtype=float)
     centre, half = float(np.median(x)), np.full(len(x), np.inf)
     between = slope = slope_p = run = None
-    if len(x) >= FEWEST:
+    if len(x) >= FEWEST_SESSIONS:
         sigma = float(np.median(np.abs(np.diff(x)))) / MEDIAN_RANGE
         between = float(np.sqrt(max(0.0, sigma**2 - float(np.median(s**2)))))
         half = find_factor(len(x)) * np.sqrt(between**2 + s**2)

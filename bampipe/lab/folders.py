@@ -22,12 +22,12 @@ def run_folders(runs: Path) -> list[Path]:
 
 
 def is_foreign(folder: Path) -> bool:
-    """Whether ``folder`` holds something that is not a lab's: it is left alone."""
+    """Return whether ``folder`` holds files other than a lab's, which must not be replaced."""
     return folder.is_dir() and not (folder / LOCK).exists() and any(folder.iterdir())
 
 
 def is_current(runs: Path, folder: Path) -> bool:
-    """Whether ``folder`` holds the runs in ``runs``, none younger than it: nothing to collect."""
+    """Return whether ``folder`` holds all runs in ``runs``, none of them younger."""
     about = folder / FILE
     if not about.is_file():
         return False

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bampipe.lab.control_chart import FEWEST, make_chart
+from bampipe.lab.control_chart import FEWEST_SESSIONS, make_chart
 from bampipe.lists import join_names
 from bampipe.phrases import lab as phrases
 from bampipe.results.lab import (
@@ -43,7 +43,7 @@ def build_trends(tables: Tables) -> TrendsResult:
     charts = _make_charts(tables)
     return TrendsResult(
         schema="bampipe.trends/1",
-        fewest_sessions=FEWEST,
+        fewest_sessions=FEWEST_SESSIONS,
         series=tuple(charts),
         sessions=tuple(_judge_session(row, tables, charts) for row in tables["sessions"]),
     )
@@ -217,7 +217,7 @@ def _refit_outside(
 
 
 def _is_within(chart: ControlChart, point: ChartPoint, value: float, sd: float) -> bool:
-    """Whether ``value``, in place of the estimate at ``point``, lies inside the limits."""
+    """Return whether ``value``, in place of the estimate at ``point``, lies inside the limits."""
     between, upper = chart.between_sd or 0.0, point.upper or 0.0
     variance = between**2 + point.sd**2
     ratio = (between**2 + sd**2) / variance if variance > 0.0 else 1.0

@@ -1,4 +1,4 @@
-"""The filter on samples as they come: state, parameters, and an alarm when they stop agreeing."""
+"""The filter on live samples: state, parameters, and an alarm when they become inconsistent."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from bampipe.physics import System
 from bampipe.results.intervals import NORMAL_95
 
 PORTION = 512
-"""Samples filtered at once, so that memory stays the same."""
+"""Samples filtered at once, which bounds the memory."""
 
 
 class Monitor:
-    """Takes samples, keeps the distribution of state and parameters, judges the innovations.
+    """Filters samples, keeps the distribution of state and parameters, tests the innovations.
 
     Attributes:
-        alarm: whether the last complete window was inconsistent, or held nothing of use;
-            alarms: how many were, by runs of consecutive ones.
-        restarts: how often the motion was started anew after a gap or a lost motion.
-        samples: how many were taken.
+        alarm: whether the last complete window was inconsistent or held no useful sample;
+            alarms: number of runs of such windows.
+        restarts: how often the motion was restarted after a gap or a failure of the filter.
+        samples: number of samples received.
     """
 
     def __init__(
@@ -38,9 +38,9 @@ class Monitor:
         options: MonitorOptions,
         complain: Callable[[str], None],
     ) -> None:
-        """Begin at ``start``; where that is None, from the first `FIRST_LOOK` samples.
+        """Start from ``start``, or if it is None from the first `FIRST_LOOK` samples.
 
-        ``complain`` is called for the first few new starts of the motion.
+        ``complain`` is called for the first few restarts of the motion.
         """
         self.system, self.options, self._complain = system, options, complain
         self.alarm, self.alarms, self.restarts, self.samples = False, 0, 0, 0
@@ -52,38 +52,38 @@ class Monitor:
         self._first_t = np.nan
         self._useless = 0
         if start is not None:
-            self._begin(start)
+            self._start_filter(start)
 
     def push(self, names: Sequence[str], values: Array) -> None:
-        """Take samples (T, m), columns ``names`` as a `StreamLayout` has them."""
+        """Filter samples (T, m) with columns ``names``, as in a `StreamLayout`."""
         for first in range(0, len(values), PORTION):
             part = values[first : first + PORTION]
             if not np.isfinite(self._first_t):
                 self._first_t = float(part[0, 0])
             t = part[:, 0].copy()
-            u = self._inputs(names, part)
+            u = self._arrange_inputs(names, part)
             q = part[:, [names.index(f"q_{axis}") for axis in self.system.coordinates]]
             self.samples += len(part)
             if self.start is None:
                 useful = np.isfinite(q).all(axis=1)
                 self._useless = 0 if useful.any() else self._useless + len(part)
-                self._judge(self._useless >= FIRST_LOOK)
+                self._set_alarm(self._useless >= FIRST_LOOK)
                 self._waiting.append((t[useful], u[useful], q[useful]))
                 if sum(len(item[0]) for item in self._waiting) < FIRST_LOOK:
                     self._t = float(t[-1])
                     continue
                 t, u, q = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
                 self._waiting.clear()
-                self._begin(start_from_samples(self.system, t, u, q, self.options))
-            self._take(t, u, q)
+                self._start_filter(start_from_samples(self.system, t, u, q, self.options))
+            self._filter_samples(t, u, q)
 
     def note_lines_without_sample(self, lines: int) -> None:
-        """Raise the alarm where a window of lines has come and no sample in them."""
+        """Raise the alarm if a whole window of lines contained no sample."""
         if lines >= (FIRST_LOOK if self.start is None else self.start.window):
-            self._judge(True)
+            self._set_alarm(True)
 
     def report(self) -> dict[str, object]:
-        """Return the current state, as JSON can hold it; no state before the filter has begun."""
+        """Return the current state as JSON values, without estimates before the filter starts."""
         content: dict[str, object] = {
             "t": None if np.isnan(self._t) else self._t,
             "samples": self.samples,
@@ -130,16 +130,16 @@ class Monitor:
         }
         return content
 
-    def _judge(self, inconsistent: bool) -> None:
+    def _set_alarm(self, inconsistent: bool) -> None:
         self.alarms += inconsistent and not self.alarm
         self.alarm = inconsistent
 
-    def _begin(self, start: Start) -> None:
+    def _start_filter(self, start: Start) -> None:
         self.start = start
         self._test = WindowTest(len(self.system.coordinates), start.window)
         self._threshold = start.reference.threshold(self.options.probability)
 
-    def _inputs(self, names: Sequence[str], values: Array) -> Array:
+    def _arrange_inputs(self, names: Sequence[str], values: Array) -> Array:
         brakes = {name: f"brake_{axis}" for axis, name in self.system.model.device.brakes.items()}
         u = np.zeros((len(values), len(self.system.inputs)))
         for place, name in enumerate(self.system.inputs):
@@ -150,13 +150,13 @@ class Monitor:
                 u[:, place] = values[:, names.index(column)]
         return u
 
-    def _take(self, t: Array, u: Array, q: Array) -> None:
-        """Filter samples, cut where a gap starts the motion anew."""
+    def _filter_samples(self, t: Array, u: Array, q: Array) -> None:
+        """Filter samples in stretches; a gap between them restarts the motion."""
         ahead = np.diff(t, prepend=t[0] if np.isnan(self._t) else self._t)
         gaps = (int(i) for i in np.flatnonzero(ahead > self.options.gap_s) if i > 0)
         for first, last in pairwise([0, *gaps, len(ahead)]):
             if ahead[first] > self.options.gap_s and self._filter is not None:
-                self._again(f"a gap of {ahead[first]:.3g} s before {t[first]:.3f} s")
+                self._restart(f"a gap of {ahead[first]:.3g} s before {t[first]:.3f} s")
             self._filter_stretch(t[first:last], u[first:last], q[first:last])
         self._t = float(t[-1])
 
@@ -181,7 +181,7 @@ class Monitor:
         except FilterFailure as failure:
             self._filter = None
             self._add_unfiltered(np.zeros(q.shape, dtype=bool))
-            self._again(f"near {t[min(failure.sample, t.size - 1)]:.3f} s {failure.reason}")
+            self._restart(f"near {t[min(failure.sample, t.size - 1)]:.3f} s {failure.reason}")
             return
         with np.errstate(over="ignore"):
             squares = np.square(found.innovation / found.innovation_sd)
@@ -190,7 +190,7 @@ class Monitor:
         self._take_innovations(test, found.nis, squares, present)
 
     def _add_unfiltered(self, present: Flags) -> None:
-        """Count samples of which the filter made nothing; ``present`` as for the test."""
+        """Count samples that were not filtered; ``present``: see `WindowTest.take`."""
         if self._test is not None:
             nothing = np.full(present.shape, np.nan)
             self._take_innovations(self._test, np.full(len(present), np.nan), nothing, present)
@@ -199,15 +199,15 @@ class Monitor:
         self, test: WindowTest, nis: Array, squares: Array, present: Flags
     ) -> None:
         for mean in test.take(nis, squares, present):
-            self._judge(bool(mean > self._threshold))
+            self._set_alarm(bool(mean > self._threshold))
             worst = np.where(test.useless, np.inf, test.by_reading)
             self._axis = self.system.coordinates[int(np.argmax(worst))]
 
-    def _again(self, why: str) -> None:
-        """Start the motion anew; the parameters go on from where they are, if they are known."""
+    def _restart(self, why: str) -> None:
+        """Restart the motion; the parameters keep their present estimates."""
         self.restarts += 1
         if self.restarts <= MOST_COMPLAINTS:
-            self._complain(f"{why}: the motion starts anew")
+            self._complain(f"{why}: the motion is restarted")
         if self._filter is not None and self.start is not None:
             nx = self.start.model.n_states
             self.start = replace(

@@ -1,4 +1,4 @@
-"""Where a monitor starts from: a run that was identified, or the priors of a device."""
+"""The start of a monitor: from an identified run, or from the priors of a device."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _NO_STEP = 3e-6
 LONGEST_WINDOW_S = 3600.0
 
 FIRST_LOOK = 500
-"""Samples from which the noise is found where no run states it."""
+"""Samples from which the noise is estimated without a run."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,10 @@ class MonitorOptions:
 
     Attributes:
         window_s: length of the windows that the alarm judges, s.
-        false_alarms_per_hour: how often a consistent filter may raise it.
-        memory_s: time over which a parameter may wander by its starting uncertainty, s;
-            infinite for parameters that stay.
-        gap_s: a longer gap between samples starts the motion, not the parameters, anew.
+        false_alarms_per_hour: alarms of a consistent filter that are accepted.
+        memory_s: time in which a parameter may drift by its initial uncertainty, s; infinite for
+            constant parameters.
+        gap_s: a longer gap between samples restarts the motion, but not the parameters.
     """
 
     window_s: float = 1.0
@@ -57,7 +57,7 @@ class MonitorOptions:
     gap_s: float = 0.5
 
     def check(self) -> None:
-        """Raise :class:`InputError` where an option makes no sense."""
+        """Raise :class:`InputError` if an option makes no sense."""
         given = (self.window_s, self.false_alarms_per_hour, self.memory_s)
         for option, value in zip(("--window", "--false-alarms", "--memory"), given, strict=True):
             if not value > 0.0:
@@ -71,19 +71,19 @@ class MonitorOptions:
 
     @property
     def probability(self) -> float:
-        """Of a false alarm in one window."""
+        """Probability of a false alarm in one window."""
         return self.false_alarms_per_hour * self.window_s / 3600.0
 
 
 @dataclass(frozen=True)
 class Start:
-    """What the filter starts from.
+    """The start of the filter.
 
     Attributes:
         model, settings: of the filter.
         theta, covariance: (nt,) and (nt, nt) parameters, on the scale of estimation.
         speed_sd: (n_q,) standard deviation of the rates at the first sample.
-        reference: law of the mean NIS over a window; window: its length in samples.
+        reference: distribution of the mean NIS over a window; window: its length in samples.
     """
 
     model: FilterModel
@@ -95,7 +95,7 @@ class Start:
     window: int
 
     def state(self, system: System, q: Array, u: Array) -> tuple[Array, Array]:
-        """State (nx,) at rest where the encoders read q (n_q,) under inputs u, and its sd (nx,)."""
+        """Return the state (nx,) at rest for readings q (n_q,) and inputs u, and its sd (nx,)."""
         p = self.model.parameters.copy()
         p[self.model.free] = self.model.to_physical(self.theta)[0]
         return infer_initial_state(
@@ -103,14 +103,14 @@ class Start:
         )
 
 
-def layouts(system: System, session: Session | None) -> tuple[StreamLayout, ...]:
-    """What the header of a stream for this model may look like.
+def list_layouts(system: System, session: Session | None) -> tuple[StreamLayout, ...]:
+    """Return the headers that a stream for this model may have.
 
-    SI columns named as in ``ingest/samples.parquet``, brake commands being zero where their
-    columns are absent; with a session file, also the columns of its raw logs.
+    They are SI columns named as in ``ingest/samples.parquet``, with brake commands of zero if their
+    columns are absent, and with a session file also the columns of its raw logs.
 
     Raises:
-        InputError: the model needs an input that no sensor gives at once, such as a rate.
+        InputError: the model needs an input that no sensor gives in real time, such as a rate.
     """
     device = system.model.device
     given = {*device.forces, *device.channels, *device.brakes.values(), "t"}
@@ -140,29 +140,29 @@ def open_stream(
     strict: bool,
     complain: Callable[[str], None],
 ) -> SampleStream:
-    """Open a growing file, or standard input where ``samples`` is ``-``.
+    """Open a growing file, or standard input if ``samples`` is ``-``.
 
     Args:
-        samples: path, or ``-``; system: the model; session: folder whose raw columns may come.
-        strict: raise at a bad line; complain: called for the first ones that are skipped.
+        samples: path, or ``-``; system: the model; session: folder whose raw columns are accepted.
+        strict: raise at a bad line; complain: called for the first lines that are skipped.
     """
-    known = layouts(system, read_session(session) if session is not None else None)
+    known = list_layouts(system, read_session(session) if session is not None else None)
     if samples == "-":
         return SampleStream(0, "standard input", known, strict, complain)
     try:
         descriptor = os.open(samples, os.O_RDONLY)
     except OSError as error:
         raise InputError(
-            f"cannot be read: {error.strerror}", where=samples, remedy="which file grows?"
+            f"cannot be read: {error.strerror}", where=samples, remedy="name the growing file"
         ) from error
     return SampleStream(descriptor, samples, known, strict, complain)
 
 
 def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[System, Start]:
-    """Take model, parameters and noise from an identified run.
+    """Return model, parameters and noise from an identified run.
 
-    The alarm's threshold comes from the run's own free trials, filtered as the monitor will:
-    what counts is whether the innovations change.
+    The threshold of the alarm comes from the free trials of the run, filtered as the monitor does,
+    so that the alarm responds to a change of the innovations.
 
     Raises:
         InputError: the model has not been identified by the filter.
@@ -172,7 +172,7 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
     path = IdentifyResult.file(name)
     if found.noise is None:
         raise InputError(
-            "identified without the filter: its noise levels are not known",
+            "identified without the filter, so that the noise levels are not known",
             where=str(run.path(path)),
             remedy=f"bampipe identify {run.root} --set method=ukf",
         )
@@ -183,12 +183,12 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
     ingested = run.read(IngestResult)
     if ingested.kept_every > 1:
         raise InputError(
-            f"identified from one sample in {ingested.kept_every}, and a stream has all of them",
+            f"identified from one sample in {ingested.kept_every}, but a stream has all of them",
             where=str(run.path(IngestResult.FILE)),
             remedy="bampipe run SESSION --set ingest.fastest_hz=0",
         )
     rate = ingested.sample_rate_hz
-    trials = [_trial(run, trial, system) for trial in free_trials(run, fitted=True)]
+    trials = [_read_trial(run, trial, system) for trial in free_trials(run, fitted=True)]
     model = build_filter_model(system, trials, values, False, found.input_timing.estimate)
     sd = np.array([found.parameters[parameter].sd for parameter in names])
     value = values[model.free]
@@ -208,7 +208,9 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
         stride=max(trial.t.size for trial in trials),
     )
     n = len(system.coordinates)
-    speed = np.sqrt(np.mean([np.mean(np.square(_speeds(trial)), axis=0) for trial in trials], 0))
+    speed = np.sqrt(
+        np.mean([np.mean(np.square(_find_speeds(trial)), axis=0) for trial in trials], 0)
+    )
     window = max(2, round(options.window_s * rate))
     start = Start(
         model, settings, theta, covariance, np.maximum(speed, 1e-3),
@@ -232,9 +234,9 @@ def start_from_run(run: RunFolder, name: str, options: MonitorOptions) -> tuple[
 def start_from_samples(
     system: System, t: Array, u: Array, q: Array, options: MonitorOptions
 ) -> Start:
-    """Take parameters from the device's priors and the noise from the first samples.
+    """Return parameters from the priors of the device and noise from the first samples.
 
-    The noise of every channel is settled as `ingest` settles it. The alarm's threshold is that of
+    The noise of each channel is estimated as `ingest` does. The threshold of the alarm is that of
     white Gaussian noise.
 
     Args:
@@ -271,8 +273,8 @@ def start_from_samples(
     )  # fmt: skip
 
 
-def _trial(run: RunFolder, trial_id: str, system: System) -> Trial:
-    """The raw samples of a trial from the first complete reading on; its state is left open."""
+def _read_trial(run: RunFolder, trial_id: str, system: System) -> Trial:
+    """Return the raw samples of a trial from the first complete reading on, without a state."""
     columns = read_samples(run, trial_id, system)
     t = columns["t"]
     u = input_columns(columns, system.inputs, system.model.device.brakes)
@@ -284,8 +286,8 @@ def _trial(run: RunFolder, trial_id: str, system: System) -> Trial:
     return Trial(t[first:], u[first:], y[first:], np.zeros(0), np.zeros(0))
 
 
-def _speeds(trial: Trial) -> Array:
-    """Coarse velocities over a twentieth of a second, (rows, n_q), for their size only."""
+def _find_speeds(trial: Trial) -> Array:
+    """Return coarse velocities over 0.05 s, (rows, n_q), to find their size."""
     step = max(1, round(0.05 / float(np.median(np.diff(trial.t)))))
     speed = np.diff(trial.y[::step], axis=0) / np.diff(trial.t[::step])[:, None]
     return np.nan_to_num(speed)

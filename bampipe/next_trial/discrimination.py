@@ -1,4 +1,4 @@
-"""How well trials tell alternative effects apart: what is left when the wrong one is refitted."""
+"""How well trials distinguish alternative effects: the error of the wrong one, refitted."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from bampipe.trials.likelihood import Likelihood, Noise, lay_out_samples, take_s
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
 
-_STEP = 1e-3
-"""Of a parameter, for the slope of what its effect adds to the residual."""
+_SLOPE_STEP = 1e-3
+"""Relative step of a parameter for the slope of the residual of its effect."""
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """Effects that may be what a model lacks.
+    """Effects that a model may lack.
 
     Attributes:
         items: the candidates; none where nothing is missing.
         values: the parameters of each, in the order of its file.
-        odds: that it is these.
-        slopes: parameters that are fitted: number of the item, and of the parameter in it.
+        odds: probability of this alternative.
+        slopes: fitted parameters: index of the item, and of the parameter in it.
     """
 
     items: tuple[Candidate, ...]
@@ -53,12 +53,12 @@ class Sums:
     """Sums of products over the samples of some trials.
 
     Attributes:
-        squares: (n_q, m, m) of all columns over the standard deviation of the noise, by
-            independent samples: the nuisance and the free parameters of the model, then what each
-            alternative adds, and its slopes by its own parameters.
-        independent: (n_q,) samples.
-        added: (n_q, alternatives) of what each adds with itself; applied: (n_q,) of the applied
-            force, both of all samples, N.m or N squared.
+        squares: (n_q, m, m) of all columns over the standard deviation of the noise, scaled to
+            independent samples: the nuisance and the free parameters of the model, then the force
+            of each alternative and its slopes with respect to its own parameters.
+        independent: (n_q,) independent samples.
+        added: (n_q, alternatives) squared force of each alternative; applied: (n_q,) squared
+            applied force; both over all samples, (N.m)^2 or N^2.
     """
 
     squares: Array
@@ -69,19 +69,19 @@ class Sums:
     def __add__(self, other: Sums) -> Sums:
         return Sums(*map(add, vars(self).values(), vars(other).values()))
 
-    def scaled(self, factor: float) -> Sums:
-        """The sums of trials that are ``factor`` times as long."""
+    def scale_by(self, factor: float) -> Sums:
+        """Return the sums of trials that are ``factor`` times as long."""
         return Sums(*(factor * values for values in vars(self).values()))
 
 
 @dataclass(frozen=True)
 class Remainder:
-    """What fitted columns leave of a target.
+    """Remainder of a target after a fit of other columns.
 
     Attributes:
-        squares: sum by axis, (n_q,), in variances of the noise.
-        prior: twice what the parameters' departure from what is known of them costs, nats.
-        share: both together, of the sum of squares of the target on all axes.
+        squares: sum of squares by axis, (n_q,), in variances of the noise.
+        prior: twice the cost of the parameters' distance from their priors, nats.
+        share: both together over the sum of squares of the target on all axes.
     """
 
     squares: Array
@@ -89,7 +89,7 @@ class Remainder:
     share: float
 
     def distance(self, independent: Array, factor: Array | float = 1.0) -> Array:
-        """Expected log likelihood ratio of the target times a factor over what is fitted, nats.
+        """Return the expected log likelihood ratio of ``factor`` times the target, nats.
 
         Args:
             independent: (n_q,) samples; factor: one, or several, (...).
@@ -103,10 +103,10 @@ class Contrast:
     """How two alternatives differ on some trials.
 
     Attributes:
-        distance: expected log likelihood ratio of the right one over the wrong one refitted, nats,
-            the smaller of both ways.
-        left: (n_q,) root mean square that the wrong one leaves of the right one, in standard
-            deviations of the noise, the smaller of both ways.
+        distance: expected log likelihood ratio of the right one over the wrong one refitted, nats;
+            the smaller one if the roles are exchanged.
+        left: (n_q,) root mean square error of the wrong one, in standard deviations of the noise;
+            the smaller one likewise.
     """
 
     distance: float
@@ -118,8 +118,8 @@ class Comparison:
     """Alternative effects beside one model, under the likelihood of the trials at hand.
 
     Attributes:
-        session: the trials, and what decides; fit: the model without any of the alternatives.
-        final: the model by whose error they are weighed: the better one, fitted.
+        session: the trials and the criteria; fit: the model without any of the alternatives.
+        final: the fitted model with the most probable effects, whose error sets the noise.
         alternatives: the effects.
     """
 
@@ -130,30 +130,31 @@ class Comparison:
 
     @cached_property
     def scale(self) -> Array:
-        """Mean square that the better model leaves, in variances of the noise, (n_q,)."""
+        """Mean square error of the better model, in variances of the noise, (n_q,)."""
         return self.final.solved.left / self.final.problem.count
 
     @cached_property
     def independent_share(self) -> Array:
-        """Independent samples over those by the noise alone, (n_q,), as the diagnosis counts.
+        """Share of the samples that are independent in the presence of model errors, (n_q,).
 
-        What the better model lacks comes back with the motion: many samples then say one thing.
+        Errors of the better model recur with the motion, so that many samples hold the same
+        information; they are counted as the diagnosis counts them.
         """
         counted = self.final.count_independent(self.session.criteria)
         pairs = zip(counted, self.final.likelihood.samples, strict=True)
         return np.array([ours.independent / max(all_.independent, 1e-300) for ours, all_ in pairs])
 
     @cached_property
-    def at_hand(self) -> Sums:
+    def sums_now(self) -> Sums:
         """The sums over the trials at hand."""
         return self._sums_of(self.fit.evidence, self.fit.likelihood)
 
     def sums(self, motions: Sequence[Motion]) -> Sums:
-        """The sums over ``motions``, replays of the model through the sensors."""
+        """Return the sums over ``motions``, replays of the model through the sensors."""
         return reduce(add, (self._sums_of(*self._observe(motion)) for motion in motions))
 
     def _observe(self, motion: Motion) -> tuple[Evidence, Likelihood]:
-        """The model on a replay, whose noise goes with speed as in the trials at hand."""
+        """Return the model on a replay, with the noise that the trials show at each speed."""
         e, c = self.fit.evidence, self.session.criteria
         name = motion.trial_id
         seen = gather_evidence(
@@ -164,7 +165,7 @@ class Comparison:
         speed = [np.abs(motion.qd[e.band.thinned_rows(len(motion.t))])]
         bias, variance, classes = [], [], []
         for axis, here in enumerate(samples):
-            # One replay is its bias with the noise of one.
+            # A single replay is its own bias, with the noise of one replay.
             bias.append(take_samples(seen.residual, here, axis))
             speeds, variances, numbers = self._noise_by_speed[axis]
             at = np.searchsorted(speeds[:-1], take_samples(speed, here, axis))
@@ -183,7 +184,7 @@ class Comparison:
         for axis, here in enumerate(likelihood.samples):
             speed, noise = take_samples(speeds, here, axis), likelihood.noise
             order = np.argsort(speed)
-            # An axis that never moves has none, and counts for nothing.
+            # An axis that never moves has no samples and does not count.
             known = speed[order], noise.variance[axis][order], noise.speed[axis][order]
             found.append(known if speed.size else (_ZERO, _ZERO, np.zeros(1, dtype=np.int64)))
         return found
@@ -218,7 +219,7 @@ class Comparison:
         return Sums(np.array(squares), independent, np.array(plain), np.array(applied))
 
     def _added_by(self, alternative: Alternative, base: ModelOnTrial) -> list[Array]:
-        """What an alternative adds to the residual, its slopes by its parameters, each (T, n_q)."""
+        """Return the residual of an alternative and its slopes by its parameters, each (T, n_q)."""
 
         def residual(number: int, values: Array) -> Array:
             item = alternative.items[number]
@@ -230,14 +231,14 @@ class Comparison:
         for number, place in alternative.slopes:
             q = alternative.items[number].parameters[place]
             moved = alternative.values[number].copy()
-            step = _STEP * max(abs(moved[place]), _STEP * q.sd)
+            step = _SLOPE_STEP * max(abs(moved[place]), _SLOPE_STEP * q.sd)
             step = -step if moved[place] + step > q.upper else step
             moved[place] += step
             rows.append((residual(number, moved) - here[number]) / step)
         return rows
 
     def _places(self, width: int) -> list[tuple[int, list[int]]]:
-        """For each alternative, the column of what it adds and those of its slopes."""
+        """Return, for each alternative, the column of its residual and those of its slopes."""
         widths = [1 + len(alternative.slopes) for alternative in self.alternatives]
         ends = width - sum(widths) + np.cumsum(widths)
         firsts = [int(end) - w for end, w in zip(ends, widths, strict=True)]
@@ -245,18 +246,18 @@ class Comparison:
 
     @cached_property
     def _precision(self) -> Array:
-        """What is known beforehand of the nuisance parameters and of the model's own."""
+        """Prior precisions of the nuisance parameters and of the model's own."""
         e = self.fit.evidence
         of_timing = [12.0 / (e.timing[1] - e.timing[0]) ** 2] if e.by_timing else []
         return np.concatenate([np.ones(2 * len(self.scale)), e.precision, of_timing])
 
     def find_remainders(self, total: Sums) -> list[Remainder]:
-        """What the model alone leaves of each alternative."""
+        """Return the remainder of each alternative after a fit of the model alone."""
         targets = [target for target, _ in self._places(total.squares.shape[1])]
         return self._find_remainders(total, targets, [])
 
     def information(self, total: Sums, number: int) -> Array:
-        """On the parameters of an alternative by which there are slopes, else on a factor of it."""
+        """Return the information on the fitted parameters of an alternative, else on its size."""
         target, slopes = self._places(total.squares.shape[1])[number]
         columns = slopes or [target]
         nb = len(self._precision)
@@ -265,11 +266,11 @@ class Comparison:
         return np.asarray(squares[np.ix_(columns, columns)] - taken)
 
     def contrasts(self, total: Sums, on: Sums | None = None) -> dict[tuple[int, int], Contrast]:
-        """How each pair of alternatives differs once the trials of ``total`` are fitted.
+        """Return the contrast of each pair of alternatives, with the trials of ``total`` fitted.
 
         Args:
-            total: of all trials that the fit sees.
-            on: of those on which `Contrast.left` is taken; the same by default.
+            total: sums of all trials that are fitted.
+            on: sums of the trials on which `Contrast.left` is taken; the same by default.
         """
         places, on = self._places(total.squares.shape[1]), on or total
         found = {}
@@ -290,7 +291,7 @@ class Comparison:
     def _find_remainders(
         self, total: Sums, targets: Sequence[int], fitted: Sequence[int], on: Sums | None = None
     ) -> list[Remainder]:
-        """What the model and ``fitted`` columns leave of each target on some trials."""
+        """Return the remainder of each target after a fit of the model and ``fitted`` columns."""
         on, nb = on or total, len(self._precision)
         taken, columns = self._fit(total, targets, fitted), [*range(nb), *fitted]
         by_fitted = on.squares[:, columns]
@@ -315,40 +316,40 @@ class Comparison:
         return np.asarray(scale * solved)
 
     def weights(self) -> dict[tuple[int, int], float]:
-        """Weight of each pair, after Box and Hill (1967): the product of their odds, sum one."""
+        """Return Box-Hill weights (1967): the product of the odds of each pair, normalised."""
         pairs = list(combinations(range(len(self.alternatives)), 2))
         products = [self.alternatives[i].odds * self.alternatives[j].odds for i, j in pairs]
         total = sum(products) or 1.0
         return {pair: product / total for pair, product in zip(pairs, products, strict=True)}
 
     @cached_property
-    def now(self) -> dict[tuple[int, int], Contrast]:
-        """How each pair of alternatives differs on the trials at hand."""
-        return self.contrasts(self.at_hand)
+    def contrasts_now(self) -> dict[tuple[int, int], Contrast]:
+        """The contrast of each pair of alternatives on the trials at hand."""
+        return self.contrasts(self.sums_now)
 
     def confusions(
         self, contrasts: Mapping[tuple[int, int], Contrast]
     ) -> dict[tuple[int, int], float]:
-        """Chance of taking one of each pair of alternatives for the other, with more trials."""
-        odds = [alternative.odds for alternative in self.alternatives]
+        """Return the chance of confusing each pair of alternatives, with more trials."""
+        odds, now = [one.odds for one in self.alternatives], self.contrasts_now
         return {
-            (i, j): chance_of_confusion(odds[i], odds[j], found.distance - self.now[i, j].distance)
+            (i, j): chance_of_confusion(odds[i], odds[j], found.distance - now[i, j].distance)
             for (i, j), found in contrasts.items()
         }
 
     def confusion_with(self, motion: Motion) -> float:
-        """Chance over all pairs, by their weights, once ``motion`` has been recorded, too."""
-        found = self.confusions(self.contrasts(self.at_hand + self.sums([motion])))
+        """Return the weighted chance over all pairs once ``motion`` is recorded too."""
+        found = self.confusions(self.contrasts(self.sums_now + self.sums([motion])))
         return sum(weight * found[pair] for pair, weight in self.weights().items())
 
     def expect(self, motions: Sequence[Motion]) -> tuple[ExpectedConfusion, ...]:
-        """What one trial says of each pair, the median over ``motions``, its versions."""
+        """Return the expected confusion of each pair: the median over versions of a trial."""
         sums = [self.sums([motion]) for motion in motions]
-        then = [self.contrasts(self.at_hand + new, new) for new in sums]
+        then = [self.contrasts(self.sums_now + new, new) for new in sums]
         chances, weights = [self.confusions(found) for found in then], self.weights()
-        before, axes = self.confusions(self.now), self.fit.evidence.system.coordinates
+        before, axes = self.confusions(self.contrasts_now), self.fit.evidence.system.coordinates
         expected = []
-        for pair, now in self.now.items():
+        for pair, now in self.contrasts_now.items():
             left = np.median([found[pair].left for found in then], axis=0).tolist()
             expected.append(
                 ExpectedConfusion(
@@ -368,11 +369,11 @@ _ZERO = np.zeros(1)
 
 
 def chance_of_confusion(first: float, second: float, gained: float) -> float:
-    """Chance that the less probable of two is the right one, after more trials.
+    """Return the chance that the less probable of two is the right one, after more trials.
 
     Args:
-        first, second: odds as they stand.
-        gained: expected log likelihood ratio by the trials, nats; its variance is twice that.
+        first, second: present odds.
+        gained: expected log likelihood ratio from the trials, nats; its variance is twice that.
     """
     total = first + second
     if gained <= 0.0:

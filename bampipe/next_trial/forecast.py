@@ -1,4 +1,4 @@
-"""What the proposed trials are expected to give, as it is stored."""
+"""The expected gain of a proposed trial, as it is stored."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.arrays import Array
-from bampipe.next_trial.choice import RankedDesign
+from bampipe.next_trial.design_sentence import describe_design
 from bampipe.next_trial.discrimination import Comparison
-from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import Primitive, find_beyond
+from bampipe.next_trial.ranking import RankedDesign
+from bampipe.next_trial.rehearsal import Rehearsal
 from bampipe.next_trial.sensitivity import Detectability
-from bampipe.next_trial.words import describe
 from bampipe.results.next import ExpectedSd, Move, Proposal, Purpose
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What is needed to say what a design gives.
+    """The models from which the gain of a design is forecast.
 
     Attributes:
-        rehearsal: the fitted model that designs are tried with.
-        precision: what is known of its parameters.
+        rehearsal: the fitted model with which designs are tried.
+        precision: uncertainty of its parameters.
         comparison: alternatives to distinguish, if that is the purpose.
-        detectability: of the effects of the library, if that is.
+        detectability: of the effects of the library, if that is the purpose.
     """
 
     rehearsal: Rehearsal
@@ -36,26 +36,26 @@ class Forecast:
 
     @property
     def purpose(self) -> Purpose:
-        """What a trial is for."""
+        """The purpose of the trial."""
         if self.comparison is not None:
             return "decision"
         return "precision" if self.detectability is None else "sensitivity"
 
     def added_by(self, ranked: RankedDesign) -> list[Array]:
-        """The information (m, m) that each usual version of a design adds on the parameters.
+        """Return the information (m, m) on the parameters from each usual version of a design.
 
-        None on a model to which the trial is not fitted.
+        It is zero if the model is not fitted to such a trial.
         """
         nothing, is_fitted = self.precision.information * 0.0, self.is_fitted_to(ranked.design)
         motions = ranked.expected_motions
         return [self.precision.of_motion(one) if is_fitted else nothing for one in motions]
 
     def is_fitted_to(self, design: Primitive) -> bool:
-        """Whether the model is fitted to such a trial: with brakes on, if it has their effects."""
+        """Return whether the model is fitted to such a trial; with brakes on, if it has brakes."""
         return self.rehearsal.system.braked or not design.field
 
     def proposal(self, ranked: RankedDesign) -> Proposal:
-        """The record of a design that has been ranked."""
+        """Return the record of a design that has been ranked."""
         device, seen, design = (
             self.rehearsal.system.model.device,
             self.rehearsal.seen,
@@ -64,10 +64,10 @@ class Forecast:
         names, added = [axis.name for axis in device.coordinates], self.added_by(ranked)
         moved = set(design.strokes) or range(len(names))
         farther, faster = (tuple(names[i] for i in some) for some in find_beyond(design, seen))
-        # Of a model that lacks something, uncertainties are not worth a forecast.
+        # If the model lacks something, uncertainties cannot be forecast.
         has_forecast = self.comparison is None and self.is_fitted_to(design)
         return Proposal(
-            sentence=describe(design, seen, device),
+            sentence=describe_design(design, seen, device),
             seconds=design.seconds,
             moves=describe_moves(design, self.rehearsal),
             pose={n: float(design.pose[i]) for i, n in enumerate(names) if i not in moved},
@@ -101,7 +101,7 @@ class Forecast:
 
 
 def describe_moves(design: Primitive, rehearsal: Rehearsal) -> dict[str, Move]:
-    """The record of the strokes of a design."""
+    """Return the record of the strokes of a design."""
     axes = rehearsal.system.model.device.coordinates
     strokes = {i: (s.low, s.high, s.slow, s.fast, s.rest_s) for i, s in design.strokes.items()}
     if design.series is not None:

@@ -1,4 +1,4 @@
-"""Trials that a person can record: strokes of some axes, within what machine and person can do."""
+"""Trials that a person can record: strokes of some axes, within the limits of both."""
 
 from __future__ import annotations
 
@@ -13,55 +13,55 @@ from bampipe.trials.measured import trial_of_block
 from bampipe.trials.motion import Motion
 
 PEAK = 1.875
-"""Highest over mean speed of a stroke of least jerk; of the acceleration, over travel per time
-squared, see `PEAK_ACCELERATION` (Flash and Hogan 1985)."""
+"""Highest over mean speed of a minimum-jerk stroke (Flash and Hogan 1985)."""
 PEAK_ACCELERATION = 5.77
+"""Its highest acceleration over travel per time squared."""
 FEWEST_STROKES = 3
-"""In a trial: a sweep too slow for so many is made shorter."""
+"""Fewest strokes in a trial: a slower sweep is made shorter."""
 PARTS = 2
-"""Trials in which motion is recorded that leaves what has been seen: each trial is judged by what
-the others say, and a trial that is the only one of its kind can be judged by none."""
-SHORTEST_S = 4.0
-"""Of each of these."""
-_HIGHEST = 0.6
-_SPEEDS = {"slow": (0.02, 0.08), "moderate": (0.15, 0.35), "fast": (0.35, _HIGHEST)}
-"""Bands of the highest speed of each stroke, as shares of the speed seen in the trials: people
-hurry, and whether the model describes what is faster than anything seen is not known."""
-_ACCELERATION = 0.25
-"""Share of the acceleration seen, likewise."""
-_MARGIN = 0.05
-"""Of the range that the device states, from which designs beyond what has been seen keep away."""
-_FASTER = 2.0
-"""Of the highest speed seen: no design is faster, whatever the device allows."""
-_OF_LIMIT = 0.5
-"""Of the speed that the device allows: somebody at twice the speed of a design keeps to it."""
+"""Trials in which motion beyond the present range is recorded: each trial is judged by parameters
+fitted to the others, and none of them resembles a trial that is the only one of its kind."""
+SHORTEST_PART_S = 4.0
+"""Shortest of these trials."""
+_FASTEST_SHARE = 0.6
+_SPEEDS = {"slow": (0.02, 0.08), "moderate": (0.15, 0.35), "fast": (0.35, _FASTEST_SHARE)}
+"""Bands of the highest speed of each stroke, as shares of the highest speed in the trials: people
+hurry, and the model may not describe faster motion."""
+_ACCELERATION_SHARE = 0.25
+"""Share of the highest acceleration in the trials, for the same reason."""
+_RANGE_MARGIN = 0.05
+"""Margin of designs beyond the trials to the ends of the stated range, as a share of it."""
+_MOST_SPEED_GAIN = 2.0
+"""No design is faster than this times the highest speed in the trials."""
+_LIMIT_SHARE = 0.5
+"""Share of the stated speed limit: somebody at twice the speed of a design still keeps it."""
 _HAND_SPEED = 1.0
-"""Of a grip, m/s: hands that reach for something are about so fast (Flash and Hogan 1985)."""
-_WORTHWHILE = 1.1
-"""Of range or speed seen: from there on it is worth going beyond."""
-_NOTABLE = 0.02
-"""Of range or speed: by so much a design exceeds them before it is said to."""
+"""Speed of a grip moved by hand, m/s (reaching movements; Flash and Hogan 1985)."""
+_LEAST_GAIN = 1.1
+"""Least ratio of allowed to recorded range or speed that makes wider designs worthwhile."""
+_TOLERATED_EXCESS = 0.02
+"""Share by which a design may exceed range or speed of the trials before that is mentioned."""
 _SPANS = {
     "whole": (0.0, 1.0), "middle": (0.33, 0.67), "lower": (0.0, 0.4), "upper": (0.6, 1.0),
     "low end": (0.0, 0.2), "high end": (0.8, 1.0),
 }  # fmt: skip
-"""Ends of the strokes, as shares of the range of the trials. Half of a stroke near the end is as
-far away from elsewhere as all of it: that somebody covers only half of it costs little."""
-_SMALL = (0.45, 0.55)
-_POINTS = 2000
-"""Of a series, at which its extent is taken."""
+"""Ends of the strokes, as shares of the range of the trials. Near an end, half a stroke is about as
+useful as a whole one, so that a person who covers only half loses little."""
+_SMALL_SPAN = (0.45, 0.55)
+_EXTENT_POINTS = 2000
+"""Points at which the extent of a series is computed."""
 _REST_S = 1.0
-GENTLE = 0.12
-"""Half the range of an axis that is moved gently, so that it does not rest."""
-_POSES = (0.2, 0.8)
-"""Where other axes may be, as shares of their range; else at their usual place."""
-_FIELDS = (0.5, 1.0)
+GENTLE_SPAN = 0.12
+"""Half the travel of an axis that moves only to avoid rest, as a share of its range."""
+_POSE_SHARES = (0.2, 0.8)
+"""Places of other axes that are tried beside their usual one, as shares of their range."""
+_BRAKE_SHARES = (0.5, 1.0)
 """Shares of the brake commands of the viscous trials."""
 
 
 @dataclass(frozen=True)
 class Envelope:
-    """What the trials have shown that the device and its user can do.
+    """The range, speed and acceleration that the trials have shown.
 
     Attributes:
         low, high: ends of the travel by axis, (n_q,), rad or m.
@@ -69,7 +69,7 @@ class Envelope:
         speed: (n_q,), rad/s or m/s; acceleration: (n_q,), per s squared.
         field: brake command over speed in the viscous trials by axis, (n_q,); zero without them.
         levels: lowest, usual and highest value of each further channel.
-        wider: the same with what the device allows beyond; None where it allows nothing more.
+        wider: the wider envelope that the device allows; None if it allows nothing more.
     """
 
     low: Array
@@ -83,7 +83,7 @@ class Envelope:
 
     @classmethod
     def of_trials(cls, motions: Sequence[Motion], system: System, p: Array) -> Envelope:
-        """The envelope of the trials at hand, by a model with parameters ``p`` (n_p,)."""
+        """Return the envelope of the trials at hand, for a model with parameters ``p`` (n_p,)."""
         device = system.model.device
         axes = [c.name for c in device.coordinates]
         q, qd, qdd = (
@@ -101,36 +101,38 @@ class Envelope:
         seen = cls(
             low, np.maximum(high, low), np.clip(np.median(q, axis=0), low, high),
             np.quantile(np.abs(qd), 0.99, axis=0), np.quantile(np.abs(qdd), 0.99, axis=0),
-            np.array([_field_of(motions, device.brakes.get(a), i) for i, a in enumerate(axes)]),
+            np.array([_brake_gain(motions, device.brakes.get(a), i) for i, a in enumerate(axes)]),
             levels,
         )  # fmt: skip
-        return seen.within(bounds, _speed_limits(motions, system, p))
+        return seen.widen(bounds, _find_speed_limits(motions, system, p))
 
-    def within(self, bounds: Array, speeds: Array) -> Envelope:
-        """The same with what limits of the device allow beyond.
+    def widen(self, bounds: Array, speeds: Array) -> Envelope:
+        """Return the envelope with a wider one within the limits of the device.
 
-        Faster motion may have the acceleration seen, and no more.
+        The acceleration stays that of the trials, also for faster motion.
 
         Args:
-            bounds: (n_q, 2) range of each axis, infinite where none is stated.
-            speeds: (n_q,) highest speed, NaN where none is known.
+            bounds: (n_q, 2) range of each axis, infinite if none is stated.
+            speeds: (n_q,) highest speed, NaN if none is known.
         """
         stated = np.isfinite(bounds[:, 0]) & np.isfinite(bounds[:, 1])
         bounds = np.where(stated[:, None], bounds, np.column_stack([self.low, self.high]))
-        margin = _MARGIN * (bounds[:, 1] - bounds[:, 0]) * stated
+        margin = _RANGE_MARGIN * (bounds[:, 1] - bounds[:, 0]) * stated
         low = np.minimum(self.low, bounds[:, 0] + margin)
         high = np.maximum(self.high, bounds[:, 1] - margin)
-        far = high - low > _WORTHWHILE * (self.high - self.low)
-        highest = np.fmin(_FASTER * self.speed, _OF_LIMIT * speeds) * np.isfinite(speeds)
-        fast = np.nan_to_num(highest) > _WORTHWHILE * _HIGHEST * self.speed
+        far = high - low > _LEAST_GAIN * (self.high - self.low)
+        highest = np.fmin(_MOST_SPEED_GAIN * self.speed, _LIMIT_SHARE * speeds) * np.isfinite(
+            speeds
+        )
+        fast = np.nan_to_num(highest) > _LEAST_GAIN * _FASTEST_SHARE * self.speed
         if not (far | fast).any():
             return self
         wider = replace(
             self,
             low=np.where(far, low, self.low),
             high=np.where(far, high, self.high),
-            speed=np.where(fast, highest / _HIGHEST, self.speed),
-            acceleration=np.where(fast, self.acceleration / _ACCELERATION, self.acceleration),
+            speed=np.where(fast, highest / _FASTEST_SHARE, self.speed),
+            acceleration=np.where(fast, self.acceleration / _ACCELERATION_SHARE, self.acceleration),
         )
         return replace(self, wider=wider)
 
@@ -141,18 +143,18 @@ class Envelope:
         return farthest.low, farthest.high
 
     @property
-    def movable(self) -> list[int]:
+    def moved_axes(self) -> list[int]:
         """Axes that the trials have moved."""
         return [i for i in range(len(self.low)) if self.high[i] > self.low[i] and self.speed[i] > 0]
 
 
-def _speed_limits(motions: Sequence[Motion], system: System, p: Array) -> Array:
-    """Highest speed of each axis, (n_q,): of the device, or of a hand; NaN where none is known."""
+def _find_speed_limits(motions: Sequence[Motion], system: System, p: Array) -> Array:
+    """Return the speed limit of each axis, (n_q,): of the device or of a hand; NaN if unknown."""
     device = system.model.device
     known = [device.speed_limits.get(axis, np.nan) for axis in system.coordinates]
     if device.drive or device.prescribed or device.force_unit != "N":
         return np.array(known)
-    # A force at the grip acts on an axis by the lever by which the axis moves the grip.
+    # The lever of a force at the grip is the one by which the axis moves the grip.
     levers = [
         np.linalg.norm(system.input_map(m.q, m.inputs(system.inputs), p), axis=2) for m in motions
     ]
@@ -161,8 +163,8 @@ def _speed_limits(motions: Sequence[Motion], system: System, p: Array) -> Array:
     return np.where(np.isnan(known), by_hand, known)
 
 
-def _field_of(motions: Sequence[Motion], brake: str | None, axis: int) -> float:
-    """Command of a brake over the speed of its axis, in the trials in which it is commanded."""
+def _brake_gain(motions: Sequence[Motion], brake: str | None, axis: int) -> float:
+    """Return brake command over speed of the axis, in the trials in which it is commanded."""
     if brake is None:
         return 0.0
     ratios = []
@@ -175,13 +177,13 @@ def _field_of(motions: Sequence[Motion], brake: str | None, axis: int) -> float:
 
 @dataclass(frozen=True)
 class Stroke:
-    """Back and forth of one axis.
+    """Motion of one axis back and forth.
 
     Attributes:
         low, high: where it turns, rad or m.
         slow, fast: band of the highest speed of each stroke, rad/s or m/s.
         rest_s: pause at each turn, s.
-        gentle: whether it is only there so that the axis does not rest.
+        gentle: whether its only purpose is that the axis does not rest.
     """
 
     low: float
@@ -193,7 +195,7 @@ class Stroke:
 
     @property
     def typical_s(self) -> float:
-        """How long a stroke in the middle of its band takes, with the pause after it."""
+        """Duration of a stroke in the middle of its band, with the pause after it."""
         return PEAK * (self.high - self.low) / float(np.sqrt(self.slow * self.fast)) + self.rest_s
 
 
@@ -213,24 +215,24 @@ class Example:
 
     @property
     def ends(self) -> tuple[Array, Array]:
-        """Lowest and highest positions but for the outermost hundredths, each (n_q,)."""
+        """Lowest and highest positions: the 1 % and 99 % quantiles, each (n_q,)."""
         return np.quantile(self.motion.q, 0.01, axis=0), np.quantile(self.motion.q, 0.99, axis=0)
 
     @property
     def speed(self) -> Array:
-        """Highest speed but for the fastest hundredth, (n_q,), rad/s or m/s."""
+        """Highest speed: the 99 % quantile, (n_q,), rad/s or m/s."""
         return np.asarray(np.quantile(np.abs(self.motion.qd), 0.99, axis=0))
 
 
 @dataclass(frozen=True)
 class Series:
-    """A motion of all axes for drives: harmonics about a middle that grow from rest and fade to it.
+    """A motion of all axes for drives: harmonics about a middle position, from rest to rest.
 
     Attributes:
-        middle: where it starts and ends, (n_q,), rad or m.
+        middle: start and end, (n_q,), rad or m.
         sine, cosine: amplitudes of the harmonics, (K, n_q).
-        seconds: how long it is, the period of the first harmonic.
-        ramp_s: how long it grows, and fades.
+        seconds: its length, which is the period of the first harmonic.
+        ramp_s: time in which it grows, and fades.
     """
 
     middle: Array
@@ -240,7 +242,7 @@ class Series:
     ramp_s: float
 
     def path(self, t: Array) -> tuple[Array, Array, Array]:
-        """Position, velocity and acceleration, each (T, n_q), at times ``t``, over and over."""
+        """Return position, velocity and acceleration at times ``t``, each (T, n_q), repeated."""
         t = np.mod(t, self.seconds)
         w = 2.0 * np.pi / self.seconds * np.arange(1, len(self.sine) + 1)
         sin, cos = np.sin(t[:, None] * w), np.cos(t[:, None] * w)
@@ -259,14 +261,14 @@ class Series:
             size * a + 2.0 * rate * v + bend * x,
         )
 
-    def scaled(self, share: Array | float) -> Series:
-        """The same with all amplitudes times ``share``, one for each axis or one for all."""
+    def scale_by(self, share: Array | float) -> Series:
+        """Return the series with all amplitudes times ``share``, a number or one for each axis."""
         return replace(self, sine=share * self.sine, cosine=share * self.cosine)
 
     @property
     def extent(self) -> tuple[Array, Array, Array, Array]:
         """Lowest and highest positions, highest speeds and accelerations, each (n_q,)."""
-        q, qd, qdd = self.path(np.linspace(0.0, self.seconds, _POINTS))
+        q, qd, qdd = self.path(np.linspace(0.0, self.seconds, _EXTENT_POINTS))
         return q.min(axis=0), q.max(axis=0), np.abs(qd).max(axis=0), np.abs(qdd).max(axis=0)
 
 
@@ -275,14 +277,14 @@ class Primitive:
     """One trial that a person can record, or one in several parts.
 
     Attributes:
-        strokes: by number of the axis, those that move; the first is the one that it is about.
-        pose: where the others are held, (n_q,), rad or m.
-        seconds: how long.
+        strokes: by number of the axis; the first is the one that the trial excites.
+        pose: position at which the other axes are held, (n_q,), rad or m.
+        seconds: total length.
         field: share of the brake commands of the viscous trials, 0 without brakes.
         levels: values at which further channels are held.
-        parts: trials in which it is recorded, each as long.
-        example: what is imitated where there are no strokes.
-        series: what drives follow where there is neither.
+        parts: number of trials in which it is recorded, of equal length.
+        example: the trial that is imitated, if there are no strokes.
+        series: the motion that drives follow, if there is neither.
     """
 
     strokes: Mapping[int, Stroke]
@@ -296,32 +298,32 @@ class Primitive:
 
     @property
     def part_s(self) -> float:
-        """How long each of its trials is, s."""
+        """Length of each of its trials, s."""
         return self.seconds / self.parts
 
 
 def list_primitives(
     seen: Envelope, seconds: float, axes: Sequence[int], with_rests: bool
 ) -> list[Primitive]:
-    """Primitives about ``axes``; all other axes move gently about their usual place.
+    """Return primitives that excite ``axes``; all other axes move gently about their usual place.
 
-    Within what has been seen first, then those that leave it as far as the device allows. What
-    rests tells nothing, and estimators that use it all the same believe too much of it.
+    Designs within the range of the trials come first, then those beyond it. No axis rests: rest
+    holds no information, and estimators overrate it.
     """
     found = _list_within(seen, seen, seconds, axes, with_rests)
     if seen.wider is not None:
-        part_s = max(seconds / PARTS, min(seconds, SHORTEST_S))
+        part_s = max(seconds / PARTS, min(seconds, SHORTEST_PART_S))
         others = _list_within(seen.wider, seen, part_s, axes, with_rests)
         found += [
-            _in_parts(replace(design, seconds=seconds), seen)
+            _split_if_new(replace(design, seconds=seconds), seen)
             for design in others
-            if any(find_beyond(design, seen, _HIGHEST))
+            if any(find_beyond(design, seen, _FASTEST_SHARE))
         ]
     return _drop_repeated(found)
 
 
 def _drop_repeated(designs: Sequence[Primitive]) -> list[Primitive]:
-    """The designs, each once: slow strokes of several ranges may be alike for lack of time."""
+    """Return the designs without repetition: slow strokes of several ranges may be the same."""
     found: dict[tuple[object, ...], Primitive] = {}
     for design in designs:
         key: list[object] = [design.parts]
@@ -334,7 +336,7 @@ def _drop_repeated(designs: Sequence[Primitive]) -> list[Primitive]:
 
 
 def imitate_trials(motions: Sequence[Motion], seen: Envelope, seconds: float) -> list[Primitive]:
-    """Primitives that imitate each of ``motions``; of a trial in blocks, the longest."""
+    """Return primitives that imitate each of ``motions``; of a trial in blocks, the longest one."""
     examples: dict[str, Example] = {}
     for motion in sorted(motions, key=lambda motion: -motion.t.size):
         example = Example(motion, trial_of_block(motion.trial_id))
@@ -343,22 +345,22 @@ def imitate_trials(motions: Sequence[Motion], seen: Envelope, seconds: float) ->
     return [Primitive({}, seen.usual, seconds, example=examples[name]) for name in sorted(examples)]
 
 
-def _in_parts(design: Primitive, seen: Envelope) -> Primitive:
-    """The same in several trials where it leaves what has been seen, and is long enough."""
-    is_new = any(find_beyond(design, seen)) and design.seconds >= PARTS * SHORTEST_S
+def _split_if_new(design: Primitive, seen: Envelope) -> Primitive:
+    """Return the design in several trials if it exceeds the present range and is long enough."""
+    is_new = any(find_beyond(design, seen)) and design.seconds >= PARTS * SHORTEST_PART_S
     return replace(design, parts=PARTS if is_new else 1)
 
 
 def find_beyond(
     design: Primitive, seen: Envelope, share: float = 1.0
 ) -> tuple[list[int], list[int]]:
-    """The axes that go farther than has been seen, and those faster than a share of its speed."""
-    slack = _NOTABLE * (seen.high - seen.low)
+    """Return the axes that go farther than in the trials, and those faster than a share of that."""
+    slack = _TOLERATED_EXCESS * (seen.high - seen.low)
     moves = {i: (stroke.low, stroke.high, stroke.fast) for i, stroke in design.strokes.items()}
     if design.series is not None:
         moves = dict(enumerate(zip(*design.series.extent[:3], strict=True)))
     lowest, highest = seen.low - slack, seen.high + slack
-    most = (share + _NOTABLE) * seen.speed
+    most = (share + _TOLERATED_EXCESS) * seen.speed
     farther = [i for i, (low, high, _) in moves.items() if low < lowest[i] or high > highest[i]]
     return farther, [i for i, (_, _, fast) in moves.items() if fast > most[i]]
 
@@ -366,37 +368,37 @@ def find_beyond(
 def _list_within(
     reach: Envelope, seen: Envelope, seconds: float, axes: Sequence[int], with_rests: bool
 ) -> list[Primitive]:
-    """Primitives within ``reach``; what moves gently stays within ``seen``."""
+    """Return primitives within ``reach``; gentle strokes stay within ``seen``."""
 
     def stroke(axis: int, span: tuple[float, float], pace: str) -> Stroke:
         return _make_stroke(reach, seconds, axis, span, _SPEEDS[pace])
 
     whole = _SPANS["whole"]
     designs = [
-        {axis: stroke(axis, span, pace) for axis in seen.movable}
+        {axis: stroke(axis, span, pace) for axis in seen.moved_axes}
         for pace in _SPEEDS
-        for span in (whole, _SMALL)
-        if len(seen.movable) > 1
+        for span in (whole, _SMALL_SPAN)
+        if len(seen.moved_axes) > 1
     ]
     for axis in axes:
         own = [stroke(axis, span, pace) for span in _SPANS.values() for pace in _SPEEDS]
-        own += [stroke(axis, _SMALL, pace) for pace in ("slow", "fast")]
+        own += [stroke(axis, _SMALL_SPAN, pace) for pace in ("slow", "fast")]
         if with_rests:
             wide = (stroke(axis, whole, pace) for pace in ("moderate", "fast"))
             own += [replace(one, rest_s=_REST_S) for one in wide]
-        others = [i for i in seen.movable if i != axis]
+        others = [i for i in seen.moved_axes if i != axis]
         gentle = {i: _make_gentle(seen, seconds, i, seen.usual[i]) for i in others}
         designs += [{axis: one, **gentle} for one in own]
-        # One of the others over all of its range.
+        # One further axis over its whole range.
         both = {axis: stroke(axis, whole, "moderate"), **gentle}
         designs += [both | {i: stroke(i, whole, "moderate")} for i in others]
     return [Primitive(strokes, seen.usual, seconds) for strokes in designs]
 
 
 def _make_gentle(seen: Envelope, seconds: float, axis: int, middle: float) -> Stroke:
-    """Small easy strokes of an axis about a place."""
+    """Return small easy strokes of an axis about ``middle``."""
     share = (middle - seen.low[axis]) / (seen.high[axis] - seen.low[axis])
-    low, high = np.clip([share - GENTLE, share + GENTLE], 0.0, 1.0)
+    low, high = np.clip([share - GENTLE_SPAN, share + GENTLE_SPAN], 0.0, 1.0)
     span = float(low), float(high)
     return replace(_make_stroke(seen, seconds, axis, span, _SPEEDS["moderate"]), gentle=True)
 
@@ -404,7 +406,7 @@ def _make_gentle(seen: Envelope, seconds: float, axis: int, middle: float) -> St
 def _make_stroke(
     reach: Envelope, seconds: float, axis: int, span: tuple[float, float], band: tuple[float, float]
 ) -> Stroke:
-    """Strokes of one axis over a span of its range, within a band of its speed."""
+    """Return strokes of one axis over a span of its range, within a band of its speed."""
     travel = reach.high[axis] - reach.low[axis]
     low, high = (float(reach.low[axis] + share * travel) for share in span)
     slow, fast = (float(share * reach.speed[axis]) for share in band)
@@ -412,23 +414,25 @@ def _make_stroke(
     if high - low > longest:
         middle = 0.5 * (low + high)
         low, high = middle - 0.5 * float(longest), middle + 0.5 * float(longest)
-    # Not faster than the acceleration that has been seen allows on that travel.
-    hardest = _ACCELERATION * reach.acceleration[axis]
+    # Not faster than the acceleration limit allows on that travel.
+    hardest = _ACCELERATION_SHARE * reach.acceleration[axis]
     fast = min(fast, float(PEAK * np.sqrt(hardest * (high - low) / PEAK_ACCELERATION)))
     return Stroke(low, high, min(slow, fast), fast)
 
 
 def vary_surroundings(seen: Envelope, given: Primitive) -> Iterator[Primitive]:
-    """The same design with other axes elsewhere, with brakes, and at other levels of channels."""
+    """Yield the design with other axes elsewhere, with brakes, and at other channel levels."""
     for axis in list(given.strokes)[1:]:
         for reach in [seen] if seen.wider is None else [seen, seen.wider]:
             low, high = float(reach.low[axis]), float(reach.high[axis])
             if reach is seen or high - low > float(seen.high[axis] - seen.low[axis]):
-                for share in _POSES:
+                for share in _POSE_SHARES:
                     moved = _make_gentle(reach, given.seconds, axis, low + share * (high - low))
-                    yield _in_parts(replace(given, strokes={**given.strokes, axis: moved}), seen)
+                    yield _split_if_new(
+                        replace(given, strokes={**given.strokes, axis: moved}), seen
+                    )
     if seen.field.any():
-        for field in _FIELDS:
+        for field in _BRAKE_SHARES:
             yield replace(given, field=field)
     for name, (least, _, most) in seen.levels.items():
         for level in dict.fromkeys((least, most)):

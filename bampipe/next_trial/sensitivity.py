@@ -1,4 +1,4 @@
-"""What trials would have revealed: the smallest strength of each effect that a diagnosis finds."""
+"""The smallest strength of each effect that a diagnosis of these trials would have found."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from bampipe.results.next import Detectable
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
 
-_FACTORS = np.geomspace(1e-4, 100.0, 241)
-"""Of the typical strength: a factor of 1.06 from one to the next, with straight lines between. What
-shows from the last one on only shows at no size that a machine has."""
-_MOST_GROWTH = 0.15
-"""Growth of the jump of friction at a reversal from which on no strength is promised. The joint of
-the independent simulator, at the strength that was: friction by load (0.07, 0.08) showed in three
-sessions of four, Stribeck friction (0.24 to 0.53) in none of four."""
-_POSES, _SLIDING = 50, 5.0
-"""At which that jump is looked at, and the speed on either side, in widths of the sign."""
+_STRENGTHS = np.geomspace(1e-4, 100.0, 241)
+"""Strengths tried, as factors of the typical one, with straight lines between them. No machine has
+an effect of the largest size."""
+_MOST_JUMP_GROWTH = 0.15
+"""Largest growth of the jump of friction at a reversal for which a strength is promised. On a
+simulated joint, load-dependent friction (growth 0.07 and 0.08) was found at the promised strength
+in three sessions of four, Stribeck friction (0.24 to 0.53) in none of four."""
+_JUMP_POSES, _JUMP_SPEED = 50, 5.0
+"""Poses at which the jump is computed; speed on either side of it, in widths of the sign."""
 
 
 @dataclass(frozen=True)
 class DetectionLimit:
-    """How large an effect must be to be found.
+    """The strength from which on an effect is found.
 
     Attributes:
         alternative: the effect with its typical strengths and shape.
-        factor: of the typical strength, from which on it is found; infinite where the trials do
-            not excite it.
-        axis: where it shows first.
-        growth: of the jump of friction as that axis turns round, at the typical strength.
+        factor: that strength over the typical one; infinite if the trials do not excite the effect.
+        axis: the axis that shows it first.
+        growth: relative growth of the jump of friction where that axis reverses, at the typical
+            strength.
     """
 
     alternative: Alternative
@@ -58,22 +58,22 @@ class DetectionLimit:
 
     @property
     def parameter(self) -> Parameter:
-        """The strength that is meant."""
-        return self.item.parameters[_strengths(self.item)[0]]
+        """The strength parameter."""
+        return self.item.parameters[_find_strengths(self.item)[0]]
 
     @property
     def typical(self) -> float:
-        """Its typical size, in its unit."""
-        return float(abs(self.alternative.values[0][_strengths(self.item)[0]]))
+        """Typical size of that parameter, in its unit."""
+        return float(abs(self.alternative.values[0][_find_strengths(self.item)[0]]))
 
     @property
     def is_promised(self) -> bool:
-        """Whether the machine would have moved much as it did.
+        """Whether the machine would have moved much as it did without the effect.
 
-        When friction jumps between two samples no log says, and what that leaves grows with the
-        jump; while a joint sticks and breaks free, it is not where it was without the effect.
+        A log does not show at which instant between two samples friction jumps, and the error that
+        this causes grows with the jump. A joint that sticks and breaks free moves differently.
         """
-        return np.isinf(self.factor) or self.factor * self.growth <= _MOST_GROWTH
+        return np.isinf(self.factor) or self.factor * self.growth <= _MOST_JUMP_GROWTH
 
     @property
     def is_hidden(self) -> bool:
@@ -81,20 +81,20 @@ class DetectionLimit:
         return self.factor > 1.0
 
 
-def _strengths(item: Candidate) -> list[int]:
+def _find_strengths(item: Candidate) -> list[int]:
     return [i for i, q in enumerate(item.parameters) if q.strength and not q.fixed]
 
 
 def _is_linear(item: Candidate) -> bool:
-    return len(item.linear_indices) == len(_strengths(item))
+    return len(item.linear_indices) == len(_find_strengths(item))
 
 
 def make_typical_alternative(item: Candidate, scale: MachineScale) -> Alternative | None:
-    """An effect at its typical strength, its shape within the range that the trials show.
+    """Return an effect at its typical strength; None if it has no strength parameter.
 
-    None where it has no strength.
+    Its shape is limited to the range that the trials show.
     """
-    strengths = _strengths(item)
+    strengths = _find_strengths(item)
     if not strengths:
         return None
     effect, values = item.system.model.effects[-1], []
@@ -110,12 +110,10 @@ def make_typical_alternative(item: Candidate, scale: MachineScale) -> Alternativ
 
 
 def find_limits(comparison: Comparison, sums: Sums, needed: float) -> list[DetectionLimit]:
-    """From which strength on each alternative of ``comparison`` would be called missing.
+    """Return the strength from which on each alternative of ``comparison`` is called missing.
 
-    Its log evidence, with the penalties of `Search`, must be what is needed, or more, with the
-    probability that an effect must have to be called missing; and its size must matter. What an
-    effect takes off the measured quantity it takes off the noise of its residual, too. Here noise
-    is that of what was measured, with the effect and without, and the two cancel.
+    Its log evidence, less the penalties of `Search`, must reach ``needed`` with the probability
+    that the criteria ask for, and its size must matter.
 
     Args:
         comparison: effects at their typical strengths; sums: of the trials.
@@ -126,8 +124,8 @@ def find_limits(comparison: Comparison, sums: Sums, needed: float) -> list[Detec
     remainders = comparison.find_remainders(sums)
     pairs = zip(comparison.alternatives, remainders, strict=True)
     for number, (alternative, left) in enumerate(pairs):
-        expected = left.distance(sums.independent, _FACTORS)
-        # Noise scatters a log likelihood ratio by the root of twice what is expected of it.
+        expected = left.distance(sums.independent, _STRENGTHS)
+        # The variance of a log likelihood ratio is twice its expectation.
         surely = expected - sure * np.sqrt(2.0 * expected)
         excess = surely - needed - _find_penalty(comparison, sums, number)
         enough = np.flatnonzero(excess >= 0.0)
@@ -135,29 +133,29 @@ def find_limits(comparison: Comparison, sums: Sums, needed: float) -> list[Detec
         if enough.size:
             k = max(int(enough[0]), 1)
             share = np.clip(-excess[k - 1] / max(excess[k] - excess[k - 1], 1e-300), 0.0, 1.0)
-            factor = float(_FACTORS[k - 1] * (_FACTORS[k] / _FACTORS[k - 1]) ** share)
-        # What it adds that the model cannot imitate, where it is most beside the applied force.
+            factor = float(_STRENGTHS[k - 1] * (_STRENGTHS[k] / _STRENGTHS[k - 1]) ** share)
+        # The part that the model cannot imitate, on the axis where it is largest.
         added = sums.added[:, number] / np.maximum(sums.applied, 1e-300)
         size = np.sqrt(float(added.max()) * left.share)
         scatter = sure / np.sqrt(max(float(left.squares.sum()) + left.prior, 1e-300))
         factor = max(factor, float(criteria.size / max(size, 1e-300) + scatter))
-        found.append(DetectionLimit(alternative, _limit(factor), int(np.argmax(left.squares))))
+        found.append(DetectionLimit(alternative, _cap_factor(factor), int(np.argmax(left.squares))))
     return found
 
 
-def _limit(factor: float) -> float:
-    """A factor, infinite where no machine has such a size."""
-    return factor if factor < _FACTORS[-1] else float("inf")
+def _cap_factor(factor: float) -> float:
+    """Return ``factor``, or infinity if no machine has an effect of that size."""
+    return factor if factor < _STRENGTHS[-1] else float("inf")
 
 
 def _find_penalty(comparison: Comparison, sums: Sums, number: int) -> Array:
-    """What the priors of an alternative take off its log evidence, at each factor, nats."""
+    """Return the penalty of the priors on the log evidence of an alternative at each strength."""
     alternative = comparison.alternatives[number]
     item, values = alternative.items[0], alternative.values[0]
     linear, information = list(item.linear_indices), comparison.information(sums, number)
-    typical, spread, factors = np.ones(1), np.ones(1), np.ones_like(_FACTORS)
+    typical, spread, factors = np.ones(1), np.ones(1), np.ones_like(_STRENGTHS)
     if linear:
-        typical, factors = np.abs(values[linear]), _FACTORS
+        typical, factors = np.abs(values[linear]), _STRENGTHS
         spread = np.array([item.parameters[i].sd for i in linear]) / typical
     if alternative.slopes:
         information = information * np.outer(values[linear], values[linear])
@@ -166,22 +164,22 @@ def _find_penalty(comparison: Comparison, sums: Sums, number: int) -> Array:
 
 
 def find_needed(criteria: Criteria, candidates: int, by_chance: Sequence[float] = ()) -> float:
-    """The log evidence before its penalties that makes an effect probable enough, nats.
+    """Return the log evidence, before penalties, that makes an effect probable enough, nats.
 
     Args:
-        criteria: of the diagnosis; candidates: that are weighed.
-        by_chance: the most that each replay of a model gives to any candidate, nats.
+        criteria: of the diagnosis; candidates: how many are weighed.
+        by_chance: largest gain of any candidate on each replay of a model, nats.
     """
     return least_gain(criteria, by_chance) - log_prior(criteria, candidates)
 
 
 @dataclass(frozen=True)
 class Detectability:
-    """What the trials at hand would have shown of the library's effects.
+    """The effects of the library that the trials at hand would have shown.
 
     Attributes:
         comparison: every effect at its typical strength.
-        limits: from which strength on each would have been found.
+        limits: the strength from which on each would have been found.
         needed: log evidence, nats.
     """
 
@@ -191,37 +189,37 @@ class Detectability:
 
     @property
     def hidden_numbers(self) -> list[int]:
-        """Numbers of the effects that would go unnoticed at their typical size, worst first."""
+        """Indices of the effects that would go unnoticed at their typical size, worst first."""
         order = sorted(range(len(self.limits)), key=lambda k: -self.limits[k].factor)
         return [k for k in order if self.limits[k].is_hidden]
 
     @property
     def unpromised_names(self) -> tuple[str, ...]:
-        """Names of those of which nothing is said; see `DetectionLimit.is_promised`."""
+        """Names of the effects without a promised size; see `DetectionLimit.is_promised`."""
         return tuple(one.alternative.name for one in self.limits if not one.is_promised)
 
     @property
     def brake_effects(self) -> tuple[str, ...]:
-        """Names of the effects that show where brakes are on."""
+        """Names of the effects that show only with brakes on."""
         return tuple(one.alternative.name for one in self.limits if one.item.system.braked)
 
     def restrict(self, chosen: Sequence[int]) -> Detectability:
-        """The same for some of the effects."""
+        """Return the same for the effects numbered ``chosen``."""
         limits = tuple(self.limits[k] for k in chosen)
         comparison = replace(self.comparison, alternatives=tuple(one.alternative for one in limits))
         return Detectability(comparison, limits, self.needed)
 
     def gain(self, motion: Motion) -> float:
-        """Sum of the logarithms by which a trial lowers what goes unnoticed of these effects."""
-        now = np.minimum([one.factor for one in self.limits], _FACTORS[-1])
+        """Return by how much a trial lowers the limits of these effects: sum of the logarithms."""
+        now = np.minimum([one.factor for one in self.limits], _STRENGTHS[-1])
         then = np.clip(self.factors_with(motion), 1.0, now)
         return float(np.sum(np.log(now / then)))
 
     def tabulate(self, motions: Sequence[Motion]) -> dict[str, Detectable]:
-        """The smallest strength of each effect that shows, without and with a trial.
+        """Return the smallest strength of each effect that shows, without and with a trial.
 
         Args:
-            motions: versions of the trial, of which the median counts.
+            motions: versions of the trial; their median counts.
         """
         after = np.median([self.factors_with(motion) for motion in motions], axis=0)
         axes = self.comparison.fit.evidence.system.coordinates
@@ -239,18 +237,18 @@ class Detectability:
         }
 
     def factors_with(self, motion: Motion) -> Array:
-        """From which factor on each effect is found once ``motion`` has been recorded."""
-        now, before = np.array([one.factor for one in self.limits]), self._factors_at_hand
-        after = self._factors(self.comparison.at_hand + self.comparison.sums([motion]))
-        # What is not linear in its strength is taken to change alike.
+        """Return the factor from which on each effect is found once ``motion`` is recorded."""
+        now, before = np.array([one.factor for one in self.limits]), self._factors_now
+        after = self._factors(self.comparison.sums_now + self.comparison.sums([motion]))
+        # An effect that is not linear in its strength is assumed to change by the same ratio.
         ratio = np.ones(len(now))
         known = np.isfinite(before) & np.isfinite(now)
         ratio[known] = now[known] / before[known]
-        return np.array([_limit(factor) for factor in after * ratio])
+        return np.array([_cap_factor(factor) for factor in after * ratio])
 
     @cached_property
-    def _factors_at_hand(self) -> Array:
-        return self._factors(self.comparison.at_hand)
+    def _factors_now(self) -> Array:
+        return self._factors(self.comparison.sums_now)
 
     def _factors(self, sums: Sums) -> Array:
         found = find_limits(self.comparison, sums, self.needed)
@@ -260,29 +258,29 @@ class Detectability:
 def find_detectability(
     session: Session, fit: Fit, by_chance: Sequence[float] = ()
 ) -> Detectability:
-    """What the trials would have shown of every effect of the library that the model lacks.
+    """Return the detection limits of every effect of the library that the model lacks.
 
     Args:
         session: the trials; fit: the model.
-        by_chance: what replays give to any candidate, nats.
+        by_chance: largest gain of any candidate on each replay, nats.
     """
     scale, names = MachineScale.of_trials(fit.evidence), session.candidate_names(fit.recipe)
     typical = (make_typical_alternative(item, scale) for item in candidates_of(fit.recipe, names))
     alternatives = tuple(alternative for alternative in typical if alternative is not None)
     comparison = Comparison(session, fit, fit, alternatives)
     needed = find_needed(session.criteria, len(names), by_chance)
-    limits = find_limits(comparison, comparison.at_hand, needed)
+    limits = find_limits(comparison, comparison.sums_now, needed)
     limits = [
-        replace(one, factor=_within(one, scale), growth=growth_of_jump(comparison, one))
-        for one in _refine(comparison, limits, needed)
+        replace(one, factor=_bound_factor(one, scale), growth=find_jump_growth(comparison, one))
+        for one in _refine_limits(comparison, limits, needed)
     ]
     return Detectability(comparison, tuple(limits), needed)
 
 
-def _refine(
+def _refine_limits(
     comparison: Comparison, found: Sequence[DetectionLimit], needed: float
 ) -> list[DetectionLimit]:
-    """The same with each effect at the strength found: it may not be linear in its strength."""
+    """Repeat the search around the strengths found for effects not linear in their strength."""
     refined = list(found)
     for _ in range(3):
         chosen = [
@@ -293,16 +291,16 @@ def _refine(
         if not chosen:
             break
         probe = replace(
-            comparison, alternatives=tuple(_at_strength_found(refined[k]) for k in chosen)
+            comparison, alternatives=tuple(_set_found_strength(refined[k]) for k in chosen)
         )
-        again = find_limits(probe, probe.at_hand, needed)
+        again = find_limits(probe, probe.sums_now, needed)
         for k, one in zip(chosen, again, strict=True):
             refined[k] = replace(refined[k], factor=refined[k].factor * one.factor, axis=one.axis)
     return refined
 
 
-def _at_strength_found(found: DetectionLimit) -> Alternative:
-    values, strengths = found.alternative.values[0].copy(), _strengths(found.item)
+def _set_found_strength(found: DetectionLimit) -> Alternative:
+    values, strengths = found.alternative.values[0].copy(), _find_strengths(found.item)
     own = [found.item.parameters[i] for i in strengths]
     values[strengths] = np.clip(
         values[strengths] * found.factor, [q.lower for q in own], [q.upper for q in own]
@@ -310,17 +308,17 @@ def _at_strength_found(found: DetectionLimit) -> Alternative:
     return replace(found.alternative, values=(values,))
 
 
-def _within(found: DetectionLimit, scale: MachineScale) -> float:
-    """The factor from which on an effect is found where its strength is looked for."""
+def _bound_factor(found: DetectionLimit, scale: MachineScale) -> float:
+    """Return the factor within the range in which the diagnosis searches the strength."""
     q, effect = found.parameter, found.item.system.model.effects[-1]
     least = 0.0 if _is_linear(found.item) else scale.range_of(effect, q).low / found.typical
     return max(found.factor, least) if found.factor * found.typical <= q.upper else float("inf")
 
 
-def growth_of_jump(comparison: Comparison, found: DetectionLimit) -> float:
-    """By which share an effect of typical strength makes friction jump more where motion turns.
+def find_jump_growth(comparison: Comparison, found: DetectionLimit) -> float:
+    """Return the relative growth of the jump of friction at a reversal, at typical strength.
 
-    0 of an effect with a memory, whose force does not jump.
+    It is 0 for an effect with internal states, whose force does not jump.
 
     Args:
         comparison: of the effect; found: the effect on the trials at hand.
@@ -330,8 +328,8 @@ def growth_of_jump(comparison: Comparison, found: DetectionLimit) -> float:
         return 0.0
     axis, motion = found.axis, e.motions[0]
     p = np.append(e.p[: len(item.system.parameters) - len(values)], values)
-    motion = motion.rows(slice(None, None, max(1, len(motion.t) // _POSES)))
-    speed = _SLIDING * e.system.model.device.coordinates[axis].sign_width
+    motion = motion.rows(slice(None, None, max(1, len(motion.t) // _JUMP_POSES)))
+    speed = _JUMP_SPEED * e.system.model.device.coordinates[axis].sign_width
     own = more = 0.0
     for side in (1.0, -1.0):
         qd = np.zeros_like(motion.qd)

@@ -1,4 +1,4 @@
-"""What a diagnosis left undecided, and the trial that would decide it."""
+"""The alternatives that a diagnosis left undecided, and the trial that would decide."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.select import open_search, start_of
 from bampipe.diagnosis.session import Fit, Session, system_of, without_members
-from bampipe.next_trial.choice import DesignSpace, rank_designs
+from bampipe.next_trial.design_sentence import describe_design
 from bampipe.next_trial.discrimination import Alternative, Comparison
-from bampipe.next_trial.motion import Rehearsal
 from bampipe.next_trial.primitives import Envelope
-from bampipe.next_trial.words import describe
+from bampipe.next_trial.ranking import DesignSpace, rank_designs
+from bampipe.next_trial.rehearsal import Rehearsal
 from bampipe.phrases.proposal import say_chance
 from bampipe.physics.recipe import Recipe
 from bampipe.results.diagnose import DiagnoseResult, SuggestedTrial
 from bampipe.results.next import AS_FORECAST
 
 _MOST_ALTERNATIVES = 4
-_ROUNDS = 4
-"""Steps in which the shapes of an alternative are refined."""
+_REFINEMENTS = 4
+"""Steps that refine the shapes of an alternative."""
 _SUGGESTED_S = 20.0
 
 
@@ -33,8 +33,8 @@ class Ambiguity:
     """Sets of effects between which a diagnosis could not decide.
 
     Attributes:
-        odds: of the effects in which they differ; of none where one has only the common ones.
-        common: effects of all of them.
+        odds: by the effects in which they differ; none if a set has only the common ones.
+        common: effects of all sets.
     """
 
     odds: Mapping[tuple[str, ...], float]
@@ -42,7 +42,7 @@ class Ambiguity:
 
 
 def find_ambiguity(found: DiagnoseResult, criteria: Criteria) -> Ambiguity | None:
-    """The fewest sets that together are as probable as a verdict asks; None where one is."""
+    """Return the fewest sets that together reach the probability of a verdict; None if one does."""
     if all(axis.verdict != "undecided" for axis in found.axes.values()):
         return None
     sets, total = [], 0.0
@@ -59,7 +59,7 @@ def find_ambiguity(found: DiagnoseResult, criteria: Criteria) -> Ambiguity | Non
 
 
 def compare_alternatives(session: Session, final: Fit, asked: Ambiguity) -> Comparison | None:
-    """The alternatives of ``asked`` as they explain the trials; None where fewer than two can.
+    """Fit the alternatives of ``asked`` to the trials; None if fewer than two explain anything.
 
     Args:
         session: the trials; final: the model with its most probable set, fitted.
@@ -80,14 +80,14 @@ def compare_alternatives(session: Session, final: Fit, asked: Ambiguity) -> Comp
 def _fit_alternative(
     search: Search, recipe: Recipe, members: tuple[str, ...], odds: float
 ) -> Alternative | None:
-    """A set of effects with its most probable parameters; None where it explains nothing."""
+    """Return a set of effects with its most probable parameters; None if it explains nothing."""
     keys: tuple[Key, ...] = ()
     for name in members:
         places = [key for key in search.places if key[0] == name]
         if not places:
             return None
         keys = (*keys, min(places, key=lambda key: search.cost((*keys, key))))
-    (keys,) = search.refine([keys], _ROUNDS)
+    (keys,) = search.refine([keys], _REFINEMENTS)
     if not np.isfinite(search.cost(keys)):
         return None
     wider = without_members(recipe, (), members)
@@ -105,9 +105,9 @@ def _fit_alternative(
 
 
 def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> SuggestedTrial | None:
-    """The trial that would decide what a diagnosis did not; None where there is none.
+    """Return the trial that would decide between the alternatives; None if there is none.
 
-    With it a wrong choice must be as improbable as a verdict asks.
+    With it, a wrong choice must be as improbable as a verdict demands.
 
     Args:
         session: the trials; final: the model with its most probable set, fitted.
@@ -120,23 +120,24 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
     seen = Envelope.of_trials(trials.motions, e.system, e.p)
     rehearsal = Rehearsal(e.system, e.p, trials.sensors, trials.kinematics, seen, session.seed)
 
-    # About the axes on which alternatives act: elsewhere they all leave the same.
+    # Only the axes on which alternatives act: on others they all leave the same residual.
     acts = {axis for one in comparison.alternatives for i in one.items for axis in i.system.touched}
-    axes = [axis for axis in seen.movable if axis in acts] or seen.movable
+    axes = [axis for axis in seen.moved_axes if axis in acts] or seen.moved_axes
     space = DesignSpace(rehearsal, _SUGGESTED_S, axes, with_rests=True, with_brakes=True)
     best = rank_designs(space, lambda motion: -comparison.confusion_with(motion))[0]
-    pairs = zip(comparison.expect(best.expected_motions), comparison.now.values(), strict=True)
+    confusions, contrasts = comparison.expect(best.expected_motions), comparison.contrasts_now
+    pairs = zip(confusions, contrasts.values(), strict=True)
     expected, now = max(pairs, key=lambda pair: pair[0].weight * pair[0].before)
     if expected.after > min(1.0 - session.criteria.probability, expected.before / AS_FORECAST):
         return None
     axis = max(expected.left, key=lambda name: expected.left[name])
     first, second = expected.between
-    design = describe(best.design, seen, e.system.model.device)
+    design = describe_design(best.design, seen, e.system.model.device)
     before, after = expected.before, expected.after
     return SuggestedTrial(
         between=expected.between, axis=axis, design=design, separation=expected.left[axis],
         separation_now=float(now.left[e.system.coordinates.index(axis)]),
         confusion=after, confusion_now=before,
-        sentence=f"To tell {first} from {second}, record this: {design} The chance of confusing"
-        f" them would fall from {say_chance(before)} to {say_chance(after)}.",
+        sentence=f"To distinguish {first} from {second}, record this trial: {design} The chance of"
+        f" confusing them would fall from {say_chance(before)} to {say_chance(after)}.",
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Trajectories for drives: sums of harmonics from rest to rest within the limits of the machine.
+"""Trajectories for drives: sums of harmonics, from rest to rest, within the machine's limits.
 
 Source: Swevers, Ganseman, Tükel, de Schutter and Van Brussel 1997, Optimal robot excitation and
 identification.
@@ -16,38 +16,38 @@ import numpy as np
 from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.lists import join_names
-from bampipe.next_trial.motion import Rehearsal
-from bampipe.next_trial.primitives import PARTS, SHORTEST_S, Envelope, Primitive, Series
+from bampipe.next_trial.primitives import PARTS, SHORTEST_PART_S, Envelope, Primitive, Series
+from bampipe.next_trial.rehearsal import Rehearsal
 from bampipe.physics.device import Device
 from bampipe.results.next import Extent
 
 Form = Literal["csv", "json", "yaml"]
 HZ = 100.0
-"""Points a second of a trajectory that is written."""
-_OF_LIMIT, _OF_EFFORT = 0.9, 0.8
-"""Shares of speed and acceleration, and of the effort, which the model forecasts with an error."""
+"""Points per second of a trajectory file."""
+_LIMIT_SHARE, _EFFORT_SHARE = 0.9, 0.8
+"""Shares of the limits that are used: speed and acceleration, and effort, which is a forecast."""
 _HARMONICS = 10
 _RAMP_S, _RAMP_SHARE = 2.0, 0.2
-"""In which a motion grows from rest, and fades: at most this share of the trial."""
-_MOST = 60
+"""Time in which a motion grows from rest and fades, and its largest share of the trial."""
+_MOST_TRAJECTORIES = 60
 _HALVINGS = 8
-_TINY = 1e-300
-_FIELDS = ("positions", "velocities", "accelerations", "effort")
-"""Of a point of the ROS message."""
+_SMALLEST_EXTENT = 1e-300
+_POINT_FIELDS = ("positions", "velocities", "accelerations", "effort")
+"""Fields of a point of the ROS message."""
 
 
 def require_limits(device: Device, where: str) -> None:
-    """Refuse a machine that can follow no trajectory, or whose limits are not known.
+    """Refuse a machine without drives, or with unknown limits.
 
     Raises:
-        InputError: the device has no drives, or states no range, speed or effort of an axis.
+        InputError: the device has no drives, or an axis has no stated range, speed or effort.
     """
     if not (device.drive or device.prescribed):
         raise InputError(
-            "it has no motors that could follow a trajectory: a person moves it, and the force is"
-            " measured",
+            "the device has no motors that could follow a trajectory: a person moves it, and the"
+            " force is measured",
             where=where,
-            remedy="record the sentence of `bampipe next` by hand; --plan prints a sheet of trials",
+            remedy="follow the sentence of `bampipe next` by hand; --plan prints a sheet of trials",
         )
     axes = [c.name for c in device.coordinates]
     stated: dict[str, Mapping[str, object]] = {
@@ -68,7 +68,7 @@ def require_limits(device: Device, where: str) -> None:
 
 
 def read_limits(device: Device, seen: Envelope) -> dict[str, Extent]:
-    """The limits of each axis by name; an acceleration that is not stated is the highest seen."""
+    """Return the limits of each axis; an unstated acceleration is the highest of the trials."""
     return {
         axis: Extent(
             lower=device.limits[axis][0],
@@ -84,28 +84,28 @@ def read_limits(device: Device, seen: Envelope) -> dict[str, Extent]:
 def list_trajectories(
     rehearsal: Rehearsal, limits: Mapping[str, Extent], seconds: float, count: int
 ) -> list[Primitive]:
-    """At most ``count`` random trajectories within ``limits``, half of them within what was seen.
+    """Return up to ``count`` random trajectories within ``limits``, half of them as in the trials.
 
     Raises:
         InputError: the weight alone takes more effort than a drive may give.
     """
     seen, found = rehearsal.seen, []
     stated = np.array([[*one.model_dump().values()] for one in limits.values()]).T
-    usable = stated * np.array([1.0, 1.0, _OF_LIMIT, _OF_LIMIT, _OF_EFFORT])[:, None]
+    usable = stated * np.array([1.0, 1.0, _LIMIT_SHARE, _LIMIT_SHARE, _EFFORT_SHARE])[:, None]
     known = usable.copy()
     known[2:4] = np.minimum(usable[2:4], [seen.speed, seen.acceleration])
-    for number in range(min(count, _MOST)):
+    for number in range(min(count, _MOST_TRAJECTORIES)):
         rng = np.random.default_rng([rehearsal.seed, number])
         beyond = number % 2 == 0
-        parts = PARTS if beyond and seconds >= PARTS * SHORTEST_S else 1
+        parts = PARTS if beyond and seconds >= PARTS * SHORTEST_PART_S else 1
         reach, most = (seen.wider or seen, usable) if beyond else (seen, known)
-        series = _draw(reach, most, seen.movable, seconds / parts, rng)
+        series = _draw_series(reach, most, seen.moved_axes, seconds / parts, rng)
         fitting = _scale_to_effort(rehearsal, usable[4], series)
         if fitting is not None:
             found.append(Primitive({}, fitting.middle, seconds, parts=parts, series=fitting))
     if not found:
         raise InputError(
-            f"at rest the model takes more than {100.0 * _OF_EFFORT:.0f} % of the stated effort"
+            f"at rest the model needs more than {100.0 * _EFFORT_SHARE:.0f} % of the stated effort"
             " in every pose tried",
             where="limits",
             remedy="check effort in [limits] or in the URDF against the data sheet",
@@ -113,16 +113,16 @@ def list_trajectories(
     return found
 
 
-def _draw(
-    reach: Envelope, limits: Array, movable: Sequence[int], seconds: float, rng: np.random.Generator
+def _draw_series(
+    reach: Envelope, limits: Array, axes: Sequence[int], seconds: float, rng: np.random.Generator
 ) -> Series:
-    """A random series that touches one of the bounds of each axis: position, speed, acceleration.
+    """Return a random series that reaches one bound of each axis: position, speed, acceleration.
 
-    Its amplitudes fall with the number of the harmonic, less or more: slow and wide, or quick.
+    A random power law for the amplitudes of the harmonics gives slow wide or quick short motion.
 
     Args:
-        reach: ends of each axis; limits: (5, n_q), as in `Extent`; movable: axes that move.
-        seconds: its length; rng: source of what is random.
+        reach: ends of each axis; limits: (5, n_q), as in `Extent`; axes: axes that move.
+        seconds: its length; rng: draws the amplitudes.
     """
     n = len(reach.low)
     fall = np.arange(1, _HARMONICS + 1)[:, None] ** -rng.uniform(0.0, 2.0)
@@ -133,15 +133,15 @@ def _draw(
     lowest, highest, speed, acceleration = unit.extent
     room = np.array([middle - low, high - middle, limits[2], limits[3]])
     taken = np.array([middle - lowest, highest - middle, speed, acceleration])
-    share = np.min(room / np.maximum(taken, _TINY), axis=0)
-    return unit.scaled(share * np.isin(np.arange(n), movable))
+    share = np.min(room / np.maximum(taken, _SMALLEST_EXTENT), axis=0)
+    return unit.scale_by(share * np.isin(np.arange(n), axes))
 
 
 def _scale_to_effort(rehearsal: Rehearsal, most: Array, series: Series) -> Series | None:
-    """The largest of the series that takes at most so much effort, (n_q,); None if none does."""
+    """Return the series scaled to the effort ``most``, (n_q,); None if no scale fits."""
 
     def fits(share: float) -> bool:
-        _, effort = rehearsal.effort(series.scaled(share))
+        _, effort = rehearsal.effort(series.scale_by(share))
         return bool((np.abs(effort).max(axis=0) <= most).all())
 
     if fits(1.0):
@@ -150,7 +150,7 @@ def _scale_to_effort(rehearsal: Rehearsal, most: Array, series: Series) -> Serie
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if fits(middle) else (low, middle)
-    return series.scaled(low) if low > 0.0 else None
+    return series.scale_by(low) if low > 0.0 else None
 
 
 @dataclass(frozen=True)
@@ -168,14 +168,14 @@ class Points:
 
     @classmethod
     def of_series(cls, series: Series, rehearsal: Rehearsal) -> Points:
-        """`HZ` points a second, and one at the end, where it is at rest again."""
+        """Return `HZ` points per second, and one at the end, where the motion rests again."""
         t = np.linspace(0.0, series.seconds, round(series.seconds * HZ) + 1)
         clock, effort = rehearsal.effort(series)
         given = np.stack([np.interp(t, clock, column) for column in effort.T], axis=1)
         return cls(rehearsal.system.coordinates, t, (*series.path(t), given))
 
     def extents(self) -> dict[str, Extent]:
-        """How far, fast and hard each axis goes."""
+        """Return range, highest speed, acceleration and effort of each axis."""
         q, *others = self.columns
         rows = np.stack([q.min(axis=0), q.max(axis=0), *(np.abs(c).max(axis=0) for c in others)])
         return {
@@ -184,32 +184,34 @@ class Points:
         }
 
     def text(self, form: Form, names: Mapping[str, str], sentence: str) -> str:
-        """The file: a table, or a trajectory_msgs/JointTrajectory as JSON or YAML.
+        """Return the file: a table, or a trajectory_msgs/JointTrajectory as JSON or YAML.
 
         Args:
-            form: of the file; names: that a robot's drives go by, where others than the axes'.
-            sentence: what to do with it.
+            form: of the file; names: those of a robot's drives, if they differ from the axes'.
+            sentence: instruction, written as a comment.
         """
         if form == "csv":
             head = ["t", *(f"{n}_{a}" for n in ("q", "qd", "qdd", "effort") for a in self.axes)]
             rows = np.column_stack([self.t, *self.columns])
-            return "\n".join([",".join(head), *(",".join(map(_write, row)) for row in rows), ""])
+            return "\n".join(
+                [",".join(head), *(",".join(map(_format_number, row)) for row in rows), ""]
+            )
         points = []
         for k, t in enumerate(self.t):
             sec, nanosec = divmod(round(1e9 * float(t)), 10**9)
-            values = [[float(_write(v)) for v in column[k]] for column in self.columns]
+            values = [[float(_format_number(v)) for v in column[k]] for column in self.columns]
             clock = {"time_from_start": {"sec": sec, "nanosec": nanosec}}
-            points.append(dict(zip(_FIELDS, values, strict=True)) | clock)
+            points.append(dict(zip(_POINT_FIELDS, values, strict=True)) | clock)
         header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
         joints = [names.get(axis, axis) for axis in self.axes]
         if form == "json":
             message = {"header": header, "joint_names": joints, "points": points}
             return json.dumps(message, indent=1) + "\n"
-        # JSON is YAML, so that a point takes a line.
+        # JSON is valid YAML: a point takes one line.
         lines = [f"# trajectory_msgs/msg/JointTrajectory. {sentence}"]
         lines += [f"header: {json.dumps(header)}", f"joint_names: {json.dumps(joints)}", "points:"]
         return "\n".join([*lines, *(f"- {json.dumps(one)}" for one in points), ""])
 
 
-def _write(value: float) -> str:
+def _format_number(value: float) -> str:
     return f"{value:.9g}"

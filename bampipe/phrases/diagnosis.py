@@ -13,7 +13,7 @@ from bampipe.results.floor import FLOOR_WRONG
 from bampipe.results.rounding import significant
 
 _MOST_ALTERNATIVES = 3
-"""Sets of effects that a phrase names."""
+"""Most sets of effects that a phrase names."""
 _NO_SHAPES: Mapping[str, str] = MappingProxyType({})
 _PROBABILITY = "probability "
 
@@ -25,7 +25,7 @@ def probability(value: float) -> str:
 
 
 def percent_of_force(share: float) -> str:
-    """Return a share of the force in per cent, with enough decimals to tell it from all of it."""
+    """Return a share of the force in per cent, with enough decimals to differ from 100."""
     left = 100.0 * abs(1.0 - share)
     decimals = 1 if left == 0.0 else max(1, math.ceil(-math.log10(left)))
     return f"{100.0 * share:.{min(decimals, 6)}f} %"
@@ -156,17 +156,17 @@ def describe_axes(result: DiagnoseResult, shapes: Mapping[str, str] = _NO_SHAPES
     for axis, entry in result.axes.items():
         name = axis.capitalize() if axis.isalpha() else axis  # joint_1 is a name, not a word
         if entry.verdict == "no_verdict":
-            said[axis] = f"{name}: no verdict, for {_explain_refusal(axis, entry, result)}"
+            said[axis] = f"{name}: no verdict, because {_explain_refusal(axis, entry, result)}"
             continue
         parts = [f"{name}: {_describe_verdict(axis, entry, result)}."]
         if entry.remains and entry.verdict in ("missing", "undecided"):
             rest = _describe_unknown(entry, result)
-            parts.append(f"Beside that, something is missing that {rest}.")
+            parts.append(f"In addition, something is missing that {rest}.")
         if entry.remains and shapes.get(axis):
             parts.append(f"Its shape: {shapes[axis]}.")
         if not entry.remains and entry.standing == "above_floor":
             parts.append(
-                "Without the bias that filters leave where friction turns, the error is"
+                "Without the bias that filters leave where friction changes sign, the error is"
                 f" {significant(entry.rmse_beyond_bias)} {entry.unit}."
             )
         said[axis] = " ".join(parts)
@@ -198,7 +198,7 @@ def _describe_verdict(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> 
 def _describe_addition(entry: AxisVerdict, result: DiagnoseResult) -> str:
     """Return which effects give the errors of an axis: its own, or those of several axes."""
     if set(entry.effects) != set(result.selected):
-        return f"adding all that is selected ({join_names(result.selected)})"
+        return f"adding all selected effects ({join_names(result.selected)})"
     if entry.verdict == "missing":
         return "adding it" if len(entry.effects) == 1 else "adding them"
     return f"adding {join_names(entry.effects)}"
@@ -235,5 +235,5 @@ def _explain_refusal(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> s
                 f" {worst.t_start:.1f} to {worst.t_end:.1f} s of trial {worst.trial_id}"
                 f" ({worst.doing}): look there first."
             )
-    fit = f"By their fit alone: {list_effects(entry, entry.likely)}." if entry.likely else ""
+    fit = f"Judged by fit alone: {list_effects(entry, entry.likely)}." if entry.likely else ""
     return " ".join(filter(None, (why, fit, do)))

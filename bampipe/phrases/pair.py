@@ -59,5 +59,5 @@ def describe_journey(one: Journey) -> str:
     if found:
         return f"{line} It lacks {join_names(dict.fromkeys(found))} there."
     if len(reached) < len(one.failed):
-        line += f" What it lacks there is not known{f': {one.reason}' * bool(one.reason)}."
+        line += f" The missing effect is not known{f': {one.reason}' * bool(one.reason)}."
     return line

@@ -1,4 +1,4 @@
-"""Sentences about a proposed trial: the reason for it and the expected gain."""
+"""Sentences on a proposed trial: the reason for it and the expected gain."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from bampipe.lists import join_names
 from bampipe.results.next import AS_FORECAST, Detectable, NextResult, Trajectory
 
-_SHOWN = 3
-"""Parameters or effects that a sentence names."""
+_MOST_NAMED = 3
+"""Most parameters or effects that a sentence names."""
 
 
 def say_chance(value: float) -> str:
@@ -17,9 +17,9 @@ def say_chance(value: float) -> str:
 
 
 def say_sizes(table: Mapping[str, Detectable], names: Iterable[str]) -> str:
-    """Return effects with the sizes from which on a proposed trial shows them."""
+    """Return effects with the sizes from which a proposed trial shows them."""
     sizes = (f"{name} from {table[name].with_proposal:.2g} {table[name].unit}" for name in names)
-    return f"{join_names((size.rstrip() for size in sizes), _SHOWN)} on"
+    return f"{join_names((size.rstrip() for size in sizes), _MOST_NAMED)} on"
 
 
 def say_trajectory(found: Trajectory) -> list[str]:
@@ -33,19 +33,19 @@ def say_trajectory(found: Trajectory) -> list[str]:
         most.append(f"{100.0 * shares[axis]:.0f} % of the {name} ({axis})")
     said = [
         f"The trajectory uses at most {join_names(most)} that its limits allow. Check it for"
-        " collisions: the model knows none."
+        " collisions: the model does not know obstacles."
     ]
     if found.assumed:
-        axes = join_names(found.assumed, _SHOWN)
+        axes = join_names(found.assumed, _MOST_NAMED)
         said.append(
-            f"No acceleration is stated of {axes} ([limits]): the highest seen in these trials is"
-            " the limit."
+            f"No acceleration limit is stated for {axes} ([limits]); the highest in these trials is"
+            " used."
         )
     return said
 
 
 def find_shown(table: Mapping[str, Detectable]) -> tuple[str, ...]:
-    """Return what the trials at hand do not show and the proposed one would, the smallest first."""
+    """Return the effects that only the proposed trial would show, the smallest first."""
     hidden = _find_hidden(table)
     sizes = {
         name: entry.with_proposal / entry.typical
@@ -68,10 +68,10 @@ def explain_proposal(
 
     Args:
         found: the proposal, without these sentences.
-        unlimited: axes of which the device states no range, so that nothing wider was tried.
+        unlimited: axes without a stated range, for which no wider motion was tried.
         lacking: axes whose held-out error is above the noise floor.
-        missing: effects that the diagnosis found and the model does not have; None without one.
-        unbraked: effects of brakes that no trial at hand has on.
+        missing: effects that the model lacks by the diagnosis; None without a diagnosis.
+        unbraked: effects of brakes, if no present trial uses brakes.
     """
     best = found.proposals[0]
     why, expected = _explain_purpose(found, unlimited, unbraked)
@@ -79,76 +79,73 @@ def explain_proposal(
         why += " Add it to session.toml as a viscous trial."
     if best.farther or best.faster:
         expected += (
-            " This forecast takes the model to hold beyond what the trials at hand have shown."
+            " This forecast assumes that the model holds beyond the range of the present trials."
         )
     if best.parts > 1:
         why += (
-            " It takes more than one trial, because each is judged by what the others say and none"
-            " at hand is like it."
+            " It takes more than one trial: each is judged by parameters fitted to the others, and"
+            " no present trial resembles it."
         )
     if best.sd and missing:
         why = (
-            f"By the diagnosis the model lacks {join_names(missing, _SHOWN)}: add that first"
-            f" (`bampipe extend`), and ask again. {why}"
+            f"According to the diagnosis, the model lacks {join_names(missing, _MOST_NAMED)}."
+            f" Extend the model first (`bampipe extend`), then ask again. {why}"
         )
         expected += " These are the uncertainties of a model that lacks something."
     elif best.sd and lacking:
-        error = f"The error of {join_names(lacking, _SHOWN)} is above the noise floor:"
+        error = f"The error of {join_names(lacking, _MOST_NAMED)} is above the noise floor:"
         if missing is None:
-            why = f"{error} ask first what the model lacks (`bampipe diagnose`). {why}"
-        expected += f" {error} what the model lacks there counts as noise in these uncertainties."
+            why = f"{error} find the missing effect first (`bampipe diagnose`). {why}"
+        expected += f" {error} the missing effect counts as noise in these uncertainties."
     return why, expected
 
 
 def _explain_purpose(
     found: NextResult, unlimited: Sequence[str], unbraked: Sequence[str]
 ) -> tuple[str, str]:
-    """Why, and what is expected as far as the model goes."""
+    """Return the reason, and the gain that the model predicts."""
     if found.purpose == "decision":
         return _explain_decision(found, unlimited)
-    most = (
-        f"says most of `{found.parameter}`"
-        if found.parameter
-        else "adds most to what is known of all parameters together"
-    )
+    about = f"`{found.parameter}`" if found.parameter else "all parameters together"
+    most = f"adds most information on {about}"
     if found.purpose == "precision":
-        return f"Of the motions tried, this one {most}.", _say_uncertainties(found)
+        return f"Of all motions tried, this one {most}.", _say_uncertainties(found)
     why = _say_unseen(found, unbraked)
     if shown := find_shown(found.sensitivity):
         sizes = say_sizes(found.sensitivity, shown)
         return why, f"It would show {sizes} with 90 % probability."
-    # Nothing tried shows more: then it is for the parameters.
+    # No trial would show more: the proposal is for the parameters.
     return f"{why} This one {most}.", _say_uncertainties(found)
 
 
 def _say_unseen(found: NextResult, unbraked: Sequence[str]) -> str:
-    """Which effects the trials at hand would not have shown."""
+    """Name the effects that the present trials would not have shown."""
     table, unpromised = found.sensitivity, found.unpromised
     hidden = list(dict.fromkeys([*find_shown(table), *_find_hidden(table)]))
-    # Neither the trials at hand nor the one proposed show these, whatever their size.
+    # Neither the present trials nor the proposed one show these at any size.
     never = [
         name
         for name, entry in table.items()
         if entry.smallest is None and entry.with_proposal is None and name not in unbraked
     ]
     if hidden:
-        sizes = join_names([_say_size(name, table[name]) for name in hidden], _SHOWN)
+        sizes = join_names([_say_size(name, table[name]) for name in hidden], _MOST_NAMED)
         why = f"These trials would not have shown {sizes}."
     else:
         every = "every other effect" if never or unbraked or unpromised else "every effect"
         why = f"These trials would have shown {every} of the library at its typical size."
     if never:
         one = "one effect stays" if len(never) == 1 else f"{len(never)} effects stay"
-        names = join_names(never, _SHOWN)
-        why += f" In trials like these {one} out of sight at any size ({names})."
+        names = join_names(never, _MOST_NAMED)
+        why += f" In trials like these, {one} invisible at any size ({names})."
     if unbraked:
-        names = join_names(unbraked, _SHOWN)
-        why += f" What brakes do ({names}) shows in viscous trials, of which there are none."
+        names = join_names(unbraked, _MOST_NAMED)
+        why += f" Effects of brakes ({names}) show in viscous trials only, and there are none."
     if unpromised:
-        names = join_names(unpromised, _SHOWN)
+        names = join_names(unpromised, _MOST_NAMED)
         why += (
-            f" Of {names} no size is promised: large enough to show, it changes how the motion"
-            " turns round."
+            f" No size is given for {names}: an effect large enough to show would change how the"
+            " motion reverses."
         )
     return why
 
@@ -166,30 +163,30 @@ def _explain_decision(found: NextResult, unlimited: Sequence[str]) -> tuple[str,
             f"The chance of confusing them is expected to fall from {before} to {after}.",
         )
     remedy = (
-        f", or a wider motion: the device file states no [limits] of"
-        f" {join_names(unlimited, _SHOWN)}, so that none was tried."
+        f", as may a wider motion: none was tried, because the device file states no [limits] of"
+        f" {join_names(unlimited, _MOST_NAMED)}."
     )
     return why, (
-        f"No trial tried tells them apart: the chance would be {after} after this one. Another load"
-        f" may{remedy if unlimited else '.'}"
+        f"None of the trials that were tried distinguishes them: the chance would be {after} after"
+        f" this one. Another load may help{remedy if unlimited else '.'}"
     )
 
 
 def _say_size(name: str, entry: Detectable) -> str:
-    """An effect, and the size at which trials do not show it."""
+    """Return an effect and the size up to which trials do not show it."""
     if entry.smallest is None:
         return f"{name} at any size"
     return f"{name} below {entry.smallest:.2g} {entry.unit}".rstrip()
 
 
 def _say_uncertainties(found: NextResult) -> str:
-    """By how much the uncertainty of parameters falls."""
+    """Return the expected uncertainties of parameters, with the present ones."""
     sds = found.proposals[0].sd
     falls = {name: sd.after / sd.before for name, sd in sds.items() if sd.before > 0.0}
     names = [found.parameter] if found.parameter else sorted(falls, key=lambda name: falls[name])
-    shown = {name: sds[name] for name in names[:_SHOWN] if name in sds}
+    shown = {name: sds[name] for name in names[:_MOST_NAMED] if name in sds}
     if not shown:
-        return "No uncertainties are forecast: the model is not fitted to such a trial."
+        return "No uncertainties are forecast, because the model is not fitted to such a trial."
     parts = [
         f"`{name}` ± {sd.number} {sd.unit}".rstrip() + f", now ± {sd.before:.2g}"
         for name, sd in shown.items()
@@ -199,7 +196,7 @@ def _say_uncertainties(found: NextResult) -> str:
 
 
 def _find_hidden(table: Mapping[str, Detectable]) -> list[str]:
-    """Effects that go unnoticed at their typical size though trials can show them, worst first."""
+    """Return effects that trials can show, but not at their typical size, worst first."""
     factors = {
         name: float("inf") if entry.smallest is None else entry.smallest / entry.typical
         for name, entry in table.items()

@@ -26,15 +26,13 @@ STANDINGS: Mapping[FloorStatus, str] = {
     "at_floor": "at the noise floor",
     "above_floor": "above the noise floor",
     "floor_implausible": "far below its noise floor, which is therefore wrong",
-    "floor_missing": "without a noise floor to be held against",
+    "floor_missing": "without a noise floor for comparison",
 }
 TIMING_AT_LIMIT = (
     "the model lacks something that shifts the force in time, such as a delay, a lag, a command"
     " held from sample to sample or friction that builds up"
 )
 """The likely cause of a timing at its limit."""
-_TIMING_LIMIT = 0.95
-"""Share of half a sample beyond which the timing of the inputs counts as at its limit."""
 
 
 def describe_hum(hum: MainsHum) -> str:
@@ -87,10 +85,9 @@ def find_failed_checks(
     yield from (f"estimate by {METHODS[identified.method]}: {doubt}" for doubt in doubts)
     if not (identified.convergence.converged or doubts):
         yield "the estimates have not converged"
-    timing, half = identified.input_timing, 0.5 / session.sample_rate_hz
+    timing = identified.input_timing
     # If the trials do not determine the timing, it indicates nothing about the clocks.
-    least = max(_TIMING_LIMIT * half, NORMAL_95 * timing.sd)
-    if timing.sd > 0.0 and abs(timing.estimate) >= least:
+    if timing.is_at_limit and abs(timing.estimate) >= NORMAL_95 * timing.sd:
         yield (
             f"input timing: {round_with_sd(1e3 * timing.estimate, 1e3 * timing.sd)} ms, at its"
             f" limit of half a sample: {TIMING_AT_LIMIT}, or the clocks disagree"

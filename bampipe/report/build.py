@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from bampipe.report import page, style, typeset
 from bampipe.report.document import Block, Callout, Document, Figure, Section
 from bampipe.report.explorer.page import explorer_page
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.sections import SECTIONS
 from bampipe.results.setup import SetupResult
 
@@ -33,8 +33,8 @@ class Report:
     sections: tuple[str, ...]
 
     @classmethod
-    def of(cls, document: Document, recorded: int, explorer: str = "") -> Report:
-        """Return the files of ``document``; see `typeset.pdf` for ``recorded``."""
+    def from_document(cls, document: Document, recorded: int, explorer: str = "") -> Report:
+        """Return the files of ``document``; see `typeset.render_pdf` for ``recorded``."""
         figures = {
             block.name: block.svg
             for section in document.sections
@@ -42,11 +42,11 @@ class Report:
             if isinstance(block, Figure)
         }
         titles = tuple(section.title for section in document.sections)
-        html = page.page(document, "explore.html" if explorer else "")
-        return cls(typeset.pdf(document, recorded), html, explorer, figures, titles)
+        html = page.render_page(document, "explore.html" if explorer else "")
+        return cls(typeset.render_pdf(document, recorded), html, explorer, figures, titles)
 
 
-def build(results: Results, progress: Callable[[float, str], None]) -> Report:
+def build_run_report(results: Results, progress: Callable[[float, str], None]) -> Report:
     """Return the report of ``results``; ``progress``: called with the share done."""
     sections = []
     for number, name in enumerate(SECTIONS):
@@ -65,19 +65,19 @@ def build(results: Results, progress: Callable[[float, str], None]) -> Report:
     when = _read_moment(results)
     if when is not None and when.tzinfo is None:
         when = when.replace(tzinfo=datetime.UTC)
-    return Report.of(document, max(0, int(when.timestamp())) if when else 0, explorer)
+    return Report.from_document(document, max(0, int(when.timestamp())) if when else 0, explorer)
 
 
 def _list_warnings(results: Results) -> tuple[Block, ...]:
-    """Return the mistakes of the set-up, and which results are outdated."""
+    """Return the mistakes in the set-up, and the outdated results."""
     blocks: list[Block] = []
     setup = results.read(SetupResult)
     for mistake in setup.mistakes if setup else ():
-        text = f"Set right, {mistake.evidence}."
+        text = f"Once this is corrected, {mistake.evidence}."
         if mistake.alternatives:
             others = "; ".join(other.sentence for other in mistake.alternatives)
-            text += f" The trials cannot tell it from: {others}."
-        text += " Nothing below counts before the session file is corrected."
+            text += f" The trials cannot distinguish it from: {others}."
+        text += " No result below is valid before the session file is corrected."
         blocks.append(Callout("attention", f"Set-up: {mistake.sentence}", text))
     if setup and setup.warnings:
         text = " ".join(f"{line}." for line in setup.warnings)
@@ -85,7 +85,7 @@ def _list_warnings(results: Results) -> tuple[Block, ...]:
     if results.outdated:
         steps = ", ".join(f"`{step}`" for step in results.outdated)
         text = f"Run these again before relying on their results: {steps}."
-        title = "Some results are older than what they were made from"
+        title = "Some results are older than their inputs"
         blocks.append(Callout("attention", title, text))
     return tuple(blocks)
 

@@ -15,7 +15,7 @@ from bampipe.report.wording import format_prose
 
 Tone = Literal["good", "attention", "unknown", "note"]
 Span = tuple[Literal["plain", "strong", "code", "link"], str]
-"""Kind and text; of a link its words and its target, with a line break between."""
+"""Kind and text; a link holds its words and its target, separated by a line break."""
 
 _MARK = re.compile(
     r"\*\*(?P<strong>[^*]+)\*\*|`(?P<code>[^`]+)`"
@@ -59,7 +59,7 @@ class Paragraph:
 
 @dataclass(frozen=True)
 class Subheading:
-    """A heading below that of the section."""
+    """A heading one level below that of the section."""
 
     text: str
 
@@ -73,7 +73,7 @@ class Bullets:
 
 @dataclass(frozen=True)
 class Formulas:
-    """Lines of formulas, each as it is."""
+    """Lines of formulas, printed verbatim."""
 
     lines: tuple[str, ...]
 
@@ -83,8 +83,8 @@ class Callout:
     """A verdict in a box.
 
     Attributes:
-        tone: "good" (nothing to do), "attention" (something is missing), "unknown" (something
-            that nothing explains) or "note" (not done yet).
+        tone: "good" (nothing to do), "attention" (something is missing), "unknown" (an
+            unexplained residual) or "note" (not done yet).
         title: the verdict in a few words.
         text: one to three sentences, or a line for each axis.
     """
@@ -168,7 +168,7 @@ class Document:
 
     Attributes:
         subtitle: session, device, date of recording.
-        scale: of its type in print.
+        scale: of the type in print.
     """
 
     title: str
@@ -178,7 +178,7 @@ class Document:
 
 
 def number_blocks(document: Document) -> Iterator[tuple[Section, list[tuple[Block, str]]]]:
-    """Yield each section with its blocks, each with ``Figure 3`` or ``Table 2``, else ""."""
+    """Yield each section with its blocks, each with a number such as ``Figure 3``, or ""."""
     counts = {Figure: 0, Table: 0}
     for section in document.sections:
         blocks: list[tuple[Block, str]] = []

@@ -26,7 +26,7 @@ _TEMPLATE = Path(__file__).parent / "templates" / "page.html"
 _TAGS = {"strong": "strong", "code": "code"}
 
 
-def page(document: Document, beside: str = "") -> str:
+def render_page(document: Document, beside: str = "") -> str:
     """Return ``document`` as HTML with its figures inside.
 
     Args:
@@ -53,7 +53,7 @@ def page(document: Document, beside: str = "") -> str:
 
 
 def _render_spans(text: str, *, breaking: bool = False) -> str:
-    """Return HTML for text with marks; ``breaking``: names may break behind their marks."""
+    """Return HTML for text with marks; ``breaking``: names may break after their marks."""
     parts = []
     for kind, body in split_spans(text):
         if kind == "link":
@@ -118,7 +118,7 @@ def _render_table(table: Table, number: str) -> str:
 
 
 def _embed_drawing(svg: str, name: str, caption: str) -> str:
-    """Return the drawing for use inside a page: ids of its own, colours from the style sheet."""
+    """Return the drawing for use inside a page: with unique ids and colours of the style sheet."""
     drawing = svg[svg.index("<svg") :]
     drawing = re.sub(r"<metadata>.*?</metadata>", "", drawing, flags=re.DOTALL)
     drawing = re.sub(r'\bid="', f'id="{name}-', drawing)

@@ -11,34 +11,34 @@ from bampipe.report.wording import format_decimals
 from bampipe.results.next import Plan, PlannedSd
 
 _BY_HAND = "Tare the force sensor with the hand off the handle."
-_BY_DRIVE = "Check the way for obstacles: the model knows none."
+_BY_DRIVE = "Check the path for obstacles: the model does not know them."
 _BEFORE = (
     "Start the log, wait two seconds, then move.",
-    "Better a little slower and a little less far than faster and farther.",
+    "If in doubt, move more slowly and less far.",
 )
 _AFTER = (
     "Add each file to session.toml, as a free trial or, with brakes on, as a viscous one.",
     "Then run the session again.",
 )
 _VERSIONS = ((1.0, 100), (0.9, 30), (0.9, 12), (0.8, 12), (0.8, 6), (0.7, 3))
-"""Scale of the type, and number of parameters listed: the first that fits on a page is printed."""
+"""Type scale and number of listed parameters: the first version that fits on a page is printed."""
 
 
 def protocol_sheet(plan: Plan, session: str, model: str, by_hand: bool) -> bytes:
     """Return the PDF of a plan: the same plan gives the same bytes.
 
     Args:
-        plan: what to record; session, model: that it is for.
+        plan: what to record; session, model: of the plan.
         by_hand: whether a person moves the device, or else its drives.
     """
     versions = [_sheet(plan, session, model, by_hand, listed) for _, listed in _VERSIONS]
-    return typeset.sheet(
+    return typeset.render_sheet(
         [replace(one, scale=scale) for one, (scale, _) in zip(versions, _VERSIONS, strict=True)], 0
     )
 
 
 def _sheet(plan: Plan, session: str, model: str, by_hand: bool, listed: int) -> Document:
-    """The sheet with at most so many parameters ``listed``."""
+    """Return the sheet with at most ``listed`` parameters."""
     blocks: list[Block] = [Paragraph(plan.sentence)]
     if plan.trials:
         rows = [
@@ -67,7 +67,7 @@ def _sheet(plan: Plan, session: str, model: str, by_hand: bool, listed: int) -> 
 
 
 def _tabulate_uncertainties(plan: Plan, model: str, listed: int) -> Table:
-    """Tabulate the standard deviations farthest above the limit that is asked."""
+    """Tabulate the standard deviations farthest above the required limit."""
 
     def left(entry: PlannedSd) -> float:
         return entry.after / entry.asked if entry.asked > 0.0 else 0.0

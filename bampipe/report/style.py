@@ -1,4 +1,4 @@
-"""How figures look: size, colours that colour-blind readers tell apart, and the SVG they become.
+"""Style of figures: size, colours that colour-blind readers can distinguish, and SVG output.
 
 Colours are those of Okabe and Ito (2008). Lines that matter also differ in dash or width.
 """
@@ -39,7 +39,7 @@ COLOURS: dict[str, str] = {name.lower(): globals()[name] for name in _NAMES}
 """All colours in use, by the name that the page's style sheet gives them."""
 
 _LABEL = 30
-"""Letters in a line of an axis label: more is clipped where panels stand in threes."""
+"""Letters in a line of an axis label: longer lines are clipped if three panels share a row."""
 _HEADING = 70
 """Letters of a heading across the whole width."""
 _LETTER, _HANDLE = 0.058, 0.42
@@ -95,7 +95,7 @@ _SETTINGS: dict[str, Any] = {
 
 
 def use_style() -> AbstractContextManager[None]:
-    """Return the context in which figures are drawn: nothing of a user's own settings counts."""
+    """Return the context in which figures are drawn, independent of the user's own settings."""
     settings: dict[Any, Any] = {**mpl.rcParamsDefault, **_SETTINGS, "backend": "svg"}
     return mpl.rc_context(settings)
 
@@ -143,7 +143,7 @@ def split_figure(rows: int, height: float) -> tuple[Figure, list[Axes]]:
 def finish(
     figure: Figure, name: str, caption: str, legend_from: Sequence[Axes] = ()
 ) -> document.Figure:
-    """Return the block of a figure, with one legend of these panels below all of it."""
+    """Return the block of a figure, with a common legend of these panels below."""
     handles, names = [], []
     for axes in legend_from:
         more_handles, more_names = axes.get_legend_handles_labels()
@@ -159,7 +159,7 @@ def finish(
 def render_svg(figure: Figure) -> str:
     """Return the figure as SVG: the same figure gives the same text."""
     _part_labels(figure)
-    figure.set_layout_engine("none")  # it is laid out, which takes half of the drawing
+    figure.set_layout_engine("none")  # already laid out, which takes half of the time
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()
@@ -177,7 +177,7 @@ def _part_labels(figure: Figure) -> None:
 
 
 def _touch(axes: Axes) -> bool:
-    """Whether ticks that matplotlib chose have labels closer than the width of a letter."""
+    """Return whether matplotlib's own ticks have labels closer than the width of a letter."""
     if not isinstance(axes.xaxis.get_major_locator(), MaxNLocator) or not axes.axison:
         return False
     boxes = [
@@ -222,7 +222,7 @@ def draw_series(
 
 
 def mark_trials(axes: Axes, trace: pd.DataFrame, clock: str) -> None:
-    """Mark where each trial but the first starts in a trace, by its column of times."""
+    """Mark the start of each trial but the first in a trace, by its column of times."""
     starts = trace.loc[trace["trial_id"].ne(trace["trial_id"].shift()), clock].to_numpy()
     for start in starts[1:]:
         axes.axvline(start, color=FAINT, lw=0.6, ls=(0, (1, 2)), zorder=0)
@@ -242,7 +242,7 @@ def set_limits(axes: Axes, values: Sequence[np.ndarray], *, zero: bool = False) 
 
 
 def use_decades(axes: Axes, values: Sequence[float] | np.ndarray) -> None:
-    """Make the vertical axis logarithmic over ``values``, all above zero: no labels crowded."""
+    """Make the vertical axis logarithmic over positive ``values``, without crowded labels."""
     low, high = float(min(values)), float(max(values))
     axes.set_yscale("log")
     axes.set_ylim(low / 1.6, high * 1.6)

@@ -1,4 +1,4 @@
-"""A document as a PDF, by typst with the fonts that its wheel carries."""
+"""A document as a PDF, made by typst with the fonts of its wheel."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _MANY_COLUMNS = 7
 _MANY_ROWS, _MANY_LETTERS = 8, 1500
 """Size beyond which a table may continue on the next page."""
 _VERBATIM = ("name", "tone", "lines", "columns")
-"""Fields of blocks that hold no text with inline marks."""
+"""Fields of blocks without inline marks."""
 
 
-def pdf(document: Document, recorded: int) -> bytes:
+def render_pdf(document: Document, recorded: int) -> bytes:
     """Return ``document`` as PDF: the same document gives the same bytes.
 
     Args:
@@ -47,11 +47,11 @@ def pdf(document: Document, recorded: int) -> bytes:
     return _print(document, recorded)[0]
 
 
-def sheet(versions: Sequence[Document], recorded: int) -> bytes:
+def render_sheet(versions: Sequence[Document], recorded: int) -> bytes:
     """Return the first of ``versions`` that fits on one page as PDF, or the last of them.
 
     Args:
-        versions: of one document, the fullest first; recorded: as for `pdf`.
+        versions: of one document, the fullest first; recorded: as for `render_pdf`.
     """
     printed = b""
     for document in versions:
@@ -92,7 +92,7 @@ def _print(document: Document, recorded: int) -> tuple[bytes, int]:
         (root / "document.json").write_text(json.dumps(described), encoding="utf-8")
         compiler = typst.Compiler(source, root=root, ignore_system_fonts=True)
         printed = compiler.compile(format="pdf", timestamp=int(stamp))
-        assert isinstance(printed, bytes)  # a list of pages comes for other formats
+        assert isinstance(printed, bytes)  # other formats return a list of pages
         return printed, json.loads(compiler.query("<pages>", field="value"))[0]
 
 

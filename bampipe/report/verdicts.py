@@ -8,7 +8,7 @@ from bampipe.lists import join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.phrases.results import STANDINGS
 from bampipe.report.document import Callout
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import count_noun, format_digits
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.validate import ValidateResult
@@ -18,7 +18,7 @@ _MOST_NAMED = 3
 
 
 def describe_held_out(validated: ValidateResult) -> str:
-    """Return which trials were held out, and from what."""
+    """Return the trials that were held out of the fit, in words."""
     names = [name for name, trial in validated.trials.items() if trial.held_out]
     if not names:
         return "nothing could be held out, so that the error is that of the fit"
@@ -53,7 +53,7 @@ def judge_session(results: Results) -> Callout:
 
 
 def _list_failures(failed: Sequence[str]) -> str:
-    """Return the checks that failed, a line each."""
+    """Return the checks that failed, one per line."""
     return "\n".join(f"{one[:1].upper()}{one[1:]}".rstrip(".") + "." for one in failed)
 
 

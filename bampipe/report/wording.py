@@ -10,15 +10,15 @@ from bampipe.results import rounding
 
 _POWERS = {"2": "²", "3": "³"}
 _PREFIXES = ((1e-6, 1e-7, "µ"), (1e-3, 1e-4, "m"), (1.0, 0.1, ""), (1e3, 1e3, "k"), (1e6, 1e6, "M"))
-"""Size of each prefix, and from which largest value on it is used."""
+"""Factor of each prefix, and the largest value from which it is used."""
 _PREFIXED = ("rad", "m", "N", "Pa")
 """Units that take a prefix when they lead; kg already has one."""
-_UNIT = re.compile(r"\b(?:(?:k?N|kg)(?:\.(?:m2?|s2?))+(?:/[A-Za-z]+2?)?|(?:rad|m)/s2)\b")
+_UNIT_PATTERN = re.compile(r"\b(?:(?:k?N|kg)(?:\.(?:m2?|s2?))+(?:/[A-Za-z]+2?)?|(?:rad|m)/s2)\b")
 _MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.])")
 _POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]\d+)\b")
 _BASE_PARAMETERS = {"viscous": "viscous damping", "coulomb": "Coulomb friction"}
 NONE = "–"
-"""In place of a number that is not known."""
+"""Shown in place of an unknown number."""
 
 
 def format_unit(text: str) -> str:
@@ -30,7 +30,7 @@ def format_unit(text: str) -> str:
 def format_prose(text: str) -> str:
     """Return text with minus signs, powers of ten and units as printed; names are not changed."""
     text = _MINUS.sub("−", _POWER.sub(lambda found: f"{found[1]}{_format_power(found[2])}", text))
-    return _UNIT.sub(lambda found: format_unit(found[0]), text)
+    return _UNIT_PATTERN.sub(lambda found: format_unit(found[0]), text)
 
 
 def _format_power(exponent: int | str) -> str:
@@ -78,7 +78,7 @@ def format_digits(value: float | None, digits: int = 3) -> str:
 
 
 def format_stated(value: float) -> str:
-    """Return a number that somebody stated: four digits at most, no zeros added."""
+    """Return a stated number with at most four digits and no zeros added."""
     return format_prose(f"{value:.4g}")
 
 

@@ -1,4 +1,4 @@
-"""Every JSON file that bampipe writes, declared once: a module a file.
+"""Every JSON file that bampipe writes, declared once: one module per file.
 
 A record (:mod:`bampipe.results.record`) is what a stage builds, what ``RunFolder.read`` returns,
 and what the JSON Schema in ``schemas/`` is generated from (``python .ci/write_schemas.py``).

@@ -56,10 +56,10 @@ class Rung(Record):
         return {h.horizon_s: h.median for h in found.horizons} if found else {}
 
     def improves_on(self, other: Rung) -> bool:
-        """Whether its held-out error is lower, and can be judged where that of ``other`` can.
+        """Return whether its held-out error is lower and can still be judged.
 
-        A version that has lost its noise floor is no better, whatever its error: nothing says what
-        the sensors alone would leave of it, most often since its replicates run away.
+        A version that has lost its noise floor is no better, whatever its error: most often its
+        replicates run away, and the error that sensors alone would leave is unknown.
         """
         return self.has_lower_error_than(other) and not self.has_lost_its_floor(other)
 
@@ -109,8 +109,8 @@ class CompareResult(Result):
     STAGE: ClassVar[str] = "compare"
 
     best: str = Field(
-        description="The model that counts where a command names none: the confirmed one with the "
-        "lowest held-out error"
+        description="The model used where a command names none: the confirmed one with the lowest "
+        "held-out error"
     )
     ladder: tuple[Rung, ...] = Field(min_length=1, description="Parents before children")
     parameters: dict[str, dict[str, Value]] = Field(description="By name, then by model")

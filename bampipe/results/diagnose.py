@@ -136,7 +136,7 @@ class DiagnoseResult(Result):
     STAGE: ClassVar[str] = "diagnose"
 
     model: str
-    trials: Names = Field(default=(), description="From which effects were weighed")
+    trials: Names = Field(default=(), description="Trials on which effects were weighed")
     sentence: str = Field(description="The verdicts in words")
     next: str = Field(description="The command or action that follows")
     axes: dict[str, AxisVerdict] = Field(min_length=1)
@@ -150,7 +150,7 @@ class DiagnoseResult(Result):
         default=None, description="null where replicates do not resemble the measurement"
     )
     cut_short: bool = Field(
-        default=False, description="Whether more effects were wanted than may be added"
+        default=False, description="Whether the search stopped at the largest set allowed"
     )
     suggested_trial: SuggestedTrial | None
     not_weighed: Names = Field(default=(), description="Effects left out of the search on request")

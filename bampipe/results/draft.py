@@ -14,7 +14,7 @@ DraftVerdict = Literal["drafted", "nothing_beyond_chance", "no_lower_error"]
 
 
 class FittedConstant(Record):
-    """A number of a formula, as fitted together with all parameters of the model."""
+    """A constant of a formula, fitted together with all parameters of the model."""
 
     value: float
     low: float = Field(description="Lower end of its 95 % interval")
@@ -23,7 +23,7 @@ class FittedConstant(Record):
 
 
 class DraftCurve(Record):
-    """A formula along what it follows, at full speed or acceleration where in proportion to it."""
+    """A formula against its variable, at the highest speed or acceleration if it scales with it."""
 
     variable: str
     variable_unit: str
@@ -62,10 +62,10 @@ class ChanceOfDraft(Record):
 class DraftOption(Record):
     """A formula that was fitted with the model."""
 
-    effects: Names = Field(description="None for the model as it is")
+    effects: Names = Field(description="Empty for the unchanged model")
     constants: Count
     held_out_rmse: Size
-    log_evidence: float = Field(description="Over the model as it is, nats")
+    log_evidence: float = Field(description="Over the unchanged model, nats")
 
 
 class NearestEffect(Record):
@@ -80,9 +80,9 @@ class AxisDraft(Record):
     """The search on one axis and its result."""
 
     verdict: DraftVerdict
-    effects: Names = Field(description="Drafted; they are what `extend` adds")
+    effects: Names = Field(description="Drafted effects, which `extend` adds")
     chance: tuple[ChanceOfDraft, ...] = Field(
-        min_length=1, description="Of the first formula, and of the next where one was looked for"
+        min_length=1, description="Of the first formula, and of the second one if it was sought"
     )
     options: tuple[DraftOption, ...] = Field(description="Shortest first")
     rmse_before: Size = Field(description="On held-out trials")

@@ -45,7 +45,7 @@ class ForceFilter(Record):
 
 
 class Disturbance(Record):
-    """A stretch of a trial that no estimate and no error counts."""
+    """A stretch of a trial that is left out of all estimates and errors."""
 
     start_s: Size = Field(description="Since the start of the trial")
     end_s: Positive
@@ -73,6 +73,6 @@ class FilterResult(Result):
     )
     force_offsets: dict[str, dict[str, float]] = Field(
         default_factory=dict,
-        description="By trial and force, N, N.m or A: what it reads too much against the mean of"
-        " the trials, where it is zeroed anew in each, and what was taken off",
+        description="By trial and force, N, N.m or A: offset from the mean of the trials, for a"
+        " sensor that was zeroed anew in each; it has been subtracted",
     )

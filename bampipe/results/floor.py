@@ -11,7 +11,7 @@ from typing import Literal
 FloorStatus = Literal["at_floor", "above_floor", "floor_implausible", "floor_missing"]
 
 AT_FLOOR = 1.2
-"""Error over floor up to which a model leaves no more than its sensors do. No replicate is perfect:
+"""Error over floor up to which a model explains all but sensor noise. No replicate is perfect:
 clean axes reach 1.08 floors, and 1.16 where friction truly stops the arm; the weakest effects that
 were found had 1.18."""
 FLOOR_SDS = 3.0

@@ -35,15 +35,15 @@ class ParameterEstimate(Record):
     )
     calibration_sd: Size | None = Field(
         default=None,
-        description="Part of sd that comes from sensors and constants known so well only, zeros "
-        "of encoders to a step among them; null where there is none",
+        description="Part of sd from the stated uncertainty of sensors and constants, and from "
+        "encoder zeros that are known to one step; null where there is none",
     )
     statistical_sd: Size | None = Field(
         default=None, description="The rest of sd, null where all of it is statistical"
     )
     least_squares_bias: float | None = Field(
         default=None,
-        description="What filters and friction that stops would add to least squares",
+        description="Bias that filters and friction at standstill would give least squares",
     )
     bound_sd: Size | None = Field(
         description="Cramer-Rao bound: least sd that the sensors allow; null where there is none"
@@ -51,21 +51,21 @@ class ParameterEstimate(Record):
 
 
 class Covariance(Record):
-    """Of the estimates, in products of their units."""
+    """Covariance of the estimates, in products of their units."""
 
     names: Names
     matrix: tuple[tuple[float, ...], ...]
 
 
 class MethodValue(Record):
-    """A parameter by one method, without what other methods add to its uncertainty."""
+    """A parameter by one method, with the uncertainty by that method alone."""
 
     estimate: float
     sd: Size
 
 
 class MethodTried(Record):
-    """One method: its parameters, and how well they predict trials that they have not seen."""
+    """Parameters by one method, and their error on held-out trials."""
 
     held_out_rmse: dict[str, Size] = Field(
         default={}, description="By axis, N.m or N; empty where it found no parameters"
@@ -86,9 +86,9 @@ class WorstSecond(Record):
     start_s: Size = Field(description="Since the start of the trial, s")
     parameter: str
     move: float = Field(
-        description="Change of it without that second, in standard deviations that the rest leaves"
+        description="Change of that parameter without the second, in its standard deviations"
     )
-    sentence: str = Field(default="", description="In words, if it is a transient or an outlier")
+    sentence: str = Field(default="", description="Explanation of a transient or an outlier")
 
 
 class Influence(Record):
@@ -109,28 +109,28 @@ class EffectEstimate(Record):
 
 
 NEAR_LIMIT = 0.95
-"""Share of the limit of a timing from which on it counts as at it."""
+"""Share of its limit from which a timing counts as at the limit."""
 
 
 class InputTiming(Record):
-    """Time by which forces were sampled after positions, within half a sample."""
+    """Delay of the force samples behind the positions, at most half a sample."""
 
     estimate: float
     sd: Size = Field(description="0 where it was not estimated")
     unit: Literal["s"]
     limit: Size = Field(
-        default=0.0, description="Half a sample, all that it may be; 0 where it was not estimated"
+        default=0.0, description="Largest value, half a sample; 0 where it was not estimated"
     )
     of_residual: float = Field(
         default=0.0,
-        description="The one that leaves the least residual, within the limit, what filters make of"
-        " changes of direction not taken off, s; of a robot the one that most drives agree on,"
-        " clear of these; 0 where the trials do not show any. Residuals are compared with it",
+        description="Timing with the least residual within the limit, s, the bias of filters at"
+        " reversals included; for a robot the one on which most drives agree away from reversals;"
+        " 0 where the trials show none. Residuals are compared at this timing",
     )
 
     @property
     def is_at_limit(self) -> bool:
-        """Whether it ends within a twentieth of its limit."""
+        """Whether the estimate is within 5 % of its limit."""
         return 0.0 < NEAR_LIMIT * self.limit <= abs(self.estimate)
 
 
@@ -142,7 +142,7 @@ class StateBound(Record):
 
 
 class Consistency(Record):
-    """Normalised innovation squared; 1 where the noise levels are right."""
+    """Normalised innovation squared; 1 if the noise levels are right."""
 
     mean: Size
     by_trial: dict[str, Size]
@@ -192,8 +192,8 @@ class Convergence(Record):
     iterations: Count | None = Field(default=None, description="Of least squares")
     settled_s: dict[str, Size] | None = Field(
         default=None,
-        description="From when on each estimate stays within 2 % or 3 sd of its final value, s "
-        "from the start of the first run",
+        description="Time after which each estimate stays within 2 % or 3 sd of its final value, "
+        "s from the start of the first run",
     )
     total_s: Size | None = Field(default=None, description="Of the first run and the last")
 
@@ -225,8 +225,8 @@ class DeviceNumber(Record):
     partner: str | None
     correlation: float
     moves_percent: dict[str, float] = Field(
-        description="By how much each estimate known to 10 % moves for an error of 1 % in it,"
-        " per cent"
+        description="Change of each estimate that is known to 10 % for an error of 1 % in this"
+        " number, per cent"
     )
 
 
@@ -238,7 +238,7 @@ class Combined(Record):
 
 
 class TrialGrowth(Record):
-    """By how much the bound of the parameter named would grow without the trial."""
+    """Relative growth of the bound of a parameter without the trial."""
 
     growth: float
     parameter: str
@@ -262,7 +262,7 @@ class BaseEstimate(Record):
     members: Names
     estimate: float
     sd: Size
-    drawn: float = Field(description="By the numbers of the drawing")
+    drawn: float = Field(description="Value from the drawing")
     drawn_sd: Size
     unit: str
     shown: bool = Field(description="Whether the trials determine it better than the drawing")
@@ -299,8 +299,8 @@ class IdentifyResult(Result):
     )
     sign_width_factor: Annotated[float, Field(gt=0, le=1)] = Field(
         default=1.0,
-        description="Width of the smoothed sign of the velocities over the device's `sign_width`: "
-        "less where the trials of a test bench are likelier so. What is made of the model has it",
+        description="Width of the smoothed sign of the velocities over the device's `sign_width`; "
+        "below 1 where trials of a test bench are more likely so. Later stages use it too",
     )
     notes: Names = Field(default=(), description="Limits of the estimates")
     nis: Consistency | None = None
@@ -316,15 +316,15 @@ class IdentifyResult(Result):
     blocks: Annotated[int, Field(ge=1)] | None = Field(
         default=None, description="Independent blocks of time"
     )
-    restarts: Count | None = Field(default=None, description="Searches until the filter followed")
+    restarts: Count | None = Field(default=None, description="Attempts until the filter followed")
 
     @property
     def inertial(self) -> frozenset[str]:
-        """Inertial numbers of a robot's bodies, of which motion determines only combinations."""
+        """Inertial numbers of a robot's bodies: motion determines only combinations of them."""
         return frozenset(name for base in self.base_parameters or () for name in base.members)
 
     repeats: Count | None = Field(
         default=None,
-        description="How often the filter ran again around its answer; the states are of the last "
+        description="Further runs of the filter around its answer; the states are of the last "
         "run, the trace of the first and the last",
     )

@@ -14,12 +14,12 @@ class EncoderChannel(Record):
     """One axis."""
 
     unit: Literal["rad", "m"]
-    resolution: Size = Field(description="Step of the encoder in that unit, as settled")
-    resolution_stated: Size | None = Field(description="By session.toml; null where it does not")
+    resolution: Size = Field(description="Step of the encoder in that unit, as used")
+    resolution_stated: Size | None = Field(description="From session.toml, or null")
     resolution_measured: Size | None = Field(
-        description="Step in which the readings move; null where they lie on no grid"
+        description="Step of the readings; null where they lie on no grid"
     )
-    noise_sd: Size = Field(description="Of a reading, its rounding included")
+    noise_sd: Size = Field(description="Of a reading, rounding included")
     scale: float = Field(default=1.0, description="rad or m for one raw unit, by session.toml")
     zero: float = Field(default=0.0, description="Raw reading at position 0, by session.toml")
     counts_per_unit: float | None = Field(default=None, description="As in session.toml, or null")
@@ -32,8 +32,8 @@ class ForceChannels(Record):
 
     columns: Names
     unit: str
-    noise_sd: dict[str, Size] = Field(description="Of a sample, by channel, as settled")
-    noise_sd_stated: Size | None = Field(description="By session.toml; null where it does not")
+    noise_sd: dict[str, Size] = Field(description="Of a sample, by channel, as used")
+    noise_sd_stated: Size | None = Field(description="From session.toml, or null")
     noise_sd_measured: dict[str, Size | None] = Field(
         description="By channel; null where too little is recorded"
     )
@@ -44,10 +44,10 @@ class ForceChannels(Record):
     raw_unit: str = Field(default="", description="Unit of the raw columns")
     gain_sd: Size = Field(default=0.0, description="Standard uncertainty of each gain, as a share")
     crosstalk_sd: Size = Field(
-        default=0.0, description="That of how much of another component each shows, as a share"
+        default=0.0, description="Standard uncertainty of the crosstalk between components, a share"
     )
     look_like_counts: Names = Field(
-        default=(), description="Channels whose readings are rather counts of a converter"
+        default=(), description="Channels whose readings look like counts of a converter"
     )
 
 
@@ -109,16 +109,16 @@ class IngestResult(Result):
     simulated: bool = Field(default=False, description="Whether a simulator made it")
     sample_rate_hz: Positive = Field(description="Median over the trials, from their clocks")
     announced_rate_hz: Positive | None = Field(description="By session.toml, or null")
-    kept_every: int = Field(default=1, ge=1, description="Samples of a log for one that is kept")
+    kept_every: int = Field(default=1, ge=1, description="One sample of a log in this many is kept")
     axes: dict[str, EncoderChannel] = Field(min_length=1)
     force: ForceChannels
     sensor_warnings: Names = Field(
-        description="Where stated and measured noise or resolution disagree by more than twice, or"
-        " readings are rather counts"
+        description="Stated noise or resolution that differs from the measured one by more than a"
+        " factor of two, and readings that look like counts"
     )
     mains_hum: tuple[MainsHum, ...] = ()
     brakes: dict[str, RecordedChannel]
     channels: dict[str, RecordedChannel]
     dead: dict[str, tuple[DeadStretch, ...]] = Field(
-        default_factory=dict, description="By trial: stretches without a sensor"
+        default_factory=dict, description="By trial: stretches in which a sensor was dead"
     )

@@ -1,4 +1,4 @@
-"""How wide an interval is for what it is to hold."""
+"""Width of confidence intervals."""
 
 from __future__ import annotations
 

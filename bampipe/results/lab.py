@@ -41,7 +41,7 @@ class ControlChart(Record):
     unit: str
     centre: float = Field(description="Median")
     between_sd: Size | None = Field(
-        description="Scatter between sessions, their own uncertainty taken out"
+        description="Scatter between sessions, without the uncertainty within them"
     )
     slope_per_session: float | None
     slope_p: Share | None
@@ -53,7 +53,7 @@ class ControlChart(Record):
 
     @property
     def has_limits(self) -> bool:
-        """Whether there are sessions enough for control limits."""
+        """Whether there are enough sessions for control limits."""
         return self.points[0].lower is not None
 
 
@@ -94,6 +94,6 @@ class TrendsResult(Result):
     STAGE: ClassVar[str] = "lab"
 
     schema_: Literal["bampipe.trends/1"] = Field(alias="schema")
-    fewest_sessions: int = Field(ge=1, description="Fewer have no limits")
+    fewest_sessions: int = Field(ge=1, description="Fewest sessions for control limits")
     series: tuple[ControlChart, ...]
     sessions: tuple[SessionVerdict, ...]

@@ -11,8 +11,8 @@ from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
 Purpose = Literal["precision", "decision", "sensitivity"]
-"""Purpose of a trial: smaller uncertainties, one effect distinguished from others, or effects
-revealed that the present trials would not have revealed."""
+"""Purpose of a trial: smaller uncertainties, a decision between effects, or sensitivity to effects
+that the present trials would not have revealed."""
 
 NOTHING = "nothing missing"
 """Name of the alternative without any missing effect."""
@@ -31,12 +31,12 @@ def split_effects(name: str) -> set[str]:
 
 
 class Move(Record):
-    """Back and forth of one axis."""
+    """Motion of one axis back and forth."""
 
     low: float
     high: float
-    slow: Size = Field(description="Least and")
-    fast: Size = Field(description="most of the highest speed of each stroke")
+    slow: Size = Field(description="Highest speed of the slowest stroke")
+    fast: Size = Field(description="Highest speed of the fastest stroke")
     rest_s: Size = 0.0
     unit: Literal["rad", "m"]
 
@@ -46,8 +46,8 @@ class ExpectedSd(Record):
 
     before: Size = Field(description="As published")
     after: Size = Field(description="Median")
-    low: Size = Field(description="The outcome lies between this and")
-    high: Size = Field(description="this, in eight of ten cases")
+    low: Size = Field(description="Lower end of the range that holds eight of ten outcomes")
+    high: Size = Field(description="Upper end of that range")
     unit: str
 
     @property
@@ -67,7 +67,7 @@ class ExpectedConfusion(Record):
     between: Names = Field(description="Each by its effects, joined by +")
     weight: Share = Field(description="Box-Hill weight of the pair: product of the odds")
     before: Share = Field(description="By the probabilities of the diagnosis")
-    after: Share = Field(description="Median of those who follow it")
+    after: Share = Field(description="Median over people who follow it")
     distance_before: Size = Field(description="Expected log likelihood ratio, nats")
     distance_after: Size
     left: dict[str, Size] = Field(
@@ -80,13 +80,13 @@ class Proposal(Record):
 
     sentence: str
     seconds: Size = Field(description="Of all its trials together")
-    parts: Count = Field(default=1, description="Trials in which it is recorded, each as long")
+    parts: Count = Field(default=1, description="Trials of equal length in which it is recorded")
     like: str = Field(default="", description="The present trial that is imitated, without moves")
     moves: dict[str, Move] = Field(description="By axis; the trial is designed for the first")
     pose: dict[str, float] = Field(description="Positions at which other axes are held, rad or m")
     brakes: Share = Field(default=0.0, description="Share of the commands of the viscous trials")
     levels: dict[str, float] = Field(default={}, description="Of further channels")
-    worth: float = Field(description="By which proposals are ranked; of nine versions in ten")
+    worth: float = Field(description="Utility that ranks proposals: nine in ten versions reach it")
     information_gain: float = Field(description="Half the drop of the log determinant, nats")
     sd: dict[str, ExpectedSd] = Field(
         default={},
@@ -109,7 +109,7 @@ class Detectable(Record):
 
 
 class Extent(Record):
-    """How far, fast and hard an axis moves: what it may do, or what it does."""
+    """Range, speed, acceleration and effort of an axis: limits, or values that are reached."""
 
     lower: float = Field(description="Position, rad or m")
     upper: float
@@ -119,9 +119,9 @@ class Extent(Record):
 
 
 class Trajectory(Record):
-    """What drives follow in each trial of the first proposal."""
+    """The trajectory that drives follow in each trial of the first proposal."""
 
-    file: str = Field(description="Of the run")
+    file: str = Field(description="Path in the run folder")
     seconds: Size
     limits: dict[str, Extent] = Field(description="By axis")
     assumed: Names = Field(
@@ -140,13 +140,13 @@ class PlannedTrial(Record):
 
 
 class PlannedSd(ExpectedSd):
-    """The same with the trials of a plan, beside what is asked."""
+    """Standard deviation with the trials of a plan, and the required limit."""
 
     asked: Size
 
 
 class PlannedConfusion(Record):
-    """Chance of taking one effect for another, without and with the trials of a plan."""
+    """Chance of confusing two effects, without and with the trials of a plan."""
 
     between: Names
     before: Share
@@ -154,11 +154,11 @@ class PlannedConfusion(Record):
 
 
 class Plan(Record):
-    """The trials that bring every uncertainty below what is asked."""
+    """The trials that bring every uncertainty below the limit asked for."""
 
     sentence: str
     seconds: Size = Field(description="Of all trials")
-    is_enough: bool = Field(description="Whether what is asked is expected to be reached")
+    is_enough: bool = Field(description="Whether the limit is expected to be reached")
     trials: tuple[PlannedTrial, ...]
     sd: dict[str, PlannedSd] = Field(
         default={}, description="By parameter; none where the model lacks something"

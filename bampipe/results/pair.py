@@ -1,4 +1,4 @@
-"""What `bampipe compare A B` finds of two sessions of one device."""
+"""The comparison of two sessions of one device by `bampipe compare A B`."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ class Travel(Record):
     noise_floor: Size | None
     uncertainty: Size = Field(description="Part of the error that the parameters' sd accounts for")
     limit: Size = Field(
-        description="Largest error with which it travels, by the floor there; by own_error where it"
-        " is above the floor of its own session"
+        description="Largest error of a model that travels: by the floor there, or by own_error if"
+        " the model is above the floor of its own session"
     )
     unit: str
     travels: bool
@@ -67,7 +67,7 @@ class Refit(Record):
 
     changes: dict[str, float] = Field(description="By parameter, in its unit")
     errors: dict[str, Size] = Field(description="By axis, on trials left out of the refit")
-    travels: Names = Field(description="Axes on which it does then")
+    travels: Names = Field(description="Axes on which the refitted model travels")
 
 
 class Journey(Record):
@@ -83,8 +83,8 @@ class Journey(Record):
     )
     lacking: dict[str, AxisVerdict] = Field(
         default={},
-        description="Of its like there, on axes that these do not bring to their limit, and on"
-        " those whose own model is above its floor",
+        description="By axis: verdict on a model with the same effects in the other session, where"
+        " no refit reaches the limit or the own model is above its floor",
     )
     reason: str = Field(default="", description="Why these are not known")
 

@@ -27,15 +27,14 @@ class Record(Declaration):
     """Part of a result.
 
     A field of another type, one that is not declared, and a number that is not finite are
-    refused; numbers of numpy are taken. A field with a default is left out of the file where it
-    holds it.
+    refused; numbers of numpy are taken. A field that holds its default is left out of the file.
     """
 
     model_config = ConfigDict(strict=False, serialize_by_alias=True)
 
     @classmethod
     def of(cls, *sources: object, **values: object) -> Self:
-        """Return the record of ``values``, and of what ``sources`` have by the names of its fields.
+        """Return a record of ``values`` and of those attributes of ``sources`` that are fields.
 
         Arrays become tuples; an earlier source goes before a later one.
         """
@@ -103,7 +102,7 @@ class Result(Record):
         return cls.model_validate_json(json.dumps(content), strict=True)
 
     def write(self, folder: Path) -> dict[str, Any]:
-        """Write the result below ``folder``, whole or not at all, and return what it says."""
+        """Write the result below ``folder``, whole or not at all, and return its content."""
         content = self.model_dump(mode="json")
         write_json(folder / self.file(getattr(self, "model", "")), content)
         return content

@@ -1,4 +1,4 @@
-"""Numbers rounded as their uncertainty allows, for the sentences that results carry."""
+"""Numbers rounded to their uncertainty, for sentences in results."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import math
 
 _MOST_DECIMALS = 9
 SMALLEST_PLAIN, _LARGEST_PLAIN = 1e-4, 1e7
-"""Sizes outside which a number is written with a power of ten: nobody counts zeros."""
+"""Range in which a number is written without a power of ten."""
 
 
 def decimals_for(sd: float | None, value: float) -> int:
-    """Return how many decimals of ``value`` mean something: those of two digits of ``sd``."""
+    """Return the number of significant decimals of ``value``: two digits of ``sd``."""
     size = abs(sd) if sd is not None and math.isfinite(sd) else 0.0
     if size == 0.0:
         if value == 0.0 or not math.isfinite(value):
@@ -20,7 +20,7 @@ def decimals_for(sd: float | None, value: float) -> int:
 
 
 def significant(value: float, digits: int = 3) -> str:
-    """Return ``value`` with so many significant digits, as tables have it: zeros at its end too."""
+    """Return ``value`` with ``digits`` significant digits, trailing zeros included."""
     if value == 0.0 or not math.isfinite(value):
         return f"{value:g}"
     size = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
@@ -30,7 +30,7 @@ def significant(value: float, digits: int = 3) -> str:
 
 
 def power_for(value: float, sd: float | None) -> int:
-    """Return the power of ten to take out of ``value`` and ``sd``; 0 where both read well as is."""
+    """Return the power of ten to factor out of ``value`` and ``sd``; 0 if none is needed."""
     largest = max((abs(x) for x in (value, sd or 0.0) if math.isfinite(x)), default=0.0)
     if largest == 0.0 or SMALLEST_PLAIN <= largest < _LARGEST_PLAIN:
         return 0
@@ -38,7 +38,7 @@ def power_for(value: float, sd: float | None) -> int:
 
 
 def round_with_sd(value: float, sd: float) -> str:
-    """Return ``value ± sd``, both to two digits of ``sd``, and by powers of ten where need be."""
+    """Return ``value ± sd``, both to two digits of ``sd``, with powers of ten if needed."""
     if sd == 0.0:
         return f"{value:.4g} ± 0"
     power = power_for(value, sd)

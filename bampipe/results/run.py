@@ -87,7 +87,7 @@ class Timing(Record):
 
 
 class Commit(Record):
-    """What a step has made that is not yet in its place; ``remove``: what it no longer has."""
+    """Results of a step that are not yet in their place; ``remove``: obsolete ones."""
 
     step: str
     record: StepRecord
@@ -100,7 +100,7 @@ class GateVerdict(Record):
 
     gate: str
     model: str = Field(default="", description='The model that was judged, or ""')
-    key: str = Field(description='What * stood for, or ""')
+    key: str = Field(description='The key for which * stood, or ""')
     state: GateState
     value: float | None
     message: str
@@ -120,7 +120,7 @@ class RunResult(Result):
     timings: dict[str, Timing] = Field(default={})
     failures: dict[str, str] = Field(default={}, description="By step: why its last try failed")
     versions: dict[str, str] = Field(
-        default={}, description="Of Python, bampipe and what it rests on, at the last run"
+        default={}, description="Of Python, bampipe and its dependencies, at the last run"
     )
     gates: tuple[GateVerdict, ...] = ()
 

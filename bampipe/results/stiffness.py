@@ -54,8 +54,8 @@ class AxisStiffness(Record):
         description="By the scatter over the cycles, or of the regression over all, the larger"
     )
     systematic: Size = Field(
-        description="A quarter of what the slope changes by where loops should be straight, or "
-        "could change by"
+        description="A quarter of the change of slope, measured or possible, where loops should "
+        "be straight"
     )
     calibration_sd: Size = Field(
         description="Part from the stated uncertainties of sensors, and the zeros of encoders"
@@ -97,8 +97,8 @@ class GearStiffness(Record):
     late_s: float = Field(description="Delay of the second encoder's reading after the first, s")
     late_sd: Size
     explained: float = Field(
-        description="By stiffness and play, of what timing and the drive's own losses leave of the"
-        " difference's variance, up to 1"
+        description="Share of the variance of the difference that stiffness and play explain, after"
+        " timing and the drive's own losses"
     )
     channel: str = Field(description="Of the second encoder")
 

@@ -1,4 +1,4 @@
-"""``models/<model>/terms.json``: the equations of a model and what each term contributes."""
+"""``models/<model>/terms.json``: the equations of a model and the force of each term."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class ModelTerm(Record):
 
 
 class TermsResult(Result):
-    """The equations of a model, and what each of its terms contributes."""
+    """The equations of a model, and the force of each of its terms."""
 
     FILE: ClassVar[str] = "models/{model}/terms.json"
     STAGE: ClassVar[str] = "validate"

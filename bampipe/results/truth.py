@@ -1,4 +1,4 @@
-"""``<session>.truth.json``: what `bampipe simulate` put into a session."""
+"""``<session>.truth.json``: the truth about a session made by `bampipe simulate`."""
 
 from __future__ import annotations
 

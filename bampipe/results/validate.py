@@ -30,7 +30,7 @@ class AxisError(Record):
 
 
 class JudgedError(AxisError):
-    """Error of one axis over all trials, held against its noise floor."""
+    """Error of one axis over all trials, compared with its noise floor."""
 
     noise_floor: Size | None = Field(
         description="held_out_rmse of the fitted model's own replicates, same sensors and filters; "
@@ -41,7 +41,7 @@ class JudgedError(AxisError):
     expected_ratio: Annotated[float, Field(ge=1)] = Field(
         default=1.0,
         description="published_rmse over held_out_rmse if the published parameters were true, from "
-        "a replicate; asked where it is above 1.2 on the trials",
+        "a replicate; computed where the ratio exceeds 1.2 on the trials",
     )
     estimate: Literal["accepted", "refused"] = Field(
         description="Refused where published_rmse is more than 1.2 times held_out_rmse and more "
@@ -101,7 +101,7 @@ class AxisDrift(Record):
 
     unit: str = Field(description="rad or m")
     horizons: tuple[Drift, ...] = Field(description="Shortest first")
-    reason: str = Field(default="", description="Reason for a lack of longer horizons")
+    reason: str = Field(default="", description="Why there are no longer horizons")
 
 
 class FreeRun(Record):
@@ -128,7 +128,7 @@ class ValidateResult(Result):
     model: str
     headline: str
     cutoff_hz: dict[str, Positive] = Field(description="Low-pass of both sides by axis, Hz")
-    floor_replays: Count = Field(description="Replicates that the noise floor is the mean of")
+    floor_replays: Count = Field(description="Replicates over which the noise floor is a mean")
     failed_checks: Names = Field(description="Of data, estimate and floor; a sound model has none")
     notes: Names
     axes: dict[str, JudgedError] = Field(

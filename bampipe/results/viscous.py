@@ -42,7 +42,7 @@ class ViscousResult(Result):
     )
     process_noise_factor: Annotated[float, Field(ge=1)] | None = Field(
         default=None,
-        description="By how much the filter's process noise had to be raised; 1 mostly",
+        description="Factor by which the filter's process noise had to be raised; mostly 1",
     )
     directions: dict[str, Damping] = Field(
         description="By component of the handle's force; empty without viscous trials"

@@ -108,10 +108,7 @@ def _signed_drives(compared: Comparison, mounting: Mounting) -> list[Array]:
 
 
 def describe_heavy(
-    compared: Comparison,
-    mounting: Mounting,
-    found: HeavierBody,
-    in_tip: Callable[[Array], Array],
+    compared: Comparison, mounting: Mounting, found: HeavierBody, in_tip: Callable[[Array], Array]
 ) -> str:
     """Say which body is heavier than drawn; of the last one, with the payload that it suggests.
 

@@ -1,4 +1,4 @@
-"""One specimen of a device with effects hidden in it: what a simulated session is recorded from."""
+"""The specimen of a device, with hidden effects, that a simulated session records."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ STIFFNESS = {"rotary": 2200.0, "linear": 109e3}
 
 @dataclass(frozen=True)
 class Config:
-    """What to simulate.
+    """Settings of a simulation.
 
     Attributes:
-        effects: effects to hide, such as ``stribeck:yaw``; a strength of its own may follow,
+        effects: effects to hide, such as ``stribeck:yaw``, or with a strength,
             ``stribeck:yaw=0.5``.
-        strength: size of the effects that state none. 1 is each effect's typical size: every
-            strength parameter is this times its ``typical`` (its ``sd`` where it has none), its
-            sign drawn where both make sense.
+        strength: strength of the other effects, as a multiple of the ``typical`` value of each
+            strength parameter (of its ``sd`` if it has none); its sign is drawn if both are valid.
         seed: of every random draw.
         device: name of a built-in device.
         effect_files: paths of effect files beside the built-in ones.
@@ -39,7 +38,7 @@ class Config:
         duration: of a free or viscous trial, s.
         sample_rate: Hz.
         viscous_damping: Cartesian damping of the viscous field, N.s/m.
-        amplitude: scale of the motion, 1 for all of what a person uses.
+        amplitude: scale of the motion; 1 is the range that a person uses.
         force_noise: standard deviation of the force sensor, N.
         parameters: values that replace drawn ones, by full name.
         file_format: of the trial files, ``csv`` or ``parquet``.
@@ -64,16 +63,16 @@ class Config:
 
 @dataclass(frozen=True)
 class Specimen:
-    """The mechanism and its sensors as they truly are.
+    """The true mechanism and its sensors.
 
     Attributes:
         device: what is simulated.
         motion: model with the effects that act on the motion.
-        force: model with the effects on the force reading, a pure delay left out; None without.
+        force: model with the effects on the force reading except a delay; None without any.
         position: model with the effects on the position reading; None without.
         values: true value of every parameter, by full name.
-        delay: by which the force reading is late, s.
-        stiffness: of each axis' transmission, N.m/rad or N/m.
+        delay: of the force reading, s.
+        stiffness: of the transmission of each axis, N.m/rad or N/m.
     """
 
     device: Device
@@ -85,15 +84,15 @@ class Specimen:
     stiffness: Mapping[str, float]
 
     def p(self, system: System) -> Array:
-        """True parameters of ``system``, (n_p,)."""
+        """Return the true parameters of ``system``, (n_p,)."""
         return np.array([self.values[p.name] for p in system.parameters])
 
 
-def _device(name: str) -> Device:
-    """The built-in device of that name.
+def _find_device(name: str) -> Device:
+    """Return a built-in device.
 
     Raises:
-        InputError: there is none, or it takes more than forces.
+        InputError: there is no such device, or it has inputs other than forces.
     """
     known = registry.device_names()
     if name not in known:
@@ -106,31 +105,31 @@ def _device(name: str) -> Device:
     others = (*no_forces, *device.channels)
     if others:
         raise InputError(
-            f"device {name!r} cannot be simulated: it takes {' and '.join(others)}, and nothing but"
-            " forces is simulated"
+            f"device {name!r} cannot be simulated: it takes {' and '.join(others)}, and only forces"
+            " are simulated"
         )
     return device
 
 
-def input_column(system: System, name: str) -> int:
-    """Column of an input in u, -1 where the model has no use for it."""
+def find_input_column(system: System, name: str) -> int:
+    """Return the column of an input in u, -1 if the model does not use it."""
     return system.inputs.index(name) if name in system.inputs else -1
 
 
 def draw_specimen(config: Config) -> tuple[Specimen, dict[str, float]]:
-    """Draw the specimen; also the strength of each effect by canonical name."""
-    device = _device(config.device)
+    """Draw the specimen; return it with the strength of each effect."""
+    device = _find_device(config.device)
     extra = [
         registry.effect_from(read_toml(path), str(path)) for path in map(Path, config.effect_files)
     ]
-    strengths = dict(_strength(text, config.strength) for text in config.effects)
+    strengths = dict(_read_strength(text, config.strength) for text in config.effects)
     if len(strengths) < len(config.effects):
         raise InputError("an effect is named twice")
     full = Model(device, strengths, extra)
     rng = np.random.default_rng([config.seed, 0])
-    values = _base_values(device, rng)
+    values = _draw_base_values(device, rng)
     for item in full.effects:
-        values |= _effect_values(item, strengths[item.name], rng)
+        values |= _draw_effect_values(item, strengths[item.name], rng)
     for name, value in config.parameters.items():
         if name not in values:
             known = ", ".join(values)
@@ -150,11 +149,11 @@ def draw_specimen(config: Config) -> tuple[Specimen, dict[str, float]]:
 
 
 def _is_delay(item: BoundEffect) -> bool:
-    """The one effect whose expression is a series for what the sensor does exactly."""
+    """Whether this is the delay, which the sensor model applies exactly, not as a series."""
     return item.effect.name == "force_delay"
 
 
-def _strength(text: str, default: float) -> tuple[str, float]:
+def _read_strength(text: str, default: float) -> tuple[str, float]:
     name, sign, number = text.partition("=")
     if not sign:
         return name, default
@@ -167,21 +166,21 @@ def _strength(text: str, default: float) -> tuple[str, float]:
     return name, value
 
 
-def _base_values(device: Device, rng: np.random.Generator) -> dict[str, float]:
-    """Parameters of one specimen of ``device``, around their typical values or priors."""
+def _draw_base_values(device: Device, rng: np.random.Generator) -> dict[str, float]:
+    """Draw the parameters of the device around their typical values or priors."""
     spread = {"viscous": 0.15, "coulomb": 0.1}
     values = {}
     for p in device.parameters:
         nominal = p.prior if p.typical is None else p.typical
         factor = 1.0 + spread.get(p.name.partition(".")[0], 0.003) * float(rng.uniform(-1.0, 1.0))
-        values[p.name] = p.prior if p.fixed else _between(nominal * factor, p.lower, p.upper)
+        values[p.name] = p.prior if p.fixed else _clip(nominal * factor, p.lower, p.upper)
     return values
 
 
-def _effect_values(
+def _draw_effect_values(
     item: BoundEffect, strength: float, rng: np.random.Generator
 ) -> dict[str, float]:
-    """Parameters of an effect: strengths scaled and signed, shapes within 20 % of typical."""
+    """Draw the parameters of an effect: strengths as asked, shapes within 20 % of typical."""
     values = {}
     for p in item.parameters:
         draw = float(rng.uniform(-1.0, 1.0))
@@ -191,9 +190,9 @@ def _effect_values(
             wanted = sign * strength * usual
         else:
             wanted = usual * (1.0 + 0.2 * draw)
-        values[p.name] = p.prior if p.fixed else _between(wanted, p.lower, p.upper)
+        values[p.name] = p.prior if p.fixed else _clip(wanted, p.lower, p.upper)
     return values
 
 
-def _between(value: float, lower: float, upper: float) -> float:
+def _clip(value: float, lower: float, upper: float) -> float:
     return min(max(value, lower), upper)

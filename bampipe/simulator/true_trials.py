@@ -1,4 +1,4 @@
-"""What a person does to a simulated machine: free and locked trials, trials in a viscous field."""
+"""True motion and force of simulated trials: free, locked, and in a viscous field."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from bampipe.arrays import Array
 from bampipe.estimate.simulation import Impedance, simulate_tracking
 from bampipe.physics.device import Coordinate, Device, derivative
-from bampipe.simulator.specimen import Config, Specimen, input_column
+from bampipe.simulator.specimen import Config, Specimen, find_input_column
 
 REACH = {"rotary": 0.65, "linear": 0.8}
-"""Largest wanted motion as a share of half the range: people use more of a rod than of a turn."""
+"""Largest intended motion as a share of half the range."""
 
 HASTE = {"rotary": 15.0, "linear": 6.0}
-"""Largest wanted acceleration, rad/s2 and m/s2: about 40 N at the handle of the BAM."""
+"""Largest intended acceleration, rad/s2 and m/s2: about 40 N at the handle of the BAM."""
 
 LOCKED_LOAD = {"rotary": 50.0, "linear": 120.0}
 """Peak load of a locked trial, N.m and N."""
@@ -23,7 +23,7 @@ LOCKED_LOAD = {"rotary": 50.0, "linear": 120.0}
 LOCKED_BRAKE = 200.0
 LOCKED_PERIOD, LOCKED_CYCLES = 4.0, 6
 BAND = (0.1, 2.0)
-"""Frequencies of the motion that the hand wants, Hz (Section II-E)."""
+"""Frequencies of the intended motion, Hz (Section II-E)."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class TrueTrial:
 def _draw_wanted_motion(
     device: Device, config: Config, rng: np.random.Generator, t: Array, share: float
 ) -> tuple[Array, Array]:
-    """Position and rate that the hand wants: band-limited noise in each axis, from rest."""
+    """Draw intended position and velocity: band-limited noise on each axis, from rest."""
     q = np.empty((len(t), len(device.coordinates)))
     qd = np.empty_like(q)
     rise = np.clip(t / 1.0, 0.0, 1.0)
@@ -48,7 +48,7 @@ def _draw_wanted_motion(
     for i, c in enumerate(device.coordinates):
         middle, half = _middle_and_half_range(device, c)
         frequency = 2 * np.pi * rng.uniform(*BAND, size=40)
-        # A hand reaches far slowly and only a little fast.
+        # A hand moves far only when it moves slowly.
         size = rng.normal(size=40) / (1.0 + (frequency / (2 * np.pi * 0.6)) ** 2) ** 2
         phase = np.outer(t, frequency) + rng.uniform(0.0, 2 * np.pi, size=40)
         wave, rate = np.sin(phase) @ size, np.cos(phase) @ (size * frequency)
@@ -63,7 +63,7 @@ def _draw_wanted_motion(
 def simulate_moving_trial(
     specimen: Specimen, config: Config, rng: np.random.Generator, viscous: bool
 ) -> TrueTrial:
-    """A free trial, or one in a viscous field."""
+    """Simulate a free trial, or one in a viscous field."""
     system, device = specimen.motion, specimen.device
     dt = 1.0 / config.sample_rate
     t = np.arange(round(config.duration * config.sample_rate), dtype=np.float64) * np.float64(dt)
@@ -73,7 +73,7 @@ def simulate_moving_trial(
     if "t" in system.inputs:
         u[:, system.inputs.index("t")] = t
     force = [system.inputs.index(f) for f in device.forces]
-    slopes = [[input_column(system, derivative(f, k)) for f in device.forces] for k in (1, 2)]
+    slopes = [[find_input_column(system, derivative(f, k)) for f in device.forces] for k in (1, 2)]
     n = len(device.coordinates)
     brakes = [system.inputs.index(device.brakes[c.name]) for c in device.coordinates] if (
         viscous or set(device.brakes) == {c.name for c in device.coordinates}
@@ -81,7 +81,7 @@ def simulate_moving_trial(
     p = specimen.p(system)
     x0 = np.concatenate([q_ref[0], np.zeros(n), system.initial_memory(q_ref[0], u[0], p)])
     pose = q_ref
-    # The field J^T K J needs the pose; its own motion settles after a few rounds.
+    # The field J^T K J depends on the pose, which settles after a few iterations.
     for _ in range(4 if viscous else 1):
         gain = config.viscous_damping * (system.input_map(pose) ** 2).sum(axis=2)
         x, total = simulate_tracking(
@@ -98,7 +98,7 @@ def simulate_moving_trial(
 def simulate_locked_trial(
     specimen: Specimen, config: Config, rng: np.random.Generator, axis: str
 ) -> TrueTrial:
-    """An axis held by its brake while the handle is loaded: the transmission winds up.
+    """Simulate a locked trial: the brake holds an axis, and the loaded transmission winds up.
 
     The load is stiffness times deflection plus friction that builds up over a tenth of the
     deflection (Dahl), which gives the loop of Fig. 3.
@@ -133,6 +133,6 @@ def simulate_locked_trial(
 
 
 def _middle_and_half_range(device: Device, c: Coordinate) -> tuple[float, float]:
-    """Middle and half width of an axis' range."""
+    """Return middle and half width of the range of an axis."""
     lower, upper = device.limits.get(c.name, (-1.0, 1.0) if c.kind == "rotary" else (-0.2, 0.2))
     return (lower + upper) / 2, (upper - lower) / 2

@@ -21,7 +21,7 @@ from bampipe.data.device_file import find_robot_file
 from bampipe.data.quality import CleaningLimits, CleanTrial, thin, thinning_factor
 from bampipe.data.run_folder import INGESTED, MOVING, RunFolder
 from bampipe.data.session import Session, TrialEntry, read_session
-from bampipe.data.session_trials import find_copies, read_sound_trial
+from bampipe.data.session_trials import describe_spans, find_copies, read_sound_trial
 from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.declarations.session_device import placeholders, session_device
 from bampipe.errors import InputError
@@ -73,7 +73,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     with ParquetAppender(out / "ingest/samples.parquet") as samples:
         rows = _ingest_trials(session, config, every, channels, samples, progress)
     text = ("trial_id", "file", "kind", "locked_axis", "status", "reason", "repairs")
-    trials = pd.DataFrame(rows).drop(columns="dead").astype(dict.fromkeys(text, "string"))
+    trials = (
+        pd.DataFrame(rows).drop(columns=["dead", "spans"]).astype(dict.fromkeys(text, "string"))
+    )
     write_parquet(out / "ingest/trials.parquet", trials)
     # The announced rate, or the median of the trials where the time stamps say otherwise.
     rate, measured = session.sample_rate / every, float(trials["sample_rate_hz"].median())
@@ -83,7 +85,12 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     description.write(out)
     if session.device_file is not None:
         _write_device(session.device_file, device, out / "ingest")
-    notes = [*description.sensor_warnings, *map(phrases.describe_hum, description.mains_hum)]
+    spans = {row["trial_id"]: row["spans"] for row in rows if row["spans"]}
+    notes = [
+        *describe_spans(spans),
+        *description.sensor_warnings,
+        *map(phrases.describe_hum, description.mains_hum),
+    ]
     if device.robot is not None:
         notes += [
             f"no body has what is drawn, and the nearest is taken: {line}"
@@ -188,6 +195,11 @@ def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, 
         "reason": reason,
         "repairs": "" if trial is None else "; ".join([*trial.repairs, *trial.notes]),
         "dead": () if trial is None else tuple(trial.dead),
+        "spans": {
+            name.removeprefix("q_"): float(np.ptp(values))
+            for name, values in (trial.columns.items() if trial and entry.kind in MOVING else ())
+            if name.startswith("q_")
+        },
     }
 
 

@@ -26,23 +26,23 @@ from bampipe.estimate.simulation import Runaway
 from bampipe.files import digest_content, write_json, write_text
 from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.sensor_noise import sensor_noise
-from bampipe.next_trial.choice import (
+from bampipe.next_trial.discrimination import Comparison
+from bampipe.next_trial.forecast import Forecast
+from bampipe.next_trial.plan import Goal, plan_trials, record_plan
+from bampipe.next_trial.precision import Precision
+from bampipe.next_trial.primitives import Envelope, imitate_trials
+from bampipe.next_trial.ranking import (
     DesignSpace,
     RankedDesign,
     count_affordable,
     find_best_of_each,
     rank_designs,
 )
-from bampipe.next_trial.discrimination import Comparison
-from bampipe.next_trial.forecast import Forecast
-from bampipe.next_trial.motion import Rehearsal
-from bampipe.next_trial.plan import Goal, plan_trials, record_plan
-from bampipe.next_trial.precision import Precision
-from bampipe.next_trial.primitives import Envelope, imitate_trials
+from bampipe.next_trial.rehearsal import Rehearsal
 from bampipe.next_trial.sensitivity import Detectability, find_detectability
 from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity
 from bampipe.next_trial.trajectory import Points, list_trajectories, read_limits, require_limits
-from bampipe.phrases.forecast import find_open, read_forecasts
+from bampipe.phrases.forecast_outcome import find_open, read_forecasts
 from bampipe.phrases.proposal import explain_proposal, find_shown, say_trajectory
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
@@ -200,7 +200,7 @@ def _read_case(
     trials = replace(trials, motions=tuple(trials.motions))
     session = Session(trials, config, config.jobs or os.cpu_count() or 1, config.seed)
     seen = Envelope.of_trials(trials.motions, system, p)
-    if not seen.movable:
+    if not seen.moved_axes:
         raise InputError("no axis moves in the trials at hand", where=str(run.root))
     limits = read_limits(model.device, seen) if config.trajectory else {}
     recipe = read_recipe(run, config.model, model)
@@ -256,7 +256,7 @@ def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
     # No parameters are fitted to what has the brakes on, but for those of brakes.
     brakes_on = of_effects or case.system.braked
     return DesignSpace(
-        forecast.rehearsal, seconds, case.seen.movable, examples, of_effects, brakes_on
+        forecast.rehearsal, seconds, case.seen.moved_axes, examples, of_effects, brakes_on
     )
 
 

@@ -51,10 +51,10 @@ class Config:
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Write the report of whatever stages have run; ingest must have."""
     # matplotlib is slow to import: only here, so that other commands do not wait for it
-    from bampipe.report.build import build
-    from bampipe.report.results import Results
+    from bampipe.report.build import build_run_report
+    from bampipe.report.run_results import Results
 
-    report = build(Results(run.root, config.detail_model), progress)
+    report = build_run_report(Results(run.root, config.detail_model), progress)
     folder = out / "report"
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     (folder / "report.pdf").write_bytes(report.pdf)
@@ -72,7 +72,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 def write_page_of_two(first: Path, second: Path) -> Path:
     """Write the page of two runs beside the folder of the first, and return its path."""
     from bampipe.report.explorer.page import explorer_page
-    from bampipe.report.results import Results
+    from bampipe.report.run_results import Results
 
     results, beside = Results(first), Results(second)
     device, other = (one.session.device for one in (results, beside))

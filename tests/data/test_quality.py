@@ -121,14 +121,6 @@ def test_wraps_and_missing_samples_together():
     assert np.abs(np.diff(trial.columns["q_yaw"])).max() < 0.01
 
 
-def test_wraps_are_undone_exactly():
-    table = columns()
-    table["yaw"] *= 4
-    wrapped = cleaned({**table, "yaw": np.mod(table["yaw"], 2**16)})
-    start = np.mod(table["yaw"][0], 2**16) - table["yaw"][0]
-    np.testing.assert_allclose(wrapped.columns["q_yaw"] * 20000, table["yaw"] + start)
-
-
 def test_a_second_of_samples_is_a_second():
     table = columns(500)
     assert len(cleaned(table).t) == 500

@@ -105,8 +105,8 @@ def test_many_blocks_are_joined_in_order(tmp_path, monkeypatch):
 @pytest.mark.parametrize("blank", [0, 3])
 def test_a_bad_cell_is_found_in_any_block(tmp_path, monkeypatch, blank):
     monkeypatch.setattr(text_reader, "BLOCK", 1024)
-    lines = ["a,b"] + ["1,2"] * 10 + [""] * blank + ["1,2"] * 2000 + ["1,x"] + ["1,2"] * 2000
-    with pytest.raises(InputError, match=f"row {2012 + blank}, column 'b': found 'x'"):
+    lines = ["a,b"] + ["1,2"] * 10 + [""] * blank + ["1,2"] * 2000 + ["1,x1"] + ["1,2"] * 2000
+    with pytest.raises(InputError, match=f"row {2012 + blank}, column 'b': found 'x1'"):
         read(tmp_path / "a.csv", "\n".join(lines).encode() + b"\n", ("a", "b"))
 
 

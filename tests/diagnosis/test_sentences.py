@@ -105,7 +105,7 @@ def test_a_verdict_names_what_is_probable(verdict: str, sets: Sets, start: str) 
 def test_what_is_left_beside_named_effects_is_said_with_its_shape() -> None:
     for verdict, sets in (("missing", {(A,): 1.0}), ("undecided", {(A,): 0.6, (B,): 0.4})):
         said = say(verdict, sets, remains=True, unknown=0.957)
-        assert "Beside that, something is missing that no effect of the library explains" in said
+        assert "In addition, something is missing that no effect of the library explains" in said
         assert "(probability 0.96)" in said and said.endswith(f"Its shape: {SHAPE}.")
         assert SHAPE not in say(verdict, sets)
     assert say("unknown_effect", {(): 1.0}).endswith(f"Its shape: {SHAPE}.")
@@ -115,13 +115,15 @@ def test_what_is_left_beside_named_effects_is_said_with_its_shape() -> None:
 
 def test_effects_of_other_axes_that_errors_come_from_are_named() -> None:
     both = {(A, "b:elbow"): 1.0}
-    assert "adding all that is selected (a:joint and b:elbow) takes" in say("missing", both)
+    assert "adding all selected effects (a:joint and b:elbow) takes" in say("missing", both)
     clean = say("nothing_missing", {("b:elbow",): 1.0}, before=0.104)
     assert "the held-out error is 0.104 N.m" in clean and "b:elbow" not in clean
 
 
 def test_an_error_above_its_floor_with_nothing_missing_says_what_filters_leave() -> None:
-    filters = "Without the bias that filters leave where friction turns, the error is 0.0831 N.m."
+    filters = (
+        "Without the bias that filters leave where friction changes sign, the error is 0.0831 N.m."
+    )
     assert say("nothing_missing", {(): 1.0}, before=0.5, after=0.5).endswith(filters)
     assert filters not in say("nothing_missing", {(): 1.0})
 
@@ -130,7 +132,7 @@ def test_an_error_above_its_floor_with_nothing_missing_says_what_filters_leave()
     ("after", "floor", "why"),
     [
         (0.3, 1.0, "its held-out error of 0.300 N.m is far below its noise floor, which is"),
-        (0.3, 0.0, "its held-out error of 0.300 N.m is without a noise floor to be held against."),
+        (0.3, 0.0, "its held-out error of 0.300 N.m is without a noise floor for comparison."),
         (20.0, 1.0, "replicates of the model do not resemble the measurement"),
     ],
 )
@@ -138,8 +140,8 @@ def test_no_verdict_says_why_and_what_to_do(after: float, floor: float, why: str
     window = {"axis": "joint", "trial_id": "t3", "t_start": 4.0, "t_end": 4.5, "rmse": 31.2,
               "unit": "N.m", "doing": "reversing"}  # fmt: skip
     said = say("no_verdict", {(A,): 1.0}, after=after, floor=floor, worst_windows=[window])
-    assert said.startswith(f"Joint: no verdict, for {why}")
-    assert "By their fit alone: a:joint (> 0.99)." in said and "is missing" not in said
+    assert said.startswith(f"Joint: no verdict, because {why}")
+    assert "Judged by fit alone: a:joint (> 0.99)." in said and "is missing" not in said
     assert "Compare the noise and resolution in session.toml" in said
     assert ("31.2 N.m, from 4.0 to 4.5 s of trial t3 (reversing)" in said) == (after > floor > 0.0)
 

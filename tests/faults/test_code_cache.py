@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -194,20 +193,6 @@ class Cache(compiled._Cache):
     @property
     def index(self) -> Path:
         return self.folder / "function.nbi"
-
-
-def test_what_another_process_compiles_is_waited_for(tmp_path: Path) -> None:
-    def wait() -> bool:
-        with compiled._one_process_at_a_time(Cache(tmp_path)):
-            return (tmp_path / "function.nbi").exists()
-
-    with ThreadPoolExecutor(1) as pool:
-        with compiled._one_process_at_a_time(Cache(tmp_path)):
-            waiting = pool.submit(wait)
-            with pytest.raises(TimeoutError):
-                waiting.result(timeout=0.2)
-            (tmp_path / "function.nbi").touch()
-        assert waiting.result(timeout=10.0), "what it waited for is there"
 
 
 def test_a_process_that_dies_while_compiling_holds_up_nobody(tmp_path: Path) -> None:

@@ -212,9 +212,7 @@ def test_inside_means_links_followed(tmp_path: Path) -> None:
     [
         ({"../../../../outside/double.json": digest("planted")}, (), "toy_double"),
         ({"run.json": digest("planted")}, (), "toy_double"),
-        ({".bampipe/lock": digest("planted")}, (), "toy_double"),
         ({"toy/more.json": digest("planted")}, ("../../outside/double.json",), "toy_double"),
-        ({"toy/more.json": digest("planted")}, ("toy",), "toy_double"),
         ({"toy/more.json": digest("planted")}, (), "toy_read"),
         ({"toy/more.json": digest("planted")}, (), "../toy_double"),
     ],
@@ -245,12 +243,8 @@ def test_a_commit_through_a_link_in_staging_is_refused(toy: Toy, outside: Path) 
     [
         (("stages", "toy_double", "declared_inputs"), ["../../outside/*"]),
         (("stages", "toy_double", "outputs"), {"../../outside/double.json": digest("mine")}),
-        (("stages", "toy_double", "inputs"), {"../../outside/double.json": digest("mine")}),
-        (("timings",), {"toy_double": 5}),
         (("failures",), {"toy_double": 5}),
         (("place",), {"session": "\0"}),
-        (("gates",), "x"),
-        (("pipeline",), 5),
         (("pipeline",), {"name": "x", "stages": 5, "settings": [], "device": 5, "effects": 5}),
         (("stages",), []),
     ],
@@ -282,7 +276,6 @@ def test_an_edited_record_is_one_line_or_rebuilt(
 UNREADABLE = {
     "empty": b"",
     "digits": b'{"schema": ' + b"9" * 5000 + b"}",
-    "a large number": b'{"schema": ' + b"9" * 400 + b"}",
     "brackets": b"[" * 200_000,
     "tables": b'{"a":' * 200_000,
     "bytes": b"\xff\xfe\x00",

@@ -21,8 +21,8 @@ from bampipe.report.document import (
     Subheading,
     Table,
 )
-from bampipe.report.page import page
-from bampipe.report.typeset import pdf
+from bampipe.report.page import render_page
+from bampipe.report.typeset import render_pdf
 from bampipe.results.run import GateVerdict
 from bampipe.run import junit
 from bampipe.run.events import Event
@@ -156,7 +156,7 @@ def test_the_report_takes_names_for_text(text: str) -> None:
         Table(text, text.replace(" | ", " "), ((text,),)),
     )
     document = Document(text, text, (Section(text, blocks),))
-    body = page(document)
+    body = render_page(document)
     for tag in ("<script>alert", "<img src=x"):
         assert tag not in body
-    assert pdf(document, 0).startswith(b"%PDF")
+    assert render_pdf(document, 0).startswith(b"%PDF")

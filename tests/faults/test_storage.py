@@ -6,7 +6,6 @@ import resource
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 from conftest import TOYS, Toy
@@ -159,12 +158,3 @@ def test_extending_respects_the_lock(toy: Toy) -> None:
     ):
         loop.extend(options, "base", ("stribeck:yaw",))
     assert toy.files() == before
-
-
-def test_a_place_where_no_folder_can_be_made_is_said(toy: Toy) -> None:
-    if not Path("/proc/self").is_dir():
-        pytest.skip("there is no /proc here")
-    toys = ["--pipeline", str(toy.pipeline_file), "--runs", "/proc/runs"]
-    command = [sys.executable, str(TOYS / "toy_bampipe.py"), "run", str(toy.session), *toys]
-    done = subprocess.run(command, cwd=toy.folder, capture_output=True, text=True)
-    refused(done, "no folder can be made here")

@@ -20,18 +20,12 @@ AXES = ("yaw", "pitch")
 
 @dataclass(frozen=True)
 class Made:
-    """What a made run says.
+    """What a made run says; ``recorded`` in ISO 8601, ``sd`` of every parameter.
 
     Attributes:
-        name: session id.
-        recorded: ISO 8601, or None.
-        parameters: estimates of the base model, by name.
-        sd: of each of them.
         child: effect added, and estimates with it.
         verdicts: verdict and effects by axis; None where no diagnosis was made.
         error: held-out error over the floor, by axis.
-        stiffness: of yaw, or None.
-        device: name of the device.
     """
 
     name: str
@@ -56,18 +50,15 @@ class Made:
             axes={axis: {"unit": "rad", "resolution": 1e-4} for axis in AXES},
         )
         trials = {
-            "trial_id": ["t1", "t2"],
-            "kind": ["free", "free"],
-            "status": ["ok", "set_aside"],
-            "reason": ["", "t2.csv, row 7: time goes backwards"],
-            "repairs": ["", ""],
-            "n_samples": [8000, 0],
-            "duration_s": [16.0, 0.0],
-            "sample_rate_hz": [500.0, 500.0],
-        }
+            "trial_id": ["t1", "t2"], "kind": ["free"] * 2, "status": ["ok", "set_aside"],
+            "reason": ["", "t2.csv, row 7: time goes backwards"], "repairs": [""] * 2,
+            "n_samples": [8000, 0], "duration_s": [16.0, 0.0], "sample_rate_hz": [500.0] * 2,
+        }  # fmt: skip
         store.write_parquet(root / "ingest/trials.parquet", trials)  # type: ignore[arg-type]
-        stiff = {} if self.stiffness is None else {"yaw": _stiffness(self.stiffness)}
-        write_result(root, StiffnessResult, axes=stiff)
+        stiff = {"stiffness": self.stiffness, "sd": 1.0, "unit": "N.m/rad", "n_cycles": 6}
+        cycles = {"cycles": [{"trial_id": "t3"}]}
+        axes = {} if self.stiffness is None else {"yaw": stiff | cycles}
+        write_result(root, StiffnessResult, axes=axes)
         self._model(root, "base", [], self.parameters, self.error)
         if self.verdicts is not None:
             axes = {
@@ -94,9 +85,8 @@ class Made:
         error: Mapping[str, float],
     ) -> None:
         listed = ", ".join(f'"{effect}"' for effect in effects)
-        text = (
-            f'schema = "bampipe.model/1"\nname = "{name}"\ndevice = "bam"\neffects = [{listed}]\n'
-        )
+        text = f'schema = "bampipe.model/1"\nname = "{name}"\ndevice = "bam"\n'
+        text += f"effects = [{listed}]\n"
         write_text(root / f"models/{name}/model.toml", text)
         entries = {
             key: {"estimate": value, "sd": self.sd, "unit": "N.m", "at_bound": False}
@@ -106,25 +96,9 @@ class Made:
         write_result(root, IdentifyResult, model=name, method="ukf", parameters=entries, nis=nis)
         axes = {
             axis: {
-                "rmse": 0.1,
-                "rmse_without_friction": 2.0,
-                "held_out_rmse": 0.02 * ratio,
-                "noise_floor": 0.02,
+                "held_out_rmse": 0.02 * ratio, "noise_floor": 0.02, "unit": "N.m",
                 "standing": compare_with_floor(0.02 * ratio, 0.02),
-                "fit_percent": 99.0,
-                "unit": "N.m",
             }
             for axis, ratio in error.items()
-        }
+        }  # fmt: skip
         write_result(root, ValidateResult, model=name, axes=axes)
-
-
-def _stiffness(value: float) -> dict[str, object]:
-    return {
-        "stiffness": value,
-        "sd": 1.0,
-        "unit": "N.m/rad",
-        "bandwidth_hz": 4.0,
-        "n_cycles": 6,
-        "cycles": [{"trial_id": "t3"}],
-    }

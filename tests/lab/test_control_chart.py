@@ -5,7 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bampipe.lab.control_chart import FALSE_ALARM, FEWEST, MEDIAN_RANGE, find_factor, make_chart
+from bampipe.lab.control_chart import (
+    FALSE_ALARM,
+    FEWEST_SESSIONS,
+    MEDIAN_RANGE,
+    find_factor,
+    make_chart,
+)
 from bampipe.results.lab import ControlChart
 
 
@@ -76,7 +82,7 @@ def test_a_step_is_a_run_on_one_side() -> None:
 
 
 def test_no_limits_from_too_few_sessions() -> None:
-    found = chart([1.0] * (FEWEST - 2) + [9.0], [0.1] * (FEWEST - 1))
+    found = chart([1.0] * (FEWEST_SESSIONS - 2) + [9.0], [0.1] * (FEWEST_SESSIONS - 1))
     assert not found.has_limits and not any(one.outside_limits for one in found.points)
 
 

@@ -9,17 +9,10 @@ import pytest
 from diagnosis.sessions import BAND, KINEMATICS, SENSORS, bam
 
 from bampipe.diagnosis.session import system_of
-from bampipe.next_trial.choice import DesignSpace, RankedDesign, find_best_of_each, rank_designs
+from bampipe.next_trial.design_sentence import describe_design
 from bampipe.next_trial.discrimination import Alternative, Comparison, chance_of_confusion
 from bampipe.next_trial.forecast import Forecast
-from bampipe.next_trial.motion import (
-    HASTY,
-    Rehearsal,
-    example_path,
-    follow_roughly,
-    stroke_path,
-)
-from bampipe.next_trial.plan import Goal, _shortest, plan_trials
+from bampipe.next_trial.plan import Goal, _find_shortest, plan_trials
 from bampipe.next_trial.precision import Precision
 from bampipe.next_trial.primitives import (
     Envelope,
@@ -30,8 +23,15 @@ from bampipe.next_trial.primitives import (
     list_primitives,
     vary_surroundings,
 )
-from bampipe.next_trial.words import describe
-from bampipe.phrases.forecast import compare_forecast, read_forecasts
+from bampipe.next_trial.ranking import DesignSpace, RankedDesign, find_best_of_each, rank_designs
+from bampipe.next_trial.rehearsal import (
+    HASTY,
+    Rehearsal,
+    example_path,
+    follow_roughly,
+    stroke_path,
+)
+from bampipe.phrases.forecast_outcome import compare_forecast, read_forecasts
 from bampipe.phrases.proposal import explain_proposal, find_shown
 from bampipe.physics import Model, compile_model, registry
 from bampipe.results.next import (
@@ -71,7 +71,7 @@ def every_design(seen: Envelope) -> list[Primitive]:
 
 
 def test_where_the_device_states_nothing_no_design_leaves_what_the_trials_have_shown():
-    assert SEEN.within(*NOTHING_STATED) is SEEN
+    assert SEEN.widen(*NOTHING_STATED) is SEEN
     designs = every_design(SEEN)
     assert len(designs) > 100
     for design in designs:
@@ -85,7 +85,7 @@ def test_where_the_device_states_nothing_no_design_leaves_what_the_trials_have_s
 
 def test_designs_go_beyond_as_far_as_the_device_allows_and_no_farther():
     speeds = np.array([20.0, 1.0, np.nan])
-    seen = TIMID.within(LIMITS, speeds)
+    seen = TIMID.widen(LIMITS, speeds)
     designs = every_design(seen)
     fastest = np.zeros(3)
     for design in designs:
@@ -110,7 +110,7 @@ def test_designs_go_beyond_as_far_as_the_device_allows_and_no_farther():
 
 @pytest.mark.parametrize(("pays", "first_is_beyond"), [(1.5, True), (1.02, False)])
 def test_going_beyond_what_has_been_seen_has_to_pay(pays, first_is_beyond):
-    seen = TIMID.within(LIMITS, np.full(3, 20.0))
+    seen = TIMID.widen(LIMITS, np.full(3, 20.0))
 
     def worth(recorded: tuple[Primitive, int]) -> float:
         return pays if any(find_beyond(recorded[0], seen)) else 1.0
@@ -181,7 +181,7 @@ def test_each_parameter_gets_the_design_that_is_best_for_it():
 
 
 def test_what_leaves_what_has_been_seen_is_recorded_in_two_trials():
-    seen = TIMID.within(LIMITS, np.full(3, 20.0))
+    seen = TIMID.widen(LIMITS, np.full(3, 20.0))
     beyond = [design for design in every_design(seen) if any(find_beyond(design, seen))]
     assert {design.parts for design in beyond} == {2}
     for design in list_primitives(seen, 20.0, [0], with_rests=False):
@@ -189,7 +189,9 @@ def test_what_leaves_what_has_been_seen_is_recorded_in_two_trials():
         # Each of them has room for three strokes.
         longest = 1.875 * (stroke.high - stroke.low) / np.sqrt(stroke.slow * stroke.fast)
         assert design.parts == 1 or 3.0 * longest < 1.01 * design.part_s
-    assert ", for 20 s in 2 trials of 10 s; " in describe(beyond[0], seen, registry.device("bam"))
+    assert ", for 20 s in 2 trials of 10 s; " in describe_design(
+        beyond[0], seen, registry.device("bam")
+    )
     assert all(d.parts == 1 for d in every_design(seen) if not any(find_beyond(d, seen)))
     assert all(d.parts == 1 for d in list_primitives(seen, 6.0, [0], with_rests=False))
 
@@ -220,7 +222,7 @@ def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
     assert np.ptp(q[:, 0]) == pytest.approx(0.2, rel=0.02)
     usual = np.abs(qd[1000:2500, 0]).max()
     assert usual == pytest.approx(0.8, rel=0.01)
-    said = describe(first, SEEN, registry.device("bam"))
+    said = describe_design(first, SEEN, registry.device("bam"))
     assert said == (
         "Move yaw and pitch as in trial t01, yaw between −11° and 11° (−0.20 to 0.20 rad) at up to"
         " 23°/s, pitch between −9° and 14° (−0.15 to 0.25 rad) at up to 30°/s, over and over for"
@@ -230,7 +232,7 @@ def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
 
 def test_who_follows_roughly_stays_within_the_device_too():
     system = SimpleNamespace(coordinates=("a", "b", "c"))
-    seen = TIMID.within(LIMITS, np.full(3, np.nan))
+    seen = TIMID.widen(LIMITS, np.full(3, np.nan))
     rehearsal = Rehearsal(system, np.zeros(0), None, None, seen, 0)
     lowest, highest = seen.reach
     for design in list_primitives(seen, 20.0, [0], with_rests=False)[-8:]:
@@ -270,7 +272,7 @@ def test_no_axis_rests_unless_the_design_says_so():
 
 @pytest.mark.parametrize("axes", [[0], [0, 1, 2]])
 def test_no_design_is_tried_twice(axes):
-    for seen in (SEEN, SEEN.within(LIMITS, np.full(3, 3.0))):
+    for seen in (SEEN, SEEN.widen(LIMITS, np.full(3, 3.0))):
         listed = list_primitives(seen, 20.0, axes, with_rests=True)
         said = [
             (design.parts, [(axis, f"{stroke}") for axis, stroke in design.strokes.items()])
@@ -311,7 +313,7 @@ def test_a_path_has_the_velocity_and_acceleration_that_it_says():
 
 def test_a_sentence_says_where_how_fast_and_how_long():
     design = list_primitives(SEEN, 20.0, [0], with_rests=False)[6]
-    said = describe(design, SEEN, registry.device("bam"))
+    said = describe_design(design, SEEN, registry.device("bam"))
     assert said.startswith("Move yaw slowly back and forth between")
     stroke = design.strokes[0]
     assert f"{np.degrees(stroke.high):.0f}°" in said
@@ -323,7 +325,7 @@ def test_a_sentence_says_where_how_fast_and_how_long():
 
 
 def test_a_sentence_says_what_goes_beyond_the_trials_at_hand():
-    device, seen = registry.device("bam"), TIMID.within(LIMITS, np.full(3, 20.0))
+    device, seen = registry.device("bam"), TIMID.widen(LIMITS, np.full(3, 20.0))
     far, fast = Stroke(-1.0, 1.0, 0.5, 1.0), Stroke(0.1, 0.4, 3.0, 4.0)
     gentle = {1: Stroke(0.05, 0.1, 0.1, 0.2, gentle=True), 2: Stroke(0.9, 1.0, 0.1, 0.2)}
     for stroke, ending in (
@@ -331,13 +333,15 @@ def test_a_sentence_says_what_goes_beyond_the_trials_at_hand():
         (fast, "; this takes yaw faster than so far."),
         (replace(far, fast=4.0), "; this takes yaw farther and faster than so far: try the way"),
     ):
-        assert ending in describe(Primitive({0: stroke, **gentle}, seen.usual, 20.0), seen, device)
+        assert ending in describe_design(
+            Primitive({0: stroke, **gentle}, seen.usual, 20.0), seen, device
+        )
     both = Primitive({0: fast, 1: Stroke(-0.9, -0.5, 0.1, 0.2, gentle=True)}, seen.usual, 20.0)
-    said = describe(both, seen, device)
+    said = describe_design(both, seen, device)
     assert "this takes pitch farther and yaw faster than so far: try the way slowly first" in said
     assert re.search(r"keep pitch moving gently, −40° ± 11° in [0-9.]+ s each way", said)
     near = list_primitives(TIMID, 20.0, [0], with_rests=False)[6]
-    assert "than so far" not in describe(near, seen, device)
+    assert "than so far" not in describe_design(near, seen, device)
 
 
 def made_proposal(after: float, farther: tuple[str, ...] = ()) -> Proposal:
@@ -391,11 +395,13 @@ def test_what_a_model_lacks_is_said_to_count_as_noise():
     assert "The error of yaw and pitch is above the noise floor" in said
     # What the diagnosis found comes before any trial; where effects compete, nothing need be said.
     reasons = explain("precision", best, {}, (), ("yaw",), ["lag:x"])
-    assert reasons.why.startswith("By the diagnosis the model lacks lag:x: add that first")
+    assert reasons.why.startswith("According to the diagnosis, the model lacks lag:x. Ext")
     assert reasons.expected.endswith("of a model that lacks something.")
     assert "noise floor" not in reasons.expected
     why = explain("precision", best, {}, (), ("yaw",), None).why
-    assert why.startswith("The error of yaw is above the noise floor: ask first what")
+    assert why.startswith(
+        "The error of yaw is above the noise floor: find the missing effect first"
+    )
     said = explain("decision", made_proposal(0.01), {}, (), ("yaw",)).expected
     assert "noise floor" not in said
 
@@ -406,12 +412,15 @@ def test_effects_of_brakes_are_said_to_need_viscous_trials():
     )
     best, table = made_proposal(0.1), {"brake_lag": entry}
     reasons = explain("sensitivity", best, table, (), (), unbraked=["brake_lag"])
-    assert "every other effect of the library at its typical size. What brakes do" in reasons.why
-    assert "(brake_lag) shows in viscous trials, of which there are none" in reasons.why
-    assert "out of sight" not in reasons.why
-    assert "promised" not in reasons.why
+    assert "every other effect of the library at its typical size. Effects of brakes" in reasons.why
+    assert "(brake_lag) show in viscous trials only, and there are none" in reasons.why
+    assert "invisible" not in reasons.why
+    assert "No size" not in reasons.why
     unpromised = explain("sensitivity", best, {}, (), (), unpromised=["stribeck:yaw"])
-    assert "every other effect of the library at its typical size. Of stri" in unpromised.why
+    assert (
+        "every other effect of the library at its typical size. No size is given for stri"
+        in unpromised.why
+    )
     braked = best.model_copy(update={"brakes": 1.0})
     why = explain("sensitivity", braked, table, (), ()).why
     assert why.endswith("Add it to session.toml as a viscous trial.")
@@ -444,10 +453,7 @@ def test_twice_the_information_narrows_an_uncertainty_by_the_root_of_two():
     after = known.expect(known.information, 20.0).median
     assert after[0] == pytest.approx(0.01 / np.sqrt(2.0), rel=1e-3)
     assert known.gain(known.information) == pytest.approx(0.5 * np.log(2.0))
-
-
-def test_what_trials_are_worth_for_one_parameter_is_the_fall_of_its_logarithm():
-    known = made_precision(0.01, 0.01, 10_000)
+    # For one parameter, trials are worth the fall of the logarithm of its uncertainty.
     much = 3.0 * known.information
     assert known.worth(much, 20.0, "mass") == pytest.approx(np.log(2.0), rel=1e-3)
     assert known.worth(much, 20.0) == known.gain(much)
@@ -533,13 +539,13 @@ def test_a_planned_trial_is_shortened_no_further_than_its_strokes_allow():
     quick = Stroke(-0.5, 0.5, 2.0, 2.0)
     slow = replace(quick, slow=0.5, fast=0.5)
     one = Primitive({0: quick}, np.zeros(1), 20.0)
-    assert _shortest(one) == 5.0
-    assert _shortest(replace(one, strokes={0: slow})) == pytest.approx(3 * 1.875 / 0.5)
-    assert _shortest(replace(one, parts=2)) == 10.0
+    assert _find_shortest(one) == 5.0
+    assert _find_shortest(replace(one, strokes={0: slow})) == pytest.approx(3 * 1.875 / 0.5)
+    assert _find_shortest(replace(one, parts=2)) == 10.0
     # Of a trial of 12 s, what is shorter does not cover what it covers.
     (like,) = imitate_trials([made_motion("t01", 2.0)], SEEN, 20.0)
-    assert _shortest(like) == pytest.approx(12.0, abs=0.01)
-    assert _shortest(replace(like, seconds=8.0)) == 8.0
+    assert _find_shortest(like) == pytest.approx(12.0, abs=0.01)
+    assert _find_shortest(replace(like, seconds=8.0)) == 8.0
 
 
 @pytest.mark.parametrize(
@@ -620,7 +626,5 @@ def test_sets_that_were_to_be_told_apart_are_held_against_the_diagnosis(selected
     axis = SimpleNamespace(verdict="undecided", probabilities=dict.fromkeys(undecided, 0.5))
     diagnosed = SimpleNamespace(trials=("t2",), selected=selected, axes={"x": axis})
     (line,) = compare_forecast(proposed, identified, diagnosed)
-    assert line.startswith(
-        "a:x or a:x + b:x: a probability of 2 % was forecast of confusing them; "
-    )
+    assert line.startswith("a:x or a:x + b:x: the forecast chance of confusion was 2 %; ")
     assert line.endswith(f"{said}.")

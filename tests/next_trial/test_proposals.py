@@ -11,7 +11,7 @@ from independent_runs import SHORT, diagnose, record_run
 
 import bampipe
 from bampipe.errors import InputError
-from bampipe.phrases.forecast import compare_forecast, compare_forecasts, read_forecasts
+from bampipe.phrases.forecast_outcome import compare_forecast, compare_forecasts, read_forecasts
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import NextResult
 

@@ -127,10 +127,10 @@ def test_a_trial_is_suggested_that_tells_apart_what_small_motion_does_not():
         "quadratic_drag:yaw",
         "stribeck:yaw",
     ]
-    assert comparison.confusions(comparison.now) == {(0, 1): pytest.approx(0.4)}
+    assert comparison.confusions(comparison.contrasts_now) == {(0, 1): pytest.approx(0.4)}
     # Twice the trials at hand leave twice the distance: nothing else is in a likelihood.
-    twice = comparison.contrasts(comparison.at_hand.scaled(2.0))[0, 1].distance
-    assert twice == pytest.approx(2.0 * comparison.now[0, 1].distance, rel=0.05)
+    twice = comparison.contrasts(comparison.sums_now.scale_by(2.0))[0, 1].distance
+    assert twice == pytest.approx(2.0 * comparison.contrasts_now[0, 1].distance, rel=0.05)
     found = suggest_trial(session, final, asked)
     assert found is not None
     assert found.axis == "yaw"
@@ -152,11 +152,11 @@ def test_where_both_alternatives_fit_badly_a_trial_tells_no_more_than_the_diagno
         final = session.fit(recipe, np.array(start))
         comparison = compare_alternatives(session, final, find_ambiguity(asked, CRITERIA))
         counted = [here.independent for here in final.count_independent(CRITERIA)]
-        assert comparison.at_hand.independent == pytest.approx(counted)
+        assert comparison.sums_now.independent == pytest.approx(counted)
         # A new trial is counted as those at hand are.
         again = comparison.sums(final.evidence.motions)
         assert again.independent == pytest.approx(counted)
-        distances.append((comparison.now[0, 1].distance, comparison.scale[0], counted[0]))
+        distances.append((comparison.contrasts_now[0, 1].distance, comparison.scale[0], counted[0]))
     (distance, scale, count), (complete, scale_then, count_then) = distances
     assert scale > 4.0 * scale_then
     assert count < 0.7 * count_then

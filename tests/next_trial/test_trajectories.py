@@ -12,10 +12,10 @@ import yaml
 
 from bampipe.data.device_file import read_device_file
 from bampipe.errors import InputError
-from bampipe.next_trial.motion import Rehearsal
+from bampipe.next_trial.design_sentence import describe_design
 from bampipe.next_trial.primitives import Envelope, Primitive, find_beyond
+from bampipe.next_trial.rehearsal import Rehearsal
 from bampipe.next_trial.trajectory import HZ, Points, list_trajectories, read_limits, require_limits
-from bampipe.next_trial.words import describe
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.device import Device
 from bampipe.trials.kinematics import AxisFilter, Kinematics
@@ -69,7 +69,7 @@ def rehearse(device: Device) -> Rehearsal:
     bounds = np.array([device.limits[axis] for axis in AXES])
     speeds = np.array([device.speed_limits[axis] for axis in AXES])
     kinematics = Kinematics("kalman", 200.0, filters, 25.0)
-    return Rehearsal(system, p, sensors, kinematics, SEEN.within(bounds, speeds), 0)
+    return Rehearsal(system, p, sensors, kinematics, SEEN.widen(bounds, speeds), 0)
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def test_all_forms_say_the_same_and_name_the_joints_as_drawn(
 
 
 def test_a_sentence_says_that_drives_follow_it(drawn: list[Primitive], rehearsal: Rehearsal):
-    said = describe(drawn[0], rehearsal.seen, rehearsal.system.model.device)
+    said = describe_design(drawn[0], rehearsal.seen, rehearsal.system.model.device)
     assert said.startswith(
         "Let the drives follow the trajectory, for 20 s in 2 trials of 10 s; this takes"
     )
@@ -200,5 +200,5 @@ def test_without_motors_or_limits_a_trajectory_is_refused(tmp_path: Path) -> Non
 def test_a_drive_too_weak_for_the_weight_is_said(tmp_path: Path) -> None:
     device = device_of(tmp_path, "[limits.lift_1]\neffort = 8.0\n")
     weak = rehearse(device)
-    with pytest.raises(InputError, match="at rest the model takes more than 80 %"):
+    with pytest.raises(InputError, match="at rest the model needs more than 80 %"):
         list_trajectories(weak, read_limits(device, SEEN), 20.0, 2)

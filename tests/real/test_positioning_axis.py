@@ -48,12 +48,8 @@ def stretches(tmp_path_factory) -> Path:
 
 
 @pytest.mark.long
-def test_least_squares_gives_the_published_parameters(whole):
+def test_least_squares_gives_the_published_parameters_and_relative_error(whole):
     assert estimates(whole) == pytest.approx(PUBLISHED, rel=0.01)
-
-
-@pytest.mark.long
-def test_least_squares_gives_the_published_relative_error(whole):
     axis = result(whole, "models/base/validate.json")["axes"]["carriage"]
     assert axis["relative_error_percent"] == pytest.approx(4.0834, abs=0.1)
 

@@ -9,14 +9,7 @@ import pytest
 from conftest import misfits
 from measured import REAL, bampipe, estimates, need, result
 
-from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
-from bampipe.estimate.least_squares import minimise
-from bampipe.estimate.low_pass import Band
-from bampipe.estimate.standstill import find_moving_samples
-from bampipe.physics import Model, compile_model, registry
-from bampipe.trials.reading import free_trials, read_motion
-from bampipe.trials.residuals import problem_of
 
 pytestmark = pytest.mark.long
 
@@ -45,7 +38,6 @@ supply = {{ column = "input_volts", unit = "V" }}
 goal = {{ column = "goal_position", unit = "rad" }}
 gain = {{ column = "kp", unit = "1/rad", scale = {gain!r} }}
 """
-BAND = Band(188.0, (8.0,))
 
 
 def write_session(folder: Path, logs: list[Path], name: str) -> Path:
@@ -142,26 +134,3 @@ def test_load_dependent_friction_gives_the_weighed_mass(by_gain):
     assert estimates(by_gain, "base+load_dependent_friction.joint")["load_mass"] == pytest.approx(
         0.49, abs=0.03
     )
-
-
-def held_out_error(runs: tuple[Path, Path], *effects: str) -> float:
-    """Error at the held-out gain, N.m, of a model fitted to the other gains."""
-    system = compile_model(Model(registry.device("servo_pendulum"), effects))
-    problems = []
-    for folder in runs:
-        run = RunFolder(folder)
-        motions = [read_motion(run, trial, system) for trial in free_trials(run)]
-        problems.append(problem_of(system, motions, BAND))
-    found = minimise(problems[0], np.append(system.prior, 0.0))
-    errors = []
-    for k, resting in enumerate(problems[1].standstill):
-        errors.append(
-            BAND.thin(problems[1].residual(k, found.p))[find_moving_samples(resting, BAND)]
-        )
-    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
-
-
-def test_load_dependent_friction_helps_at_a_gain_not_seen(runs):
-    plain = held_out_error(runs)
-    loaded = held_out_error(runs, "load_dependent_friction:joint")
-    assert loaded < 0.75 * plain

@@ -9,7 +9,7 @@ import bampipe
 from bampipe.errors import InputError
 from bampipe.files import read_json
 from bampipe.report.document import Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.sections import stiffness
 from bampipe.setup.proposal import propose, write_proposal
 

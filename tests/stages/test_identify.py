@@ -12,14 +12,13 @@ from identified_run import MODEL, RESOLUTION, TRUTH, session_truth, shared_run, 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
-from bampipe.files import digest_file, read_json, write_text
+from bampipe.files import read_json, write_text
 from bampipe.identification.estimates import Estimate
 from bampipe.identification.filter_estimate import FilterTask
 from bampipe.identification.filter_run import MotionLost
 from bampipe.progress import Progress, silent
 from bampipe.run.settings import configure
 from bampipe.stages import identify
-from bampipe.stages.base import paths_of
 
 TOLERANCE = {"viscous": 0.03, "coulomb": 0.05, "mass": 0.01}
 FAST = identify.Config(longest_step_s=2e-3)
@@ -142,18 +141,12 @@ def test_velocity_may_be_measured_too(simulated: RunFolder) -> None:
         assert content["parameters"][name]["estimate"] == pytest.approx(value, rel=0.1), name
 
 
-def test_tables_and_determinism(simulated: RunFolder, tmp_path: Path) -> None:
-    config = replace(FAST, trace_rows=300)
-    files = paths_of("base", identify.OUTPUTS)
-    hashes = []
-    for folder in ("one", "two"):
-        identify.execute(simulated, tmp_path / folder, config, silent)
-        hashes.append([digest_file(tmp_path / folder / name) for name in files])
-    assert hashes[0] == hashes[1]
-    states = read_parquet(tmp_path / "one/models/base/states.parquet")
+def test_tables_have_the_rows_that_are_asked_for(simulated: RunFolder, tmp_path: Path) -> None:
+    identify.execute(simulated, tmp_path, replace(FAST, trace_rows=300), silent)
+    states = read_parquet(tmp_path / "models/base/states.parquet")
     assert states["trial_id"].unique().tolist() == ["t00", "t01"]
     assert states.groupby("trial_id").size().max() <= 300
-    trace = read_parquet(tmp_path / "one/models/base/trace.parquet")
+    trace = read_parquet(tmp_path / "models/base/trace.parquet")
     assert (np.diff(trace["t_total"]) >= 0.0).all()
     assert {"mass", "mass_sd", "viscous.yaw", "coulomb.extension_sd"} <= set(trace.columns)
     assert np.isfinite(trace.drop(columns="trial_id").to_numpy(dtype=float)).all()
@@ -340,19 +333,3 @@ def test_innovations_of_the_right_model_pass_and_those_of_a_late_force_do_not(
     innovations = content["innovations"]
     assert not innovations["yaw"]["inputs"]["independent"]
     assert "Not independent of the inputs" in innovations["yaw"]["sentence"]
-
-
-def test_starts_five_times_off_either_way_do_not_matter(
-    simulated: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Every other parameter starts five times too large, the rest five times too small."""
-    right = identify._start
-
-    def wrong(*given: object) -> np.ndarray:
-        start = right(*given)
-        return start * np.where(np.arange(start.size) % 2 == 0, 5.0, 0.2)
-
-    monkeypatch.setattr(identify, "_start", wrong)
-    content = identified(simulated)
-    assert_recovered(content, TRUTH)
-    assert content["convergence"]["converged"]

@@ -82,16 +82,6 @@ def test_session_json_says_what_later_stages_need(tmp_path):
     assert content["recorded_at"] == "2026-10-03T10:12:00+00:00"
 
 
-def test_same_session_same_bytes(tmp_path):
-    session = Made().write(tmp_path / "session")
-    for name in ("a", "b"):
-        run_ingest(session, tmp_path / name)
-    files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*.*"))
-    assert [path.name for path in files] == ["samples.parquet", "session.json", "trials.parquet"]
-    for path in files:
-        assert (tmp_path / "a" / path).read_bytes() == (tmp_path / "b" / path).read_bytes()
-
-
 def test_the_time_column_rules_over_the_announced_rate(tmp_path):
     made = Made()
     made.session["sample_rate_hz"] = 400.0
@@ -108,11 +98,6 @@ def test_trials_of_one_name_in_two_folders_keep_apart(tmp_path):
     run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
     trials = read_parquet(tmp_path / "out/ingest/trials.parquet")
     assert trials.trial_id.tolist() == ["trials_t01_csv", "more_t01_csv", "t03"]
-
-
-def test_the_session_file_itself_may_be_named(tmp_path):
-    session = Made().write(tmp_path / "session")
-    assert run_ingest(session / "session.toml", tmp_path / "out")["session_id"] == "made"
 
 
 def test_a_limit_can_be_changed(tmp_path):

@@ -16,7 +16,7 @@ import bampipe
 from bampipe.data.session import read_session
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
-from bampipe.simulator.session import Config, simulate_session
+from bampipe.simulator.simulated_session import Config, simulate_session
 from bampipe.trials.motion import Motion
 
 AXES = ("yaw", "pitch", "extension")
@@ -249,8 +249,8 @@ def test_parquet_holds_the_same(tmp_path):
         ({"effects": ("stribeck:yaw=much",)}, "not a number"),
         ({"effects": ("stribeck:yaw=-1",)}, "must not be negative"),
         ({"device": "bamm"}, "no built-in device 'bamm', did you mean 'bam'"),
-        ({"device": "magnetic_damper"}, "it takes current, and nothing but forces is simulated"),
-        ({"device": "servo_pendulum"}, "it takes duty and supply, and nothing but forces"),
+        ({"device": "magnetic_damper"}, "it takes current, and only forces are simulated"),
+        ({"device": "servo_pendulum"}, "it takes duty and supply, and only forces"),
         ({"trials": 0}, "nothing to simulate"),
         ({"duration": 0.0}, "duration must be positive"),
         ({"duration": 0.001}, "fewer than 10 samples"),

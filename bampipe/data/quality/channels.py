@@ -26,6 +26,8 @@ def refuse_other_units(table: TrialTable, stated: Mapping[str, str]) -> None:
         found, expected = unit(text), unit(declared.get(column, ""))
         if found is None or expected is None or "" in (found.si, expected.si):
             continue
+        if found.si == "kg":  # the weight of a mass
+            found = unit(f"{text.strip('[]() ')}f") or found
         if (found.si, found.scale) != (expected.si, expected.scale):
             raise table.fault(
                 f"the file gives the unit {text}, session.toml {declared[column]}",
@@ -39,19 +41,23 @@ def fill_missing(table: TrialTable) -> None:
     channels = [name for name in table.columns if name != table.clock]
     some = np.zeros(len(table), dtype=bool)
     for name in channels:
-        missing = ~np.isfinite(table.columns[name])
-        _refuse_missing(table, name, missing)
-        some |= missing
+        some |= ~np.isfinite(table.columns[name])
     if not some.any():
         return
+    for name in channels:
+        if not np.isfinite(table.columns[name]).any():
+            raise table.fault("holds no number at all", column=name)
     sound = np.flatnonzero(~some)
     if len(sound) == 0:
         raise table.fault("no row is complete")
+    # Sensors that begin late or end early leave the rest as it is.
     start, stop = int(sound[0]), int(sound[-1]) + 1
-    if start > 0 or stop < len(table):
+    if (start > 0 or stop < len(table)) and 2 * (stop - start) >= len(table):
         dropped = len(table) - (stop - start)
         table.keep(slice(start, stop))
         table.repairs.append(f"{counted(dropped, 'row')} with missing samples at the ends dropped")
+    for name in channels:
+        _refuse_missing(table, name, ~np.isfinite(table.columns[name]))
     for name in channels:
         values = table.columns[name]
         missing = ~np.isfinite(values)
@@ -74,8 +80,6 @@ def _refuse_missing(table: TrialTable, name: str, missing: np.ndarray) -> None:
     count = int(missing.sum())
     if count == 0:
         return
-    if count == len(missing):
-        raise table.fault("holds no number at all", column=name)
     start, length = longest_run(missing)
     if length > table.limits.nan_run:
         raise table.fault(

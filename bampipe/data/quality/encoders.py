@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from bampipe.arrays import Array, Indices
 from bampipe.data.quality.channels import fill_missing, take_out
 from bampipe.data.quality.table import TrialTable, in_times
 from bampipe.data.session import Encoder
@@ -50,32 +51,44 @@ def integral(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 
 
 def unwrap(table: TrialTable, encoder: Encoder) -> None:
-    """Undo the wrap-around of a counter of 16, 24 or 32 bits, or of an angle at a full turn."""
-    if encoder.integrate:
+    """Undo the wrap-around of a counter, or of an angle at a full turn."""
+    if encoder.integrate or (encoder.unit == "m" and not encoder.counts):
         return
-    if encoder.counts:
-        periods = [(2.0**bits, f"at {bits} bits") for bits in (16, 24, 32)]
-    elif encoder.unit == "rad":
-        periods = [(2 * np.pi / encoder.raw_scale, "at a full turn")]
-    else:
-        return
+    turn = 2 * np.pi / abs(encoder.raw_scale) if encoder.unit == "rad" else 0.0
     values = table.columns[encoder.column]
+    found, rows, words = unwrapped(values, turn, encoder.counts)
+    if len(rows):
+        table.columns[encoder.column] = found
+        table.repairs.append(
+            f"column '{encoder.column}' wraps {words} {in_times(len(rows))},"
+            f" first at row {table.rows[rows[0]]}: unwrapped"
+        )
+
+
+def unwrapped(values: Array, turn: float, counts: bool) -> tuple[Array, Indices, str]:
+    """Readings that go on where they start anew: at a full turn, or at the bits of a counter.
+
+    Args:
+        values: (T,) raw readings, NaN where missing.
+        turn: raw units of a full turn, 0 where none is known.
+        counts: whether they may wrap at the 10 to 32 bits of a counter.
+
+    Returns:
+        Readings (T,), the samples before which one wraps, and where it does in words.
+    """
     known = np.flatnonzero(np.isfinite(values))
     steps = np.diff(values[known])
+    periods = [(2.0**bits, f"at {bits} bits") for bits in range(10, 33)] if counts else []
+    periods += [(turn, "at a full turn")] if turn else []
     for period, words in periods:
         wraps = np.abs(steps) > period / 2
         near = np.abs(np.abs(steps) - period) < period / 16
-        if not wraps.any() or not near[wraps].all() or np.ptp(values[known]) > period:
-            continue
-        turns = np.zeros(len(known))
-        turns[1:][wraps] = -np.sign(steps[wraps]) * period
-        values[known] += np.cumsum(turns)
-        first = table.rows[known[int(np.argmax(wraps)) + 1]]
-        table.repairs.append(
-            f"column '{encoder.column}' wraps {words} {in_times(int(wraps.sum()))},"
-            f" first at row {first}: unwrapped"
-        )
-        return
+        if wraps.any() and near[wraps].all() and np.ptp(values[known]) <= period:
+            turns, found = np.zeros(len(known)), values.copy()
+            turns[1:][wraps] = -np.sign(steps[wraps]) * period
+            found[known] += np.cumsum(turns)
+            return found, (known[np.flatnonzero(wraps) + 1]).astype(np.int64), words
+    return values, np.empty(0, dtype=np.int64), ""
 
 
 def interpolate_jumps(table: TrialTable, encoder: Encoder) -> None:

@@ -87,11 +87,11 @@ def spread_stamps(t: Array) -> tuple[Array, float]:
         return t, 0.0
     if np.any(np.abs(steps / rounding - np.rint(steps / rounding)) > 0.1):
         return t, 0.0
-    rows = np.arange(len(t), dtype=np.float64)
-    slope, start = np.polyfit(rows, t - t[0], 1)
+    rows, first = np.arange(len(t), dtype=np.float64), np.flatnonzero(steps > 0.0) + 1
+    # All rows of a stamp would tilt the line by where the first and the last stamp are cut.
+    slope, start = np.polyfit(rows[first], t[first] - t[0], 1) if len(first) > 2 else (step, 0.0)
     if np.ptp(t - t[0] - slope * rows) <= 1.2 * rounding:
         return t[0] + start + slope * rows, rounding
-    first = np.flatnonzero(steps > 0.0) + 1
     if len(first) < 3 or len(t) < 2 * len(first):
         return t, 0.0
     # Where rows are lost, the others of that stamp would be spread over the gap.

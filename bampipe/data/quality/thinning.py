@@ -51,10 +51,7 @@ def thin(trial: CleanTrial, every: int, sampled: Collection[str]) -> CleanTrial:
         for name, values in trial.columns.items()
     }
     return replace(
-        trial,
-        t=trial.t[::every].copy(),
-        columns=columns,
-        sample_rate=trial.sample_rate / every,
+        trial, t=trial.t[::every].copy(), columns=columns, sample_rate=trial.sample_rate / every
     )
 
 

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
-from bampipe.data.readers import bag, hdf5, mat, objects, parquet, tdms, text
+from bampipe.data.readers import bag, hdf5, mat, numpy_file, objects, parquet, tdms, text
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, Wanted
 from bampipe.errors import InputError
 
@@ -32,7 +32,7 @@ __all__ = [
     "read_trial",
 ]
 
-TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto")
+TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
 """File extensions of tables as text."""
 _READERS: dict[str, ModuleType] = {
     **dict.fromkeys(TEXTS, text),
@@ -42,6 +42,7 @@ _READERS: dict[str, ModuleType] = {
     **dict.fromkeys((".json", ".jsonl", ".ndjson"), objects),
     ".tdms": tdms,
     **dict.fromkeys((".bag", ".mcap", ".db3"), bag),
+    **dict.fromkeys((".npy", ".npz"), numpy_file),
 }
 EXTENSIONS = tuple(_READERS)
 """File extensions that can be read."""
@@ -55,6 +56,7 @@ _FOREIGN = {
     ".mat": ("MATLAB file", "save it again from MATLAB"),
     **dict.fromkeys((".h5", ".hdf5", ".hdf"), ("HDF5 file", _AGAIN)),
     ".tdms": ("TDMS file", _AGAIN),
+    **dict.fromkeys((".npy", ".npz"), ("file of NumPy", "save it again with np.savez")),
     **dict.fromkeys((".bag", ".db3"), ("bag", f"{_AGAIN}, with the message definitions in it")),
     ".mcap": ("MCAP file", f"{_AGAIN}, with the message definitions in it"),
 }
@@ -65,8 +67,9 @@ _KINDS = (
     (b"#ROSBAG", (".bag",), "a ROS bag"),
     (b"\x89MCAP0", (".mcap",), "an MCAP file"),
     (b"SQLite format 3", (".db3",), "an SQLite file"),
-    (b"PK\x03\x04", (), "a zip archive or spreadsheet"),
-    (b"\x1f\x8b", (), "a gzip archive"),
+    (b"PK\x03\x04", ("", ".npz"), "a zip archive or spreadsheet"),
+    (b"\x93NUMPY", (".npy",), "an array of NumPy"),
+    (b"\x1f\x8b", ("",), "a gzip archive"),
     (hdf5.SIGNATURE, (".h5", ".hdf5", ".hdf", ".mat"), "an HDF5 file"),
 )
 
@@ -193,6 +196,6 @@ def _checked_extension(path: Path, name: str) -> str:
     kinds += [(b"", (".mat",), "a MATLAB file")] if matlab else []
     for _, right, words in kinds:
         if extension not in right:
-            remedy = f"name it *{right[0]}" if right else "unpack it, or export it as CSV"
+            remedy = f"name it *{right[0]}" if right[0] else "unpack it, or export it as CSV"
             raise InputError(f"this is {words}, not *{extension}", where=name, remedy=remedy)
     return extension

@@ -11,7 +11,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import Dialect, check_columns
@@ -35,8 +35,15 @@ _NO_ANGLE = re.compile(
     r"(?i)force|moment|torque|power|activation|excitation|fiber|length|[_.][tpv][xyz]\Z|\Atime\Z"
 )
 _NUMBERED = "column_"
+_NAME_KEYS = frozenset(
+    ["name", "names", "signal", "channel", "kanal", "signalname", "channeltitle"]
+)
 _SEARCHED = 200
 _TRIED = 400
+_ALIKE = 0.97
+"""Of the most numbers in cells, what is as good: words above the samples may hold a number."""
+_LEAST_FILLED = 0.04
+"""Share of the first lines in which a column holds something, the least."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,6 @@ class TableLayout:
         start: bytes before that line.
         remarks: what is unlike a plain table with commas, a sentence each.
         units: units that the header or a line below it gives, by column.
-        ended: whether every line ends with a semicolon that separates nothing.
         title: the line that is the header, "" where there is none.
     """
 
@@ -62,22 +68,26 @@ class TableLayout:
     start: int
     remarks: tuple[str, ...] = ()
     units: dict[str, str] = field(default_factory=dict)
-    ended: bool = False
     title: str = ""
 
     def cells(self, text: str) -> list[str]:
         """The cells of one line."""
-        return cells(text.removesuffix(";") if self.ended else text, self.delimiter)
+        return cells(text, self.delimiter)
 
     def is_header(self, text: str) -> bool:
         """Whether a line among the samples is the header once more."""
         return bool(self.title) and self.cells(text) == self.cells(self.title)
 
+    def is_remark(self, text: str) -> bool:
+        """Whether a line begins with a word, where samples begin with a number or a time."""
+        first = next(iter(self.cells(text)), "")
+        return _is_remark(text) or bool(re.match(r"[^\W\d_]{2}", first))
+
     def is_chatter(self, text: str) -> bool:
         """Whether a line among the samples is text without a number in any cell."""
         row = [cell for cell in self.cells(text) if cell not in NULLS]
         plain = not any(_is_number(cell, self.decimal) or is_moment(cell) for cell in row)
-        return plain and any(map(str.isalpha, text)) and text.isprintable()
+        return plain and text.isprintable() and (any(map(str.isalpha, text)) or _is_remark(text))
 
 
 @dataclass(frozen=True)
@@ -112,9 +122,6 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     lines = _lines(head, name)
     if not _filled(lines):
         raise InputError("the file holds no text", where=name)
-    ended = _end_in_semicolons(lines)
-    if ended:
-        lines = [replace(line, text=line.text.removesuffix(";")) for line in lines]
     delimiters: list[str] = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
     index, delimiter, header = _header(lines, columns, dialect, delimiters, name)
     body = lines[index + 1 :]
@@ -126,19 +133,25 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     if above:
         remarks.append(f"{above} lines above the header passed over")
     passed = index
-    for line in body:
+    first = _guess(body, [delimiter])[0][0]
+    for at, line in enumerate(body):
         remark = _is_remark(line.text)
         row = cells(_REMARK.sub("", line.text, count=1) if remark else line.text, delimiter)
+        row, property_row = _of_properties(row)
+        property_row &= at < first < len(body)
         if (
             _is_unit_row(row, header, columns)
             and not dialect.names
             and not (remark and not _are_units(row))
+            and not (property_row and not all(unit(x) for x in row if x and not x[0].isdigit()))
         ):
             units |= {h: bare(u) for h, u in zip(header, row, strict=False) if bare(u)}
             remarks.append(f"row {line.number} gives units")
             passed += 1
-            break
-        if line.text.strip() and not remark:
+            if not property_row:
+                break
+            continue
+        if line.text.strip() and not remark and not property_row:
             break
         passed += 1
     body = lines[passed + 1 :]
@@ -150,18 +163,21 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     number = lines[passed].number + 1 if passed >= 0 else 1
     title = lines[index].text if index >= 0 and not dialect.names else ""
     return TableLayout(
-        delimiter, decimal, tuple(header), number, start, tuple(remarks), units, ended, title
+        delimiter, decimal, tuple(header), number, start, tuple(remarks), units, title
     )
 
 
 def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
-    """Columns that hold numbers, or dates and times, in most of the first lines.
+    """Columns that hold numbers, or dates and times, where the first lines hold anything.
+
+    A log of two rates has the readings of each in rows of their own.
 
     Returns:
         Their names, and whether it is dates and times.
     """
     numbers: Counter[int] = Counter()
     moments: Counter[int] = Counter()
+    filled: Counter[int] = Counter()
     rows = 0
     for line in _lines(head, "")[: layout.first_line + _TRIED]:
         if line.number < layout.first_line or not line.text.strip():
@@ -170,12 +186,13 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
         row = layout.cells(line.text)
         numbers.update(n for n, cell in enumerate(row) if _is_number(cell, layout.decimal))
         moments.update(n for n, cell in enumerate(row) if is_moment(cell))
+        filled.update(n for n, cell in enumerate(row) if cell not in NULLS)
     return {
         name: moments[n] > numbers[n]
         for n, name in enumerate(layout.header)
         if name
         and rows
-        and max(numbers[n], moments[n]) > 0.5 * rows
+        and max(numbers[n], moments[n]) > max(0.5 * filled[n], _LEAST_FILLED * rows)
         and layout.header.count(name) == 1
     }
 
@@ -211,27 +228,33 @@ def _lines(head: bytes, name: str) -> list[Line]:
 
 
 def _header(
-    lines: list[Line],
-    columns: Sequence[str],
-    dialect: Dialect,
-    delimiters: list[str],
-    name: str,
+    lines: list[Line], columns: Sequence[str], dialect: Dialect, delimiters: list[str], name: str
 ) -> tuple[int, str, list[str]]:
     """Place of the header among the lines (-1 where the session gives the names), and its cells."""
     if dialect.names:
         check_columns(dialect.names, columns, f"{name}: csv.names")
         first, delimiter = _guess(lines, delimiters)[0]
         return max(_filled(lines[:first]), default=-1), delimiter, list(dialect.names)
+    guesses = _guess(lines, delimiters)
+    width = (
+        len(cells(lines[guesses[0][0]].text, guesses[0][1])) if guesses[0][0] < len(lines) else 0
+    )
+
+    def names(index: int, delimiter: str) -> list[str]:
+        row = _names(lines[index].text, delimiter, lines[index + 1 :], lines[:index])
+        # It may be written otherwise than the samples.
+        fits = len(row) in (width, width - 1)
+        return row if fits else next(iter(_otherwise(lines[index].text, width)), row)
+
     for index, line in enumerate(lines[:_SEARCHED]) if columns else ():
         for delimiter in delimiters:
-            row = _names(line.text, delimiter, lines[index + 1 :])
+            row = names(index, delimiter)
             if set(columns) <= set(row):
                 check_columns(row, columns, f"{name}, row {line.number}")
                 first, below = _guess(lines[index + 1 :], delimiters)[0]
                 rows = lines[index + 1 + first :]  # may be separated otherwise than the header
                 fits = len(row) > 1 and rows and len(cells(rows[0].text, below)) == len(row)
                 return index, below if fits else delimiter, row
-    guesses = _guess(lines, delimiters)
     found = [(_above(lines, first, delimiter), delimiter) for first, delimiter in guesses]
     index, delimiter = next((each for each in found if each[0] >= 0), (-1, ""))
     if index < 0:
@@ -245,10 +268,7 @@ def _header(
             remedy=f"add a line {','.join(columns)}, or give names under [csv]; without names, the"
             f" columns are {row[0]} to {row[-1]}",
         )
-    width = len(cells(lines[guesses[0][0]].text, delimiter)) if guesses[0][0] < len(lines) else 0
-    row = _names(lines[index].text, delimiter, lines[index + 1 :])
-    if len(row) not in (width, width - 1):  # the header is written otherwise than the samples
-        row = next(iter(_otherwise(lines[index].text, width)), row)
+    row = names(index, delimiter)
     check_columns(row, columns, f"{name}, row {lines[index].number}")
     return index, delimiter, row
 
@@ -260,11 +280,12 @@ def _filled(lines: list[Line]) -> list[int]:
 
 def _otherwise(text: str, width: int) -> list[list[str]]:
     """The names in a header of ``width`` cells, by each delimiter that separates so many."""
-    split = [cells(_REMARK.sub("", text, count=1), delimiter) for delimiter in DELIMITERS]
+    plain = _REMARK.sub("", text, count=1).strip()
+    split = [cells(plain, delimiter) for delimiter in DELIMITERS] + [re.split(r"\s{2,}", plain)]
     return [row for row in split if len(row) == width > 1]
 
 
-def _names(text: str, delimiter: str, below: list[Line]) -> list[str]:
+def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> list[str]:
     """Names in a header, which may be written as a remark: ``# t x`` has two names or three."""
     plain, bare = (cells(t, delimiter) for t in (text, _REMARK.sub("", text, count=1)))
     rows = [line.text for line in below if line.text.strip() and not _is_remark(line.text)]
@@ -274,7 +295,29 @@ def _names(text: str, delimiter: str, below: list[Line]) -> list[str]:
         row = plain if rows and len(cells(rows[0], delimiter)) == len(plain) else bare
     if delimiter == " ":
         row = [name.rstrip(",;") or name for name in row]
-    return _named_items(row, [cells(text, delimiter) for text in rows[:_SEARCHED]])
+    row = [name.strip("\"'") for name in row]
+    if _is_key_of_names(row):
+        row = ["Time" if name == row[0] else name for name in row]
+    row = _named_items(row, [cells(text, delimiter) for text in rows[:_SEARCHED]])
+    return _told_apart(row, cells(above[-1].text, delimiter) if above else [])
+
+
+def _is_key_of_names(row: list[str]) -> bool:
+    """Whether a line says of itself that it holds names: before each of them, or once."""
+    key = row[0].lower() if row else ""
+    return key.rstrip("=:") in _NAME_KEYS and (row.count(row[0]) > 1 or key[-1] in "=:")
+
+
+def _told_apart(header: list[str], above: list[str]) -> list[str]:
+    """The header with names that stand more than once below those of groups, else with a number."""
+    count = Counter(name for name in header if name)
+    if len(above) == len(header) and not any(map(_POINT.match, above)):
+        groups = [next(filter(None, above[n::-1]), "") for n in range(len(above))]
+        pairs = zip(groups, header, strict=True)
+        header = [f"{group} {name}".strip() if count[name] > 1 else name for group, name in pairs]
+        count = Counter(name for name in header if name)
+    seen = [header[: n + 1].count(name) for n, name in enumerate(header)]
+    return [f"{x} ({n})" if count[x] > 1 else x for x, n in zip(header, seen, strict=True)]
 
 
 def _named_items(header: list[str], rows: list[list[str]]) -> list[str]:
@@ -309,12 +352,17 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
         ranked.append((share * width if width > 1 else 0.0, width, delimiter))
     found = []
     best = max(score for score, _, _ in ranked)
-    for _, width, delimiter in (each for each in ranked if each[0] == best):
-        split = (cells(line.text, delimiter) for line in lines)
-        numeric = (
-            len(row) == width and _number_cells(row, delimiter) > 0.5 * width for row in split
-        )
-        first = next((n for n, is_sample in enumerate(numeric) if is_sample), len(lines))
+    for _, width, delimiter in (each for each in ranked if each[0] >= _ALIKE * best):
+        split = [cells(line.text, delimiter) for line in lines]
+        samples = [
+            [
+                n
+                for n, row in enumerate(split)
+                if len(row) == width and _number_cells(row, delimiter) > 0.5 * of(row)
+            ]
+            for of in (len, lambda row: sum(map(bool, row)))  # of cells, or of those with something
+        ]
+        first = next((found[0] for found in samples if found), len(lines))
         # What was logged before all sensors had answered are samples with empty cells.
         while 0 < first < len(lines) and _is_sparse(cells(lines[first - 1].text, delimiter), width):
             first -= 1
@@ -329,17 +377,10 @@ def _is_sparse(row: list[str], width: int) -> bool:
     )
 
 
-def _end_in_semicolons(lines: list[Line]) -> bool:
-    """Whether lines end with a semicolon, and have other delimiters in them."""
-    tried = [line.text for line in lines[-_TRIED:] if line.text.strip()]
-    ended = [text for text in tried if text.endswith(";") and text.count(";") == 1]
-    return 2 * len(ended) > len(tried) and all(re.search(r"[,\t |]", text) for text in ended)
-
-
 def _number_cells(row: list[str], delimiter: str) -> int:
-    """How many cells of a line are numbers; a comma inside one is a decimal sign."""
+    """How many cells of a line are numbers or moments; a comma inside one is a decimal sign."""
     signs = (_POINT,) if delimiter == "," else (_POINT, _COMMA)
-    return sum(any(sign.match(cell) for sign in signs) for cell in row)
+    return sum(any(sign.match(cell) for sign in signs) or is_moment(cell) for cell in row)
 
 
 def _above(lines: list[Line], first: int, delimiter: str) -> int:
@@ -352,16 +393,33 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
         if not width - 1 <= len(row) <= width:
             rows[n] = next(iter(_otherwise(lines[n].text, width)), row)
     fitting = [n for n, row in rows.items() if width - 1 <= len(row) <= width]
+    while len(fitting) > 1 and any(re.match(r"[A-Za-z ]+:\s+\S", c) for c in rows[fitting[-1]]):
+        fitting.pop()  # Type: double
+    for n in reversed(_filled(lines[:first])):
+        row = cells(lines[n].text, delimiter)
+        if len(row) != width:
+            break
+        if _is_key_of_names(row):
+            return n
+    bare = [n for n in fitting if not any(map(_POINT.match, rows[n]))]
+    if bare and bare[-1] != fitting[-1]:
+        return bare[-1]  # what is below has numbers, and cells that are empty
     if len(fitting) > 1 and _are_units(rows[fitting[-1]]) and len(rows[fitting[-2]]) == width:
         return fitting[-2]
     return fitting[-1] if fitting else -1
 
 
 def _padded(header: list[str], body: list[Line], delimiter: str) -> list[str]:
-    """The header with one more, nameless column where every line ends with a delimiter."""
+    """The header with a nameless column: lines end with a delimiter, or begin with their number."""
     rows = [cells(line.text, delimiter) for line in body[:_TRIED] if line.text.strip()]
-    longer = rows and all(len(row) == len(header) + 1 and not row[-1] for row in rows)
-    return [*header, ""] if longer else header
+    longer = [row for row in rows if len(row) == len(header) + 1]
+    if not rows or len(longer) < len(rows):
+        return header
+    if not any(row[-1] for row in longer):
+        return [*header, ""]
+    numbers = [row[0].strip('"') for row in longer]  # of the rows, as R writes them
+    counted = all(map(str.isdigit, numbers)) and int(numbers[-1]) - int(numbers[0]) == len(rows) - 1
+    return ["", *header] if counted else header
 
 
 def _decimal(
@@ -413,7 +471,24 @@ def _decimal(
 
 
 def _is_remark(text: str) -> bool:
-    return bool(_REMARK.match(text))
+    return bool(_REMARK.match(text) or re.fullmatch(r"\s*[-=_*~]{3,}[-=_*~+|\s]*", text))
+
+
+def _of_properties(row: list[str]) -> tuple[list[str], bool]:
+    """A row below the header without its keys, and whether it has such: ``Unit``, ``Type: double``.
+
+    Programs for measurements write what they know of a channel there.
+    """
+    said = [cell for cell in row if cell]
+    keys = [match for cell in said if (match := re.match(r"([A-Za-z ]+):\s+\S", cell))]
+    if len(keys) >= 0.5 * len(said) > 0:
+        return [re.sub(r"^[A-Za-z ]+:\s+", "", cell) for cell in row], True
+    key = row[0] if row else ""
+    listed = re.match(r"[A-Za-z]{3}", key) is not None and key.lower() not in ("sec", "rad", "deg")
+    alone = row.count(key) > 1 or unit(key) is None
+    if not (listed and alone):
+        return row, False
+    return ["" if cell == key else cell for cell in row], True
 
 
 def _is_unit_row(row: list[str], header: list[str], columns: Sequence[str]) -> bool:

@@ -21,6 +21,8 @@ from bampipe.errors import InputError
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _MOST_DATASETS = 2000
 _BLOCK_ROWS = 1 << 14
+_COLUMNS = ("columns", "names", "column_names", "labels", "fields")
+"""Attributes with the names of the columns of a matrix."""
 
 
 def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTrial:
@@ -60,6 +62,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
 
     shapes: dict[str, tuple[int, ...]] = {}
     units: dict[str, str] = {}
+    named: dict[str, str] = {}
     with h5py.File(path, "r") as file:
         for label, data in _datasets(file):
             for field in data.dtype.names or (None,):
@@ -68,7 +71,11 @@ def columns(path: Path, name: str) -> dict[str, str]:
                     column = label if field is None else f"{label}.{field}"
                     shapes[column] = data.shape
                     units |= dict.fromkeys(labels(column, data.shape), _unit(data))
-    return {column: units[column] for column in recorded(shapes)}
+                    named |= dict(zip(labels(column, data.shape), _names(data), strict=False))
+    return {
+        f"{column.rpartition('[')[0]}/{named[column]}" if column in named else column: units[column]
+        for column in recorded(shapes)
+    }
 
 
 def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
@@ -97,6 +104,9 @@ def _found(
 
     path, index = split_index(column, file)
     field = None
+    own, _, item = column.rpartition("/")
+    if own and isinstance(file.get(own), h5py.Dataset) and item in _names(file[own]):
+        path, index = own, _names(file[own]).index(item)
     if path not in file and path.replace(".", "/") in file:  # as a field of a struct is written
         path = path.replace(".", "/")
     if path not in file and "." in path and path.rpartition(".")[0] in file:
@@ -127,6 +137,18 @@ def _found(
             remedy=f"it has {', '.join(data.dtype.names or ['none'])}",
         )
     return data, field, index
+
+
+def _names(data: Any) -> list[str]:
+    """Names that the file gives to the columns of a matrix: beside it, or as pandas stores them."""
+    items = data.name.removesuffix("_values") + "_items"
+    width = min((extent for extent in data.shape if extent != 1), default=0)
+    found = next((data.attrs[key] for key in _COLUMNS if key in data.attrs), ())
+    beside = dict(_datasets(data.parent)).get(items.rpartition("/")[2])
+    if not len(found) and beside is not None and beside.shape == (width,):
+        found = beside[()]
+    texts = [x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in found]
+    return texts if data.ndim == 2 and len(texts) == width and len(set(texts)) == width else []
 
 
 def _check(data: Any, kind: Any, moment: bool, where: str) -> None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +22,13 @@ _HEADER = 128
 _MATRIX, _COMPRESSED = 14, 15
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
 _NUMBERS |= {12: "i8", 13: "u8"}
-_STRUCT_CLASS, _NUMERIC_CLASSES, _OPAQUE_CLASS = 2, range(6, 16), 17
+_CELL_CLASS, _STRUCT_CLASS, _TEXT_CLASS, _NUMERIC_CLASSES, _OPAQUE_CLASS = 1, 2, 4, range(6, 16), 17
 _COMPLEX = 0x0800
 _DEEPEST = 8
 _MOST_FIELDS = 4096
+_NAMES = ("name", "label", "signalname", "channel")
+_VALUES = ("values", "value", "data")
+"""Fields of a struct that say what it is called, and that hold its readings."""
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
@@ -39,14 +45,21 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         )
     if not _is_level_5(path, name):
         return hdf5.read(path, wanted, name, "variable")
-    return read_arrays(_arrays(path, name), wanted, name, "variable")
+    arrays, units, root = _arrays(path, name)
+    arrays |= {f"{root}{label}": array for label, array in arrays.items() if root}
+    return replace(
+        read_arrays(arrays, wanted, name, "variable"),
+        units={column: units[column] for column in wanted.columns if column in units},
+    )
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
     """Names of the vectors of numbers that were recorded together, or of columns; no units."""
     if not _is_level_5(path, name):
         return hdf5.columns(path, name)
-    return columns_of_arrays(_arrays(path, name))
+    arrays, units, _ = _arrays(path, name)
+    found = columns_of_arrays(arrays)
+    return {column: units.get(column, "") for column in found}
 
 
 def _is_level_5(path: Path, name: str) -> bool:
@@ -63,15 +76,20 @@ def _is_level_5(path: Path, name: str) -> bool:
     )
 
 
-def _arrays(path: Path, name: str) -> dict[str, np.ndarray | None]:
-    """Arrays of a file, each struct followed by what is in it; None for what are no real numbers.
+def _arrays(path: Path, name: str) -> tuple[dict[str, np.ndarray | None], dict[str, str], str]:
+    """Arrays of a file, each struct followed by what is in it, None for what are no real numbers;
+    their units; and what is left out of the names.
+
+    Structs of a list that say what they are called go by that name, and units beside an array are
+    its own: so scopes and recorders write their channels. A struct that is all of the file and has
+    a number in its name, as recorders count their files, is left out of the names.
 
     scipy.io reads the same files, but past its buffers where a damaged one lies about a length,
     which ends the process without a word. Source: MathWorks, MAT-File Format, level 5.
     """
     data = memoryview(path.read_bytes())
     order = "<" if bytes(data[126:128]) == b"IM" else ">"
-    found: dict[str, np.ndarray | None] = {}
+    found: dict[str, np.ndarray | str | None] = {}
     at = _HEADER
     while at + 8 <= len(data):
         kind, size = struct.unpack_from(order + "II", data, at)
@@ -81,7 +99,49 @@ def _arrays(path: Path, name: str) -> dict[str, np.ndarray | None]:
         if kind != _MATRIX or at > len(data):
             raise ValueError("an element is not what it says")
         found |= {label: a for label, a in _Elements(body, order).arrays("", 0) if label}
-    return found
+    return _called(found)
+
+
+def _called(
+    found: dict[str, np.ndarray | str | None],
+) -> tuple[dict[str, np.ndarray | None], dict[str, str], str]:
+    texts = {label: text for label, text in found.items() if isinstance(text, str) and text}
+    names, units = dict[str, str](), dict[str, str]()
+    for label, text in texts.items():
+        owner, _, key = label.rpartition(".")
+        if key.lower() in _NAMES and owner.endswith("]"):
+            names.setdefault(owner, re.sub(r"[^\w ./+-]|[\[\]]", "", text))
+        elif key.lower() in ("unit", "units"):
+            units[owner] = text
+    lists: dict[str, dict[int, str]] = {}
+    for label, text in texts.items():
+        if item := re.fullmatch(r"(.+)\[(\d+)\]", label):
+            lists.setdefault(item[1], {})[int(item[2])] = text
+    for label, value in [*found.items()]:
+        sides = value.shape if isinstance(value, np.ndarray) and value.ndim == 2 else (0,)
+        inner = label.rpartition(".")[0]
+        fitting = (own for x, own in lists.items() if x.rpartition(".")[0] == inner)
+        own = next((own for own in fitting if len(set(own.values())) == min(sides) > 1), {})
+        if own and isinstance(value, np.ndarray):  # as of importdata
+            del found[label]
+            table = value if sides[0] >= sides[1] else value.T
+            found |= {f"{label}.{own[k]}": table[:, k] for k in sorted(own)}
+    several = Counter((owner.rpartition("[")[0], name) for owner, name in names.items())
+    whole = {label.partition(".")[0] for label in found}
+    root = f"{whole.pop()}." if len(whole) == 1 else ""
+    root = root if re.search(r"\d", root) else ""
+    arrays: dict[str, np.ndarray | None] = {}
+    stated: dict[str, str] = {}
+    for label, value in found.items():
+        owner, _, key = label.rpartition(".")
+        kept = owner.rpartition("[")[0]
+        if owner in names and several[kept, names[owner]] == 1:
+            label = f"{kept}.{names[owner]}" + ("" if key.lower() in _VALUES else f".{key}")
+        label = label.removeprefix(root)
+        arrays[label] = None if isinstance(value, str) else value
+        if owner in units and key.lower() in _VALUES:
+            stated[label] = units[owner]
+    return arrays, stated, root
 
 
 class _Elements:
@@ -112,7 +172,7 @@ class _Elements:
         """The next element, of letters."""
         return bytes(self.take()[1]).decode("utf-8", "replace")
 
-    def arrays(self, label: str, depth: int) -> Iterator[tuple[str, np.ndarray | None]]:
+    def arrays(self, label: str, depth: int) -> Iterator[tuple[str, np.ndarray | str | None]]:
         """This array, called ``label`` or as it says itself, and those in its fields."""
         flags = int(self.numbers()[0])
         kind = flags & 0xFF
@@ -122,8 +182,20 @@ class _Elements:
         if kind in _NUMERIC_CLASSES and not flags & _COMPLEX:
             yield label, self.numbers().reshape(extents, order="F")
             return
+        if kind == _TEXT_CLASS:
+            letters = self.take()
+            plain = bytes(letters[1]).decode(
+                "utf-16-le" if letters[0] in (4, 17) else "utf-8", "replace"
+            )
+            yield label, plain.strip("\0 ")
+            return
         yield label, None
         count = math.prod(extents)
+        if kind == _CELL_CLASS and depth < _DEEPEST and count <= _MOST_FIELDS:
+            for number in range(count):
+                body = self.take()[1]
+                if len(body):
+                    yield from _Elements(body, self._order).arrays(f"{label}[{number}]", depth + 1)
         if kind != _STRUCT_CLASS or depth >= _DEEPEST:
             return
         width, names = int(self.numbers()[0]), self.text()

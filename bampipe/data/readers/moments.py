@@ -17,11 +17,19 @@ _DAY = 86_400 * NANOSECONDS
 _MOMENT = re.compile(r"\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?\s*\Z")
 """Date and time as of ISO 8601."""
 _OF_DAY = re.compile(r"\s*\d{1,2}:\d\d:\d\d([.,]\d+)?\s*\Z")
+_LOCAL = re.compile(
+    r"\s*(?:(?P<a>\d{1,2})(?P<sep>[./-])(?P<b>\d{1,2}|[A-Z][a-z]{2})(?P=sep)(?P<year>\d{4})[T ]+)?"
+    r"(?P<hour>\d{1,2})(?P<rest>:\d\d(?::\d\d(?:[.,:]\d+)?)?)(?P<half> ?[AaPp]\.?[Mm]\.?)?\s*\Z"
+)
+"""Date and time as people write them: the date may be left out beside AM or PM."""
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 
 
 def is_moment(cell: str) -> bool:
     """Whether a text is a date and time, or a time of day, that needs no form."""
-    return bool(_MOMENT.match(cell) or _OF_DAY.match(cell))
+    local = _LOCAL.match(cell)
+    known = local is not None and bool(local["a"] or local["half"])
+    return known or bool(_MOMENT.match(cell) or _OF_DAY.match(cell))
 
 
 def nanoseconds(
@@ -46,7 +54,7 @@ def nanoseconds(
     text = pd.Series(values, dtype="string").str.strip()
     plain = text
     if not form:
-        plain = text.str.replace(",", ".")  # ISO 8601 takes either as decimal sign
+        plain = _iso_of_local(text).str.replace(",", ".")  # ISO 8601 takes either as decimal sign
         of_day = plain.str.match(_OF_DAY).fillna(False)
         plain = plain.mask(
             of_day, "1970-01-01T" + plain.str.replace(r"^(\d):", r"0\1:", regex=True)
@@ -67,6 +75,37 @@ def nanoseconds(
             remedy="" if form else 'give its form: format = "%d.%m.%Y %H:%M:%S.%f" under [time]',
         )
     return np.asarray(moments.dt.tz_localize(None), dtype="datetime64[ns]").astype(np.int64)
+
+
+def _iso_of_local(text: pd.Series) -> pd.Series:
+    """Dates and times as people write them as of ISO 8601; others, and doubtful ones, as they are.
+
+    Whether 03/10 is in March or October shows where a date beyond the 12th stands in the column, or
+    does not matter where it is the only date.
+    """
+    first = text.dropna().head(1)
+    if (
+        not len(first)
+        or (seen := _LOCAL.match(str(first.iloc[0]))) is None
+        or not (seen["a"] or seen["half"])
+    ):
+        return text
+    parts = text.str.extract(_LOCAL)
+    day, month = parts["a"], parts["b"]
+    if seen["sep"] == "/":
+        beyond = [pd.to_numeric(part, errors="coerce").max() > 12 for part in (day, month)]
+        if not any(beyond) and len(parts.loc[day.notna(), ["a", "b"]].drop_duplicates()) > 1:
+            return text
+        day, month = (day, month) if beyond[0] else (month, day)
+    numbers = {name: f"{n:02d}" for n, name in enumerate(_MONTHS, 1)}
+    month = month.str.lower().replace(numbers)
+    date = parts["year"] + "-" + month.str.zfill(2) + "-" + day.str.zfill(2)
+    late = parts["half"].str.contains("[Pp]").fillna(False).astype(int) * 12
+    hour = pd.to_numeric(parts["hour"]).astype("Int64")
+    hour = hour.where(parts["half"].isna(), hour % 12 + late).astype("string").str.zfill(2)
+    rest = parts["rest"].str.replace(r"(:\d\d:\d\d):", r"\1.", regex=True)
+    whole = date.fillna("1970-01-01") + "T" + hour + rest
+    return whole.where(parts["hour"].notna(), text)
 
 
 def seconds(moments: np.ndarray) -> np.ndarray:

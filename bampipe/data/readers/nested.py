@@ -126,6 +126,11 @@ def _part(value: Any, key: str) -> Any:
     return getattr(value, key, MISSING) if key in _keys(value) else MISSING
 
 
+def is_number(text: str) -> bool:
+    """Whether a text is a number, as some programs write them into JSON."""
+    return bool(re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", text))
+
+
 def as_number(cell: Any, where: str) -> float:
     """A value as a number: null is missing, true is 1.
 
@@ -134,6 +139,8 @@ def as_number(cell: Any, where: str) -> float:
     """
     if cell is None:
         return float("nan")
+    if isinstance(cell, str) and is_number(cell):
+        return float(cell)
     if not isinstance(cell, bool | int | float | np.number | np.bool_):
         raise InputError(f"found {str(cell)[:40]!r}, expected a number", where=where)
     try:

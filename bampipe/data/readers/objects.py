@@ -17,7 +17,7 @@ import numpy as np
 
 from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import columns_of_arrays, read_arrays
-from bampipe.data.readers.nested import MISSING, as_number, find, leaves
+from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns
 from bampipe.errors import InputError
 
@@ -58,10 +58,15 @@ def columns(path: Path, name: str) -> dict[str, str]:
     """Names of the values that are numbers, or moments (unit "datetime"), in the first sample."""
     samples, constants, _ = _samples(path, name)
     if isinstance(samples, dict):
-        return columns_of_arrays(samples) | dict.fromkeys(constants, "")
+        lines = path.suffix.lower() != ".json"
+        content = {} if lines else _parsed(path.read_text(encoding="utf-8-sig"), name)
+        beside = {label: find(content, f"{label.rpartition('.')[0]}.unit") for label in samples}
+        units = {label: unit for label, unit in beside.items() if isinstance(unit, str)}
+        found = columns_of_arrays(samples) | dict.fromkeys(constants, "")
+        return {column: units.get(column, stated) for column, stated in found.items()}
     found = {}
     for column, cell in leaves(samples[0]):
-        if isinstance(cell, int | float):
+        if isinstance(cell, int | float) or (isinstance(cell, str) and is_number(cell)):
             found[column] = ""
         elif isinstance(cell, str) and moments.is_moment(cell):
             found[column] = "datetime"
@@ -93,8 +98,10 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
                     yield label, array
     elif isinstance(value, list) and len(value) > 1:
         if isinstance(value[0], dict):
-            for k, item in enumerate(value):
-                yield from _arrays(item, f"{path}[{k}]")
+            own = [next((str(x[key]) for key in _CALLED if key in x), "") for x in value]
+            places = own if all(own) and len(set(own)) == len(own) else range(len(value))
+            for place, item in zip(places, value, strict=True):
+                yield from _arrays(item, f"{path}[{place}]")
             return
         if isinstance(value[0], str):
             if moments.is_moment(value[0]) and all(isinstance(x, str | None) for x in value):
@@ -106,6 +113,10 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
             return
         if array.ndim <= 2 and array.size:
             yield path or "data", array
+
+
+_CALLED = ("name", "label", "signal", "channel")
+"""Keys of what an object is called."""
 
 
 def _are_names(values: list[object]) -> bool:
@@ -179,10 +190,11 @@ def _lists_of_samples(content: object) -> dict[str, list[object]]:
 
 def _is_sample(value: object) -> bool:
     """Whether an object is a sample rather than a recording, whose values are long lists."""
-    return any(isinstance(cell, int | float) for _, cell in leaves(value))
+    cells = (cell for _, cell in leaves(value))
+    return any(isinstance(x, int | float) or (isinstance(x, str) and is_number(x)) for x in cells)
 
 
 def _numbers(content: object) -> dict[str, object]:
     """The numbers beside the samples of a parsed file."""
-    items = content.items() if isinstance(content, dict) else ()
-    return {str(key): value for key, value in items if isinstance(value, int | float)}
+    found = leaves(content) if isinstance(content, dict) else ()
+    return {key: value for key, value in found if isinstance(value, int | float) and "[" not in key}

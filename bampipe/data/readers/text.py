@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 
 from bampipe.data.readers import dialect as dialects
-from bampipe.data.readers import moments
+from bampipe.data.readers import moments, rewriting
 from bampipe.data.readers.dialect import HEAD, NULLS, Line, TableLayout
 from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size
 from bampipe.errors import InputError
@@ -29,42 +29,14 @@ _MOST_CHATTER = 50
 """Lines of text among the samples, messages of a logger, that are left out."""
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _WESTERN = "cp1252"
-_TAKEN_AS = "not UTF-8: names and units are taken as Windows-1252"
-
-
-class _Stretch(io.RawIOBase):
-    """A binary file of which only the bytes from ``start`` to ``end`` are seen."""
-
-    def __init__(self, stream: BinaryIO, start: int, end: int, ended: bool = False) -> None:
-        stream.seek(start)
-        self._stream = stream
-        self._left = max(end - start, 0)
-        self._ended = ended
-
-    def readable(self) -> bool:
-        return True
-
-    def read(self, size: int = -1, /) -> bytes:
-        size = self._left if size < 0 else min(size, self._left)
-        data = self._stream.read(size)
-        self._left -= len(data)
-        return data.replace(b";", b" ") if self._ended else data
-
-
-class _SingleBlanks(_Stretch):
-    """The same with one blank in place of several, and none at the ends of a line."""
-
-    _held = b"\n"
-
-    def read(self, size: int = -1, /) -> bytes:
-        while True:
-            data = super().read(size)
-            text = self._held + data
-            body = text.rstrip(b" \t\r\n") if data else text.rstrip(b" \t")
-            self._held = text[len(body) :]
-            body = re.sub(rb"[ \t]*([\r\n]+)[ \t]*", rb"\1", re.sub(rb"[ \t]+", b" ", body))
-            if body or not data:
-                return body
+_TAKEN_AS = {
+    encoding: f"not UTF-8: names and units are taken as {what}"
+    for encoding, what in (
+        (_WESTERN, "Windows-1252"),
+        ("gb18030", "GBK"),
+        ("shift_jis", "Shift-JIS"),
+    )
+}
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
@@ -73,8 +45,8 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     Raises:
         InputError: binary data, a wrong layout, or a cell that is not a number; names the row.
     """
-    with _opened(path, wanted.dialect, name) as (stream, said):
-        layout = dialects.find_layout(_head(stream, name), wanted.columns, wanted.dialect, name)
+    with _opened(path, wanted.dialect, name) as (stream, dialect, said):
+        layout = dialects.find_layout(_head(stream, name), wanted.columns, dialect, name)
         end, notes = _sound_end(stream, layout)
         samples = _Samples(wanted)
         _read_samples(stream, layout, end, samples, name)
@@ -95,8 +67,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
 
 def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, str]:
     """Names and units of the columns of numbers, or of moments (unit "datetime")."""
-    dialect = dialect or Dialect()
-    with _opened(path, dialect, name) as (stream, _):
+    with _opened(path, dialect or Dialect(), name) as (stream, dialect, _):
         head = _head(stream, name)
     layout = dialects.find_layout(head, (), dialect, name)
     return {
@@ -106,8 +77,10 @@ def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, 
 
 
 @contextmanager
-def _opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO, tuple[str, ...]]]:
-    """The file as UTF-8, itself or a copy of it in memory; and what to say of it.
+def _opened(
+    path: Path, dialect: Dialect, name: str
+) -> Iterator[tuple[BinaryIO, Dialect, tuple[str, ...]]]:
+    """The file as a table in UTF-8, itself or a copy in memory; its dialect, and what to say of it.
 
     Raises:
         InputError: it is not in the encoding that it claims.
@@ -116,8 +89,10 @@ def _opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO,
         head = stream.read(HEAD)
         stream.seek(0)
         encoding = dialect.encoding or _encoding(head)
-        if encoding == "utf-8":
-            yield stream, ()
+        whole = head[: head.rfind(b"\n") + 1] or head
+        form = rewriting.find_form(whole.decode(encoding, "ignore"))
+        if encoding == "utf-8" and form is None:
+            yield stream, dialect, ()
             return
         try:
             text = stream.read().decode(encoding)
@@ -127,8 +102,13 @@ def _opened(path: Path, dialect: Dialect, name: str) -> Iterator[tuple[BinaryIO,
                 where=name,
                 remedy="save it as UTF-8, or say another encoding under [csv]",
             ) from error
-        said = (_TAKEN_AS,) if encoding == _WESTERN and not dialect.encoding else ()
-        yield io.BytesIO(text.encode("utf-8", "replace")), said
+        said = () if dialect.encoding or encoding not in _TAKEN_AS else (_TAKEN_AS[encoding],)
+        if form is not None:
+            text = re.sub(r"[^\r\n]+", lambda line: form.rewrite(line[0]), text)
+            said = (*said, form.said) if form.said else said
+            if form.names and not dialect.names:
+                dialect = dialect.model_copy(update={"names": form.names})
+        yield io.BytesIO(text.encode("utf-8", "replace")), dialect, said
 
 
 def _encoding(head: bytes) -> str:
@@ -139,16 +119,33 @@ def _encoding(head: bytes) -> str:
     """
     if head.startswith(_UTF16):
         return "utf-16"
+    asian = _asian(head)
+    if asian:
+        return asian
     even, odd = head[0::2].count(0), head[1::2].count(0)
     if min(even, odd) == 0 and max(even, odd) > 0.4 * len(head):
         return "utf-16-be" if even else "utf-16-le"
-    for encoding in ("utf-8", _WESTERN):
-        try:
-            codecs.getincrementaldecoder(encoding)().decode(head)
-        except UnicodeDecodeError:
-            continue
-        return encoding
-    return "utf-8"
+    return _WESTERN if not _sound(head, "utf-8") and _sound(head, _WESTERN) else "utf-8"
+
+
+def _asian(head: bytes) -> str:
+    """The encoding of Chinese or Japanese in which all letters beyond ASCII are, "" where not."""
+    runs = re.findall(rb"[\x80-\xff]+", head)
+    if not runs or _sound(head, "utf-8"):
+        return ""
+    # Letters of Western Europe stand alone among others.
+    if all(len(run) % 2 == 0 for run in runs) and _sound(head, "gb2312"):
+        return "gb18030"
+    japanese = re.findall(rb"[\x82\x83\x88-\x9f][\x40-\xfc]", head)
+    return "shift_jis" if len(japanese) > 2 and _sound(head, "shift_jis") else ""
+
+
+def _sound(head: bytes, encoding: str) -> bool:
+    try:
+        codecs.getincrementaldecoder(encoding)().decode(head)
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def _head(stream: BinaryIO, name: str) -> bytes:
@@ -171,6 +168,7 @@ class _Samples:
     """
 
     wanted: Wanted
+    nothing: list[str] = field(default_factory=list)
     parts: dict[str, list[np.ndarray]] = field(default_factory=dict)
     rows: int = 0
     notes: list[str] = field(default_factory=list)
@@ -190,6 +188,19 @@ class _Samples:
             self.parts.setdefault(column, []).append(part)
         self.rows += batch.num_rows
         check_size(self.rows, self.wanted, name)
+
+    def passes_over(self, message: str, line: Line, layout: TableLayout) -> bool:
+        """Whether a word stands where a number is expected: no reading, as "OVERLOAD" says."""
+        cell = _CELL.search(message)
+        word = cell[3] if cell else ""
+        if not _NO_READING.fullmatch(word) or len(self.nothing) == _MOST_WORDS:
+            return False
+        self.nothing.append(word)
+        column = layout.header[int(cell[1])] if cell else ""
+        self.notes.append(
+            f"column '{column}' says '{word}' from row {line.number} on: taken as no reading"
+        )
+        return True
 
     def cut(self, rows: int, parts: int) -> None:
         """Forget all but the first ``rows``, which the first ``parts`` hold."""
@@ -221,13 +232,17 @@ def _read_samples(
             _read_stretch(stream, layout, end, samples, name)
             return
         except pa.ArrowInvalid as error:
-            if "Empty CSV file" in str(error):
-                return
             line = _faulty_line(stream, str(error), layout)
             again = line is not None and layout.is_header(line.text)
-            if line is None or not (again or layout.is_chatter(line.text)):
-                raise _fault(str(error), layout, line, name) from error
             samples.cut(rows, parts)
+            if line is not None and not again and _is_end(stream, line, end, layout):
+                samples.notes.append(f"row {line.number} and what follows are no samples: left out")
+                end = line.start
+                continue
+            if line is None or not (again or layout.is_chatter(line.text)):
+                if line is not None and samples.passes_over(str(error), line, layout):
+                    continue
+                raise _fault(str(error), layout, line, name) from error
             _read_samples(stream, layout, line.start, samples, name)
             if again:
                 samples.begun += [samples.rows] if samples.rows else []
@@ -248,27 +263,57 @@ def _read_stretch(
 ) -> None:
     wanted = samples.wanted
     kinds = {c: pa.string() if c in wanted.datetimes else pa.float64() for c in wanted.columns}
-    seen = _SingleBlanks if layout.delimiter == " " else _Stretch
-    before = samples.rows
-    reader = pa_csv.open_csv(
-        pa.PythonFile(seen(stream, layout.start, end, layout.ended), mode="r"),
-        read_options=pa_csv.ReadOptions(
-            use_threads=False,
-            block_size=BLOCK,
-            # Names that are not wanted may be repeated or empty: a number stands for them.
-            column_names=[c if c in kinds else f"\0{n}" for n, c in enumerate(layout.header)],
-        ),
-        parse_options=pa_csv.ParseOptions(delimiter=layout.delimiter),
-        convert_options=pa_csv.ConvertOptions(
-            column_types=kinds,
-            include_columns=list(kinds),
-            null_values=[*NULLS, *wanted.dialect.missing],
-            strings_can_be_null=True,
-            decimal_point=layout.decimal,
-        ),
-    )
-    for batch in reader:
-        samples.add(batch, layout.first_line + samples.rows - before, name)
+    # Names that are not wanted may be repeated or empty: a number stands for them.
+    names = [c if c in kinds else f"\0{n}" for n, c in enumerate(layout.header)]
+    at, before, held = layout.start, samples.rows, b""
+    # Block by block: Arrow's own reader of streams keeps a thread that a faulty row leaves waiting
+    # for itself, and then the process never ends.
+    while at < end or held:
+        stream.seek(at)
+        block = stream.read(min(BLOCK, end - at))
+        held += block or b"\n"
+        at, end = at + len(block), end if block else at  # the file may have become shorter
+        cut = max(held.rfind(b"\n"), held.rfind(b"\r")) + 1
+        whole, held = held[:cut], held[cut:]
+        if len(held) > BLOCK:
+            raise InputError("a line is far too long", where=name)
+        if layout.delimiter == " ":
+            whole = re.sub(
+                rb"[ \t]*([\r\n]+)[ \t]*", rb"\1", re.sub(rb"[ \t]+", b" ", whole)
+            ).strip(b" ")
+        if not whole.strip():
+            continue
+        try:
+            table = pa_csv.read_csv(
+                pa.BufferReader(whole),
+                pa_csv.ReadOptions(
+                    use_threads=False, block_size=len(whole) + 1, column_names=names
+                ),
+                pa_csv.ParseOptions(delimiter=layout.delimiter),
+                pa_csv.ConvertOptions(
+                    column_types=kinds,
+                    include_columns=list(kinds),
+                    null_values=[*NULLS, *wanted.dialect.missing, *samples.nothing],
+                    strings_can_be_null=True,
+                    decimal_point=layout.decimal,
+                ),
+            )
+        except pa.ArrowInvalid as error:
+            number = re.compile(r"(?<=Row #)\d+").search(str(error))
+            row = f"{int(number[0]) + samples.rows - before}" if number else ""
+            message = re.sub(r"(?<=Row #)\d+", row, str(error), count=1)
+            raise pa.ArrowInvalid(message) from error
+        for batch in table.to_batches():
+            samples.add(batch, layout.first_line + samples.rows - before, name)
+
+
+def _is_end(stream: BinaryIO, line: Line, end: int, layout: TableLayout) -> bool:
+    """Whether this line and all that follow are words about the log, as a summary at its end."""
+    if line.start <= layout.start or end - line.start > HEAD:
+        return False
+    stream.seek(line.start)
+    rest = stream.read(end - line.start).decode("utf-8", "replace").splitlines()
+    return all(layout.is_remark(text) for text in rest if text.strip())
 
 
 def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, ...]]:
@@ -285,7 +330,7 @@ def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, .
     ended = len(content) < len(tail)
     cut = max(content.rfind(b"\n"), content.rfind(b"\r"))
     last = content[cut + 1 :]
-    if not last:
+    if not last or layout.is_remark(last.decode("utf-8", "replace")):
         return size, ()
     row = _split(last, layout)
     short = len(row) < len(layout.header)
@@ -300,10 +345,12 @@ def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, .
 
 
 def _split(line: bytes, layout: TableLayout) -> list[bytes]:
-    line = line.rstrip(b";") if layout.ended else line
     return line.split() if layout.delimiter == " " else line.split(layout.delimiter.encode())
 
 
+_NO_READING = re.compile(r"[^\d\s\"\\][^\d\"\\]{0,19}|[-+]?1\.#\w+|#[A-Z]+[/\d!?]*")
+"""Words for no reading, numbers of old C libraries among them."""
+_MOST_WORDS = 8
 _TORN = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+): (.*?)(?: \.\.\.)?$", re.DOTALL)
 _CELL = re.compile(r"In CSV column #(\d+): (?:Row #(\d+): )?.*invalid value '(.*)'", re.DOTALL)
 
@@ -344,14 +391,11 @@ def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> I
                 " columns, or a point before the fraction of a second"
             )
         return InputError(
-            f"{actual} cells, where the header has {expected}",
-            where=f"{name}{at}",
-            remedy=remedy,
+            f"{actual} cells, where the header has {expected}", where=f"{name}{at}", remedy=remedy
         )
     cell = _CELL.search(message)
     if cell is None:
-        what = "a line is far too long" if "straddl" in message else message
-        return InputError(what, where=name)
+        return InputError(message, where=name)
     column, value = layout.header[int(cell[1])], cell[3]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
     other = "," if layout.decimal == "." else "."
@@ -361,12 +405,8 @@ def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> I
         remedy = f"export with one decimal sign; '{layout.decimal}' was taken from the first rows"
     elif moments.is_moment(value):
         remedy = 'is it the time? then say unit = "datetime" under [time]'
-    elif shown == value and re.fullmatch(r"[^\d\"\\]+", value.strip()):
-        remedy = f'if that means no reading, say missing = ["{value.strip()}"] under [csv]'
     elif re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?\s+[^\d\s]\S*", value.strip(), re.IGNORECASE):
         remedy = "export numbers without their units"
     return InputError(
-        f"found '{shown}', expected a number",
-        where=f"{name}{at}, column '{column}'",
-        remedy=remedy,
+        f"found '{shown}', expected a number", where=f"{name}{at}, column '{column}'", remedy=remedy
     )

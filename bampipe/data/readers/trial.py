@@ -67,6 +67,7 @@ class RawTrial:
         resumed: after lines that hold no sample, the sample that follows and its row.
         begun: samples at which another recording begins: the header stands again, or an episode.
         since: of columns of dates and times, where known, their first moment, ns since 1970.
+        kept: (T,) rows of the samples, where some between them were left out.
     """
 
     columns: dict[str, np.ndarray]
@@ -77,6 +78,7 @@ class RawTrial:
     resumed: tuple[tuple[int, int], ...] = ()
     begun: tuple[int, ...] = ()
     since: Mapping[str, int] = field(default_factory=dict)
+    kept: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
@@ -84,6 +86,8 @@ class RawTrial:
     @property
     def rows(self) -> np.ndarray:
         """Row in the file of every sample, (T,) int64."""
+        if self.kept is not None:
+            return self.kept
         rows = np.arange(self.first_row, self.first_row + len(self), dtype=np.int64)
         for sample, row in self.resumed:
             rows[sample:] += row - rows[sample] if sample < len(rows) else 0
@@ -97,6 +101,7 @@ class RawTrial:
             first_row=int(self.rows[start]),
             resumed=tuple((at - start, row) for at, row in self.resumed if start < at < stop),
             begun=tuple(at - start for at in self.begun if start < at < stop),
+            kept=None if self.kept is None else self.kept[start:stop],
         )
 
 

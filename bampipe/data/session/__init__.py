@@ -6,14 +6,7 @@ is wrong with one trial's file is the reader's and the quality rules' business.
 """
 
 from bampipe.data.session.channels import SECONDS, Channel, Clock, Encoder
-from bampipe.data.session.file import (
-    Part,
-    Session,
-    TrialEntry,
-    inside,
-    read_session,
-    session_from,
-)
+from bampipe.data.session.file import Part, Session, TrialEntry, inside, read_session, session_from
 
 __all__ = [
     "SECONDS",

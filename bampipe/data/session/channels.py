@@ -29,9 +29,9 @@ from bampipe.schema import (
 LARGEST_CONDITION = 1e8
 """A calibration matrix with a larger condition number counts as singular."""
 
-TimeUnit = Literal["ns", "us", "ms", "s", "datetime"]
+TimeUnit = Literal["ns", "us", "ms", "s", "min", "h", "days", "datetime"]
 CLOCK_UNITS: tuple[TimeUnit, ...] = get_args(TimeUnit)
-SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0}
+SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "days": 86_400.0}
 
 
 def _name(text: str) -> str:
@@ -43,9 +43,7 @@ def _name(text: str) -> str:
 
 
 ChannelName = Annotated[
-    str,
-    AfterValidator(_name),
-    Field(json_schema_extra={"pattern": "^[A-Za-z][A-Za-z0-9_]*$"}),
+    str, AfterValidator(_name), Field(json_schema_extra={"pattern": "^[A-Za-z][A-Za-z0-9_]*$"})
 ]
 
 
@@ -125,9 +123,7 @@ class Clock(Declaration):
     def cross_faults(self) -> Iterator[InputError]:
         if self.unit == "samples" and self.column:
             yield InputError(
-                'given although unit = "samples" counts them',
-                where="column",
-                remedy="leave it out",
+                'given although unit = "samples" counts them', where="column", remedy="leave it out"
             )
         if self.unit != "samples" and not self.column:
             yield InputError(
@@ -412,7 +408,7 @@ class Force(Declaration):
                 yield InputError(
                     "the matrix is singular: some force gives no voltage",
                     where="calibration_n_per_v",
-                    remedy="check for equal or zero rows",
+                    remedy="no row is zero, none like another: fill in what a known force reads",
                 )
 
 

@@ -14,7 +14,7 @@ from bampipe.files import read_toml
 from bampipe.lists import join_names
 from bampipe.report.document import strip_marks
 from bampipe.report.explorer.packing import Packer
-from bampipe.report.results import R, Results
+from bampipe.report.run_results import R, Results
 from bampipe.report.wording import format_unit, name_trial_state, split_name
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
@@ -22,7 +22,7 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.validate import ValidateResult
 
 _BREAK_S = 0.5
-"""Time drawn between one trial and the next."""
+"""Gap between two trials on the axis of time, seconds."""
 
 Cell = str | float | int | None
 Content = dict[str, Any]
@@ -30,7 +30,7 @@ Content = dict[str, Any]
 
 @dataclass(frozen=True)
 class _Span:
-    """Place of a trial on the session's one axis of time: ``t`` of the trial plus ``offset``."""
+    """Place of a trial on the common axis of time: ``t`` of the trial plus ``offset``."""
 
     id: str
     kind: str
@@ -47,7 +47,7 @@ class _Session:
     prefix: str
 
     def table(self, path: str, columns: Sequence[str] | None = None) -> pd.DataFrame | None:
-        """A Parquet file with trials named as on the page; None where there is none, or no row."""
+        """Return a Parquet file with the page's names of trials; None if it is missing or empty."""
         frame = self.results.table(path, columns)
         if frame is None or frame.empty:
             return None
@@ -63,14 +63,14 @@ class _Version:
     label: str
 
     def table(self, name: str) -> pd.DataFrame | None:
-        """A Parquet file of the model, as `_Session.table` returns it."""
+        """Return a Parquet file of the model, as `_Session.table` does."""
         return self.session.table(self.session.results.model_file(name, self.model))
 
 
 def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
-    """Return everything that the page shows of sessions of one device; ``packer`` packs channels.
+    """Return the content of the page for sessions of one device; ``packer`` packs channels.
 
-    Trials and models of a second session stand behind those of the first.
+    Trials and models of a second session follow those of the first.
     """
     results = sessions[0]
     for other in sessions[1:]:
@@ -121,7 +121,7 @@ def gather_content(sessions: Sequence[Results], packer: Packer) -> Content:
 
 
 def _place_trials(sessions: Sequence[_Session]) -> list[_Span]:
-    """Return the trials that were read, one after the other."""
+    """Return the trials that were read, in order."""
     found, start = [], 0.0
     for session in sessions:
         for row in session.results.trials.to_dict("records"):
@@ -138,13 +138,13 @@ def _place_trials(sessions: Sequence[_Session]) -> list[_Span]:
 
 
 def _join(frames: Iterable[pd.DataFrame | None]) -> pd.DataFrame | None:
-    """Return the rows of all sessions that have some; None where none has."""
+    """Return the rows of all sessions together; None if there are none."""
     found = [frame for frame in frames if frame is not None]
     return pd.concat(found, ignore_index=True) if len(found) > 1 else next(iter(found), None)
 
 
 class _Grids:
-    """Channels by the grid of times that they share, packed as they come."""
+    """Channels grouped by their common grid of times, each packed when it is added."""
 
     def __init__(self, spans: Sequence[_Span], packer: Packer) -> None:
         self.channels: list[Content] = []
@@ -168,7 +168,7 @@ class _Grids:
         return known
 
     def align(self, name: str, frame: pd.DataFrame) -> pd.DataFrame | None:
-        """Return the rows of ``frame`` at the times of a grid; None where they are not the same."""
+        """Return the rows of ``frame`` at the times of a grid; None if they have repeated times."""
         rows = pd.MultiIndex.from_frame(frame[["trial_id", "t"]])
         if not rows.is_unique:
             return None

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-_LEVELS = 65534
-_GAP = 65535
-_LEVEL = 6
+_LARGEST_CODE = 65534
+_GAP_CODE = 65535
+_COMPRESSION = 6
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class Packer:
         finite = np.isfinite(values)
         low = float(values[finite].min()) if finite.any() else 0.0
         high = float(values[finite].max()) if finite.any() else 0.0
-        step = (high - low) / _LEVELS or 1.0
-        codes = np.full(len(values), _GAP, dtype=np.uint16)
+        step = (high - low) / _LARGEST_CODE or 1.0
+        codes = np.full(len(values), _GAP_CODE, dtype=np.uint16)
         codes[finite] = np.rint((values[finite] - low) / step).astype(np.uint16)
         once = np.diff(codes, prepend=codes.dtype.type(0))
         twice = np.diff(once, prepend=once.dtype.type(0))
@@ -67,7 +67,7 @@ class Packer:
 
     def _add(self, raw: bytes) -> int:
         if raw not in self._known:
-            packed = zlib.compress(raw, _LEVEL)
+            packed = zlib.compress(raw, _COMPRESSION)
             self._known[raw] = len(self.blocks)
             self.blocks.append(base64.b64encode(packed).decode("ascii"))
         return self._known[raw]

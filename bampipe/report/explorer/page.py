@@ -1,4 +1,4 @@
-"""The page for exploring in one file that asks for nothing: records, channels, style, scripts."""
+"""The page for exploring as one self-contained file: records, channels, style, scripts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from bampipe.report import verdicts
 from bampipe.report.document import strip_marks
 from bampipe.report.explorer.content import Content, gather_content
 from bampipe.report.explorer.packing import Packer
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 
 _ASSETS = Path(__file__).parent / "assets"
 SCRIPTS = (

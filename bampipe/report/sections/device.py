@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from bampipe.report.document import Block, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import format_decimals, format_digits, format_stated, format_unit
 from bampipe.results.identify import Combined, DeviceNumber, IdentifyResult
 from bampipe.results.performance import DeviceConstant, PerformanceResult
@@ -44,7 +44,7 @@ def _tabulate_constants(
 
 
 def _tabulate_numbers(numbers: Iterable[DeviceNumber]) -> Table:
-    """Tabulate what the trials say of these numbers, and which estimates depend on them."""
+    """Tabulate the numbers as tested by the trials, and the estimates that depend on them."""
     rows = []
     for one in numbers:
         moved = sorted(one.moves_percent.items(), key=lambda item: -abs(item[1]))[:2]

@@ -20,7 +20,7 @@ from bampipe.report.document import (
     Subheading,
     Table,
 )
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.sections import next_trial
 from bampipe.report.wording import (
     count_noun,
@@ -44,10 +44,10 @@ from bampipe.results.next import NextResult
 
 Maps = Mapping[str, ResidualMap]
 TITLE = "Diagnosis"
-_RANKED = 8
-_WINDOWS = 6
-_MAPS = 6
-"""Most maps of one axis: those that explain most, best first."""
+_MOST_RANKED = 8
+_MOST_WINDOWS = 6
+_MOST_MAPS = 6
+"""Most maps shown of one axis: those that explain most, best first."""
 
 
 def section(results: Results) -> Section:
@@ -58,7 +58,7 @@ def section(results: Results) -> Section:
         if (content := results.read(DiagnoseResult, model)) is not None
     ]
     if not found:
-        text = f"No model has been diagnosed yet: `{results.diagnose_command}` does it."
+        text = f"No model has been diagnosed yet: run `{results.diagnose_command}`."
         return Section(TITLE, (Paragraph(text),))
     blocks: list[Block] = []
     last, after = found[-1]
@@ -96,19 +96,19 @@ def _show_model(
 
 
 def _tell_sensitivity(results: Results, model: str) -> Paragraph:
-    """Say which effects these trials would not have revealed, where nothing is missing."""
+    """Name the effects that these trials would not have revealed, if nothing is missing."""
     proposed = results.read(NextResult, model)
     if proposed is not None and proposed.sensitivity:
         return Paragraph(f"{proposed.why} The table under {next_trial.TITLE} lists every effect.")
     option = f" --model {model}" if len(results.models) > 1 else ""
     return Paragraph(
-        f"`bampipe next {results.root.name}{option}` computes how large an effect could be and go"
-        " unnoticed in these trials, and which trial would reveal it."
+        f"`bampipe next {results.root.name}{option}` computes the size up to which an effect would"
+        " go unnoticed in these trials, and the trial that would reveal it."
     )
 
 
 def _advise(results: Results, model: str, found: DiagnoseResult) -> list[Block]:
-    """Return the command that follows; where it has been run, the model that it made."""
+    """Return the next command, or its result if it has been run."""
     compared = results.read(CompareResult)
     wanted = set(found.selected)
     for rung in compared.ladder if compared else ():
@@ -152,7 +152,7 @@ def _tabulate_sets(found: DiagnoseResult) -> list[Block]:
             phrases.probability(one.probability),
             format_digits(one.log_evidence),
         )
-        for one in shown[:_RANKED]
+        for one in shown[:_MOST_RANKED]
     ]
     columns = "Effects | >Probability | >Log evidence over the first (nats)"
     return [Table("Sets of effects, the most probable first", columns, rows), null]
@@ -188,7 +188,7 @@ def tabulate_candidates(
 
 
 def _tabulate_ranking(ranking: Sequence[RankedEffect]) -> Table:
-    shown, more = ranking[:_RANKED], len(ranking) - _RANKED
+    shown, more = ranking[:_MOST_RANKED], len(ranking) - _MOST_RANKED
     rows = [
         (one, (one.axis, join_names(f"`{n}`" for n in one.indistinguishable_from))) for one in shown
     ]
@@ -201,7 +201,7 @@ def _tabulate_ranking(ranking: Sequence[RankedEffect]) -> Table:
 
 
 def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Figure:
-    names = sorted(maps, key=lambda name: -maps[name].variance_share)[:_MAPS]
+    names = sorted(maps, key=lambda name: -maps[name].variance_share)[:_MOST_MAPS]
     figure, panels = style.make_grid(len(names), 3, 1.65, column_width=1.9)
     for number, (panel, name) in enumerate(zip(panels, names, strict=True)):
         draw_map(panel, name, maps[name], style.VERMILLION, "the model")
@@ -241,7 +241,7 @@ def draw_map(panel: Any, name: str, shown: ResidualMap, colour: str, title: str)
 
 
 def _name_values(name: str, centre: Sequence[float]) -> list[str] | None:
-    """Return the values of a variable that counts or sorts by name, else None."""
+    """Return the names of the values of a discrete variable, else None."""
     if not all(value.is_integer() for value in centre):
         return None
     first = 1 if name == "trial" else 0
@@ -258,7 +258,7 @@ def _tabulate_windows(results: Results, windows: Sequence[WorstWindow]) -> Table
             f"{format_digits(one.rmse)} {format_unit(one.unit)}",
             one.doing or "–",
         )
-        for one in windows[:_WINDOWS]
+        for one in windows[:_MOST_WINDOWS]
     ]
     return Table(
         "Worst windows: where the prediction fails most, and how the machine moved there",

@@ -1,4 +1,4 @@
-"""Drafts: formulas for what no effect explains, over the residual and the null distribution."""
+"""Drafts: formulas over residuals that no effect explains, and over the null distribution."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from bampipe.lists import join_names
 from bampipe.report import style
 from bampipe.report.document import Block, Figure, Formulas, Paragraph, Section, Subheading, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits, format_unit, split_name
 from bampipe.results.diagnose import DiagnoseResult, ResidualMap
 from bampipe.results.draft import AxisDraft, DraftedEffect, DraftResult
@@ -24,7 +24,7 @@ _DRAWN_AT = {
 
 
 def section(results: Results) -> Section | None:
-    """Return the section; None where no formula was looked for."""
+    """Return the section; None if no formula was searched for."""
     blocks: list[Block] = []
     for model in results.models:
         found = results.read(DraftResult, model)

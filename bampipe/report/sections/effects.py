@@ -13,7 +13,7 @@ from bampipe.lists import join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.report import style
 from bampipe.report.document import Block, Figure, Formulas, Paragraph, Section, Subheading, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.sections.diagnosis import tabulate_candidates
 from bampipe.report.wording import format_digits, format_unit, format_with_sd, split_name
 from bampipe.results.compare import CompareResult
@@ -22,9 +22,9 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.terms import ModelTerm, TermCurve, TermsResult
 
 TITLE = "Effects"
-_WEIGHED = 8
+_MOST_CANDIDATES = 8
 _ALTERNATIVES = 3
-_LEAST_SHARE = 0.2
+_LEAST_CURVE_SHARE = 0.2
 """Share of a term's variance that its curve has to carry to be drawn."""
 
 
@@ -40,8 +40,7 @@ def section(results: Results) -> Section | None:
         blocks.append(Paragraph(f"Model `{results.model}` is the device without effects."))
     if curves := [term.curves[0] for term in friction if term.curves]:
         caption = (
-            "Friction as identified: the force that it takes, with its 95 % band, over the motion "
-            "of the trials."
+            "Identified friction of each axis with its 95 % band, over the motion of the trials."
         )
         blocks.append(_draw_curves("friction", curves, caption))
     shown: set[str] = set()
@@ -52,9 +51,9 @@ def section(results: Results) -> Section | None:
 
 
 def _show_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
-    """Return the blocks of one effect; ``shown``: versions whose worst window is drawn already."""
+    """Return the blocks of one effect; ``shown``: versions whose worst window is already drawn."""
     text = term.text
-    words = [f"**Alternatives.** {_tell_alternatives(results, term.name)}"]
+    words = [f"**Diagnosis.** {_tell_alternatives(results, term.name)}"]
     if text.on_the_machine:
         words.insert(0, f"**On the machine.** {text.on_the_machine}.")
     if text.source:
@@ -94,16 +93,16 @@ def _draw_curve(panel: Axes, curve: TermCurve) -> None:
     panel.set_title(curve.axis)
     panel.set_xlabel(style.label_axis(split_name(curve.variable), unit))
     kind = "torque" if curve.unit.startswith("N.m") else "force"
-    panel.set_ylabel(style.label_axis(f"{kind} it takes", curve.unit))
+    panel.set_ylabel(style.label_axis(f"{kind} taken", curve.unit))
 
 
 def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
-    """Draw the curves of an effect and, once a version, its worst window without and with it."""
+    """Draw the curves of an effect and, once per version, its worst window without and with it."""
     name = f"effect-{term.name.replace(':', '-')}"
-    curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_SHARE]
+    curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_CURVE_SHARE]
     blocks: list[Block] = []
     if term.curves and not curves:
-        words = "No single variable carries a fifth of its force, so that no curve is drawn."
+        words = "No curve is drawn: no single variable accounts for a fifth of its force."
         blocks.append(Paragraph(words))
     found = _find_window(results, term)
     if found is None or found.added in shown:
@@ -128,7 +127,9 @@ def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Blo
         f"he worst window of {found.window.axis} without {found.added} ({found.window.doing}), "
         f"where {change}."
     )
-    beside = f"Left: {_describe(term, [first])} Right: t{caption}" if first else f"T{caption}"
+    beside = (
+        f"Left: {_describe_curves(term, [first])} Right: t{caption}" if first else f"T{caption}"
+    )
     blocks.append(style.finish(figure, name, beside, [top]))
     others = [curve for curve in curves if curve is not first]
     return [*blocks, *_draw_contribution(f"{name}-more", term, others)]
@@ -137,21 +138,21 @@ def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Blo
 def _draw_contribution(name: str, term: ModelTerm, curves: Sequence[TermCurve]) -> list[Block]:
     if not curves:
         return []
-    words = _describe(term, curves)
+    words = _describe_curves(term, curves)
     return [_draw_curves(name, curves, words[:1].upper() + words[1:])]
 
 
-def _describe(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
+def _describe_curves(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
     variables = join_names(dict.fromkeys(curve.variable for curve in curves))
     return (
-        f"the force that `{term.name}` takes, with its 95 % band, against the variable that it "
-        f"follows most ({variables}), over the motion of the trials."
+        f"the force taken by `{term.name}`, with its 95 % band, against its main variable "
+        f"({variables}), over the motion of the trials."
     )
 
 
 @dataclass(frozen=True)
 class _Window:
-    """A window that was worst before effects were ``added``: residuals without and with them."""
+    """The worst window before effects were ``added``: residuals without and with them."""
 
     window: WorstWindow
     added: str
@@ -221,16 +222,16 @@ def _read_diagnoses(results: Results) -> Iterable[DiagnoseResult]:
 
 
 def _tell_alternatives(results: Results, effect: str) -> str:
-    """Say how probable ``effect`` is, and which effects could stand in its place."""
+    """Return the probability of ``effect``, and its alternatives."""
     for diagnosis in _read_diagnoses(results):
         if effect not in diagnosis.selected:
             continue
         known = {n: p for one in diagnosis.axes.values() for n, p in one.probabilities.items()}
         others = diagnosis.alternatives[effect][:_ALTERNATIVES]
         named = (f"`{n}` ({phrases.probability(known.get(n, 0.0))})" for n in others)
-        place = f"In its place: {join_names(named)}" if others else "Nothing else takes its place"
+        place = f"Alternatives: {join_names(named)}" if others else "It has no alternative"
         return f"Its probability is {phrases.probability(known[effect])}. {place}."
-    return "No diagnosis of this run has weighed it against others."
+    return "No diagnosis of this run has compared it with other effects."
 
 
 def _tabulate_weighed(results: Results, added: set[str]) -> list[Table]:
@@ -243,6 +244,6 @@ def _tabulate_weighed(results: Results, added: set[str]) -> list[Table]:
         (one, [f"{text.summary}. " + "; ".join(f"`{line}`" for line in text.formulas[:2])])
         for one in diagnosis.ranking
         if one.effect not in added and (text := texts.get(one.effect.partition(":")[0]))
-    ][:_WEIGHED]
+    ][:_MOST_CANDIDATES]
     title = f"Weighed on model `{diagnosis.model}`, best first"
     return [tabulate_candidates(title, rows, "Description and formula ~2.6")] if rows else []

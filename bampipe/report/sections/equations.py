@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bampipe.report.document import Formulas, Paragraph, Section
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.results.terms import TermsResult
 
 

@@ -13,7 +13,7 @@ from bampipe.lists import join_names
 from bampipe.phrases.results import METHODS
 from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     find_digits,
     format_decimals,
@@ -35,9 +35,9 @@ from bampipe.results.validate import ValidateResult
 
 TITLE = "Identification"
 _LEAST_CALIBRATION = 0.1
-"""Share of an SD from which on a table gives the part that calibration has in it."""
-_COLUMNS, _MOST_ROWS = (2, 3, 4), 7
-"""Of panels: those that leave the fewest places empty, and of these the least."""
+"""Least share of calibration in an SD for which the table gives it."""
+_PANEL_COLUMNS, _MOST_PANEL_ROWS = (2, 3, 4), 7
+"""Columns and rows of panels: of the columns that leave the fewest places empty, the least."""
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
 
@@ -57,7 +57,7 @@ def section(results: Results) -> Section:
     if identified.state_3sigma:
         blocks.append(_tabulate_states(results, identified.state_3sigma))
     trace = results.table(results.model_file("trace.parquet"))
-    # Least squares leaves a row a trial at most: nothing converges along the data.
+    # Least squares stores at most one row per trial: nothing converges along the data.
     if trace is not None and len(trace) > trace["trial_id"].nunique():
         blocks.append(_draw_convergence(results, identified, trace))
     if motion := _draw_motion(results):
@@ -134,7 +134,7 @@ def _qualify_intervals(results: Results) -> str:
 
 
 def _select_parameters(identified: IdentifyResult) -> Mapping[str, ParameterEstimate]:
-    """The parameters without a robot's inertial numbers: motion determines only combinations."""
+    """Return all but a robot's inertial numbers, of which motion determines only combinations."""
     inertial, found = identified.inertial, identified.parameters
     return {name: one for name, one in found.items() if name not in inertial}
 
@@ -176,8 +176,8 @@ def _list_checks(identified: IdentifyResult) -> str:
     if identified.nis is not None:
         mean = format_digits(identified.nis.mean, 2)
         parts.append(
-            f"The mean normalised innovation squared is {mean}; it is 1 where the noise levels "
-            "are right."
+            f"The mean normalised innovation squared is {mean}; it is 1 if the noise levels are "
+            "right."
         )
     lag, sd = 1e3 * timing.estimate, 1e3 * timing.sd  # ms; 0 where it was not estimated
     if sd > 0.0 and abs(lag) < NORMAL_95 * sd:
@@ -192,7 +192,7 @@ def _list_checks(identified: IdentifyResult) -> str:
 def _tabulate_states(results: Results, bounds: Mapping[str, StateBound]) -> Table:
     rows = []
     for axis, one in results.order_axes(bounds).items():
-        # A smoother before least squares bounds no position: no column of dashes for it.
+        # The smoother before least squares gives no bound of position: no column of dashes.
         place = "" if one.position is None else format_scaled(one.position, results.unit(axis))
         rows.append((axis, place, format_scaled(one.velocity, results.rate_unit(axis))))
     caption = f"Error of the filtered state, 3σ bounds{results.cite_paper('Table VI')}"
@@ -214,7 +214,7 @@ def _group_parameters(
 
 def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.DataFrame) -> Figure:
     groups = _group_parameters(results, _select_parameters(identified), trace)
-    few = [n for n in _COLUMNS if len(groups) <= n * _MOST_ROWS] or _COLUMNS[-1:]
+    few = [n for n in _PANEL_COLUMNS if len(groups) <= n * _MOST_PANEL_ROWS] or _PANEL_COLUMNS[-1:]
     columns = min(few, key=lambda columns: (-len(groups) % columns, columns))
     figure, panels = style.make_grid(len(groups), columns, 1.35)
     clock = "t_total" if "t_total" in trace else "t"
@@ -246,7 +246,7 @@ def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.Da
 def _draw_traces(
     results: Results, panel: Any, shown: pd.DataFrame, clock: str, names: Sequence[str]
 ) -> None:
-    """Draw the estimates of one panel with their bounds, and what the design says of them."""
+    """Draw the estimates of one panel with their bounds and design values."""
     t = shown[clock].to_numpy()
     for number, name in enumerate(names):
         axis = name.split(".")[-1]
@@ -277,7 +277,7 @@ def _limit_panel(panel: Any, trace: pd.DataFrame, names: Sequence[str]) -> None:
 
 
 def _draw_motion(results: Results) -> Figure | None:
-    """Draw forces and positions of the first trial, axes that turn beside those that slide."""
+    """Draw forces and positions of the first trial, rotary axes beside sliding ones."""
     path = results.model_file("states.parquet")
     columns = results.columns(path)
     axes = [axis for axis in results.axes if f"q_{axis}" in columns]

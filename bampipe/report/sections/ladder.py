@@ -9,7 +9,7 @@ import numpy as np
 from bampipe.lists import join_names
 from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Figure, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
     choose_scale,
@@ -24,7 +24,7 @@ from bampipe.results.compare import CompareResult, Rung, Value, horizons_of
 
 _MOST_COLUMNS = 3
 _MOST_NUMBERS = 4
-"""Versions of which each can have its number below a panel."""
+"""Most versions for which every number fits below a panel."""
 
 
 def section(results: Results) -> Section | None:
@@ -60,7 +60,7 @@ def _tabulate_errors(results: Results, rungs: Sequence[Rung], axes: Sequence[str
 
 
 def tabulate_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> list[Table]:
-    """Return how far each version left to itself is off: over whole trials, and within horizons."""
+    """Return the errors of each version in free runs: whole trials, and short horizons."""
     found = [_tabulate_free_runs(rungs, axes)] if any(rung.free_run for rung in rungs) else []
     return [*found, _tabulate_drift(rungs, axes)] if horizons_of(rungs) else found
 
@@ -72,7 +72,7 @@ def _choose_scales(
 
 
 def _tabulate_free_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
-    """Position error of each version left to itself: mean absolute, and relative to the motion."""
+    """Tabulate the position error in free runs: mean absolute, and relative to the motion."""
     runs = {axis: [rung.free_run.get(axis) for rung in rungs] for axis in axes}
     scales = _choose_scales(
         {axis: [one.mean_absolute for one in found if one] for axis, found in runs.items()},
@@ -97,7 +97,7 @@ def _tabulate_free_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
 
 
 def _tabulate_drift(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
-    """How far each version drifts within each horizon: the medians."""
+    """Tabulate the median drift of each version within each horizon."""
     horizons = horizons_of(rungs)
     drifts = {axis: [rung.median_drift(axis) for rung in rungs] for axis in axes}
     scales = _choose_scales(
@@ -113,9 +113,9 @@ def _tabulate_drift(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
         rows.append((_name_version(rungs, rung), *cells))
     heads = (f">{axis} ({unit})" for axis, (_, unit) in scales.items())
     within = " / ".join(f"{h:g}" for h in horizons)
-    note = "–: the model runs away or drifts further than the axis moves, or the axis hardly moves."
+    note = "–: the model runs away or drifts farther than the axis moves, or the axis hardly moves."
     return Table(
-        f"Drift of each version left to itself for {within} s under the recorded inputs, median",
+        f"Median drift of each version in free runs of {within} s under the recorded inputs",
         " | ".join(("Version", *heads)),
         rows,
         note if any(NONE in cell for row in rows for cell in row) else "",
@@ -151,7 +151,7 @@ def _draw(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Figur
 
 
 def _name_ticks(first: str, error: np.ndarray) -> list[str]:
-    """Return each version with its error below, of many versions the first and last alone."""
+    """Return each version with its error below; of many versions only the first and the last."""
     names = [first, *(str(number) for number in range(1, len(error)))]
     shown = range(len(error)) if len(error) <= _MOST_NUMBERS else (0, len(error) - 1)
     return [
@@ -161,7 +161,7 @@ def _name_ticks(first: str, error: np.ndarray) -> list[str]:
 
 
 def _describe_change(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
-    """Say by how much the error of each axis changed from the first version to the last."""
+    """Return the change of the error of each axis from the first version to the last."""
     parts = []
     for axis in axes:
         sound = [rung for rung in rungs if axis not in rung.refused] or rungs

@@ -1,12 +1,12 @@
-"""The trial to record next, what it would give, and what the present trials cannot reveal."""
+"""The trial to record next, its expected gain, and the limits of the present trials."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from bampipe.phrases.forecast import compare_forecasts, read_forecasts
+from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts
 from bampipe.report.document import Block, Bullets, Callout, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits, format_percent, format_unit
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
@@ -38,11 +38,11 @@ def section(results: Results) -> Section | None:
             blocks.append(Bullets(tuple(one.replace("RUN", results.root.name) for one in lines)))
     best = found.proposals[0]
     if best.confusion:
-        title = "Probability of taking one effect for the other"
+        title = "Probability of confusing two effects"
         heads = ">with the present trials | >with the next one"
         blocks.append(tabulate_confusion(title, heads, best.confusion))
     if best.sd:
-        title = "Standard deviation of each parameter, now and once the trial has been recorded"
+        title = "Standard deviation of each parameter, now and with the next trial"
         blocks.append(tabulate_sds(title, best.sd))
     if found.sensitivity:
         blocks.append(_tabulate_sensitivity(found.sensitivity))
@@ -52,7 +52,7 @@ def section(results: Results) -> Section | None:
 def tabulate_confusion(
     title: str, heads: str, pairs: Sequence[ExpectedConfusion | PlannedConfusion]
 ) -> Table:
-    """Return the probability of taking one effect for another, without and with new trials."""
+    """Tabulate the probability of confusing two effects, without and with new trials."""
     rows = [
         (
             " or ".join(f"`{name}`" for name in pair.between),
@@ -65,10 +65,10 @@ def tabulate_confusion(
 
 
 def tabulate_sds(title: str, entries: Mapping[str, ExpectedSd]) -> Table:
-    """Return the standard deviations of parameters, without and with new trials.
+    """Tabulate the standard deviations of parameters, without and with new trials.
 
     Args:
-        title: of the table; entries: by parameter; of a plan, the limit that it is to reach, too.
+        title: of the table; entries: by parameter, in a plan with the required limit.
     """
     rows = []
     for name, one in entries.items():
@@ -98,6 +98,6 @@ def _tabulate_sensitivity(table: Mapping[str, Detectable]) -> Table:
         rows,
         "With 90 % probability, for the typical shape of the effect. A dash: such trials do not "
         "reveal it at any size, or the model's own parameters imitate it. Typical: the strength at "
-        "which it is clearly there. A number may grow with the next trial: errors are means over "
+        "which it is clearly visible. A number may grow with the next trial: errors are means over "
         "all trials, and the next one may excite an effect less than the present ones do.",
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from bampipe.report.document import Block, Paragraph, Section, Subheading, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.results.run import RunResult, StepRecord
 
 _DIGITS = 12
@@ -65,7 +65,7 @@ def _order_stages(stages: Mapping[str, StepRecord]) -> list[tuple[str, StepRecor
 
     def rank(step: str) -> int:
         if step not in ranks:
-            ranks[step] = 0  # a record that was tampered with may go round in circles
+            ranks[step] = 0  # a record that was tampered with may be circular
             before = {made_by.get(name, step) for name in stages[step].inputs} - {step}
             ranks[step] = 1 + max(map(rank, before), default=0)
         return ranks[step]

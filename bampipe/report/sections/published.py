@@ -7,7 +7,7 @@ from typing import Any
 
 from bampipe.files import read_json_table
 from bampipe.report.document import Block, Bullets, Callout, Section, Subheading, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import NONE, format_digits, format_unit, format_with_sd
 
 _SIMULATED = Callout(

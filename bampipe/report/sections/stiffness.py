@@ -10,7 +10,7 @@ import pandas as pd
 
 from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     choose_scale,
     format_digits,

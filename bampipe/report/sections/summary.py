@@ -9,7 +9,7 @@ from bampipe.lists import join_names
 from bampipe.phrases.results import METHODS
 from bampipe.report import verdicts
 from bampipe.report.document import Block, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
     count_noun,
@@ -28,7 +28,7 @@ from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import JudgedError, ValidateResult
 
 _MOST_OTHERS = 12
-"""Parameters of no axis that a note can name."""
+"""Most parameters other than friction that a note names."""
 _FRICTION = ("viscous.", "coulomb.")
 _TERMS = (
     "RMSE: root mean square of measured minus predicted force. Noise floor: the error that sensor "
@@ -99,7 +99,7 @@ def _describe_ladder(results: Results) -> str:
 
 
 def _explain_rejection(results: Results, compared: CompareResult) -> str:
-    """Say why no later version counts, although one may have a lower error."""
+    """Say why no later version is accepted, although one may have a lower error."""
     first = compared.ladder[0]
     better = [rung for rung in compared.ladder if rung.has_lower_error_than(first)]
     if not better:

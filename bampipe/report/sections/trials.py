@@ -11,7 +11,7 @@ from typing import Any
 from bampipe.lists import join_names
 from bampipe.phrases import results as phrases
 from bampipe.report.document import Block, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
     format_decimals,
@@ -24,11 +24,11 @@ from bampipe.results.filter import FilterResult
 
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 _BLANK = "\0"
-"""The place of a number that was taken out."""
+"""Placeholder of a number in a remark."""
 _LONG = 60
-"""Letters from which on a remark shared by several trials is printed once, below the table."""
+"""Length from which a remark shared by several trials is printed once, below the table."""
 _SAME_RATE = 0.02
-"""Of the rate of the grid: a mean that differs by less is called the same."""
+"""Largest relative difference between a mean rate and the grid's for which they are the same."""
 
 
 def section(results: Results) -> Section:

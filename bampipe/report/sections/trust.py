@@ -1,11 +1,11 @@
-"""How far the estimates can be trusted: weak directions, trials, tests of the innovations."""
+"""Trust in the estimates: weak directions, trials, tests of the innovations."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 from bampipe.report.document import Block, Bullets, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import format_decimals, format_digits, format_percent, format_unit
 from bampipe.results.identify import IdentifiabilityReport, IdentifyResult, InnovationTests
 
@@ -13,7 +13,7 @@ TITLE = "Trust in the estimates"
 
 
 def section(results: Results) -> Section | None:
-    """Return the section; None where nothing of it is stored."""
+    """Return the section; None if nothing is stored for it."""
     identified = results.read(IdentifyResult)
     if identified is None:
         return None

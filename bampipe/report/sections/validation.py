@@ -1,4 +1,4 @@
-"""Validation: force measured and predicted (Fig. 9), error without friction (Fig. 4), tables."""
+"""Validation: measured and predicted force (Fig. 9), error without friction (Fig. 4), tables."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pandas as pd
 from bampipe.lists import join_names
 from bampipe.report import style, verdicts
 from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
     choose_scale,
@@ -23,7 +23,7 @@ from bampipe.report.wording import (
 from bampipe.results.validate import AxisDrift, ValidateResult
 
 TITLE = "Validation"
-_WINDOW_S = 12.0
+_SHOWN_S = 12.0
 _SETTLE_S = 1.0
 
 
@@ -93,7 +93,7 @@ def _tabulate_trials(results: Results, validated: ValidateResult) -> Table:
 def _tabulate_drift(
     results: Results, validated: ValidateResult, drift: Mapping[str, AxisDrift]
 ) -> list[Block]:
-    """Return how far the model drifts in short free runs, and the reasons where it is unknown."""
+    """Return the drift of the model in short free runs, or the reasons why it is unknown."""
     axes = results.order_axes(drift)
     horizons = sorted({h.horizon_s for one in axes.values() for h in one.horizons})
     reasons = {axis: one.reason for axis, one in axes.items() if one.reason}
@@ -118,7 +118,7 @@ def _tabulate_drift(
             "quantile, and the distance that the axis itself has moved by then."
         )
         columns = " | ".join(("Axis", *heads, "Unit"))
-        blocks.append(Table("Drift of the model left to itself", columns, rows, note))
+        blocks.append(Table("Drift of the model in free runs", columns, rows, note))
     if reasons:
         lines = (f"{axis}: {why[:1].lower()}{why[1:]}" for axis, why in reasons.items())
         blocks.append(Bullets(tuple(lines)))
@@ -145,14 +145,14 @@ def _read_trial(results: Results) -> pd.DataFrame | None:
 
 
 def _draw_forces(results: Results, frame: pd.DataFrame) -> Figure:
-    """Fig. 9: forces at the handle if they are stored with and without friction, else at joints."""
+    """Draw Fig. 9: forces at the handle if both kinds of prediction are stored, else at joints."""
     start = "force_predicted_without_friction_"
     components = [str(n).removeprefix(start) for n in frame.columns if str(n).startswith(start)]
     names = components or [a for a in results.axes if f"torque_measured_{a}" in frame]
     kind = "force" if components else "torque"
     figure, panels = style.make_panels(len(names), 1, 0.45 + 1.2 * len(names), sharex=True)
     t = frame["t"].to_numpy()
-    window = (t >= t[0] + _SETTLE_S) & (t <= t[0] + _SETTLE_S + _WINDOW_S)
+    window = (t >= t[0] + _SETTLE_S) & (t <= t[0] + _SETTLE_S + _SHOWN_S)
     part = frame[window] if window.sum() > 10 else frame
     t = part["t"].to_numpy()
     for panel, name in zip(panels[:, 0], names, strict=True):

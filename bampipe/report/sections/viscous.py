@@ -10,7 +10,7 @@ import pandas as pd
 from bampipe.lists import join_names
 from bampipe.report import style
 from bampipe.report.document import Block, Figure, Paragraph, Section, Table
-from bampipe.report.results import Results
+from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits, format_p_value, format_with_sd
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.viscous import Damping, ViscousResult

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from bampipe.data.quality.stamps import spread_stamps, unroll
 from bampipe.data.session import SECONDS
 from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import spelled
+from bampipe.errors import InputError
 from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted
 
 _RECORDED = ":@time"
@@ -19,6 +21,8 @@ _LIKELY_RATE_HZ = 100.0
 """Assumed for the other guesses where nothing shows the rate."""
 _COUNTERS = frozenset(["tick", "ticks", "cycle", "cycles", "timestep", "timesteps", "cyccnt"])
 """Words in the name of a clock that counts at a rate of its own."""
+_FALLING = 0.9
+"""Share of steps at which the time of a log that is written backwards falls, the least."""
 _SLOW_HZ = 40.0
 """Below, accelerations of a joint that stops within a tenth of a second are not seen."""
 _OF_ROWS = (
@@ -45,8 +49,9 @@ class ProposedClock:
 
 def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     """Propose a clock: by stamps in one column or two, else by counting samples."""
-    counters = [c for c in found.columns if words(c.name) and set(words(c.name)) <= _COUNTERS]
-    times = [*found.of("time"), *counters]
+    counters = [c for c in found.columns if not c.role and not _COUNTERS.isdisjoint(words(c.name))]
+    unnamed = [c for c in found.columns if not c.role and c not in counters and _counts_on(c)]
+    times = [*found.of("time"), *counters, *unnamed]
     seconds = [c for c in times if _whole_seconds(c)]
     rest = [c for c in times if _nanoseconds_on_top(c)]
     if seconds and rest:
@@ -59,18 +64,26 @@ def clock_of(found: Survey, notes: Notes) -> ProposedClock:
         beside = c.name.partition(":")[0] in topics or not topics
         return c.name.endswith(_RECORDED), "stamp" not in words(c.name), not beside
 
-    stamped = sorted(times, key=rank)
+    stamped = [*sorted(found.of("time"), key=rank), *counters, *unnamed]
     column = next((c for c in stamped if _increases(c.values)), None)
     return _counted(found, notes) if column is None else _in_one_column(column, notes)
 
 
 def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
-    stamps = column.values - column.values[np.isfinite(column.values)][0]
+    start = column.values[np.isfinite(column.values)][0]
+    stamps = column.values - start
     known, rows = np.isfinite(stamps), np.arange(len(stamps))
     stamps = np.interp(rows, rows[known], spread_stamps(unroll(stamps[known])[0])[0])
     named = f"column = {quoted(column.name)}"
-    counter = not _COUNTERS.isdisjoint(words(column.name))
-    kind = "" if counter else guesses.time_unit(stamps, column.unit)
+    counter = not _COUNTERS.isdisjoint(words(column.name)) or column.role != "time"
+    kind = "" if counter else guesses.time_unit(stamps + start, column.unit)
+    tick = re.search(r"(?<!\d)(\d+) ?_?(ns|us|ms)(?![A-Za-z])", column.name)
+    if counter and tick:
+        size = float(tick[1]) * SECONDS[tick[2]]
+        note = notes.guess(f"a count of {column.name} is {tick[0]}, by its name")
+        table = _table(named, 'unit = "ticks"', f"ticks_per_s = {1.0 / size:.10g}{note}")
+        rate = _stamped_rate(guesses.sample_rate(stamps * size), notes)
+        return ProposedClock(stamps * size, (column.name,), table, rate)
     if not kind:
         if counter:
             step = float(np.median(np.diff(stamps)))
@@ -123,6 +136,12 @@ def _counted(found: Survey, notes: Notes) -> ProposedClock:
         rate = f"sample_rate_hz = {1.0 / step_s:g}"
         return ProposedClock(step_s * samples, (name,), _table(f'unit = "samples"{note}'), rate)
     stamps = next((column for column in found.of("time") if not column.is_constant), None)
+    if stamps is not None and _FALLING < np.mean(np.diff(stamps.values) < 0.0):
+        raise InputError(
+            f"{stamps.name} falls from row to row: the log is written backwards",
+            where=found.trials[0].file,
+            remedy="turn the order of its rows round",
+        )
     why = "no column increases like a time" if stamps is None else _describe_stamps(stamps)
     note = notes.guess(f"samples are counted: {why}")
     rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, rows a second", _OF_ROWS)
@@ -135,6 +154,13 @@ def _describe_stamps(column: SurveyedColumn) -> str:
     falls, stops = int(np.sum(steps < 0)), int(np.sum(steps == 0))
     what = f"falls at {falls}" if falls > stops else f"does not change at {stops}"
     return f"{column.name} {what} of {len(steps)} steps"
+
+
+def _counts_on(column: SurveyedColumn) -> bool:
+    """Whether a column whose name says nothing rises evenly, otherwise than as a number of rows."""
+    steps = np.diff(column.values)
+    rises = len(steps) > 3 and bool(np.all(steps > 0.0))
+    return rises and bool(np.ptp(steps) < np.median(steps)) and float(np.median(steps)) != 1.0
 
 
 def _table(*lines: str) -> tuple[str, ...]:

@@ -13,8 +13,9 @@ from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
 from bampipe.setup.proposal.positions import in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
-_SURE = 2.0
-"""Standard errors within which a power of two, as most encoders count, is what a turn counts."""
+_SURE, _NEAR = 2.0, 0.025
+"""Standard errors, and share, within which a power of two, as most encoders count, is what a turn
+counts."""
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
 
 
@@ -60,9 +61,11 @@ def _encoder(
             " the angle; put in the ratio of the gear"
         )
     right, geared = column.si == axis.unit, axis.name in match.robot.gears
-    if column.by_looks and not right:
+    if (column.by_looks or column.is_foreign) and not right:
+        stated = f"stated as '{column.stated}'" if column.is_foreign else ""
         note = notes.ask(
-            f"the unit of {column.name}, which looks like the position of {axis.name}",
+            f"the unit of {column.name}, "
+            + (stated or f"which looks like the position of {axis.name}"),
             "who wrote the logger, or by how far the machine moves; rad, deg, m and mm are usual",
         )
         return entry(column.name, UNKNOWN, _velocity_beside(axis, alone, match, notes)) + note
@@ -105,6 +108,12 @@ def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -
 
 def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
     si = f"{axis.unit}/s"
+    if column.is_foreign:
+        note = notes.ask(
+            f"the unit of {column.name}, stated as '{column.stated}', which is integrated",
+            "who wrote the logger; rad/s, rev/min and mm/s are usual",
+        )
+        return entry(column.name, UNKNOWN) + note
     said = spelled(column.unit, _SPEED_UNITS) if column.si == si else ""
     return entry(column.name, said or si) + notes.guess(
         f"no position was recorded: that of {axis.name} is the integral of {column.name}"
@@ -117,7 +126,7 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: No
     zero = worth.zero if worth is not None else float(np.median(column.values))
     turn, sd = (2.0 * np.pi * x for x in ((worth.size, worth.sd) if worth is not None else (0, 0)))
     power = 2.0 ** round(np.log2(turn)) if turn > 0.0 else 0.0
-    is_power = abs(turn - power) < _SURE * sd
+    is_power = abs(turn - power) < max(_SURE * sd, _NEAR * power)
     size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}" if turn > 0.0 else "0.0"
     counting = f"counts_per_unit = {size}, zero_counts = {zero:.0f}"
     table = f'{{ column = {quoted(column.name)}, {counting}, unit = "{axis.unit}" }}'

@@ -19,6 +19,7 @@ _FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "
 _SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])
 _FORCES = frozenset(["force", "forc", "kraft", "loadcell", "fx", "fy", "fz"])
 _TORQUES = frozenset(["torque", "tau", "trq", "moment", "effort", "drehmoment"])
+_LOGGER = "who wrote the logger, or its manual"
 _QUANTITY = {"N": "force", "N.m": "torque", "A": "current", "V": "voltage"}
 _FEWEST_COUNTS = 100
 _MOST_VOLTS = 60.0
@@ -97,14 +98,19 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             volts = notes.guess("the force channels are volts, by their names")
             zero = notes.ask("zero_v, the volts without force", "a log of the unloaded sensor")
         return [f'unit = "V"{volts}', f"calibration_n_per_v = {rows}{ask}", f"zero_v = {row}{zero}"]
-    if any(column.by_looks for column in columns):
+    odd = next((column for column in columns if column.is_foreign), None)
+    if odd is not None or any(c.by_looks or not (c.role or c.unit or why) for c in columns):
+        looks = "which looks like what drives the motion"
         note = notes.ask(
-            f"the unit of {names}, which looks like what drives the motion",
+            f"the unit of {names}, " + (f"stated as '{odd.stated}'" if odd is not None else looks),
             "who wrote the logger; N.m or N of a sensor, V with calibration_n_per_v of counts",
         )
         return [f'unit = "{UNKNOWN}"{note}']
     if device.force_unit == "N.m" and any(_is_force(column) for column in columns):
         note = "" if common else notes.guess(f"{names} is a force in N")
+        if any(column.si == "kg" for column in columns):
+            common = next(unit for unit in ("kgf", "gf") if columns[0].unit.startswith(unit[:-1]))
+            note = notes.guess(f"{names} is the weight of a mass: a force in {common}")
         ask = notes.ask(
             f"lever_m, how far from the axis {names} acts, m",
             "measure it on the machine, or take it from the drawing; if the column is a torque"
@@ -119,14 +125,15 @@ def _is_force(column: SurveyedColumn) -> bool:
     """Whether the column of a drive is a force rather than a torque, by its unit or its name."""
     said = set(words(column.name))
     if column.si is not None:
-        return column.si == "N"
+        return column.si in ("N", "kg")
     return bool(said & _FORCES) and not said & _TORQUES
 
 
 def _needs_gain(column: SurveyedColumn) -> bool:
     """Whether the column of a force is a share or a count, by its name or by whole numbers."""
     counts = column.is_integer and float(np.ptp(column.values)) > _FEWEST_COUNTS
-    return not column.unit and (counts or not _SHARES.isdisjoint(words(column.name)))
+    shares = not _SHARES.isdisjoint(words(column.name))
+    return column.si == "" or (not column.unit and (counts or shares))
 
 
 def _brakes_table(device: Device, match: Matcher, notes: Notes) -> list[str]:
@@ -174,6 +181,15 @@ def _channel(
         if column.stated and not why and register is None:
             return table
         return table + notes.guess(f"{column.name} is {name}{why}{_unscaled(si, column, register)}")
+    if column.is_foreign and si and not register:
+        note = notes.ask(f"the unit of {column.name}, stated as '{column.stated}'", _LOGGER)
+        return entry(column.name, UNKNOWN, fields) + note
+    if register and si and not column.unit:
+        note = notes.ask(
+            f"the unit of {column.name}, what one count is, such as 2.69mA; {register.words}",
+            "the drive's table of registers",
+        )
+        return entry(column.name, UNKNOWN, fields) + note
     likely = si if register else guesses.likely_unit(si, column.values) or si
     if name == "supply" and column.is_integer and float(np.nanmedian(column.values)) > _MOST_VOLTS:
         likely = "0.1V"

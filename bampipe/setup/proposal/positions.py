@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.quality.encoders import integral
+from bampipe.data.quality.encoders import integral, unwrapped
+from bampipe.data.quality.faulty_readings import INPUT, POSITION, find_spikes
 from bampipe.data.quality.stamps import find_fresh_rows
 from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
 from bampipe.data.units import unit
@@ -15,6 +16,8 @@ from bampipe.setup.proposal.notes import Notes
 
 SLIDING = frozenset(["stroke", "displacement", "disp", "dist", "weg", "hub", "carriage", "piston"])
 _FEWEST_COUNTS = 100
+_MOST_WILD = 0.01
+"""Share of the readings that are wild or missing, the most."""
 
 
 def is_velocity(column: SurveyedColumn) -> bool:
@@ -74,7 +77,8 @@ def fresh_readings(found: Survey, notes: Notes) -> Survey:
 def signed_readings(found: Survey) -> tuple[Survey, dict[str, guesses.Register]]:
     """The log with its registers as signed numbers, and how each of them holds its sign.
 
-    A position that counts on where a counter starts anew is no register: ingest unwraps it.
+    A position that counts on where a counter starts anew is no register: like ingest, it is
+    unwrapped, and wild readings are taken out.
     """
     registers = {
         column.name: register
@@ -82,8 +86,16 @@ def signed_readings(found: Survey) -> tuple[Survey, dict[str, guesses.Register]]
         if (register := guesses.find_register(column.values)) is not None
         and (register.sign_bit or column.role != "position")
     }
-    columns = tuple(
-        replace(c, values=registers[c.name].signed(c.values)) if c.name in registers else c
-        for c in found.columns
-    )
-    return replace(found, columns=columns), registers
+    columns = []
+    for c in found.columns:
+        values = registers[c.name].signed(c.values) if c.name in registers else c.values
+        if c.role == "position" and c.name not in registers and (in_counts(c) or c.si == "rad"):
+            values = unwrapped(values, 2.0 * np.pi / c.scale if c.si else 0.0, in_counts(c))[0]
+        if c.role in ("position", *DRIVERS):
+            known = np.isfinite(values)
+            known[known] = ~find_spikes(values[known], POSITION if c.role == "position" else INPUT)
+            if 0 < np.sum(~known) <= _MOST_WILD * len(values):
+                rows = np.arange(len(values))
+                values = np.interp(rows, rows[known], values[known])
+        columns.append(replace(c, values=values))
+    return replace(found, columns=tuple(columns)), registers

@@ -1,4 +1,4 @@
-// Spectrum and correlation of what is in view; the ladder; parameters by version.
+// Spectrum and correlation of the samples in view; the ladder; parameters by version.
 
 const structure = {};
 const ladders = [];
@@ -46,7 +46,7 @@ function drawStructure() {
   const sources = [{ channel: measured, label: "measured", colour: "ink" }, ...residuals.map((channel) => ({ channel, label: `residual, ${labelOf(channel.model)}`, colour: colourOf(channel.model) }))];
   const spectra = sources.map((source) => spectrum(pieces(source.channel, ...view), rate));
   const { frequency } = spectra[0];
-  // What a filter has left of a density far beyond the band has no place on a logarithmic axis.
+  // The remainder of a filtered density far beyond the band has no place on a logarithmic axis.
   const least = FAINTEST * Math.max(...spectra.flatMap((one) => one.density));
   if (frequency.length) {
     structure.spectrum.show({
@@ -151,7 +151,7 @@ function buildParameterMap() {
   host.append(
     tableOf({
       title: "Parameter map",
-      note: "Estimate ± one standard deviation; drawn with the 95 % interval, one row a version, each parameter on its own scale. * At the limit of its range.",
+      note: "Estimate ± one standard deviation; drawn with the 95 % interval, one row per version, each parameter on its own scale. * At the limit of its range.",
       head: ["Parameter", "Unit", ...labels],
       rows: rows.map((row) => row.cells.slice(0, 2 + labels.length)),
       texts: rows.map((row) => row.texts),

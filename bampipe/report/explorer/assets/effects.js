@@ -5,7 +5,7 @@ const percentOf = (share) => (share > 0 && share < 0.01 ? "< 1 %" : `${Math.roun
 function buildEffects() {
   const host = document.getElementById("effect-list");
   if (!content.verdicts.length) {
-    host.append(make("p", {}, "No effects have been weighed yet: bampipe diagnose does that."));
+    host.append(make("p", {}, "No effects have been compared yet: run bampipe diagnose."));
   }
   for (const verdict of content.verdicts) host.append(verdictOf(verdict));
 }
@@ -40,7 +40,7 @@ function bar(name, share, place, evidence) {
   return button;
 }
 
-/** What speaks for an effect: errors without and with it, chance, sets that hold it, its looks. */
+/** Evidence for an effect: errors without and with it, chance, sets that contain it, its signature. */
 function evidenceOf({ name, ranked, said, sets }, model, axis) {
   const found = [make("p", {}, make("code", {}, name), said ? `: ${said.summary}` : "")];
   if (ranked) {
@@ -50,14 +50,14 @@ function evidenceOf({ name, ranked, said, sets }, model, axis) {
       make("p", {}, `Held-out error of ${axis} ${format(ranked.held_out_rmse_before, 3)} ${ranked.unit} without it, ${format(ranked.held_out_rmse_after, 3)} ${ranked.unit} with it (${format(fall, 2)} % less); gain ${format(ranked.score, 3)} nats. Replicates of the model give some candidate such a gain with probability ${format(ranked.p_value, 2)}.`),
     );
     if (numbers.length) found.push(make("p", {}, `Fitted: ${numbers.join(", ")}.`));
-    if (ranked.indistinguishable_from.length) found.push(make("p", {}, `These trials do not tell it from ${ranked.indistinguishable_from.join(", ")}.`));
+    if (ranked.indistinguishable_from.length) found.push(make("p", {}, `These trials do not distinguish it from ${ranked.indistinguishable_from.join(", ")}.`));
   }
   if (said) {
-    found.push(make("p", {}, `What it looks like: ${said.looks_like}.`));
+    found.push(make("p", {}, `Signature: ${said.looks_like}.`));
     if (said.on_the_machine) found.push(make("p", {}, `On the machine: ${said.on_the_machine}.`));
   }
   if (sets.length) {
-    found.push(make("p", {}, "Sets of effects that hold it:"), make("ul", {}, ...sets.map((one) => make("li", {}, `${one.effects}: ${percentOf(one.probability)}`))));
+    found.push(make("p", {}, "Sets that contain it:"), make("ul", {}, ...sets.map((one) => make("li", {}, `${one.effects}: ${percentOf(one.probability)}`))));
   }
   return [...found, ways(axis, model)];
 }

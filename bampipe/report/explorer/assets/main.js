@@ -1,4 +1,4 @@
-// What belongs together: the view, the cursor, the mark, the versions shown.
+// State that all figures share: the view, the cursor, the mark, the versions shown.
 
 let waiting = 0;
 
@@ -35,7 +35,7 @@ function setMark(mark) {
   const place = document.getElementById("marked");
   place.hidden = !mark;
   if (mark) {
-    const clear = make("button", { type: "button", onclick: () => setMark(null) }, "Take the mark off");
+    const clear = make("button", { type: "button", onclick: () => setMark(null) }, "Remove the mark");
     place.replaceChildren(`${mark.rows.size} samples marked: ${mark.words}. `, clear);
   }
   drawTraces();
@@ -146,7 +146,7 @@ function buildControls() {
   }
   if (content.models.length > 1) {
     const { label, name } = content.models[content.shown];
-    host.append(make("p", { class: "remark counts" }, `${label === name ? name : `${label} (${name})`} is the version that counts: the report is about it.`));
+    host.append(make("p", { class: "remark counts" }, `${label === name ? name : `${label} (${name})`} is the version that the report shows.`));
   }
   const axes = content.axes.filter(({ name }) => find({ role: "measured", axis: name }).length);
   if (axes.length > 1) {
@@ -184,7 +184,7 @@ async function start() {
   buildEffects();
   buildTables();
   if (!content.trials.length) {
-    document.getElementById("plots").append(make("p", {}, "No trial of this session could be used: the table of trials says why."));
+    document.getElementById("plots").append(make("p", {}, "No trial of this session could be used: the table of trials gives the reasons."));
     document.documentElement.dataset.complete = String(Math.round(performance.now()));
     return;
   }

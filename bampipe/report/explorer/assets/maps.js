@@ -1,4 +1,4 @@
-// Residual maps: every sample against what might cause its residual, linked with the traces.
+// Residual maps: every sample against possible causes of its residual, linked with the traces.
 
 const MOST_DOTS = 6000;
 const MOST_MAPS = 6;
@@ -191,7 +191,7 @@ async function buildMaps() {
   host.replaceChildren();
   const variables = variablesOf(state.axis);
   if (!variables.length) {
-    host.append(make("p", { class: "remark" }, `No diagnosis of ${state.axis} yet: bampipe diagnose ${content.session} makes its maps.`));
+    host.append(make("p", { class: "remark" }, `No diagnosis of ${state.axis} yet: run bampipe diagnose ${content.session}.`));
     return;
   }
   const add = (one) => maps.set(one.variable, new ResidualMap(host, state.axis, one));

@@ -57,7 +57,7 @@ async function buildPose() {
   drawPose();
 }
 
-/** What holds the arm in all its poses, some hundred of them tried: middle and half the width, m. */
+/** A square that holds the arm in some hundred poses: middle and half the width, m. */
 function frameOf(grid) {
   const [low, high] = [[0, 0, 0], [0, 0, 0]];
   for (let i = 0; i < grid.length; i += Math.ceil(grid.length / POSES)) {

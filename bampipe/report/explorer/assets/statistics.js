@@ -1,4 +1,4 @@
-// Spectrum and correlation of what is in view.
+// Spectrum and correlation of the samples in view.
 
 /** Fast Fourier transform in place; the length is a power of two. */
 function transform(re, im) {
@@ -30,7 +30,7 @@ function transform(re, im) {
   }
 }
 
-/** Samples of a channel in view, one array a trial, gaps closed. */
+/** Samples of a channel in view, one array per trial, gaps closed. */
 function pieces(channel, from, to) {
   return channel.on
     .segments(from, to)

@@ -29,7 +29,7 @@ from bampipe.report.wording import (
 from bampipe.results.floor import AT_FLOOR
 from bampipe.results.lab import ControlChart, SessionVerdict, TrendsResult
 
-_COLUMNS = 3
+_PANEL_COLUMNS = 3
 _MOST_PANELS = 12
 _MOST_NAMES = 12
 _MOST_CALLOUTS = 6
@@ -37,7 +37,7 @@ _MOST_TRIALS = 40
 _TICKS = (0.5, 1, 2, 5, 10, 20, 50, 100)
 
 
-def build_report(folder: Path, pages: Mapping[str, str]) -> Report:
+def build_lab_report(folder: Path, pages: Mapping[str, str]) -> Report:
     """Return the report of the lab's folder.
 
     Args:
@@ -51,7 +51,7 @@ def build_report(folder: Path, pages: Mapping[str, str]) -> Report:
     moments = [one.recorded for one in trends.sessions if one.recorded]
     document = Document("All sessions", _make_subtitle(trends, moments), tuple(sections))
     stamps = (int(datetime.fromisoformat(moment).timestamp()) for moment in moments)
-    return Report.of(document, max(0, *stamps, 0))
+    return Report.from_document(document, max(0, *stamps, 0))
 
 
 def _make_subtitle(trends: TrendsResult, moments: Sequence[str]) -> str:
@@ -87,10 +87,10 @@ def _summarise(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
         for one in trends.sessions
     ]
     columns = (
-        "Session | Recorded (UTC) | Model that counts ~1.2 | >Error / floor, worst axis"
+        "Session | Recorded (UTC) | Best confirmed model ~1.2 | >Error / floor, worst axis"
         " | Beyond its limits ~1 | Verdict ~0.8"
     )
-    note = "Error of that model on unseen trials, over the error that sensors and filters leave."
+    note = "Error of that model on unseen trials over the noise floor of sensors and filters."
     blocks.append(Table("Sessions in the order of recording", columns, rows, note))
     return Section("Summary", tuple(blocks))
 
@@ -147,7 +147,7 @@ def _show_charts(trends: TrendsResult) -> list[Section]:
         for start in range(0, len(charts), _MOST_PANELS):
             part = charts[start : start + _MOST_PANELS]
             number = f"-{start // _MOST_PANELS + 1}" if len(charts) > _MOST_PANELS else ""
-            figure, panels = style.make_grid(len(part), _COLUMNS, 1.75, extra=0.25)
+            figure, panels = style.make_grid(len(part), _PANEL_COLUMNS, 1.75, extra=0.25)
             for panel, chart in zip(panels, part, strict=True):
                 _draw_chart(panel, chart)
             caption = "Parameters of the base model and stiffnesses, session by session."
@@ -194,7 +194,7 @@ def _draw_chart(panel: Axes, chart: ControlChart) -> None:
 
 
 def _name_sessions(panel: Axes, names: list[str]) -> None:
-    """Name every n-th session below a panel, upright where names are long."""
+    """Name every n-th session below a panel, vertically if names are long."""
     places = range(0, len(names), -(-len(names) // _MOST_NAMES))
     shown = [names[place] for place in places]
     panel.set_xlim(-0.5, len(names) - 0.5)
@@ -244,12 +244,12 @@ def _show_errors(folder: Path, trends: TrendsResult) -> list[Section]:
     sessions = [one.session for one in trends.sessions if one.session in with_error]
     axes = list(dict.fromkeys(frame["axis"]))
     counts = (frame["model"] == frame["session_id"].map(model_of)) & (frame["model"] != "base")
-    figure, panels = style.make_grid(len(axes), _COLUMNS, 1.9)
+    figure, panels = style.make_grid(len(axes), _PANEL_COLUMNS, 1.9)
     for panel, axis in zip(panels, axes, strict=True):
         panel.axhspan(0.0, AT_FLOOR, color=style.GREEN, alpha=0.12, lw=0)
         for chosen, colour, mark, name in (
             (frame["model"] == "base", style.BLUE, "o", "base model"),
-            (counts, style.VERMILLION, "D", "model that counts, where extended"),
+            (counts, style.VERMILLION, "D", "best confirmed model, if extended"),
         ):
             part = frame[chosen & (frame["axis"] == axis)]
             x = [sessions.index(session) for session in part["session_id"]]
@@ -267,8 +267,7 @@ def _show_errors(folder: Path, trends: TrendsResult) -> list[Section]:
     caption = "Error on unseen trials over the noise floor, session by session."
     text = (
         "The noise floor is the error that sensors and filters leave if the model is exactly "
-        f"right. In the green band, below {AT_FLOOR:g}, a model leaves nothing that the session "
-        "could show."
+        f"right. In the green band, below {AT_FLOOR:g}, the session shows no further effect."
     )
     picture = style.finish(figure, "errors", caption, panels[:1])
     return [Section("Prediction", (Paragraph(text), picture))]

@@ -1,4 +1,4 @@
-"""Two sessions of one device side by side: what changed, and whether a model travels."""
+"""Comparison of two sessions of one device: changed parameters, and whether models travel."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ from bampipe.run import models
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import read_measured_trials
 
-_MAPPED = ("position", "velocity", "direction")
-_BINS, _FEWEST, _SHOWN = 8, 12, 5
+_MAPPED_VARIABLES = ("position", "velocity", "direction")
+_MAP_BINS, _FEWEST_SAMPLES, _MOST_REFITS = 8, 12, 5
 _LEAST_GAIN = 0.03
 """Share of an axis' error above its limit that a further parameter has to remove."""
-_STEPS = 4
+_REFIT_STEPS = 4
 """Gauss-Newton steps of a refit of parameters in which the residual is not linear."""
 
 
@@ -74,14 +74,14 @@ class _Side:
         return tuple(effect.name for effect in self.system.model.effects)
 
     def predict(self, other: _Side) -> Evidence:
-        """This model on the trials of ``other``, not refitted."""
+        """Return this model on the trials of ``other``, not refitted."""
         trials = read_measured_trials(other.run, self.system, timing=other.found.input_timing)
         return gather_evidence(
             self.system, trials.motions, trials.band, self.p, trials.folds, most_iterations=0
         )
 
     def covariance(self, evidence: Evidence) -> Array:
-        """Of the free parameters, (n_free, n_free); 0 of what is not estimated."""
+        """Return the covariance of the free parameters, (n_free, n_free); 0 if not estimated."""
         known = self.found.covariance
         free = [self.system.parameters[i].name for i in evidence.free]
         frame = pd.DataFrame(known.matrix, list(known.names), list(known.names))
@@ -105,11 +105,12 @@ def compare_runs(
 
     Args:
         first, second: run folders.
-        model: of both; the best confirmed one of each where empty.
+        model: of both sessions; if empty, the best confirmed one of each.
         progress: called with the share done.
 
     Raises:
-        InputError: other devices, axes or parameters, one run twice, or a stage has not run.
+        InputError: devices, axes or parameters differ, a run is given twice, or a stage has not
+            run.
     """
     roots = [open_run(run).root for run in (first, second)]
     differ = roots[0].name != roots[1].name
@@ -119,7 +120,7 @@ def compare_runs(
     there, back = a.predict(b), b.predict(a)
     journeys = []
     for one, other, evidence in ((a, b, there), (b, a, back)):
-        progress(0.3, f"what the model of {one.name} lacks on {other.name}")
+        progress(0.3, f"effects that the model of {one.name} lacks on {other.name}")
         journeys.append(_describe_journey(one, other, evidence))
     progress(0.9, "residual by state")
     parameters, alone = _compare_parameters(a, b)
@@ -137,7 +138,7 @@ def compare_runs(
 
 
 def _require_one_device(a: _Side, b: _Side) -> list[str]:
-    """Refuse sessions that cannot be compared; return what to know of others."""
+    """Refuse sessions that cannot be compared; return notes on the others."""
     if a.run.root.resolve() == b.run.root.resolve():
         raise InputError("this is one run twice", where=str(a.run.root))
     facts = [_list_facts(side.system) for side in (a, b)]
@@ -156,12 +157,12 @@ def _require_one_device(a: _Side, b: _Side) -> list[str]:
     changed = sorted(key for key in keys if one.get(key) != other.get(key))
     notes = [f"The device files differ in {join_names(changed)}."] if changed else []
     if a.effects != b.effects:
-        notes.append("The models differ, so that their common parameters stand beside others.")
+        notes.append("The models have different effects beside their common parameters.")
     return notes
 
 
 def _list_facts(system: System) -> dict[str, set[str]]:
-    """What sessions of one device have in common, whatever the effects in their models."""
+    """Return the device, axes and own parameters, which sessions of one device share."""
     of_effects = {q.name for effect in system.model.effects for q in effect.parameters}
     own = (q for q in system.parameters if q.name not in of_effects)
     return {
@@ -174,7 +175,7 @@ def _list_facts(system: System) -> dict[str, set[str]]:
 def _compare_parameters(
     a: _Side, b: _Side
 ) -> tuple[dict[str, ParameterChange], dict[str, list[str]]]:
-    """Common parameters; and those of one model only, by session."""
+    """Return the common parameters, and those of one model only, by session."""
     tables: list[dict[str, ParameterEstimate | BaseEstimate]] = []
     for side in (a, b):
         every, inertial = side.found.parameters, side.found.inertial
@@ -202,7 +203,7 @@ def _compare_parameters(
 
 
 def correct_p_values(z: Sequence[float]) -> list[float]:
-    """Two-sided p-values of standard normal numbers, corrected for their number (Holm 1979)."""
+    """Return two-sided p-values of standard normal numbers, corrected by Holm (1979)."""
     p = np.array([math.erfc(abs(value) / math.sqrt(2.0)) for value in z])
     order, found = np.argsort(p), np.ones(len(p))
     found[order] = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
@@ -210,13 +211,13 @@ def correct_p_values(z: Sequence[float]) -> list[float]:
 
 
 def _compare_states(a: _Side, here: Evidence, there: Evidence) -> tuple[StateChange, ...]:
-    """Residual of the model of ``a`` on both sessions by state, in bins of equal count."""
+    """Return the residual of the model of ``a`` on both sessions by state, in equal bins."""
     spread, found, every = a.covariance(here), [], []
     for axis, name in enumerate(a.system.coordinates):
         pairs = zip(variables(here, axis), variables(there, axis), strict=True)
-        for one, other in ((x, y) for x, y in pairs if x.name in _MAPPED):
+        for one, other in ((x, y) for x, y in pairs if x.name in _MAPPED_VARIABLES):
             x, y = (np.concatenate(v.values) for v in (one, other))
-            edges = np.unique(np.quantile(np.append(x, y), np.linspace(0.0, 1.0, _BINS + 1)))
+            edges = np.unique(np.quantile(np.append(x, y), np.linspace(0.0, 1.0, _MAP_BINS + 1)))
             if one.name == "direction":
                 edges = np.array([-1.5, 0.0, 1.5])
             bins = [_bin_residual(e, axis, v, edges) for e, v in ((here, x), (there, y))]
@@ -240,9 +241,9 @@ def _compare_states(a: _Side, here: Evidence, there: Evidence) -> tuple[StateCha
 
 
 def _bin_residual(e: Evidence, axis: int, values: Array, edges: Array) -> pd.DataFrame:
-    """By bin: center, mean residual, its standard error sd, count, and the mean slopes.
+    """Return, by bin, centre, mean residual, its standard error sd, count and mean slopes.
 
-    The error is that of the scatter between trials where it is more than that of the samples.
+    The standard error is the larger one of those within and between trials.
     """
     use = np.concatenate([used[:, axis] for used in e.used])
     trial = np.repeat(np.arange(len(e.used)), [len(used) for used in e.used])[use]
@@ -259,7 +260,7 @@ def _bin_residual(e: Evidence, axis: int, values: Array, edges: Array) -> pd.Dat
     between = np.sqrt((by_trial**2).groupby(level=0).sum()) / count
     means.insert(2, "sd", np.maximum(within, between))
     means.insert(3, "count", count)
-    return means[count >= _FEWEST]
+    return means[count >= _FEWEST_SAMPLES]
 
 
 def _make_map(bins: pd.DataFrame, unit: str) -> ResidualMap:
@@ -269,7 +270,7 @@ def _make_map(bins: pd.DataFrame, unit: str) -> ResidualMap:
 
 
 def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
-    """The model of one session on the trials of the other, and what would make it travel."""
+    """Return the model of one session on the trials of the other, and refits that travel."""
     judged = list(np.flatnonzero(e.folds.judged))
     count = np.maximum(e.sums.count[judged].sum(axis=0), 1.0)
     of_spread = np.einsum("kaij,ij->a", e.sums.xx[judged], model.covariance(e))
@@ -280,7 +281,7 @@ def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
         judge = trials.validated.axes[axis]
         least = judge.noise_floor
         if least is None or model.validated.axes[axis].standing != "at_floor":
-            # It lacks something on its own trials, too, which is no change.
+            # It lacks something on its own trials too: that is no change.
             least = max(judge.held_out_rmse, least or 0.0)
         limit = AT_FLOOR * math.hypot(least, spread[i]) + FLOOR_SDS * judge.noise_floor_sd
         axes[axis] = Travel(
@@ -296,7 +297,7 @@ def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
     alone = [_refit(e, [k], limits) for k in range(len(e.free))]
     alone.sort(key=lambda one: float(np.sum((np.array([*one.errors.values()]) / limits) ** 2)))
     together = _refit_together(e, limits)
-    update: dict[str, object] = {"alone": tuple(alone[:_SHOWN]), "together": together}
+    update: dict[str, object] = {"alone": tuple(alone[:_MOST_REFITS]), "together": together}
     doubtful = {*journey.failed} - {*(together.travels if together is not None else ())}
     doubtful |= {a for a, v in trials.validated.axes.items() if v.standing == "above_floor"}
     if doubtful:
@@ -305,7 +306,7 @@ def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
 
 
 def _refit_together(e: Evidence, limits: Array) -> Refit | None:
-    """Parameters added one at a time while each brings some axis nearer to its limit."""
+    """Refit parameters, added one at a time while each brings some axis nearer to its limit."""
     chosen: list[int] = []
     error = np.sqrt(e.sums.yy.sum(axis=0) / np.maximum(e.sums.count.sum(axis=0), 1.0))
     while len(chosen) < len(e.free) and np.any(error > limits):
@@ -320,7 +321,7 @@ def _refit_together(e: Evidence, limits: Array) -> Refit | None:
 
 
 def _sum_excess(error: Array, limits: Array) -> float:
-    """Log of the errors over their limits, summed over the axes above them."""
+    """Return the sum of log(error / limit) over the axes above their limits."""
     return float(np.sum(np.log(np.maximum(error / limits, 1.0))))
 
 
@@ -329,7 +330,7 @@ def _refit(e: Evidence, chosen: list[int], limits: Array) -> Refit:
     start, free = e.p, list(e.free)
     step, error = _solve(e, chosen, limits)
     if not all(e.system.constant[free[k]] for k in chosen):
-        for _ in range(_STEPS):
+        for _ in range(_REFIT_STEPS):
             p = e.p.copy()
             p[[free[k] for k in chosen]] += step
             e = gather_evidence(e.system, e.motions, e.band, p, e.folds, most_iterations=0)
@@ -346,7 +347,7 @@ def _refit(e: Evidence, chosen: list[int], limits: Array) -> Refit:
 
 
 def _solve(e: Evidence, chosen: list[int], limits: Array) -> tuple[Array, Array]:
-    """A linear step of some free parameters, and the error on trials left out of it, (n_q,)."""
+    """Return a linear step of some free parameters and its error on held-out trials, (n_q,)."""
     sums, groups = e.sums, np.array(e.folds.groups)
     fitted, judged = np.array(e.folds.fitted), np.array(e.folds.judged)
     xx = sums.xx[:, :, chosen][:, :, :, chosen]
@@ -369,7 +370,7 @@ def _solve(e: Evidence, chosen: list[int], limits: Array) -> tuple[Array, Array]
 
 
 def _find_lacking(model: _Side, trials: _Side, axes: Collection[str]) -> dict[str, object]:
-    """What the model's like in the other session lacks on ``axes``; without one, its own model."""
+    """Return what a model with the same effects lacks in the other session, by axis."""
     root, found = trials.run.root, models.names(trials.run.root)
     alike = (m for m in found if {*models.read(root, m).effects} == {*model.effects})
     name = next(alike, trials.model)

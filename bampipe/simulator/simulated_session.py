@@ -1,8 +1,8 @@
-"""A session in the raw-log format, recorded from the model itself, with effects hidden in it.
+"""A simulated session in the raw-log format, with hidden effects.
 
 The specimen is the compiled model with the effects of kind torque and energy; the effects of kind
-input and measurement act on what its sensors read. The truth goes into a file beside the session
-folder, never inside.
+input and measurement act on the readings of its sensors. The truth goes into a file beside the
+session folder, never inside.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bampipe.files import write_json, write_text
 from bampipe.physics.device import Device
 from bampipe.progress import Progress, silent
 from bampipe.results.truth import TruthResult
-from bampipe.simulator.recording import format_session_file, record_trial
+from bampipe.simulator.sensor_log import format_session_file, record_trial
 from bampipe.simulator.specimen import Config, draw_specimen
 from bampipe.simulator.true_trials import simulate_locked_trial, simulate_moving_trial
 
@@ -49,7 +49,7 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError("exists and is not an empty folder", where=str(out))
     specimen, strengths = draw_specimen(config)
-    trials = _plan(specimen.device, config)
+    trials = _list_trials(specimen.device, config)
     try:
         (out / "trials").mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -87,8 +87,7 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
 
 
 def _check(config: Config) -> None:
-    positive = ("duration", "sample_rate", "amplitude", "viscous_damping")
-    for name in positive:
+    for name in ("duration", "sample_rate", "amplitude", "viscous_damping"):
         if not 0 < getattr(config, name) < float("inf"):
             raise InputError(f"{name} must be positive, found {getattr(config, name)!r}")
     for name in ("strength", "force_noise", "trials", "viscous_trials", "seed"):
@@ -104,8 +103,8 @@ def _check(config: Config) -> None:
         raise InputError(f"file format {config.file_format!r} is neither csv nor parquet")
 
 
-def _plan(device: Device, config: Config) -> list[dict[str, str]]:
-    """The ``[[trials]]`` entries."""
+def _list_trials(device: Device, config: Config) -> list[dict[str, str]]:
+    """Return the ``[[trials]]`` entries."""
     kinds = [("free", "")] * config.trials + [("viscous", "")] * config.viscous_trials
     if config.locked_trials:
         kinds += [("locked", c.name) for c in device.coordinates if c.name in device.brakes]

@@ -6,14 +6,14 @@ import numpy as np
 
 from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Callout, Document, Figure, Section, Table, Tone
-from bampipe.report.page import page
+from bampipe.report.page import render_page
 from bampipe.report.sections.diagnosis import draw_map
 from bampipe.report.wording import count_noun, format_digits, format_p_value, format_unit
 from bampipe.results.pair import PairResult
 
 
 def tabulate_pair(pair: PairResult) -> list[Table]:
-    """Return parameters, verdicts, predictions and refits; tables without rows left out."""
+    """Return parameters, verdicts, predictions and refits; empty tables are left out."""
     sides, axes = (pair.first, pair.second), list(pair.journeys[0].axes)
     parameters = [
         (
@@ -78,7 +78,7 @@ def build_page(pair: PairResult) -> str:
         blocks += [*tabulate_pair(pair), *(_draw_states(pair, a) for a in pair.journeys[0].axes)]
     title = f"{pair.first.session} and {pair.second.session}"
     sections = (Section("What changed", tuple(blocks)),)
-    return page(Document(title, f"device {pair.device}", sections))
+    return render_page(Document(title, f"device {pair.device}", sections))
 
 
 def _draw_states(pair: PairResult, axis: str) -> Figure:

@@ -1,4 +1,4 @@
-"""What the sensors and the logger of a simulated machine write: counts, volts, brake commands."""
+"""The log of a simulated machine: encoder counts, volts of the force sensor, brake commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
 from bampipe.physics.system import System
-from bampipe.simulator.specimen import Config, Specimen, input_column
+from bampipe.simulator.specimen import Config, Specimen, find_input_column
 from bampipe.simulator.true_trials import TrueTrial
 
 ENCODERS = {
@@ -30,7 +30,7 @@ _TOO_HIGH = range(3, len(INPUT_ORDERS))
 def record_trial(
     specimen: Specimen, config: Config, rng: np.random.Generator, true: TrueTrial, locked: bool
 ) -> pd.DataFrame:
-    """Return what the logger writes: whole counts, volts, brake commands."""
+    """Return the columns of the log: whole counts, volts, brake commands."""
     device = specimen.device
     force = _sensed_force(specimen, true) + config.force_noise * rng.normal(size=true.force.shape)
     # A locked trial winds up the transmission itself: the encoder sees the deflection as given.
@@ -50,7 +50,7 @@ def record_trial(
 
 
 def _sensor_inputs(system: System, true: TrueTrial, force: Array) -> Array:
-    """Columns of u for the sensor models."""
+    """Return the inputs of the sensor models, (T, nu)."""
     u = np.zeros((len(true.t), len(system.inputs)))
     for j, f in enumerate(system.model.device.forces):
         u[:, system.inputs.index(f)] = force[:, j]
@@ -63,7 +63,7 @@ def _sensor_inputs(system: System, true: TrueTrial, force: Array) -> Array:
 
 
 def _sensed_position(specimen: Specimen, true: TrueTrial, force: Array) -> Array:
-    """The reading q_m that solves q_true = q_m + offset(q_m), by iteration; ``force`` loads it."""
+    """Solve q_true = q_m + offset(q_m) for the reading q_m by iteration, loaded by ``force``."""
     if specimen.position is None:
         return true.q
     system = specimen.position
@@ -78,11 +78,11 @@ def _sensed_position(specimen: Specimen, true: TrueTrial, force: Array) -> Array
 
 
 def _sensed_force(specimen: Specimen, true: TrueTrial) -> Array:
-    """The reading of the force sensor, without noise.
+    """Return the reading of the force sensor, without noise.
 
-    The effects say true = T(reading). T is affine in the reading and its two derivatives, so its
-    coefficients at each sample follow from probing it; the reading then solves the equation,
-    sample by sample where derivatives take part (implicit differences, stable for any lag).
+    The effects state true = T(reading), where T is affine in the reading and its two derivatives.
+    Its coefficients at each sample follow from unit inputs; the equation is then solved for the
+    reading, sample by sample if it has derivatives (implicit differences, stable for any lag).
     """
     late = np.column_stack(
         [np.interp(true.t - specimen.delay, true.t, column) for column in true.force.T]
@@ -95,27 +95,27 @@ def _sensed_force(specimen: Specimen, true: TrueTrial) -> Array:
     p, no_states = specimen.p(system), np.zeros((len(late), 0))
     still, names = np.zeros_like(true.q), specimen.device.forces
 
-    def corrected(u: Array) -> Array:
+    def correct_reading(u: Array) -> Array:
         applied = system.applied(true.q, true.qd, still, no_states, u, p)
         return system.least_force(true.q, applied)
 
     zero = _sensor_inputs(system, true, np.zeros_like(late))
-    constant = corrected(zero)
-    if any(input_column(system, derivative(f, k)) >= 0 for f in names for k in _TOO_HIGH):
+    constant = correct_reading(zero)
+    if any(find_input_column(system, derivative(f, k)) >= 0 for f in names for k in _TOO_HIGH):
         raise InputError("an input effect with a third derivative cannot be simulated")
     response = np.zeros((3, len(late), nf, nf))
     for order in range(3):
         for j, f in enumerate(names):
-            column = input_column(system, derivative(f, order))
+            column = find_input_column(system, derivative(f, order))
             if column >= 0:
                 u = zero.copy()
                 u[:, column] = 1.0
-                response[order, :, :, j] = corrected(u) - constant
+                response[order, :, :, j] = correct_reading(u) - constant
     side = late - constant
     if not response[1:].any():
         reading = np.linalg.solve(response[0], side[:, :, None])[:, :, 0]
-        if not np.allclose(corrected(_sensor_inputs(system, true, reading)), late, atol=1e-6):
-            raise InputError("an input effect is not linear in the force: cannot be simulated")
+        if not np.allclose(correct_reading(_sensor_inputs(system, true, reading)), late, atol=1e-6):
+            raise InputError("an input effect is not linear in the force and cannot be simulated")
         return np.asarray(reading)
     h = true.t[1] - true.t[0]
     reading = np.empty_like(late)

@@ -1,4 +1,4 @@
-"""The best of many primitives: tried exactly, in other surroundings, and as people follow them."""
+"""Ranking of designs: followed exactly, in other surroundings, and roughly, as people do."""
 
 from __future__ import annotations
 
@@ -9,27 +9,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.arrays import Array
-from bampipe.next_trial.motion import HASTY, Rehearsal
 from bampipe.next_trial.primitives import Primitive, find_beyond, list_primitives, vary_surroundings
+from bampipe.next_trial.rehearsal import HASTY, Rehearsal
 from bampipe.trials.motion import Motion
 
 _VERSIONS = (1, 2, 3, 4, HASTY)
-"""As followed by different people."""
-_WORK = 2.5e7
-"""Samples times parameters of all designs that are tried exactly: of a robot with 80 numbers each
-takes seconds, and some are left out."""
-_FEWEST = 12
-_FINALISTS, _OF_FEW = 5, 2
-_FOLLOWED = 4
-"""For each finalist, so many designs are also tried as somebody hasty follows them."""
-_VARIED = 2
-"""Of the best, so many are tried in other surroundings."""
+"""Versions of a design as different people follow it."""
+_MOST_WORK = 2.5e7
+"""Samples times parameters of all designs that are tried exactly. For a robot with 80 parameters
+each design takes seconds, so that some are left out."""
+_FEWEST_DESIGNS = 12
+_MOST_FINALISTS, _FEWER_FINALISTS = 5, 2
+_FOLLOWED_HASTILY = 4
+"""Number of designs, for each finalist, that are also tried as somebody hasty follows them."""
+_MOST_VARIED = 2
+"""Number of the best designs that are tried in other surroundings."""
 _QUANTILE = 0.1
-"""Of the utility over versions, by which designs are ranked: a bad day must still do."""
-_PREMIUM = 0.05
-"""Share of its utility by which a design that leaves what has been seen must be better than one
-that stays within: what is new to machine and model has to pay, and less than that is lost in the
-scatter between people."""
+"""Quantile of the utility over versions that ranks designs: a bad day must still be useful."""
+_PREMIUM_BEYOND = 0.05
+"""Relative utility by which a design beyond the range of the trials must exceed one within it: a
+smaller gain is lost in the scatter between people and not worth the risk."""
 
 Utility = Callable[[Motion], float]
 """Utility of a motion: larger is better."""
@@ -41,11 +40,11 @@ class DesignSpace:
     """The designs that are tried.
 
     Attributes:
-        rehearsal: what they are tried with.
-        seconds: how long each is; axes: that they are about.
-        examples: designs that are tried beside the primitives.
+        rehearsal: the model, sensors and filters with which they are tried.
+        seconds: length of each; axes: the axes that they excite.
+        examples: further designs beside the primitives.
         with_rests: whether an axis may rest at the turns; with_brakes: whether brakes may be on.
-        is_driven: whether the examples alone are tried, which drives follow.
+        is_driven: whether drives follow the design, so that only the examples are tried.
     """
 
     rehearsal: Rehearsal
@@ -57,7 +56,7 @@ class DesignSpace:
     is_driven: bool = False
 
     def list_designs(self) -> tuple[list[Primitive], bool]:
-        """The designs to try, and whether that takes so little that none was left out."""
+        """Return the designs to try, and whether all of them can be afforded."""
         rehearsal, most = self.rehearsal, count_affordable(self.rehearsal, self.seconds)
         if self.is_driven:
             return list(self.examples), len(self.examples) < most
@@ -65,23 +64,23 @@ class DesignSpace:
         return [*designs[:: -(-len(designs) // most)], *self.examples], len(designs) <= most
 
     def vary(self, design: Primitive) -> Iterator[Primitive]:
-        """The same design in other surroundings."""
+        """Yield the same design in other surroundings."""
         every = vary_surroundings(self.rehearsal.seen, design)
         return (other for other in every if self.with_brakes or not other.field)
 
     def goes_beyond(self, design: Primitive) -> bool:
-        """Whether a design leaves what the trials at hand have shown."""
+        """Return whether a design exceeds the range or speed of the trials at hand."""
         return any(find_beyond(design, self.rehearsal.seen))
 
     def follow(self, design: Primitive) -> tuple[Motion, ...]:
-        """A design as different people follow it, somebody hasty last."""
+        """Return a design as different people follow it, somebody hasty last."""
         return tuple(self.rehearsal.record(design, version) for version in _VERSIONS)
 
 
 def count_affordable(rehearsal: Rehearsal, seconds: float) -> int:
-    """How many designs of so many seconds may be tried exactly."""
+    """Return how many designs of this length may be tried exactly."""
     work = seconds * rehearsal.sensors.rate_hz * len(rehearsal.system.parameters)
-    return max(_FEWEST, int(_WORK / work))
+    return max(_FEWEST_DESIGNS, int(_MOST_WORK / work))
 
 
 @dataclass(frozen=True)
@@ -90,8 +89,8 @@ class RankedDesign:
 
     Attributes:
         design: the primitive.
-        utility: the quantile over versions by which designs are ranked.
-        motions: its versions, that of somebody hasty last.
+        utility: quantile of the utility over versions.
+        motions: its versions, the hasty one last.
     """
 
     design: Primitive
@@ -100,7 +99,7 @@ class RankedDesign:
 
     @property
     def expected_motions(self) -> tuple[Motion, ...]:
-        """The versions that are expected; the hasty one is only guarded against."""
+        """The expected versions: all but the hasty one."""
         return self.motions[:-1]
 
 
@@ -110,12 +109,11 @@ def rank_designs(
     progress: Progress = lambda fraction, message: None,
     least: float = -np.inf,
 ) -> list[RankedDesign]:
-    """Try the designs of a space, and the best ones as people follow them; best first.
+    """Try the designs of a space, then the best ones as people follow them; best first.
 
-    What is best when it is followed exactly may be worth little to somebody hasty, so that the
-    finalists are those that are good both ways. One of them at least stays within what the trials
-    at hand have shown. Nothing is returned if no utility reaches ``least`` when a design is
-    followed exactly.
+    The best design when followed exactly may be useless when followed hastily: finalists are good
+    both ways, and at least one stays within the range of the trials at hand. The list is empty if
+    no design reaches the utility ``least`` when followed exactly.
     """
     rehearsal = space.rehearsal
 
@@ -126,7 +124,7 @@ def rank_designs(
         return _take_low([value, utility(rehearsal.record(design, HASTY))]), design
 
     designs, is_quick = space.list_designs()
-    finalists, varied = (_FINALISTS, _VARIED) if is_quick else (_OF_FEW, 0)
+    finalists, varied = (_MOST_FINALISTS, _MOST_VARIED) if is_quick else (_FEWER_FINALISTS, 0)
     exact = []
     for k, design in enumerate(designs):
         progress(0.5 * k / len(designs), f"trying {len(designs)} designs")
@@ -137,7 +135,7 @@ def rank_designs(
         if all(try_design(other) < least for other in others):
             return []
     progress(0.5, "following them hastily")
-    ahead = exact[: _FOLLOWED * finalists]
+    ahead = exact[: _FOLLOWED_HASTILY * finalists]
     if all(space.goes_beyond(design) for _, design in ahead):
         ahead += [pair for pair in exact if not space.goes_beyond(pair[1])][:1]
     best = sorted((follow_hastily(*pair) for pair in ahead), key=lambda pair: -pair[0])
@@ -154,7 +152,7 @@ def rank_designs(
         motions = space.follow(design)
         ranked.append(RankedDesign(design, _take_low([utility(m) for m in motions]), motions))
     best_utility = max(one.utility for one in ranked)
-    enough = best_utility - _PREMIUM * abs(best_utility)
+    enough = best_utility - _PREMIUM_BEYOND * abs(best_utility)
 
     def order(one: RankedDesign) -> tuple[bool, float]:
         return one.utility < enough or space.goes_beyond(one.design), -one.utility
@@ -169,10 +167,10 @@ def find_best_of_each(
     inform: Callable[[Motion], Array],
     utilities: Sequence[Callable[[Array], float]],
 ) -> list[RankedDesign]:
-    """The best designs by each of several utilities, each once; each design is recorded once.
+    """Return the best design for each of several utilities, without repetition.
 
     Args:
-        inform: the information (m, m) of a motion; utilities: of it, larger is better.
+        inform: gives the information (m, m) of a motion; utilities: of that, larger is better.
         space: the designs.
     """
     designs, is_quick = space.list_designs()
@@ -180,10 +178,10 @@ def find_best_of_each(
     counted = Counter(
         k
         for utility in utilities
-        for k in sorted(range(len(designs)), key=lambda k: -utility(informed[k]))[:_OF_FEW]
+        for k in sorted(range(len(designs)), key=lambda k: -utility(informed[k]))[:_FEWER_FINALISTS]
     )
-    # Where that takes long, only the designs that are good by most utilities are followed.
-    chosen = [k for k, _ in counted.most_common(None if is_quick else _OF_FEW)]
+    # If that takes long, only the designs that are good by most utilities are followed.
+    chosen = [k for k, _ in counted.most_common(None if is_quick else _FEWER_FINALISTS)]
     motions = {k: space.follow(designs[k]) for k in chosen}
     versions = {k: [inform(motion) for motion in motions[k]] for k in chosen}
     found: dict[int, RankedDesign] = {}
@@ -195,5 +193,5 @@ def find_best_of_each(
 
 
 def _take_low(utilities: Sequence[float]) -> float:
-    """The utility of a design on a bad day."""
+    """Return the utility of a design on a bad day."""
     return float(np.quantile(utilities, _QUANTILE))

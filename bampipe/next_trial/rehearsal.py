@@ -1,7 +1,7 @@
-"""A primitive as the fitted model would record it: the motion prescribed, the force that it takes.
+"""A design as the fitted model would record it: prescribed motion and the force that it needs.
 
-People follow a sentence roughly. Each version of a primitive has speeds, turns and a drift of its
-own, and goes through the sensors and filters of the session.
+People follow a sentence roughly: each version of a design has its own speeds, turns and drift. It
+passes through the sensors and filters of the session.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from bampipe.trials.motion import Motion
 from bampipe.trials.replay import read_by_sensors
 from bampipe.trials.sensors import Sensors
 
-_SPEED, _RANGE, _TURN, _DRIFT = 0.2, 0.15, 0.1, 0.05
-"""How far people are off: speed and range of a trial, each turn and the slow drift of the middle,
-the last two as shares of the range."""
+_SPEED_SPREAD, _RANGE_SPREAD, _TURN_SPREAD, _DRIFT_SHARE = 0.2, 0.15, 0.1, 0.05
+"""Errors of people: speed and range of a trial, each turn and the slow drift of the middle; the
+last two are shares of the range."""
 HASTY = -1
-"""Number of the version of somebody who covers half the range at twice the speed."""
-_BACK_S = 1.0
-"""Before the end of a trial that is imitated, from where on it turns back."""
-_STEPS = 4
-"""Of the search for the force, where what the model requires depends on the force itself."""
+"""Number of the version that covers half the range at twice the speed."""
+_TURN_BACK_S = 1.0
+"""Time before the end of an imitated trial at which the motion starts to turn back."""
+_FORCE_STEPS = 4
+"""Iterations for the force, if the required force depends on the applied one."""
 
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """What designs are tried with.
+    """The fitted model and the instruments with which designs are tried.
 
     Attributes:
         system, p: the fitted model and its parameters.
         sensors, kinematics: of the session.
-        seen: what the trials have shown to be possible.
+        seen: envelope of the trials.
         seed: of the versions and of the noise.
     """
 
@@ -49,14 +49,14 @@ class Rehearsal:
     seed: int
 
     def record(self, design: Primitive, version: int) -> Motion:
-        """One version of a design, recorded; 0 is followed exactly, `HASTY` hardly at all."""
+        """Return one version of a design as recorded; 0 is followed exactly."""
         rng = np.random.default_rng([self.seed, 1 + version])
         given = design if version == 0 else follow_roughly(design, self.seen, rng, version == HASTY)
         t = np.arange(int(design.seconds * self.sensors.rate_hz)) / self.sensors.rate_hz
         return self._observe(*self._path(given, t, rng, exact=version == 0), given, rng)
 
     def effort(self, series: Series) -> tuple[Array, Array]:
-        """Times (T,), s, and what the drives give each axis along a series, (T, n_q), N.m or N."""
+        """Return times (T,), s, and the drive force of each axis along a series, (T, n_q)."""
         system = self.system
         t = np.arange(int(series.seconds * self.sensors.rate_hz)) / self.sensors.rate_hz
         design = Primitive({}, series.middle, series.seconds, series=series)
@@ -68,7 +68,7 @@ class Rehearsal:
     def _path(
         self, design: Primitive, t: Array, rng: np.random.Generator, exact: bool
     ) -> tuple[Array, Array, Array]:
-        """Position, velocity and acceleration along a design at times ``t``, each (T, n_q)."""
+        """Return position, velocity and acceleration along a design, each (T, n_q)."""
         if design.example is not None:
             return example_path(design.example, t)
         if design.series is not None:
@@ -76,8 +76,8 @@ class Rehearsal:
         n = len(self.system.coordinates)
         q, qd, qdd = np.tile(design.pose, (t.size, 1)), np.zeros((t.size, n)), np.zeros((t.size, n))
         for axis, stroke in design.strokes.items():
-            path = stroke_path(stroke, t, rng, 0.0 if exact else _TURN)
-            drift = 0.0 if exact else _DRIFT * (stroke.high - stroke.low)
+            path = stroke_path(stroke, t, rng, 0.0 if exact else _TURN_SPREAD)
+            drift = 0.0 if exact else _DRIFT_SHARE * (stroke.high - stroke.low)
             w, phase = 2.0 * np.pi * rng.uniform(0.02, 0.1), rng.uniform(0.0, 2.0 * np.pi)
             q[:, axis] = path[0] + drift * np.sin(w * t + phase)
             qd[:, axis] = path[1] + drift * w * np.cos(w * t + phase)
@@ -87,18 +87,17 @@ class Rehearsal:
     def _observe(
         self, q: Array, qd: Array, qdd: Array, design: Primitive, rng: np.random.Generator
     ) -> Motion:
-        """The motion as sensors and filters give it, with the force that the model takes."""
+        """Return the motion as sensors and filters give it, with the force that it needs."""
         system, forces = self.system, self.system.model.device.forces
         motion = self._prescribe(q, qd, qdd, design)
-        # The design is what the mechanism does. An offset at the reading is that at the truth, but
-        # for its square.
+        # The design is the true motion; to first order its offset is that at the reading.
         read = q - system.offset(q, motion.inputs(system.inputs), self.p)
         applied = motion.inputs(forces)
         recording = read_by_sensors(system, motion, read, applied, self.sensors, rng)
         return self.kinematics.observe(recording, forces)
 
     def _prescribe(self, q: Array, qd: Array, qdd: Array, design: Primitive) -> Motion:
-        """The motion of the mechanism, with the force that the model takes for it."""
+        """Return the motion of the mechanism, with the force that it needs."""
         system, device = self.system, self.system.model.device
         t = np.arange(len(q)) / self.sensors.rate_hz
         channels = {"t": t}
@@ -112,17 +111,17 @@ class Rehearsal:
         return self._with_force(Motion("design", t, q, qd, qdd, np.zeros_like(q), channels))
 
     def _with_force(self, motion: Motion) -> Motion:
-        """The motion of the mechanism with the force that leaves no residual."""
+        """Return the motion with the force that leaves no residual."""
         system, forces = self.system, self.system.model.device.forces
         at = motion.kinematics
-        for _ in range(_STEPS):
+        for _ in range(_FORCE_STEPS):
             u = motion.inputs(system.inputs)
             z = system.memory(*at, u, self.p, motion.t)
             left = system.residual(*at, z, u, self.p)
             excess = system.least_force(motion.q, left, u, self.p)
             changed = {name: motion.channels[name] - excess[:, k] for k, name in enumerate(forces)}
             if not system.driven and not system.memory_names:
-                # Nothing else depends on the force: its rates are not needed.
+                # Nothing depends on the rates of the force.
                 return motion.with_channels(changed)
             for name in forces:
                 rates = self.kinematics.input_rates(changed[name])
@@ -134,22 +133,22 @@ class Rehearsal:
 def follow_roughly(
     design: Primitive, seen: Envelope, rng: np.random.Generator, hastily: bool
 ) -> Primitive:
-    """A design as a person follows it: other speeds and turns, no farther than any design.
+    """Return a design as a person follows it: other speeds and turns, within the allowed range.
 
-    Drives follow a series as it is.
+    Drives follow a series exactly.
     """
     if design.series is not None:
         return design
     if design.example is not None:
-        haste = 2.0 if hastily else 1.0 + rng.uniform(-_SPEED, _SPEED)
-        reach = 0.5 if hastily else 1.0 - rng.uniform(0.0, _RANGE)
+        haste = 2.0 if hastily else 1.0 + rng.uniform(-_SPEED_SPREAD, _SPEED_SPREAD)
+        reach = 0.5 if hastily else 1.0 - rng.uniform(0.0, _RANGE_SPREAD)
         return replace(design, example=replace(design.example, reach=reach, haste=haste))
     strokes, (lowest, highest) = {}, seen.reach
     for axis, stroke in design.strokes.items():
-        speed = 2.0 if hastily else 1.0 + rng.uniform(-_SPEED, _SPEED)
-        share = 0.5 if hastily else 1.0 + rng.uniform(-_RANGE, _RANGE)
+        speed = 2.0 if hastily else 1.0 + rng.uniform(-_SPEED_SPREAD, _SPEED_SPREAD)
+        share = 0.5 if hastily else 1.0 + rng.uniform(-_RANGE_SPREAD, _RANGE_SPREAD)
         width = share * (stroke.high - stroke.low)
-        room = 0.5 * (stroke.high - stroke.low) * _TURN
+        room = 0.5 * (stroke.high - stroke.low) * _TURN_SPREAD
         middle = 0.5 * (stroke.low + stroke.high) + rng.uniform(-room, room)
         strokes[axis] = replace(
             stroke,
@@ -162,9 +161,9 @@ def follow_roughly(
 
 
 def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
-    """Position, velocity and acceleration, each (T, n_q), of a trial forwards, backwards and so on.
+    """Return position, velocity and acceleration of a trial played to and fro, each (T, n_q).
 
-    It is never faster than the trial, as it would be were its end joined to its beginning.
+    A jump from its end to its beginning would be faster than the trial.
 
     Args:
         t: (T,) times from 0 on, s.
@@ -172,8 +171,8 @@ def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
     motion = example.motion
     clock = motion.t - motion.t[0]
     length, rate = float(clock[-1]), example.haste / example.reach
-    back = min(_BACK_S, 0.25 * length)
-    # Distance from the last turn or the next one; near them, smooth to the second derivative.
+    back = min(_TURN_BACK_S, 0.25 * length)
+    # Distance from the nearest turn, smooth to the second derivative.
     turn = np.rint(rate * t / length)
     x = rate * t - turn * length
     u = np.where(turn == 0.0, 1.0, np.clip(np.abs(x) / back, 0.0, 1.0))
@@ -200,12 +199,12 @@ def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
 def stroke_path(
     stroke: Stroke, t: Array, rng: np.random.Generator, jitter: float
 ) -> tuple[Array, Array, Array]:
-    """Position, velocity and acceleration, each (T,), of strokes of least jerk between two turns.
+    """Return position, velocity and acceleration of minimum-jerk strokes, each (T,).
 
     Args:
-        stroke: what to do; t: (T,) times from 0 on, s.
-        rng: source of the speed of each stroke within its band, and of where it turns.
-        jitter: how far turns are off, as a share of the travel.
+        stroke: their ends and speeds; t: (T,) times from 0 on, s.
+        rng: draws the speed of each stroke within its band, and its turns.
+        jitter: largest error of a turn, as a share of the travel.
     """
     q, qd, qdd = np.empty(t.size), np.zeros(t.size), np.zeros(t.size)
     travel = stroke.high - stroke.low

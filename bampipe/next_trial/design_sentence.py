@@ -1,4 +1,4 @@
-"""A primitive in a sentence that a student can follow."""
+"""A design as a sentence that a student can follow."""
 
 from __future__ import annotations
 
@@ -11,29 +11,32 @@ from bampipe.lists import join_names
 from bampipe.next_trial.primitives import PEAK, Envelope, Example, Primitive, Stroke, find_beyond
 from bampipe.physics.device import Coordinate, Device
 
-_AGAIN = 1.2
-"""Of the length of a trial that is imitated: what lasts longer goes through it more than once."""
-_SLOW, _FAST = 0.12, 0.45
-"""Of the speed that the trials show: where a motion is called slow, and where fast."""
-_LONG_S = 2.0
-"""Nobody calls a stroke fast that takes as long."""
+_REPEATED_FROM = 1.2
+"""A design longer than this times the imitated trial repeats it."""
+_SLOW_BELOW, _FAST_FROM = 0.12, 0.45
+"""Shares of the highest speed in the trials below and above which motion is called slow or fast."""
+_LONG_STROKE_S = 2.0
+"""A stroke that takes this long is not called fast."""
 
 
-def describe(design: Primitive, seen: Envelope, device: Device) -> str:
-    """Say what to do in one sentence."""
+def describe_design(design: Primitive, seen: Envelope, device: Device) -> str:
+    """Return the instruction in one sentence."""
     axes = device.coordinates
     if design.example is not None:
-        return f"{_imitate(design, design.example, device)}{_with(design, device)}."
+        return f"{_say_example(design, design.example, device)}{_say_settings(design, device)}."
     if design.series is not None:
-        time = f"{design.seconds:.3g} s{_in_parts(design)}"
+        time = f"{design.seconds:.3g} s{_say_parts(design)}"
         text = f"Let the drives follow the trajectory, for {time}"
-        return f"{text}{_with(design, device)}{_say_beyond(design, seen, axes)}."
+        return f"{text}{_say_settings(design, device)}{_say_beyond(design, seen, axes)}."
     first = next(iter(design.strokes))
     beside = [i for i, one in design.strokes.items() if one.gentle]
     strokes = {i: one for i, one in design.strokes.items() if i not in beside}
     names = [axes[i].name for i in strokes]
-    ends = [_ends(one, axes[i].unit) for i, one in strokes.items()]
-    pace, times = _pace(design.strokes[first], seen, first), [_times(s) for s in strokes.values()]
+    ends = [_say_ends(one, axes[i].unit) for i, one in strokes.items()]
+    pace, times = (
+        _say_speed(design.strokes[first], seen, first),
+        [_say_pace(s) for s in strokes.values()],
+    )
     if len(strokes) == 1:
         text = f"Move {names[0]} {pace} back and forth {ends[0]}, {times[0]}"
     elif len(set(times)) == 1:
@@ -44,24 +47,24 @@ def describe(design: Primitive, seen: Envelope, device: Device) -> str:
             f"{name} {end}, {time}" for name, end, time in zip(names, ends, times, strict=True)
         )
         text = f"Move {join_names(names)} back and forth at once, {each}"
-    text += f", for {design.seconds:.3g} s{_in_parts(design)}"
+    text += f", for {design.seconds:.3g} s{_say_parts(design)}"
     if beside:
-        about = join_names(_about(design.strokes[i], axes[i].unit) for i in beside)
+        about = join_names(_say_gentle(design.strokes[i], axes[i].unit) for i in beside)
         others = join_names(axes[i].name for i in beside)
         text += f"; meanwhile keep {others} moving gently, {about}"
     still = [axis.name for i, axis in enumerate(axes) if i not in design.strokes]
     if still:
         text += f"; leave {join_names(still)} alone"
-    return f"{text}{_with(design, device)}{_say_beyond(design, seen, axes)}."
+    return f"{text}{_say_settings(design, device)}{_say_beyond(design, seen, axes)}."
 
 
-def _in_parts(design: Primitive) -> str:
-    """In how many trials it is recorded, if in more than one."""
+def _say_parts(design: Primitive) -> str:
+    """Return the number of trials in which it is recorded, if there are several."""
     return f" in {design.parts} trials of {design.part_s:.3g} s" if design.parts > 1 else ""
 
 
-def _with(design: Primitive, device: Device) -> str:
-    """What else is set, at the end of a sentence."""
+def _say_settings(design: Primitive, device: Device) -> str:
+    """Return brakes and channel levels, as the end of a sentence."""
     text = ""
     if design.field:
         share = "half as strong as" if design.field < 1.0 else "as"
@@ -71,38 +74,38 @@ def _with(design: Primitive, device: Device) -> str:
     return text
 
 
-def _imitate(design: Primitive, example: Example, device: Device) -> str:
-    """What to do so that a trial becomes like one at hand."""
+def _say_example(design: Primitive, example: Example, device: Device) -> str:
+    """Return the instruction to imitate a trial."""
     axes = device.coordinates
     (low, high), speed = example.ends, example.speed
     moving = [i for i in range(len(axes)) if speed[i] > 0.0 and high[i] > low[i]]
     names = [f"{axes[i].name} " if len(moving) > 1 else "" for i in moving]
     each = ", ".join(
-        f"{name}{_ends(Stroke(low[i], high[i], 0.0, 0.0), axes[i].unit)}"
-        f" at up to {_speed(speed[i], axes[i].unit)}"
+        f"{name}{_say_ends(Stroke(low[i], high[i], 0.0, 0.0), axes[i].unit)}"
+        f" at up to {_format_speed(speed[i], axes[i].unit)}"
         for i, name in zip(moving, names, strict=True)
     )
     length_s = float(example.motion.t[-1] - example.motion.t[0])
-    again = " over and over" if design.seconds > _AGAIN * length_s else ""
+    again = " over and over" if design.seconds > _REPEATED_FROM * length_s else ""
     return (
         f"Move {join_names(axes[i].name for i in moving)} as in trial {example.trial}, {each},"
         f"{again} for {design.seconds:.3g} s"
     )
 
 
-def _speed(value: float, unit: str) -> str:
+def _format_speed(value: float, unit: str) -> str:
     if unit == "rad":
-        return f"{_two_figures(math.degrees(value))}°/s"
-    return f"{_two_figures(1e3 * value)} mm/s"
+        return f"{_two_digits(math.degrees(value))}°/s"
+    return f"{_two_digits(1e3 * value)} mm/s"
 
 
-def _two_figures(value: float) -> str:
-    """A number rounded to two figures."""
+def _two_digits(value: float) -> str:
+    """Return a number rounded to two significant digits."""
     return f"{float(f'{value:.2g}'):g}"
 
 
 def _say_beyond(design: Primitive, seen: Envelope, axes: Sequence[Coordinate]) -> str:
-    """What a design asks of the machine that no trial at hand has asked."""
+    """Return the axes that go farther or faster than in the trials, as the end of a sentence."""
     farther, faster = ([axes[i].name for i in group] for group in find_beyond(design, seen))
     if not (farther or faster):
         return ""
@@ -114,41 +117,41 @@ def _say_beyond(design: Primitive, seen: Envelope, axes: Sequence[Coordinate]) -
     return f"; this takes {text} than so far" + (": try the way slowly first" if farther else "")
 
 
-def _about(stroke: Stroke, unit: str) -> str:
-    """Around where an axis is moved gently, how far, and about how long each way takes."""
+def _say_gentle(stroke: Stroke, unit: str) -> str:
+    """Return centre, half travel and time of the gentle strokes of an axis."""
     middle, half = 0.5 * (stroke.low + stroke.high), 0.5 * (stroke.high - stroke.low)
     if unit == "rad":
-        text = f"{_rounded(math.degrees(middle), 0)}° ± {_rounded(math.degrees(half), 0)}°"
+        text = f"{_round(math.degrees(middle), 0)}° ± {_round(math.degrees(half), 0)}°"
     else:
-        text = f"{_rounded(1e3 * middle, 0)} ± {_rounded(1e3 * half, 0)} mm"
-    return f"{text} in {_two_figures(stroke.typical_s)} s each way".replace("-", "−")
+        text = f"{_round(1e3 * middle, 0)} ± {_round(1e3 * half, 0)} mm"
+    return f"{text} in {_two_digits(stroke.typical_s)} s each way".replace("-", "−")
 
 
-def _rounded(value: float, digits: int) -> str:
-    """A number with so many digits behind the point, and without the sign of a zero."""
+def _round(value: float, digits: int) -> str:
+    """Return a number with ``digits`` decimals, without the sign of a zero."""
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
-def _pace(stroke: Stroke, seen: Envelope, axis: int) -> str:
+def _say_speed(stroke: Stroke, seen: Envelope, axis: int) -> str:
     share = np.sqrt(stroke.slow * stroke.fast) / float(seen.speed[axis])
-    if share < _SLOW:
+    if share < _SLOW_BELOW:
         return "slowly"
-    return "fast" if share > _FAST and stroke.typical_s < _LONG_S else "at an easy pace"
+    return "fast" if share > _FAST_FROM and stroke.typical_s < _LONG_STROKE_S else "at an easy pace"
 
 
-def _ends(stroke: Stroke, unit: str) -> str:
-    """Where to turn: degrees or millimetres first, for a person; the unit of the files after."""
+def _say_ends(stroke: Stroke, unit: str) -> str:
+    """Return the turning points: degrees or millimetres for a person, then the unit of files."""
     if unit == "rad":
-        low, high = (_rounded(math.degrees(end), 0) for end in (stroke.low, stroke.high))
-        radians = f"{_rounded(stroke.low, 2)} to {_rounded(stroke.high, 2)} rad"
+        low, high = (_round(math.degrees(end), 0) for end in (stroke.low, stroke.high))
+        radians = f"{_round(stroke.low, 2)} to {_round(stroke.high, 2)} rad"
         return f"between {low}° and {high}° ({radians})".replace("-", "−")
     digits = 0 if stroke.high - stroke.low > 0.01 else 2
-    low, high = (_rounded(1e3 * end, digits) for end in (stroke.low, stroke.high))
+    low, high = (_round(1e3 * end, digits) for end in (stroke.low, stroke.high))
     return f"between {low} and {high} mm".replace("-", "−")
 
 
-def _times(stroke: Stroke) -> str:
-    """How long a stroke takes, and how fast it is at its middle."""
+def _say_pace(stroke: Stroke) -> str:
+    """Return how long a stroke takes, and the rest at its ends."""
     travel = stroke.high - stroke.low
     short, long = (PEAK * travel / speed for speed in (stroke.fast, stroke.slow))
     text = f"{short:.2g} s each way"

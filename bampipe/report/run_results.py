@@ -29,7 +29,7 @@ class Results:
     """The results of one session; ``detail_model`` is shown in detail, "" for the best one.
 
     Raises:
-        InputError: from all that reads, where a file that must be there is not, or is damaged.
+        InputError: from every method that reads, if a required file is missing or damaged.
     """
 
     root: Path
@@ -37,7 +37,7 @@ class Results:
     _results: dict[str, Result | None] = field(default_factory=dict, repr=False)
 
     def read(self, kind: type[R], model: str = "") -> R | None:
-        """Return the result ``kind`` of ``model`` (default: the one in detail), None without it."""
+        """Return the result ``kind`` of ``model`` (default: the one in detail), or None."""
         relative = kind.file(model or (self.model if "{model}" in kind.FILE else ""))
         if relative not in self._results:
             path = self.root / relative
@@ -47,7 +47,7 @@ class Results:
     def table(
         self, relative: str, columns: Sequence[str] | None = None, trial: str | None = None
     ) -> pd.DataFrame | None:
-        """Return a Parquet file, or the rows of one trial; None where there is no such file."""
+        """Return a Parquet file, or the rows of one trial; None without such a file."""
         path = self.root / relative
         if not path.is_file():
             return None
@@ -65,7 +65,7 @@ class Results:
 
     @cached_property
     def outdated(self) -> tuple[str, ...]:
-        """Steps whose inputs were made anew after they ran, as ``run.json`` tells, sorted."""
+        """Steps whose inputs were remade after they ran, according to ``run.json``, sorted."""
         run = self.read(RunResult)
         stages = run.stages if run else {}
         makers = {name: step for step, made in stages.items() for name in made.outputs}
@@ -77,7 +77,7 @@ class Results:
                 if step not in found
                 for name, digest in made.inputs.items()
                 if name in makers
-                # Inputs in TOML count by what they say, outputs by their bytes: not to be compared.
+                # TOML inputs are hashed by content, outputs by bytes: they cannot be compared.
                 and (
                     makers[name] in found
                     or (not name.endswith(".toml") and stages[makers[name]].outputs[name] != digest)
@@ -94,7 +94,7 @@ class Results:
 
     @cached_property
     def trials(self) -> pd.DataFrame:
-        """One row a trial."""
+        """One row per trial."""
         return self._require(self.table("ingest/trials.parquet"), "ingest/trials.parquet")
 
     def _require(self, found: T | None, relative: str) -> T:
@@ -140,7 +140,7 @@ class Results:
 
     @cached_property
     def models(self) -> tuple[str, ...]:
-        """The models: in the order of the ladder, others behind, parents before children."""
+        """The models: in the order of the ladder, then all others, parents before children."""
         found = sorted(
             (path.parent.name for path in (self.root / "models").glob("*/identify.json")),
             key=lambda name: (name != "base", name.count("+"), name),
@@ -164,7 +164,7 @@ class Results:
 
     def state_undone(self, said: str, stage: str) -> Paragraph:
         """Return the paragraph on a stage that has not run, with the command that runs it."""
-        return Paragraph(f"{said}: `bampipe {stage} {self.root.name}` does it.")
+        return Paragraph(f"{said}: run `bampipe {stage} {self.root.name}`.")
 
     def state_next(self, advice: str) -> Paragraph:
         """Return the paragraph on what to do next: a command for ``RUN``, or words."""

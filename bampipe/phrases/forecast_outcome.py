@@ -1,4 +1,4 @@
-"""A proposed trial compared with its outcome, once it has been recorded."""
+"""A forecast compared with its outcome, once the proposed trial has been recorded."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import AS_FORECAST, NOTHING, ExpectedSd, NextResult, split_effects
 
-_SHOWN = 3
+_MOST_NAMED = 3
 """Parameters that are compared: those with the largest predicted improvement."""
 
 
 def read_forecasts(root: Path, model: str) -> tuple[NextResult, ...]:
     """Return the forecasts of a model's trials: that of the last proposal first, then earlier ones.
 
-    A forecast that another version of bampipe made in other terms cannot be compared and is left
-    out: a new proposal replaces it.
+    A forecast that another version of bampipe stored in another form is left out: a new proposal
+    replaces it.
     """
     last, folder = root / NextResult.file(model), root / NextResult.EARLIER.format(model=model)
     paths = [*([last] if last.is_file() else []), *sorted(folder.glob("*.json"))]
@@ -33,7 +33,7 @@ def read_forecasts(root: Path, model: str) -> tuple[NextResult, ...]:
 
 
 def find_open(forecasts: Sequence[NextResult], proposed: NextResult) -> tuple[NextResult, ...]:
-    """Return those of ``forecasts`` whose trial may still come, without the one now ``proposed``.
+    """Return those of ``forecasts`` that are still open, without the one now ``proposed``.
 
     A forecast is open until a trial is recorded that it did not know; `bampipe run` and `bampipe
     next` compare the two before a new proposal closes it.
@@ -69,10 +69,10 @@ def compare_forecast(
 
     Args:
         proposed: made before the new trials; identified: with them.
-        diagnosed: the last diagnosis, None without one; used where it includes the new trials.
+        diagnosed: the last diagnosis, None without one; used if it includes the new trials.
 
     Returns:
-        Nothing where there is no new trial.
+        Nothing without a new trial.
     """
     new = [trial for trial in identified.trials if trial not in proposed.trials]
     if not new:
@@ -80,20 +80,19 @@ def compare_forecast(
     if diagnosed is not None and not set(new) <= set(diagnosed.trials):
         diagnosed = None
     best, said = proposed.proposals[0], []
-    trials = f"{'trial' if len(new) == 1 else 'trials'} {join_names(new, _SHOWN)}"
+    trials = f"{'trial' if len(new) == 1 else 'trials'} {join_names(new, _MOST_NAMED)}"
     falls = sorted(best.sd, key=lambda name: best.sd[name].after / (best.sd[name].before or 1.0))
-    for name in [proposed.parameter] if proposed.parameter in best.sd else falls[:_SHOWN]:
+    for name in [proposed.parameter] if proposed.parameter in best.sd else falls[:_MOST_NAMED]:
         if name in identified.parameters:
             forecast, outcome = best.sd[name], identified.parameters[name].sd
             said.append(
                 f"`{name}`: ± {forecast.number} {forecast.unit} was forecast with {trials},"
                 f" ± {outcome:.2g} resulted (± {forecast.before:.2g} before)"
-                f"{_judge(forecast, outcome)}"
+                f"{_judge_forecast(forecast, outcome)}"
             )
-    for pair in best.confusion[:_SHOWN]:
+    for pair in best.confusion[:_MOST_NAMED]:
         first, second = pair.between
-        chance = "of " * (pair.after >= 0.01) + say_chance(pair.after)
-        text = f"{first} or {second}: a probability {chance} was forecast of confusing them"
+        text = f"{first} or {second}: the forecast chance of confusion was {say_chance(pair.after)}"
         if diagnosed is None:
             said.append(f"{text}; `bampipe diagnose RUN` tells the outcome.")
         else:
@@ -120,7 +119,7 @@ def _name_alternative(first: str, second: str, diagnosed: DiagnoseResult) -> str
 
 
 def _compare_revealed(proposed: NextResult, diagnosed: DiagnoseResult | None) -> Iterator[str]:
-    """Say of the effects that a trial was to reveal whether they are there."""
+    """Say whether the effects that a trial was to reveal are present."""
     if not proposed.shows:
         return
 
@@ -140,7 +139,7 @@ def _compare_revealed(proposed: NextResult, diagnosed: DiagnoseResult | None) ->
         yield compare(absent, f"the diagnosis does not find {they} hardly larger")
 
 
-def _judge(forecast: ExpectedSd, outcome: float) -> str:
+def _judge_forecast(forecast: ExpectedSd, outcome: float) -> str:
     """Compare an uncertainty with its forecast, as the end of a sentence."""
     if forecast.is_sharp:
         ratio = outcome / forecast.after if forecast.after > 0.0 else 1.0

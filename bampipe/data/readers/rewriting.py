@@ -1,0 +1,188 @@
+"""Texts of samples that are no table yet, made into one line by line: rows keep their numbers.
+
+Such are ``q=0.1 tau=2`` of a terminal, the stamps that a serial monitor puts before a line, cells
+with their units or with lists, and tables with the names of signals in a column of their own.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from bampipe.data.units import unit
+
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_PAIR = re.compile(rf"""["']?([A-Za-z_][\w./]*)["']?\s*[=:]\s*({_NUMBER})(?![\w.:])""")
+_STAMPED = re.compile(r"\s*(\d{1,2}:\d\d:\d\d[.,]\d+)\s*->\s*(.*)")
+_WITH_UNIT = re.compile(rf"({_NUMBER})[ \u00a0]?([^\W\d_]\S*|[%°]\S*)")
+_FORTRAN = re.compile(r"(\d\.?\d*)[Dd]([-+]\d)")
+_GROUPED = re.compile(r"(?<=\d)['’](?=\d{3}(?!\d))")
+_TYPESET = {"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2009": " "}
+"""Minus and blanks of typesetters."""
+_MOST = 0.8
+"""Share of the first lines that are written alike, the least."""
+_TRIED, _FEWEST, _MOST_SIGNALS = 400, 5, 64
+_DELIMITERS = (";", "\t", ",", "|")
+
+
+@dataclass(frozen=True)
+class Form:
+    """How the lines of a text become rows of a table.
+
+    Attributes:
+        said: what the text is, for its reader.
+        rewrite: the row for a line.
+        names: of the columns, where no line holds them.
+    """
+
+    said: str
+    rewrite: Callable[[str], str]
+    names: tuple[str, ...] = ()
+
+
+def find_form(head: str) -> Form | None:
+    """The form of a text that begins with ``head`` (whole lines); None of a table as it is."""
+    whole = [line for line in head.splitlines() if line.strip()]
+    lines = whole[-_TRIED:]
+    if len(lines) < _FEWEST:
+        return None
+    if any(sign in head for sign in _TYPESET):
+        plain = str.maketrans(_TYPESET)
+        inner = find_form(head.translate(plain)) or Form("", str)
+        said = "; ".join(
+            filter(None, ("typeset minus signs and blanks are plain ones", inner.said))
+        )
+        return Form(said, lambda line: inner.rewrite(line.translate(plain)), inner.names)
+    ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
+    if 2 * len(ended) > len(lines) and all(re.search(r"[,\t |]", line) for line in ended):
+        return Form("", lambda line: line.removesuffix(";"))
+    if any(map(_GROUPED.search, lines)):
+        return Form("apostrophes in numbers left out", lambda line: _GROUPED.sub("", line))
+    if _are(_STAMPED, lines):
+        return _stamped(lines)
+    if _are(_FORTRAN, lines):
+        return Form("exponents of Fortran", lambda line: _FORTRAN.sub(r"\1E\2", line))
+    if pairs := _pairs(lines):
+        return pairs
+    for delimiter in _DELIMITERS:
+        table = [_split(line, delimiter) for line in (*whole[:_TRIED], *lines)]
+        width = Counter(map(len, table)).most_common(1)[0][0]
+        rows = [row for row in table if len(row) == width > 1]
+        if len(rows) > _MOST * len(table) and (found := _cells(rows[0], rows[1:], delimiter)):
+            return found
+    return None
+
+
+def _are(kind: re.Pattern[str], lines: Sequence[str]) -> bool:
+    return sum(kind.search(line) is not None for line in lines) > _MOST * len(lines)
+
+
+def _split(line: str, delimiter: str) -> list[str]:
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+
+
+def _stamped(lines: Sequence[str]) -> Form:
+    inner = [match[2] for match in map(_STAMPED.match, lines) if match]
+    pairs = _pairs(inner)
+    joint = (
+        "," if pairs else next((d for d in _DELIMITERS if _are(re.compile(f"[{d}]"), inner)), " ")
+    )
+
+    def rewrite(line: str) -> str:
+        match = _STAMPED.match(line)
+        if match is None:
+            return line
+        rest = pairs.rewrite(match[2]) if pairs else match[2]
+        stamp = match[1].replace(",", ".") if re.search(r"\d", rest) else "time"
+        return f"{stamp}{joint}{rest}"
+
+    return Form("times stand before each line", rewrite, ("time", *pairs.names) if pairs else ())
+
+
+def _pairs(lines: Sequence[str]) -> Form | None:
+    found = Counter(tuple(name for name, _ in _PAIR.findall(line)) for line in lines)
+    names, count = found.most_common(1)[0] if found else ((), 0)
+    if len(names) < 2 or len(set(names)) < len(names) or count <= _MOST * len(lines):
+        return None
+
+    def rewrite(line: str) -> str:
+        pairs = _PAIR.findall(line)
+        alike = tuple(name for name, _ in pairs) == names
+        return ",".join(value for _, value in pairs) if alike else line
+
+    return Form("lines of names with their values", rewrite, names)
+
+
+def _cells(header: list[str], rows: list[list[str]], delimiter: str) -> Form | None:
+    """The form of a table whose cells are more than numbers."""
+    units, widths = [], []
+    for column in zip(*rows, strict=True):
+        ends = Counter(match[2] for cell in column if (match := _WITH_UNIT.fullmatch(cell)))
+        end, count = ends.most_common(1)[0] if ends else ("", 0)
+        units.append(end if count > _MOST * len(rows) and unit(end) else "")
+        width, count = Counter(len(_items(cell)) for cell in column).most_common(1)[0]
+        widths.append(width if count > _MOST * len(rows) else 0)
+    if any(units):
+        return Form("numbers with their units", _by_cell(delimiter, units, _without_unit))
+    if any(widths):
+        return Form("cells that are lists", _by_cell(delimiter, widths, _unpacked))
+    signals = Counter(row[1] for row in rows if row != header)
+    numbers = sum(bool(re.fullmatch(_NUMBER, row[-1])) for row in rows)
+    in_turn = sum(one[1] != other[1] for one, other in pairwise(rows))
+    if (
+        len(header) == 3
+        and 1 < len(signals) <= _MOST_SIGNALS
+        and min(signals.values()) >= _FEWEST
+        and all(re.match(r"[^\W\d_]", name) for name in signals)
+        and min(numbers, 2 * in_turn) > _MOST * len(rows)
+    ):
+        names = list(signals)
+
+        def rewrite(line: str) -> str:
+            row = _split(line, delimiter)
+            places = [row[2] if row[1] == name else "" for name in names] if len(row) == 3 else []
+            return delimiter.join(
+                [row[0], *(names if row == header else places)] if places else row
+            )
+
+        return Form(f"a reading a row, of {', '.join(names)} in turn", rewrite)
+    return None
+
+
+def _by_cell(
+    delimiter: str, of: Sequence[Any], act: Callable[[str, Any], list[str]]
+) -> Callable[[str], str]:
+    def rewrite(line: str) -> str:
+        row = _split(line, delimiter)
+        if len(row) != len(of):
+            return line
+        pairs = zip(row, of, strict=True)
+        return delimiter.join(
+            new for cell, own in pairs for new in (act(cell, own) if own else [cell])
+        )
+
+    return rewrite
+
+
+def _without_unit(cell: str, end: str) -> list[str]:
+    match = _WITH_UNIT.fullmatch(cell)
+    if match and match[2] == end:
+        return [match[1]]
+    return [f"{cell} [{end}]" if cell and not re.search(r"\d", cell) else cell]  # of the header
+
+
+def _unpacked(cell: str, width: int) -> list[str]:
+    items = _items(cell)
+    return items if len(items) == width else [f"{cell}[{k}]" if cell else "" for k in range(width)]
+
+
+def _items(cell: str) -> list[str]:
+    """The numbers of a list; none where it is none."""
+    inner = re.fullmatch(r"[\[(](.*)[\])]", cell)
+    items = re.split(r"[,;\s]+", inner[1].strip()) if inner else []
+    return items if all(re.fullmatch(_NUMBER, item) for item in items) else []

@@ -1,0 +1,305 @@
+"""Logs that are no plain tables: read to the same numbers, or refused with what to do."""
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+
+from bampipe.data.quality.encoders import unwrapped
+from bampipe.data.quality.stamps import spread_stamps
+from bampipe.data.readers import columns_of, read_trial
+from bampipe.data.recording import read_recording
+from bampipe.data.session import Clock, TrialEntry
+from bampipe.data.session_trials import describe_spans
+from bampipe.data.survey import survey, words
+from bampipe.data.units import unit
+from bampipe.errors import InputError
+from bampipe.setup.proposal import propose
+
+T = np.arange(60) / 100.0
+Q = np.round(np.sin(3 * T), 4)
+U = np.round(np.cos(3 * T), 4)
+
+
+def lines(form: str, head: str = "") -> str:
+    rows = [
+        form.format(t=t, q=q, u=u, n=n) for n, (t, q, u) in enumerate(zip(T, Q, U, strict=True), 1)
+    ]
+    return head + "\n".join(rows) + "\n"
+
+
+PROPERTIES = (
+    "Name\tq\tName\tu\nType\tREAL64\tType\tINT16\nUnit\tdeg\tUnit\tNm\nOffset\t0\tOffset\t0\n\n"
+)
+FORMS = {
+    "pairs": (lines("[info] t={t:.3f} q={q:.4f} u={u:.4f}", "Booting...\n"), ("t", "q", "u")),
+    "pairs of Python": (lines("{{'t': {t:.3f}, 'q': {q:.4f}, 'u': {u:.4f}}}"), ("t", "q", "u")),
+    "units in cells": (
+        lines("{t:.3f} s;{q:.4f}°;{u:.4f} Nm", "t;q;u\n"), ("t [s]", "q [°]", "u [Nm]")
+    ),
+    "units in quotes": (
+        lines('"{t:.3f} s","{q:.4f} deg","{u:.4f} Nm"', "t,q,u\n"), ("t [s]", "q [deg]", "u [Nm]")
+    ),
+    "lists in cells": (lines('{t:.3f},"[{q:.4f}, {u:.4f}]"', "t,x\n"), ("t", "x[0]", "x[1]")),
+    "arrays in cells": (lines("{t:.3f},[ {q:.4f}  {u:.4f}]", "t,x\n"), ("t", "x[0]", "x[1]")),
+    "typeset minus": (
+        lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n").replace("-", "\u2212"), ("t", "q", "u")
+    ),
+    "Fortran": (lines("{t:.6E} {q:.6E} {u:.6E}", "t q u\n").replace("E", "D"), ("t", "q", "u")),
+    "rows with numbers": (lines('"{n}" {t:.3f} {q:.4f} {u:.4f}', '"t" "q" "u"\n'), ("t", "q", "u")),
+    "groups above names": (
+        lines("{t:.3f},{q:.4f},{t:.3f},{u:.4f}", "Arm,,Cell,\nt,x,t,x\n"),
+        ("Arm t", "Arm x", "Cell x"),
+    ),
+    "names twice": (lines("{t:.3f},{q:.4f},{u:.4f}", "t,x,x\n"), ("t", "x (1)", "x (2)")),
+    "properties of channels": (
+        lines("{t:.3f}\t{q:.4f}\t{t:.3f}\t{u:.4f}", f"Scope\n\n{PROPERTIES}"),
+        ("Time (1)", "q", "u"),
+    ),
+    "properties with colons": (
+        lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n,Type: a,Type: b\ns,Units: rad,Units: N*m\n"),
+        ("t", "q", "u"),
+    ),
+    "keys once a line": (
+        lines(
+            "{t:.3f}\t{q:.4f}\t{u:.4f}",
+            "Interval=\t0.01 s\nChannelTitle=\tq\tu\nRange=\t10 V\t10 V\nUnitName=\tdeg\tNm\n",
+        ),
+        ("Time", "q", "u"),
+    ),
+    "a rule below names": (
+        lines("  {t:.3f}  {q:.4f}  {u:.4f}", "  time s   POS (ANAT)   u\n ------------------\n"),
+        ("time s", "POS (ANAT)", "u"),
+    ),
+    "apostrophes": (lines("1'00{t:.3f};{q:.4f};{u:.4f}", "t;q;u\n"), ("t", "q", "u")),
+    "a first row with holes": (
+        "t,q,u,note\n" + lines("{t:.3f},{q:.4f},{u:.4f},").replace("1.0000,", ",start", 1),
+        ("t", "q", "u"),
+    ),
+    "a summary at the end": (
+        lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n") + "\n# 60 rows\nLargest,0.99,\nOverruns: 0\n",
+        ("t", "q", "u"),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_texts_that_are_no_plain_tables(tmp_path: Path, name: str):
+    text, columns = FORMS[name]
+    path = tmp_path / "a.txt"
+    path.write_text(text)
+    assert set(columns) <= set(columns_of(path))
+    trial = read_trial(path, columns)
+    for column, values in zip(columns, (T, Q, U), strict=True):
+        values = values + 1000.0 * (name == "apostrophes" and column == "t")
+        known = np.isfinite(trial.columns[column])
+        assert known.sum() >= 59
+        np.testing.assert_allclose(trial.columns[column][known], values[known], atol=1e-9)
+
+
+def test_units_of_properties_are_heard(tmp_path: Path):
+    path = tmp_path / "a.csv"
+    path.write_text(FORMS["properties of channels"][0])
+    assert columns_of(path) == {"Time (1)": "", "q": "deg", "Time (2)": "", "u": "Nm"}
+    path.write_text(FORMS["properties with colons"][0])
+    assert columns_of(path) == {"t": "s", "q": "rad", "u": "N*m"}
+
+
+def test_words_for_no_reading_are_no_numbers(tmp_path: Path):
+    path = tmp_path / "a.csv"
+    text = lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n").split("\n")
+    text[7], text[9], text[11] = "0.06,#DIV/0!,1", "0.08,OVERLOAD,1", "0.10,1.#QNAN,1"
+    path.write_text("\n".join(text))
+    trial = read_trial(path, ("t", "q", "u"))
+    assert list(np.flatnonzero(np.isnan(trial.columns["q"]))) == [6, 8, 10]
+    assert "column 'q' says 'OVERLOAD' from row 10 on: taken as no reading" in trial.notes
+    path.write_text("\n".join([*text[:20], "0.19,1.2.3,1", *text[21:]]))
+    with pytest.raises(InputError, match=r"row 21, column 'q': found '1.2.3', expected a number"):
+        read_trial(path, ("t", "q", "u"))
+
+
+def test_signals_in_rows_of_their_own_are_put_beside_one_another(tmp_path: Path):
+    """A log of two rates: what is in between is interpolated, and lost readings stay lost."""
+    rows = ["t,q,u"]
+    for k in range(600):
+        rows.append(f"{0.01 * k:.4f},{0.1 * k:.4f},")
+        rows += [f"{0.01 * k + 0.004:.4f},,{k + 0.4:.4f}"] if not 200 < k < 230 else []
+    (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
+    entry, clock = TrialEntry(file="a.csv", kind="free"), Clock(column="t", unit="s")
+    raw = read_recording(tmp_path, entry, ("t", "q", "u"), clock)
+    assert len(raw) == 600 and raw.rows[3] == 8
+    k = np.flatnonzero(np.isfinite(raw.columns["u"]))
+    np.testing.assert_allclose(raw.columns["u"][k], k, atol=1e-9)
+    assert not {*range(202, 229)} & {*k} and len(k) > 560
+    assert (
+        "'u' stands in rows of its own: interpolated linearly at the times of 'q'"
+        in raw.remarks[-1]
+    )
+    long = ["time,signal,value"]
+    for k in range(200):
+        long += [f"{0.01 * k:.3f},q,{k}", f"{0.01 * k:.3f},u,{2 * k}"]
+    (tmp_path / "b.csv").write_text("\n".join(long) + "\n")
+    entry, clock = TrialEntry(file="b.csv", kind="free"), Clock(column="time", unit="s")
+    raw = read_recording(tmp_path, entry, ("time", "q", "u"), clock)
+    np.testing.assert_allclose(raw.columns["u"], 2.0 * raw.columns["q"])
+
+
+def test_a_header_on_every_page_begins_no_recording(tmp_path: Path):
+    head, *rows = lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n").split("\n")
+    (tmp_path / "a.csv").write_text("\n".join([head, *rows[:30], head, *rows[30:]]))
+    entry, clock = TrialEntry(file="a.csv", kind="free"), Clock(column="t", unit="s")
+    assert len(read_recording(tmp_path, entry, ("t", "q"), clock)) == 60
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "13.10.2026 14:00:0{:.3f}", "10/13/2026 2:00:0{:.3f} PM", "13-Oct-2026 14:00:0{:.3f}",
+        "2:00:0{:.3f} pm",
+    ],
+)  # fmt: skip
+def test_dates_as_people_write_them(tmp_path: Path, form: str):
+    path = tmp_path / "a.csv"
+    path.write_text(
+        "when,q\n" + "".join(f"{form.format(t)},{q}\n" for t, q in zip(T, Q, strict=True))
+    )
+    assert columns_of(path) == {"when": "datetime", "q": ""}
+    trial = read_trial(path, ("when", "q"), datetimes={"when": ""})
+    np.testing.assert_allclose(trial.columns["when"], T, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("Sollposition [°]", ["soll", "position"]), ("Motorstrom", ["motor", "strom"]),
+        ("angle mesuré", ["angle", "mesure"]), ("posición", ["posicion"]), ("q_des", ["q", "des"]),
+        ("qdes", ["q", "des"]), ("关节角速度(deg/s)", ["velocity"]), ("トルク[Nm]", ["torque"]),
+        ("rate", ["rate"]), ("timestamp", ["timestamp"]), ("ActPos", ["act", "pos"]),
+    ],
+)  # fmt: skip
+def test_words_of_names_in_other_languages(name: str, said: list[str]):
+    assert words(name) == said
+
+
+@pytest.mark.parametrize(("encoding", "time"), [("gbk", "时间"), ("shift_jis", "時間")])
+def test_encodings_of_chinese_and_japanese(tmp_path: Path, encoding: str, time: str):
+    path = tmp_path / "a.csv"
+    path.write_bytes(lines("{t:.3f},{q:.4f}", f"{time}[s],位置[deg]\n").encode(encoding))
+    assert columns_of(path) == {f"{time}[s]": "s", "位置[deg]": "deg"}
+    path.write_bytes(lines("{t:.3f},{q:.4f}", "temps (s),angle mesuré (°)\n").encode("cp1252"))
+    assert list(columns_of(path)) == ["temps (s)", "angle mesuré (°)"]
+
+
+def test_channels_go_by_the_names_beside_them(tmp_path: Path):
+    """Scopes of Simulink and dSPACE, cells of MATLAB, matrices of HDF5, lists of JSON, NumPy."""
+    kind = [("Name", object), ("Data", object), ("Unit", object)]
+    y = np.zeros((1, 2), dtype=kind)
+    y[0, 0], y[0, 1] = ('Root/"q"', Q[None, :], "rad"), ('Root/"u"', U[None, :], "Nm")
+    x = np.zeros((1, 1), dtype=kind)
+    x[0, 0] = ("", T[None, :], "s")
+    scipy.io.savemat(tmp_path / "a.mat", {"rec7": {"X": x, "Y": y}})
+    named = {"X.Data": "s", "Y.Root/q": "rad", "Y.Root/u": "Nm"}
+    assert columns_of(tmp_path / "a.mat") == named
+    trial = read_trial(tmp_path / "a.mat", ("X.Data", "Y.Root/u", "rec7.X.Data"))
+    np.testing.assert_array_equal(trial.columns["Y.Root/u"], U)
+    assert trial.units["Y.Root/u"] == "Nm"
+    runs = np.empty((1, 2), dtype=object)
+    runs[0, 0], runs[0, 1] = {"t": T, "q": Q}, {"t": T, "q": -Q}
+    scipy.io.savemat(tmp_path / "b.mat", {"runs": runs})
+    joined = read_trial(tmp_path / "b.mat", ("runs[:].t", "runs[:].q"))
+    np.testing.assert_array_equal(joined.columns["runs[:].q"], np.concatenate([Q, -Q]))
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file["log"] = np.column_stack([T, Q, U])
+        file["log"].attrs["columns"] = ["t", "q", "u"]
+    assert list(columns_of(tmp_path / "c.h5")) == ["log/t", "log/q", "log/u"]
+    trial = read_trial(tmp_path / "c.h5", ("log/t", "log/u"))
+    np.testing.assert_array_equal(trial.columns["log/u"], U)
+    content = {"log": [{"name": n, "values": [*v, *v]} for n, v in (("q", Q), ("u", U))]}
+    (tmp_path / "d.json").write_text(json.dumps(content | {"meta": {"fs": 100}}))
+    assert set(columns_of(tmp_path / "d.json")) == {"log[q].values", "log[u].values", "meta.fs"}
+    (tmp_path / "d.json").write_text(json.dumps([{"q": f"{q:.4f}"} for q in Q]))
+    np.testing.assert_array_equal(read_trial(tmp_path / "d.json", ("q",)).columns["q"], Q)
+    heads = np.array(["t", "q", "u"], dtype=object)
+    scipy.io.savemat(tmp_path / "g.mat", {"data": np.column_stack([T, Q, U]), "colheaders": heads})
+    assert list(columns_of(tmp_path / "g.mat")) == ["data.t", "data.q", "data.u"]
+    np.savez(tmp_path / "e.npz", t=T, q=np.column_stack([Q, U]))
+    np.testing.assert_array_equal(read_trial(tmp_path / "e.npz", ("q[1]",)).columns["q[1]"], U)
+    np.save(tmp_path / "f.npy", np.array([{"t": 1}], dtype=object))
+    with pytest.raises(InputError, match=r"pickled Python objects.*; save arrays of numbers"):
+        read_trial(tmp_path / "f.npy", ("t",))
+
+
+def test_counters_wrap_at_any_width_and_go_on():
+    angle = np.cumsum(np.full(500, 37.0))
+    for bits in (12, 16, 20):
+        found, rows, said = unwrapped(np.mod(angle * 2 ** (bits - 12), 2.0**bits), 0.0, True)
+        np.testing.assert_allclose(np.diff(found), 37.0 * 2 ** (bits - 12))
+        assert len(rows) == 4 and said == f"at {bits} bits"
+    assert not len(unwrapped(np.where(np.arange(500) < 250, 0.0, 3000.0), 0.0, True)[1])
+
+
+def test_stamps_of_whole_seconds_give_the_true_rate():
+    t = np.arange(2400) / 200.0 + 0.3
+    found, rounding = spread_stamps(np.floor(t))
+    assert rounding == 1.0
+    np.testing.assert_allclose(np.diff(found), 1.0 / 200.0, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("header", "asked"),
+    [
+        ("t [s],q [deg],torque [% of nominal]", "stated as '% of nominal'"),
+        ("t [s],q [furlong],torque [Nm]", "stated as 'furlong'"),
+        ("t [s],q [deg],torque [%]", "calibration_n_per_v"),
+        ("t [s],q [deg],load cell [kg]", "lever_m"),
+    ],
+)
+def test_a_unit_that_is_not_known_is_asked_for(tmp_path: Path, header: str, asked: str):
+    t = np.arange(2000) / 200.0
+    q = 57.3 * (np.sin(2 * t) + 0.3 * np.sin(5 * t))
+    u = 0.3 * np.gradient(np.gradient(q, t), t) + 40.0 * np.sin(q / 57.3)
+    np.savetxt(tmp_path / "a.csv", np.c_[t, q, u], delimiter=",", header=header, comments="")
+    assert any(asked in line for line in propose(tmp_path).fill_in)
+
+
+def test_a_log_that_is_written_backwards_is_refused(tmp_path: Path):
+    t = np.arange(2000)[::-1] / 200.0
+    table = np.c_[t, np.sin(3 * t), np.cos(3 * t)]
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="time_s,q,torque", comments="")
+    with pytest.raises(
+        InputError, match=r"time_s falls from row to row.*turn the order of its rows"
+    ):
+        propose(tmp_path)
+
+
+def test_units_that_labs_write():
+    for text, scale in (("U/min", 0.10472), ("Arms", 1.0), ("gon", 0.015708), ("grados", 0.017453)):
+        found = unit(text)
+        assert found is not None and found.scale == pytest.approx(scale, rel=1e-4)
+
+
+def test_data_of_other_kinds_are_named_with_what_to_do(tmp_path: Path):
+    (tmp_path / "a.xlsx").write_bytes(b"PK\x03\x04")
+    with pytest.raises(InputError, match=r"but a.xlsx; \*.xlsx is not read: export the sheet as"):
+        survey(tmp_path)
+    wide = "\n".join(",".join(f"{v:.3f}" for v in np.tile(row, 20)) for row in (T, Q, U))
+    (tmp_path / "b.csv").write_text(wide + "\n")
+    with pytest.raises(
+        InputError, match="3 rows of 1200 columns are no log; has it a channel a row"
+    ):
+        survey(tmp_path)
+    (tmp_path / "a.xlsx").unlink()
+    (tmp_path / "b.csv").write_text("(1.5) can0 141#A1250064\n" * 9)
+    with pytest.raises(
+        InputError, match=r"b.csv: no column of numbers in it; a line reads '\(1.5\) can0"
+    ):
+        survey(tmp_path)
+
+
+def test_a_trial_in_another_unit_is_said():
+    spans = {"a": {"q": 1.2}, "b": {"q": 71.0}, "c": {"q": 1.0}, "d": {"q": 1.4}}
+    (said,) = describe_spans(spans)
+    assert said.startswith("b: q goes 59.2 times as far as in the others")
