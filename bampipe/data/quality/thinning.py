@@ -6,7 +6,6 @@ from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import firwin, resample_poly
 
 from bampipe.data.quality.table import CleanTrial
 
@@ -41,6 +40,8 @@ def thin(trial: CleanTrial, every: int, sampled: Collection[str]) -> CleanTrial:
     """
     if every == 1:
         return trial
+    from scipy.signal import firwin, resample_poly  # slow to import, and for fast logs alone
+
     length = 2 * _HALF_LENGTH * every + 1
     low_pass = firwin(length, _HALF_POWER / every, window=("kaiser", _KAISER))
     columns = {
