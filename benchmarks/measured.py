@@ -27,7 +27,7 @@ from bampipe.declarations.model_file import identified, load_model
 from bampipe.estimate.simulation import simulate
 from bampipe.physics import System, compile_model
 from bampipe.trials.motion import Motion
-from bampipe.trials.reading import read_motion
+from bampipe.trials.reading import read_motions
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parents[1]
@@ -122,7 +122,8 @@ def load(run: Path, model: str) -> tuple[System, Array]:
 
 def read_trial(run: Path, trial: str, system: System) -> Motion:
     """One trial as the model needs it."""
-    return read_motion(RunFolder(run), trial, system)
+    motions = read_motions(RunFolder(run), system, braked=True)
+    return next(motion for motion in motions if motion.trial_id == trial)
 
 
 def run_free(

@@ -125,10 +125,9 @@ def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
 
 
 def _best_sine(trials: Sequence[tuple[Array, Array]], frequencies: Array) -> _Sine:
-    """Least-squares sine about the mean, of any phase and size in each trial (Lomb 1976).
+    """Best least-squares sine about the mean, of any phase and size in each trial (Lomb 1976).
 
-    Args:
-        trials: place or time, and residual, (T,) each; frequencies: to try, the best is taken.
+    ``trials`` are place or time, and residual, (T,) each.
     """
     centred = [(x, r - r.mean()) for x, r in trials]
     count = sum(len(r) for _, r in trials)

@@ -79,8 +79,7 @@ def _weight(squares: SquaresFit, robot: Robot, places: Indices) -> tuple[Array, 
 def base_estimates(system: System, p: Array, covariance: Array) -> tuple[BaseEstimate, ...] | None:
     """The combinations that motion can show, with what the trials add to the drawing.
 
-    Args:
-        p: (>= n_p,) parameters of the model; covariance: of those estimated, in order.
+    ``p`` (>= n_p,) are parameters of the model; ``covariance`` is that of those estimated.
     """
     robot = system.model.device.robot
     if robot is None:

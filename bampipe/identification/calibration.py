@@ -34,10 +34,8 @@ def propagate_calibration(
     Sources are gains and cross-talk of sensors and scales of encoders and channels as the session
     file states them, zeros of encoders, and constants of the device file with an ``sd``; they are
     independent. A parameter moves as least squares do (law of propagation of uncertainty, JCGM
-    100:2008, 5.1), whichever method made it; one at its bound stays.
-
-    Args:
-        motions: that were fitted, with every input of the device; squares: the fit to them.
+    100:2008, 5.1), whichever method made it; one at its bound stays. The motions that were fitted
+    have every input of the device.
     """
     count = int(np.sum(squares.free < len(system.parameters)))
     held = [int(k) for k in np.flatnonzero(squares.at_bound)]

@@ -124,8 +124,7 @@ def with_torques(
 ) -> pd.DataFrame:
     """Return the motion with the trial, the torque of the hand and that against gravity (Fig. 6).
 
-    Args:
-        t: (K,) times of the rows; columns: each (K,); p: (n_p,) parameters.
+    Rows are at times ``t`` (K,), as are the columns, each (K,).
     """
     found = ModelOnTrial(system, p, [motion])
     true, hand = found.mechanism, found.applied
@@ -159,9 +158,7 @@ def tabulate_trace(
 
     The column ``run`` is 0 from the real start on, 1 in the last run around the answer.
 
-    Args:
-        names: of the filter's parameters, of which the first ``len(names)`` are stored.
-        rows: most rows a trial.
+    The first ``len(names)`` of the filter's parameters are stored, in ``rows`` a trial at most.
     """
     frames, trial_ids = [], trial_names(motions)
     passes = zip(found.steps, found.passes, _elapsed(found.passes), strict=True)

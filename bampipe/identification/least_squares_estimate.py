@@ -172,11 +172,7 @@ class SquaresFit:
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
     def refit(self, kept: Sequence[Flags]) -> Array:
-        """Parameters (n_p + 1,) by some of the samples, to first order within the bounds.
-
-        Args:
-            kept: which samples, by axis, each (n,).
-        """
+        """Parameters (n_p + 1,) by the samples ``kept``, (n,) by axis, to first order in bounds."""
         pose, count = self.fit.problem, self.free.size
         lower, upper = pose.lower.copy(), pose.upper.copy()
         if not self.problem.linear:

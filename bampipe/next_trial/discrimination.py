@@ -89,10 +89,9 @@ class Remainder:
     share: float
 
     def distance(self, independent: Array, factor: Array | float = 1.0) -> Array:
-        """Return the expected log likelihood ratio of ``factor`` times the target, nats.
+        """Return the expected log likelihood ratio of ``factor`` times the target, nats, (...).
 
-        Args:
-            independent: (n_q,) samples; factor: one, or several, (...).
+        There are ``independent`` (n_q,) samples.
         """
         by_axis = np.square(factor)[..., None] * self.squares / np.maximum(independent, 1e-300)
         return np.asarray(0.5 * (np.log1p(by_axis) @ independent + np.square(factor) * self.prior))
@@ -268,9 +267,7 @@ class Comparison:
     def contrasts(self, total: Sums, on: Sums | None = None) -> dict[tuple[int, int], Contrast]:
         """Return the contrast of each pair of alternatives, with the trials of ``total`` fitted.
 
-        Args:
-            total: sums of all trials that are fitted.
-            on: sums of the trials on which `Contrast.left` is taken; the same by default.
+        `Contrast.left` is taken on the trials of ``on``, the same by default.
         """
         places, on = self._places(total.squares.shape[1]), on or total
         found = {}

@@ -156,10 +156,7 @@ def follow_roughly(
 def example_path(example: Example, t: Array) -> tuple[Array, Array, Array]:
     """Return position, velocity and acceleration of a trial played to and fro, each (T, n_q).
 
-    A jump from its end to its beginning would be faster than the trial.
-
-    Args:
-        t: (T,) times from 0 on, s.
+    A jump from its end to its beginning would be faster than the trial. Times ``t``, s, begin at 0.
     """
     motion = example.motion
     clock = motion.t - motion.t[0]
@@ -194,10 +191,8 @@ def stroke_path(
 ) -> tuple[Array, Array, Array]:
     """Return position, velocity and acceleration of minimum-jerk strokes, each (T,).
 
-    Args:
-        stroke: their ends and speeds; t: (T,) times from 0 on, s.
-        rng: draws the speed of each stroke within its band, and its turns.
-        jitter: largest error of a turn, as a share of the travel.
+    The speed of each stroke is drawn within its band, and its turns: ``jitter`` is the largest
+    error of a turn, as a share of the travel. Times ``t``, s, begin at 0.
     """
     q, qd, qdd = np.empty(t.size), np.zeros(t.size), np.zeros(t.size)
     travel = stroke.high - stroke.low

@@ -120,9 +120,7 @@ def _draw_series(
 
     A random power law for the amplitudes of the harmonics gives slow wide or quick short motion.
 
-    Args:
-        reach: ends of each axis; limits: (5, n_q), as in `Extent`; axes: axes that move.
-        seconds: its length; rng: draws the amplitudes.
+    ``limits`` (5, n_q) are as in `Extent`; only ``axes`` move.
     """
     n = len(reach.low)
     fall = np.arange(1, _HARMONICS + 1)[:, None] ** -rng.uniform(0.0, 2.0)
@@ -186,9 +184,8 @@ class Points:
     def text(self, form: Form, names: Mapping[str, str], sentence: str) -> str:
         """Return the file: a table, or a trajectory_msgs/JointTrajectory as JSON or YAML.
 
-        Args:
-            form: of the file; names: those of a robot's drives, if they differ from the axes'.
-            sentence: instruction, written as a comment.
+        ``names`` are those of a robot's drives, if they differ from the axes'; the sentence, an
+        instruction, is written as a comment.
         """
         if form == "csv":
             head = ["t", *(f"{n}_{a}" for n in ("q", "qd", "qdd", "effort") for a in self.axes)]

@@ -43,7 +43,7 @@ from bampipe.trials.folds import Folds
 from bampipe.trials.force_offsets import find_force_offsets
 from bampipe.trials.kinematics import AxisFilter, Kinematics
 from bampipe.trials.motion import Motion, input_derivatives, n_samples
-from bampipe.trials.reading import held_out_trials, read_motion_of
+from bampipe.trials.reading import held_out_trials, read_motion
 from bampipe.trials.sensors import Sensors
 
 SUMMARY = "Velocity and acceleration from the encoders, with error bands"
@@ -292,7 +292,7 @@ def _motions(
     """The trials just written."""
 
     def read(number: int) -> Motion:
-        return read_motion_of(path, names[number], system, left_out.get(names[number], ()))
+        return read_motion(path, names[number], system, left_out.get(names[number], ()))
 
     return TrialCache(read, len(names), n_samples, names=names, in_all=row_count(path, names))
 
@@ -329,7 +329,7 @@ def _inspect(
     fitted, others = ([k for k in ids if (k in free) == side] for side in (True, False))
     chosen = [some[k] for some in (fitted, others) for k in spread(len(some))]
     motions = [
-        read_motion_of(path, name, system, disturbances.get(name, ()), every_input=True)
+        read_motion(path, name, system, disturbances.get(name, ()), every_input=True)
         for name in chosen
     ]
     # What brakes do is no part of the bare device: it is judged by braked trials, not fitted.

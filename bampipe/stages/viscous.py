@@ -35,12 +35,13 @@ from bampipe.physics import Model, System, compile_model
 from bampipe.physics.viscous_field import NAME as FIELD
 from bampipe.physics.viscous_field import viscous_field
 from bampipe.progress import Progress
+from bampipe.results.filter import FilterResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.rounding import round_with_sd
 from bampipe.results.viscous import Damping, ViscousResult
 from bampipe.schema import STRICT, Positive
 from bampipe.trials.motion import Motion
-from bampipe.trials.reading import read_motion, read_sensors
+from bampipe.trials.reading import read_kinematics, read_motion, read_sensors
 
 SUMMARY = "Cartesian damping that the brakes rendered in the viscous trials, against the command"
 INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL)
@@ -93,8 +94,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.1, "reading the trials")
     brakes = [name for name in bare.device.brakes.values() if name in system.inputs]
     motions = []
-    for name in trials["trial_id"]:  # as if no brake had been commanded
-        motion = read_motion(run, str(name), system)
+    stretches, filters = run.read(FilterResult).disturbances, read_kinematics(run, system)
+    for name in trials["trial_id"].astype(str):  # as if no brake had been commanded
+        motion = read_motion(path, name, system, stretches.get(name, ()), filters)
         motions.append(motion.with_channels({b: np.zeros(motion.t.size) for b in brakes}))
     commanded = trials["viscous_n_s_per_m"].to_numpy(dtype=float)
     result, frame = _estimated(run, system, motions, commanded, identified, config, progress)

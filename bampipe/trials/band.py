@@ -36,10 +36,8 @@ def find_band(
     The band ends where 95 % of the power of the applied force above its noise is covered, but not
     above the bandwidth of the filtered motion, and not below `LEAST_HZ`.
 
-    Args:
-        system: the bare device, whose priors map channels to axes.
-        motions: the trials; sensors, kinematics: of the session.
-        chosen_hz: by the user for all axes, Hz; 0 takes it from the data.
+    The priors of the bare device map channels to axes. ``chosen_hz`` is that of the user for all
+    axes, Hz; 0 takes it from the data.
     """
     rate = sensors.rate_hz
     numbers = np.unique(np.linspace(0, len(motions) - 1, min(len(motions), _LONGEST)).round())

@@ -37,9 +37,7 @@ def find_force_offsets(
 
     Offsets are found beside the parameters of the bare device, so that these do not take them up.
 
-    Args:
-        system: the bare device; motions: the free trials; band: of the residual.
-        fitted: numbers of the trials that a fit may see; others get their own by what these found.
+    A fit sees the trials numbered ``fitted``; others get their own by what these found.
 
     Returns:
         N or N.m by force, by trial; empty where offsets by trial are not plain.

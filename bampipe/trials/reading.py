@@ -81,25 +81,6 @@ def free_trials(run: RunFolder, *, fitted: bool = False, braked: bool = False) -
 
 
 def read_motion(
-    run: RunFolder, trial_id: str, system: System, *, every_input: bool = False
-) -> Motion:
-    """Read one trial of ``filter/kinematics.parquet``.
-
-    Args:
-        system: the model, whose inputs and their first time derivatives are read.
-        every_input: every input of its device too, with all time derivatives: what an effect
-            that is not in the model may need.
-
-    Raises:
-        InputError: the file or a column that the model needs is missing.
-    """
-    path = run.require(KINEMATICS, "filter")
-    disturbances = run.read(FilterResult).disturbances.get(trial_id, ())
-    filters = read_kinematics(run, system)
-    return read_motion_of(path, trial_id, system, disturbances, filters, every_input=every_input)
-
-
-def read_motion_of(
     path: Path,
     trial_id: str,
     system: System,
@@ -111,8 +92,13 @@ def read_motion_of(
     """Read one trial of a table of kinematics.
 
     Args:
-        path: the table; trial_id, system, every_input: as for `read_motion`, as are the errors.
+        system: the model, whose inputs and their first time derivatives are read.
         disturbances: of the trial, which are left out; filters: that it went through.
+        every_input: every input of its device too, with all time derivatives: what an effect
+            that is not in the model may need.
+
+    Raises:
+        InputError: the file or a column that the model needs is missing.
     """
     axes, device = system.coordinates, system.model.device
     stored = frozenset(column_names(path))
@@ -186,7 +172,7 @@ def read_motions(
 
     def fetch(number: int) -> Motion:
         name = names[number]
-        motion = read_motion_of(
+        motion = read_motion(
             path, name, system, disturbances.get(name, ()), filters, every_input=every_input
         )
         return motion.with_input_timing(late_s)

@@ -63,11 +63,9 @@ class FormDictionary:
         self.starts: dict[str, Mapping[str, float]] = {}
 
     def add_grammar(self, curves: bool = False, left: Array | None = None) -> None:
-        """Add every form of the grammar.
+        """Add every form of the grammar, or ``curves`` through points in place of formulas.
 
-        Args:
-            curves: curves through points in place of formulas.
-            left: residual of the axis (n,), where points of curves belong.
+        These belong where the residual ``left`` (n,) of the axis is.
         """
         spans = self.spans
         if left is not None:
@@ -101,10 +99,9 @@ class FormDictionary:
     def _ranges(self, name: str) -> list[tuple[str, float, float, bool]]:
         """Searched constants with the ends of their ranges, and whether to step by ratios."""
         form = self.candidates[name]
-        by_ratio = {
-            n: k in ("length", "time", "wavenumber") for n, k in form.shape.searched.items()
-        }
-        return [(n, low, high, by_ratio[n]) for n, (low, high, _) in form.limits().items()]
+        by_ratio = ("length", "time", "wavenumber")
+        limits, kinds = form.limits().items(), form.shape.searched
+        return [(n, low, high, kinds[n] in by_ratio) for n, (low, high, _) in limits]
 
     def bounds(self, name: str) -> list[tuple[float, float]]:
         """Of each strength of a form: a file states none."""
@@ -210,12 +207,8 @@ class FormDictionary:
             u, z = motion.inputs(system.inputs)[rows], fitted.memory[rows]
             applied = system.applied(q, qd, qdd, z, u, e.p)[:, axis]
             sign = np.tanh(qd[:, axis] / device.coordinates[axis].sign_width)
-            values = {
-                _APPLIED: applied,
-                FRICTION: sign,
-                DAMPING: qd[:, axis],
-                INERTIA: qdd[:, axis],
-            }
+            values = {_APPLIED: applied, FRICTION: sign}
+            values |= {DAMPING: qd[:, axis], INERTIA: qdd[:, axis]}
             for c in coordinates(device, axis):
                 by_quantity = {
                     "position": q[:, c.axis],

@@ -71,15 +71,13 @@ def write_toml(declaration: Mapping[str, Any]) -> str:
     """The text of an effect file."""
     plain = {k: v for k, v in declaration.items() if not isinstance(v, Mapping)}
     lines = [f"{key} = {_value(value)}" for key, value in plain.items()]
-    if isinstance(declaration.get("torque"), Mapping):
-        lines += ["", "[torque]"]
-        lines += [f"{key} = {_value(value)}" for key, value in declaration["torque"].items()]
-    for name, entry in declaration["parameters"].items():
-        lines += ["", f"[parameters.{name}]"]
-        lines += [f"{key} = {_value(value)}" for key, value in entry.items()]
-    for name, entry in declaration.get("states", {}).items():
-        lines += ["", f"[states.{name}]"]
-        lines += [f"{key} = {_value(value)}" for key, value in entry.items()]
+    torque = declaration.get("torque")
+    tables = {"torque": torque} if isinstance(torque, Mapping) else {}
+    for group in ("parameters", "states"):
+        entries = declaration.get(group, {})
+        tables |= {f"{group}.{name}": entry for name, entry in entries.items()}
+    for head, entry in tables.items():
+        lines += ["", f"[{head}]", *(f"{key} = {_value(value)}" for key, value in entry.items())]
     return "\n".join(lines) + "\n"
 
 

@@ -318,7 +318,6 @@ def list_forms(
     """Every form for one axis.
 
     Args:
-        device: the mechanism; axis: number of the coordinate.
         spans: of the coordinates in the trials, by their words; those without one do not vary.
         times: time between samples and of a trial, s.
         scales: of the factors ``damping`` and ``inertia``.

@@ -211,8 +211,7 @@ def draft_formulas(
     """Search a formula for what a model leaves on each of some axes, one after the other.
 
     Args:
-        session: the trials; recipe: the model; start: of its parameters, (n_p,).
-        axes: numbers of the coordinates.
+        start: of the model's parameters, (n_p,); axes: numbers of the coordinates.
         source: that the effect files state.
         curves: whether a curve through points will do, where prediction is all that is wanted.
         progress: called with a fraction and a message.
