@@ -23,9 +23,8 @@ class Candidate:
         system: the device with this effect alone; with the other effects of the model before it
             where it acts on what they leave.
         is_joint: whether it is with them.
-        parameters: those of the effect.
-        linear_indices: places among them of strengths in which the residual is linear.
-        searched_indices: places among them of those that are searched.
+        linear_indices: places among the effect's parameters of strengths in which the residual is
+            linear; searched_indices: of those that are searched.
     """
 
     name: str

@@ -26,12 +26,9 @@ class Signature:
 
     Attributes:
         axis: the axis it is largest on, relative to the friction there.
-        unit: of the residual.
         rms: root mean square of the residual by axis, N.m or N.
-        against: name of what explains most of the residual.
-        against_unit: its unit.
-        share: share of the residual's variance that a curve over ``against`` explains.
-        abscissa: values of ``against``, (T,).
+        against: name of what explains most of the residual; abscissa: its values, (T,).
+        share: share of the residual's variance that a curve over that explains.
         residual: residual on ``axis``, (T,), in ``unit``.
         braked: whether the brakes were on.
     """

@@ -30,7 +30,6 @@ class Unknown:
     """The unknown function beside a set of effects.
 
     Attributes:
-        axis: its number.
         cost: negative log evidence of the set with it, as `Search.cost`.
         residual: weighted rows that are left, by axis, each (n,).
         weight: of the squares of each axis.

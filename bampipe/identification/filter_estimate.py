@@ -82,11 +82,10 @@ class FilterTask:
     """What the filter is asked.
 
     Attributes:
-        run: the run folder; system: the model; recipe: the same as data; name: for messages.
+        recipe: the model as data; name: of it, for messages.
         start: (n_p,) starting values.
         squares: least squares, which give the region of the answer.
         known: (n,) their standard deviations, of parameters that the trials leave open the prior's.
-        noise: of the sensors; choice: of the filter.
     """
 
     run: RunFolder

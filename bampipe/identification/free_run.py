@@ -68,9 +68,7 @@ def free_runs(
     if why_not and not system.model.device.prescribed:
         return FreeRun(reason=why_not)
     law = compile_law(system.model.device)
-    reason = "the device file declares no [controller]"
-    if law is not None:
-        reason = _lacks(run, system, law)
+    reason = "the device file declares no [controller]" if law is None else _lacks(run, system, law)
     mode: Literal["closed_loop", "open_loop"] = OPEN if law is None or reason else CLOSED
     runs = []
     try:

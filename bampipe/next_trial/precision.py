@@ -43,8 +43,7 @@ class Precision:
     """The present uncertainty of the parameters, and the information that trials would add.
 
     Attributes:
-        names: of the estimated parameters, in order.
-        sd: (n,) published standard deviations.
+        sd: (n,) published standard deviations of the estimated parameters, in order.
         formal_sd: (n,) those of the estimator alone, if its assumptions on noise held.
         systematic_sd: (n,) the part of ``sd`` by which methods disagree.
         irreducible_sd: (n,) the part that no further trial reduces: calibration of the sensors and

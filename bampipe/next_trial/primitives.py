@@ -203,7 +203,6 @@ class Example:
     """A trial at hand that is imitated.
 
     Attributes:
-        motion: what was recorded; trial: its name.
         reach: share of its range that is covered; haste: factor on its speeds.
     """
 

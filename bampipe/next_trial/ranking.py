@@ -40,7 +40,6 @@ class DesignSpace:
     """The designs that are tried.
 
     Attributes:
-        rehearsal: the model, sensors and filters with which they are tried.
         seconds: length of each; axes: the axes that they excite.
         examples: further designs beside the primitives.
         with_rests: whether an axis may rest at the turns; with_brakes: whether brakes may be on.

@@ -160,8 +160,7 @@ class Detectability:
     """The effects of the library that the trials at hand would have shown.
 
     Attributes:
-        comparison: every effect at its typical strength.
-        limits: the strength from which on each would have been found.
+        comparison: every effect at its typical strength; limits: of each.
         needed: log evidence, before penalties, that makes an effect probable enough, nats.
     """
 

@@ -27,7 +27,14 @@ class ChannelRecords:
 
     def __init__(self, session: Session, device: Device) -> None:
         self._session, self._device = session, device
-        self._units = _force_units(session, device)
+        # One raw unit, in SI, of the forces that are logged in a unit in which none counts whole.
+        units: dict[str, float] = {}
+        if session.force and not session.force.volts:
+            gains = np.diag(np.array(session.force.calibration))
+            units |= dict(zip(session.force.names, gains, strict=True))
+        units |= {each.name: each.scale for each in session.channels if each.offset == 0.0}
+        whole = {name: unit for name, unit in units.items() if unit >= 1.0}
+        self._units = {name: unit for name, unit in whole.items() if name in device.forces}
         self._noise: dict[str, list[RecordNoise]] = defaultdict(list)
         self._hum: dict[str, list[dict[float, float]]] = defaultdict(list)
         self._counts: dict[str, list[tuple[float, float] | None]] = defaultdict(list)
@@ -105,16 +112,6 @@ class ChannelRecords:
                 )
             )
         return said
-
-
-def _force_units(session: Session, device: Device) -> dict[str, float]:
-    """One raw unit, in SI, of the forces that are logged in a unit in which none counts whole."""
-    units: dict[str, float] = {}
-    if session.force and not session.force.volts:
-        gains = np.diag(np.array(session.force.calibration))
-        units |= dict(zip(session.force.names, gains, strict=True))
-    units |= {each.name: each.scale for each in session.channels if each.offset == 0.0}
-    return {name: unit for name, unit in units.items() if name in device.forces and unit >= 1.0}
 
 
 def _counts(readings: Array) -> tuple[float, float] | None:

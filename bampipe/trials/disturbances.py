@@ -247,14 +247,6 @@ def _joined(stretches: list[_Stretch]) -> tuple[Disturbance, ...]:
     )
 
 
-def disturbed_samples(t: Array, stretches: Sequence[Disturbance]) -> Flags:
-    """Tell which samples at times (T,), s since the start of the trial, lie in a stretch, (T,)."""
-    inside = np.zeros(t.size, dtype=bool)
-    for one in stretches:
-        inside |= (t >= one.start_s) & (t <= one.end_s)
-    return inside
-
-
 def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Motion], list[int]]:
     """Part trials at their disturbances, for what follows a motion from sample to sample.
 

@@ -38,11 +38,8 @@ class Evidence:
     """Residuals of one model on the trials of one session, linearised at its least-squares fit.
 
     Attributes:
-        system: the model.
         p: parameters at which it is linearised, (n_p,).
-        motions: the trials.
-        fitted: the model with these parameters on each of them.
-        band: the low-pass.
+        fitted: the model with these parameters on each of the trials.
         folds: which trials were fitted, and which are left out together.
         residual: low-passed and thinned, by trial, each (K, n_q), N.m or N.
         jacobian: derivative of ``residual`` by the free parameters, by trial, (K, n_q, n_free);

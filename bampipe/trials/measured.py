@@ -42,7 +42,6 @@ class MeasuredTrials:
     Attributes:
         motions: the free trials, then those in a viscous field.
         sensors: that read them; kinematics: the filters they went through.
-        band: in which residuals are compared.
         folds: which a fit may see, and which are left out together.
         blocks: how many of the motions are blocks of the only trial that is not held out.
         late_s: time by which inputs were sampled after positions, taken off already; limit_s: the

@@ -18,12 +18,15 @@ TIMING_ORDERS = 3
 residual, to 0.7 %. By the first alone it is 20 %, which looks like a lag."""
 
 
+SAMPLED = ("t", "q", "qd", "qdd", "qd_sd")
+"""Fields of a motion with one row a sample."""
+
+
 @dataclass(frozen=True)
 class Recording:
     """One trial on a uniform grid, SI units, unfiltered.
 
     Attributes:
-        trial_id: its name.
         q: encoder readings, (T, n_q), rad or m.
         channels: every other logged input of the device by name, each (T,): forces, brake
             commands, further channels.
@@ -46,7 +49,6 @@ class Motion:
     """One trial with its derivatives, on a uniform grid; one row a sample.
 
     Attributes:
-        trial_id: its name.
         t: time since the start of the trial, (T,), s.
         q, qd, qdd: (T, n_q), rad or m and derivatives.
         qd_sd: standard deviation of the velocities, (T, n_q).
@@ -109,11 +111,7 @@ class Motion:
         """Some of its samples, at the same times."""
         return replace(
             self,
-            t=self.t[which],
-            q=self.q[which],
-            qd=self.qd[which],
-            qdd=self.qdd[which],
-            qd_sd=self.qd_sd[which],
+            **{name: getattr(self, name)[which] for name in SAMPLED},
             channels={name: values[which] for name, values in self.channels.items()},
             left_out=None if self.left_out is None else self.left_out[which],
             _columns={},

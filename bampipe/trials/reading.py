@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from bampipe.physics.soundness import require_sound
 from bampipe.results.filter import Disturbance, FilterResult
 from bampipe.results.ingest import IngestResult
 from bampipe.trials.cache import TrialCache
-from bampipe.trials.disturbances import disturbed_samples
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import TIMING_ORDERS, Motion, input_derivatives, n_samples
 from bampipe.trials.sensors import Sensors
@@ -127,25 +127,15 @@ def read_motion(
         for name, column in column_of.items()
         if column in stored or name in brakes  # a brake without a logged command was off
     }
-
-    def stack(kind: str) -> Array:
-        return np.stack([columns[name] for name in motion[kind]]).T
-
+    kinematics: dict[str, Any] = {
+        kind: np.stack([columns[name] for name in names]).T for kind, names in motion.items()
+    }
     t = t - t[0]
     left_out = None
     if disturbances:
-        left_out = np.tile(disturbed_samples(t, disturbances)[:, None], (1, len(axes)))
-    return Motion(
-        trial_id=trial_id,
-        t=t,
-        q=stack("q"),
-        qd=stack("qd"),
-        qdd=stack("qdd"),
-        qd_sd=stack("qd_sd"),
-        channels=channels,
-        left_out=left_out,
-        filters=filters,
-    )
+        inside = np.any([(t >= one.start_s) & (t <= one.end_s) for one in disturbances], axis=0)
+        left_out = np.tile(inside[:, None], (1, len(axes)))
+    return Motion(trial_id, t, **kinematics, channels=channels, left_out=left_out, filters=filters)
 
 
 def read_motions(

@@ -33,6 +33,7 @@ from bampipe.physics.device import derivative
 from bampipe.trials.cache import MOST_SAMPLES, TrialCache
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import (
+    SAMPLED,
     EncoderFilters,
     Motion,
     Recording,
@@ -414,7 +415,7 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
     try:
         for count, motion in enumerate(motions, start=1):
             arrays: dict[str, Any] = {f"channel {name}": x for name, x in motion.channels.items()}
-            for name in _ARRAYS:
+            for name in SAMPLED:
                 arrays[name] = getattr(motion, name)
             filters = motion.filters
             if motion.left_out is not None:
@@ -431,9 +432,6 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
     return trials
 
 
-_ARRAYS = ("t", "q", "qd", "qdd", "qd_sd")
-
-
 def _stored_motion(path: Path, filters: EncoderFilters | None) -> Motion:
     with np.load(path) as stored:
         channels = {
@@ -441,7 +439,7 @@ def _stored_motion(path: Path, filters: EncoderFilters | None) -> Motion:
             for name in stored.files
             if name.startswith("channel ")
         }
-        arrays = {name: stored[name] for name in _ARRAYS}
+        arrays = {name: stored[name] for name in SAMPLED}
         trial_id, left_out = str(stored["trial_id"]), stored.get("left_out")
         return Motion(
             trial_id=trial_id, channels=channels, left_out=left_out, filters=filters, **arrays
