@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model_file import identified, load_model
-from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.identifiability import find_information
-from bampipe.identification.sensor_noise import sensor_noise
+from bampipe.identification.sensor_noise import FilterChoice, sensor_noise
 from bampipe.next_trial.primitives import (
     Envelope,
     Primitive,

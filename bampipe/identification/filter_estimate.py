@@ -20,7 +20,6 @@ from bampipe.estimate.unscented import (
     filter_trials,
 )
 from bampipe.identification.estimates import Estimate, input_timing
-from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_run import (
     Attempt,
     FilterRun,
@@ -41,6 +40,7 @@ from bampipe.identification.filter_tables import (
 )
 from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.identification.sensor_noise import (
+    FilterChoice,
     Noise,
     choose_tuning_trials,
     noise_levels,

@@ -22,8 +22,7 @@ from bampipe.estimate.unscented import (
     Trial,
     filter_trials,
 )
-from bampipe.identification.filter_choice import FilterChoice
-from bampipe.identification.sensor_noise import Noise
+from bampipe.identification.sensor_noise import FilterChoice, Noise
 from bampipe.physics import System
 from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.reading import input_columns, read_samples

@@ -1,11 +1,14 @@
-"""Noise of a session's sensors, and the levels that suit the filter best (NIS, likelihood)."""
+"""Settings of the filter, noise of the sensors, and the levels that suit it best (likelihood)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.arrays import Array, Flags
 from bampipe.estimate.filter_uncertainty import climb
@@ -16,9 +19,9 @@ from bampipe.estimate.unscented import (
     Trial,
     filter_trials,
 )
-from bampipe.identification.filter_choice import FilterChoice
 from bampipe.physics import System
 from bampipe.results.identify import NoiseLevels
+from bampipe.schema import STRICT, NotNegative, Positive
 from bampipe.trials.motion import Motion
 from bampipe.trials.sensors import Sensors
 
@@ -28,6 +31,36 @@ _TUNING_TRIALS = 6
 """Trials that they are taken from: what a model lacks may be small in one alone."""
 _TUNING_STEP_S = 2e-3
 """Longest Runge-Kutta step while tuning, s: noise levels need no more."""
+
+
+@checked_dataclass(frozen=True, config=STRICT)
+class FilterChoice:
+    """Settings of the filter.
+
+    Attributes:
+        engine: ``compiled``, or ``filterpy``: slow, gives the same numbers.
+        measure: ``position``, or ``position_velocity`` as in the paper; filtered velocities are
+            not white, so intervals from them are too narrow.
+        random_walk: of the parameters, in prior standard deviations per square root of a
+            second; 0 takes them as constant, and only then are the intervals calibrated.
+        reading_noise: standard deviation of a position reading in encoder steps; 0 takes it
+            from the data.
+        force_noise: of a force sample, N, model error included; 0 takes it from the data, or
+            from the identification where the model has been identified.
+        longest_step_s: longest Runge-Kutta step, s.
+        block_s: length of the blocks that are taken as independent of each other, s; shorter
+            in short sessions, for three a parameter at least.
+        trace_rows: most rows a trial in tables of states and of parameters along the data.
+    """
+
+    engine: Literal["compiled", "filterpy"] = "compiled"
+    measure: Literal["position", "position_velocity"] = "position"
+    random_walk: NotNegative = 0.0
+    reading_noise: NotNegative = 0.0
+    force_noise: NotNegative = 0.0
+    longest_step_s: Positive = 1e-3
+    block_s: Positive = 2.0
+    trace_rows: Annotated[int, Field(gt=0)] = 2000
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,8 @@ import numpy as np
 from bampipe.arrays import Array
 from bampipe.estimate.least_squares import Problem, stacked_residual
 from bampipe.estimate.low_pass import Band
-from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.identifiability import find_information
-from bampipe.identification.sensor_noise import Noise
+from bampipe.identification.sensor_noise import FilterChoice, Noise
 from bampipe.physics import System
 from bampipe.results.identify import IdentifyResult
 from bampipe.trials.motion import Motion

@@ -29,7 +29,6 @@ from bampipe.identification.choice import (
     why_not_filtered,
 )
 from bampipe.identification.estimates import Estimate, collect_result
-from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_estimate import FilterTask, estimate_by_filter
 from bampipe.identification.filter_run import MotionLost
 from bampipe.identification.identifiability import assess_identifiability
@@ -39,7 +38,7 @@ from bampipe.identification.least_squares_estimate import (
     fit_squares,
     require_enough,
 )
-from bampipe.identification.sensor_noise import Noise, sensor_noise
+from bampipe.identification.sensor_noise import FilterChoice, Noise, sensor_noise
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress

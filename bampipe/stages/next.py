@@ -24,8 +24,7 @@ from bampipe.diagnosis.session import Session, system_of, without_members
 from bampipe.errors import InputError, NothingToDoError, choose_from
 from bampipe.estimate.simulation import Runaway
 from bampipe.files import digest_content, write_json, write_text
-from bampipe.identification.filter_choice import FilterChoice
-from bampipe.identification.sensor_noise import sensor_noise
+from bampipe.identification.sensor_noise import FilterChoice, sensor_noise
 from bampipe.next_trial.discrimination import Comparison
 from bampipe.next_trial.forecast import Forecast
 from bampipe.next_trial.plan import Goal, plan_trials, record_plan

@@ -19,7 +19,6 @@ from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import read_parquet, write_parquet
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model
 from bampipe.estimate.filter_uncertainty import sandwich_covariance
-from bampipe.identification.filter_choice import FilterChoice
 from bampipe.identification.filter_run import (
     Attempt,
     FilterRun,
@@ -30,7 +29,7 @@ from bampipe.identification.filter_run import (
     run_filter,
 )
 from bampipe.identification.filter_tables import tabulate_trace
-from bampipe.identification.sensor_noise import sensor_noise, untuned_settings
+from bampipe.identification.sensor_noise import FilterChoice, sensor_noise, untuned_settings
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.viscous_field import NAME as FIELD
 from bampipe.physics.viscous_field import viscous_field
