@@ -86,9 +86,8 @@ def plan_trials(forecast: Forecast, ranked: Sequence[RankedDesign], goal: Goal) 
     # that the trials at hand would be expected to give if they were recorded again.
     left = _find_distance(_find_outcome(forecast, chosen), goal)
     while not (is_enough or is_full):
-        distances = [
-            _find_distance(_find_outcome(forecast, [*chosen, one]), goal) for one in options
-        ]
+        wider = ([*chosen, one] for one in options)
+        distances = [_find_distance(_find_outcome(forecast, plan), goal) for plan in wider]
         best = int(np.argmin(distances))
         if 0.0 < distances[best] and distances[best] > left - _LEAST_PROGRESS:
             break
@@ -109,9 +108,8 @@ def _shorten_plan(forecast: Forecast, chosen: list[_Option], goal: Goal) -> list
         if fewer and _find_distance(_find_outcome(forecast, fewer), goal) <= 0.0:
             chosen = fewer
             continue
-        while (seconds := _SHORTENED_TO * chosen[k].design.seconds) >= _find_shortest(
-            chosen[k].design
-        ):
+        shortest = _find_shortest(chosen[k].design)
+        while (seconds := _SHORTENED_TO * chosen[k].design.seconds) >= shortest:
             shorter = [*chosen[:k], chosen[k].scale_to(seconds), *chosen[k + 1 :]]
             if _find_distance(_find_outcome(forecast, shorter), goal) > 0.0:
                 break

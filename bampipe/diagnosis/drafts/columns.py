@@ -51,8 +51,7 @@ class FormDictionary:
     """The forms that may act on one axis, beside one fitted model.
 
     Attributes:
-        evidence: the model on the trials; samples: of it that count.
-        axis: number of the coordinate.
+        samples: of the evidence that count; axis: number of the coordinate.
         candidates: forms by name.
         starts: of candidates that have no grid, the searched constants to begin with.
     """

@@ -48,12 +48,9 @@ _SEED = 11
 
 @dataclass(frozen=True)
 class Term:
-    """A form with its numbers.
+    """A form with the values of its constants, by name, as fitted with the model.
 
-    Attributes:
-        form: what it is.
-        values: of its constants, by name, as fitted with the model.
-        covariance: of them, in that order.
+    Their covariance is in that order.
     """
 
     form: Form
@@ -115,7 +112,6 @@ class FoundDraft:
     """What a search for a formula on one axis came to.
 
     Attributes:
-        axis: its number.
         terms: found, at most `MOST_TERMS`.
         chance: of the first term, and of the next where one was looked for.
         noise_floor: error of replays of the final model, N.m or N.
