@@ -156,6 +156,7 @@ def rank_effects(
     initial, final = selection.initial, selection.final
     pairs = zip(final.evidence.system.parameters, final.evidence.p, strict=True)
     values = {q.name: float(value) for q, value in pairs}
+    own = {item.name: item.parameters for item in final.evidence.system.model.effects}
     unchosen = (e for e in selection.gains if e not in selection.effects)
     others = sorted(unchosen, key=lambda e: -selection.gains[e])
     chosen = sorted(selection.effects, key=lambda e: -selection.weighed.drops.get(e, 0.0))
@@ -179,16 +180,11 @@ def rank_effects(
                 probability=min(probability.get(effect, 0.0), 1.0),
                 p_value=p_values.get(effect, chance_of(gain, selection.chance)),
                 score=gain,
-                parameters={n: v for n, v in values.items() if n in _own(final, effect)},
+                parameters={q.name: values[q.name] for q in own.get(effect, ())},
                 indistinguishable_from=_alike(selection, effect, mentioned),
             )
         )
     return rows
-
-
-def _own(fit: Fit, effect: str) -> frozenset[str]:
-    found = (i for i in fit.evidence.system.model.effects if i.name == effect)
-    return frozenset(q.name for item in found for q in item.parameters)
 
 
 def _alike(selection: Selection, effect: str, mentioned: float) -> tuple[str, ...]:

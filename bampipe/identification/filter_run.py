@@ -191,29 +191,19 @@ def load_filter_trial(
 
 
 def infer_initial_state(
-    system: System,
-    p: Array,
-    q: Array,
-    qd: Array,
-    u: Array,
-    reading_sd: Array,
-    speed_sd: Array,
+    system: System, p: Array, q: Array, qd: Array, u: Array, reading_sd: Array, speed_sd: Array
 ) -> tuple[Array, Array]:
     """Return the state (nx,) of the mechanism whose encoders read this, and its sd (nx,).
 
     Args:
-        p: (n_p,) parameters.
-        q: positions that the encoders read, (n_q,); qd: rates of the mechanism, (n_q,).
-        u: (n_u,) inputs.
-        reading_sd: (n_q,) of a position; speed_sd: (n_q,) of a rate.
+        p: (n_p,) parameters; u: (n_u,) inputs; reading_sd: (n_q,) of a position.
+        q: positions that the encoders read, (n_q,); qd, speed_sd: rates of the mechanism, (n_q,).
     """
     offset = system.offset(q[None], u[None], p)[0]
     memory = system.initial_memory(q + offset, u, p)
     place = np.hypot(2.0 * reading_sd, _SHIFT_KNOWN * offset)
-    return (
-        np.concatenate([q + offset, qd, memory]),
-        np.concatenate([place, speed_sd, np.zeros(len(memory))]),
-    )
+    spread = np.concatenate([place, speed_sd, np.zeros(len(memory))])
+    return np.concatenate([q + offset, qd, memory]), spread
 
 
 def clear_of_reversal_mask(motion: Motion, system: System, t: Array) -> Flags:
