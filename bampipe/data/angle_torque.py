@@ -1,4 +1,4 @@
-"""What of a drive follows the angle of its axis: weight, a spring, both, or nothing that shows."""
+"""A motion smoothed for regressions, and what of a drive follows the angle of its axis."""
 
 from __future__ import annotations
 
@@ -6,8 +6,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.signal import oaconvolve
 from scipy.special import fdtrc
 
+from bampipe.arrays import Array
+
+_SMOOTHED_S = 0.06
+"""Length of the window over which motion and input are smoothed before they are compared, s."""
 Reading = Literal["gravity", "either", "both", "spring", "nothing"]
 
 _LEFT = 0.8
@@ -20,6 +25,44 @@ _PLAINLY = 0.9
 in their place: friction that is fitted roughly leaves a little that resembles one."""
 _WINDOW = 5.0
 """Correlation is summed up to so many times what it sums up to (Sokal 1997)."""
+
+
+@dataclass(frozen=True)
+class SmoothedMotion:
+    """The motion of one axis.
+
+    What one filter takes off the motion, `smooth` takes off what is compared with it.
+
+    Attributes:
+        window: (W,) weights; inner: samples that its ends do not reach.
+        moving: (T, 3) acceleration, velocity and its sign; position: (T,).
+    """
+
+    window: Array
+    inner: slice
+    moving: Array
+    position: Array
+
+    @classmethod
+    def of(cls, t: Array, q: Array) -> SmoothedMotion | None:
+        """Smooth a position ``q`` (T,) at ``t`` (T,), s; None where it is too short."""
+        step = float(np.median(np.diff(t)))
+        width = max(5, round(_SMOOTHED_S / step) | 1)
+        if len(t) < 4 * width + 20:
+            return None
+        window = np.hanning(width + 2)[1:-1]
+        window = window / window.sum()
+        once = oaconvolve(q, window, "same")
+        qd = np.gradient(once, step)
+        sides = [np.gradient(qd, step), qd, np.sign(qd), once]
+        *moving, position = (oaconvolve(values, window, "same") for values in sides)
+        inner = slice(2 * width, -2 * width or None)
+        return cls(window, inner, np.column_stack(moving), position)
+
+    def smooth(self, values: Array) -> Array:
+        """``values`` (T,) smoothed as often as the motion."""
+        once = oaconvolve(values, self.window, "same")
+        return np.asarray(oaconvolve(once, self.window, "same"))
 
 
 @dataclass(frozen=True)

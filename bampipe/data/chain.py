@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
 from bampipe.data.mjcf import mjcf_tree
-from bampipe.data.rigid_body import Body
 from bampipe.data.robot_tree import (
     MOVING,
+    Body,
     DriveLimits,
     LumpedBodies,
     Tree,

@@ -15,8 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
-from bampipe.data.rigid_body import Body, symmetric
-from bampipe.data.robot_tree import DriveLimits, Tree, TreeJoint, fixed_joint
+from bampipe.data.robot_tree import Body, DriveLimits, Tree, TreeJoint, fixed_joint, symmetric
 from bampipe.data.robot_xml import document, number_list, numbers
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names

@@ -11,7 +11,7 @@ from unicodedata import combining, normalize
 
 import numpy as np
 
-from bampipe.data.looks import describe, find_roles, is_time
+from bampipe.data.guesses import describe, find_roles, is_time
 from bampipe.data.parts import are_axes, join_parts
 from bampipe.data.readers import (
     EXTENSIONS,

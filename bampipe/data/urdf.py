@@ -9,8 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
-from bampipe.data.rigid_body import Body, symmetric
-from bampipe.data.robot_tree import DriveLimits, Tree, TreeJoint
+from bampipe.data.robot_tree import Body, DriveLimits, Tree, TreeJoint, symmetric
 from bampipe.data.robot_xml import document, number_list, numbers, read_xml
 from bampipe.errors import InputError
 

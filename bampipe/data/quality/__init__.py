@@ -8,9 +8,8 @@ noticed is a sentence in ``notes``. Nothing is altered without one.
 
 from __future__ import annotations
 
-from bampipe.data.quality import channels, clock, encoders, faulty_readings, motion
-from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable
-from bampipe.data.quality.thinning import thin, thinning_factor
+from bampipe.data.quality import channels, clock, encoders, faulty_readings
+from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable, thin, thinning_factor
 from bampipe.data.readers import RawTrial
 from bampipe.data.session import Session, TrialEntry
 
@@ -60,7 +59,7 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
     faulty_readings.note_dead_stretches(table)
     faulty_readings.leave_out_rails(table)
     columns = channels.to_si(table)
-    motion.refuse_wrong_motion(table, columns)
-    motion.refuse_wrong_brakes(table, columns)
+    encoders.refuse_wrong_motion(table, columns)
+    encoders.refuse_wrong_brakes(table, columns)
     rate = clock.rate_of(table.t)
     return CleanTrial(table.t, columns, rate, table.repairs, table.notes, table.dead)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from bampipe.arrays import Flags
-from bampipe.data.angle_torque import least_squares
+from bampipe.data.angle_torque import SmoothedMotion, least_squares
 from bampipe.data.quality.channels import fill_missing, take_out
 from bampipe.data.quality.table import TrialTable, find_runs, longest_run
-from bampipe.data.smoothing import SmoothedMotion
 from bampipe.results.ingest import DeadStretch
 
 POSITION, INPUT = (0.95, 20.0), (0.5, 40.0)

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
-from bampipe.data.readers import bag, hdf5, mat, numpy_file, objects, parquet, tdms, text
+from bampipe.data.readers import arrays, bag, hdf5, mat, objects, parquet, tdms, text
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, Wanted
 from bampipe.errors import InputError
 
@@ -42,7 +42,7 @@ _READERS: dict[str, ModuleType] = {
     **dict.fromkeys((".json", ".jsonl", ".ndjson"), objects),
     ".tdms": tdms,
     **dict.fromkeys((".bag", ".mcap", ".db3"), bag),
-    **dict.fromkeys((".npy", ".npz"), numpy_file),
+    **dict.fromkeys((".npy", ".npz"), arrays),
 }
 EXTENSIONS = tuple(_READERS)
 """File extensions that can be read."""

@@ -31,12 +31,11 @@ from bampipe.setup.proposal.device import (
     with_gravity,
     with_motors,
 )
-from bampipe.setup.proposal.encoders import encoders_table
-from bampipe.setup.proposal.inputs import input_tables
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import Notes, quoted
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
 from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
+from bampipe.setup.proposal.tables import encoders_table, input_tables
 
 SESSION = "session.toml"
 

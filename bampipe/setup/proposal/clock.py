@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.quality.stamps import spread_stamps, unroll
+from bampipe.data.quality.clock import spread_stamps, unroll
 from bampipe.data.session import SECONDS
 from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import spelled

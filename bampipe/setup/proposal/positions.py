@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.quality.clock import find_fresh_rows
 from bampipe.data.quality.encoders import integral, unwrapped
 from bampipe.data.quality.faulty_readings import INPUT, POSITION, find_spikes
-from bampipe.data.quality.stamps import find_fresh_rows
 from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
 from bampipe.data.units import unit
 from bampipe.setup.proposal.notes import Notes
