@@ -88,10 +88,9 @@ class AngleTorque:
 
 
 def angle_torque(moving: np.ndarray, angle: np.ndarray, drive: np.ndarray) -> AngleTorque:
-    """Regress a drive on its motion with sine and cosine of the angle, with the angle, with both.
+    """Regress a drive (T,) on its motion with sine and cosine of the angle, with it, with both.
 
-    Args:
-        moving: acceleration, velocity, its sign and 1, (T, 4); angle: (T,) rad; drive: (T,).
+    ``moving``: acceleration, velocity, its sign and 1, (T, 4); ``angle``: (T,) rad.
     """
     line, wave = angle[:, None], np.column_stack([np.sin(angle), np.cos(angle)])
     swinging, resting = np.column_stack([moving, wave]), np.column_stack([moving, line])
@@ -131,9 +130,7 @@ def least_squares(design: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, n
 def _chance(before: np.ndarray, after: np.ndarray, columns: int, more: int) -> float:
     """Probability (F test) that ``more`` columns, which mean nothing, leave as little as they do.
 
-    Args:
-        before, after: residuals without and with them, (T,).
-        columns: of the regression with them.
+    ``before`` and ``after``: residuals (T,) without and with them; ``columns``: of both together.
     """
     left = float(after @ after)
     if left <= 0.0:

@@ -41,7 +41,7 @@ empty range below the bit shows it."""
 _NICE = (1, 1.2, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 7.5, 8)
 _DERIVATIVE = 0.98
 """Correlation of a column with the integral of another, both without a line, to be that of it."""
-_DRIVEN = 0.5
+DRIVEN = 0.5
 """Share of a column that the motion must explain for it to pass as what drives it."""
 _MOVED, _CLEARLY = 0.8, 0.5
 """Of two columns, the share of one that the motion of the other must explain, and how much less it
@@ -271,11 +271,7 @@ def find_register(values: np.ndarray) -> Register | None:
 
 
 def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:
-    """Where to cut one record into parts, s: at rests near even spacing; none if it is short.
-
-    Args:
-        t: (T,) s from 0; q: (T,) position.
-    """
+    """Where to cut one record, (T,) positions at (T,) s from 0: at rests near even spacing, s."""
     parts = min(5, int(t[-1] // 4.0))
     if parts < 2:
         return []
@@ -291,12 +287,8 @@ def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:
 def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
     """Roles of columns (T,) by what they look like, those that look like nothing left out.
 
-    Args:
-        values: columns that change, by name, in the order of the file.
-        t: (T,) time, None where no column is known to be one.
-
-    Returns:
-        "time", "position", "velocity", "acceleration" or "force" (what drives the motion) by name.
+    ``t``: (T,) time, None where no column is known to be one. Roles are "time", "position",
+    "velocity", "acceleration" or "force" (what drives the motion).
     """
     found: dict[str, str] = {}
     sound = {name: v[:_MOST_ROWS] for name, v in values.items() if np.all(np.isfinite(v))}
@@ -329,7 +321,7 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
             if abs(float(np.corrcoef(q, matrix[:, k])[0, 1])) < _DERIVATIVE
         }
         best = max(share, key=lambda k: share[k], default=-1)
-        if best >= 0 and share[best] >= _DRIVEN:
+        if best >= 0 and share[best] >= DRIVEN:
             found[names[best]] = "force"
     elif positions and len(left) == len(positions):
         found |= {names[k]: "force" for k in left}

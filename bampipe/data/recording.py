@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean
-from bampipe.data.readers import LARGEST_BYTES, Dialect, RawTrial, read_trial
+from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
-from bampipe.data.readers.trial import interpolated
+from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, interpolated
 from bampipe.data.session import SECONDS, Clock, Part, Session, TrialEntry, inside
 from bampipe.errors import InputError
 from bampipe.files import digest_file
@@ -41,13 +41,7 @@ def read_recording(
 ) -> RawTrial:
     """Read the columns of one trial, those of its parts at the samples of its file.
 
-    Args:
-        root: the session folder.
-        entry: which files, and how they are joined.
-        columns: names; of a part's columns ``part:column``.
-        clock: the time column.
-        dialect: of text files.
-        largest_bytes: what one file may take in memory.
+    Columns of a part are called ``part:column``; ``largest_bytes`` is for one file.
 
     Raises:
         InputError: as :func:`read_trial`; files that do not belong together, or a file that holds
@@ -291,8 +285,7 @@ def find_copies(session: Session) -> list[str]:
 def describe_spans(spans: Mapping[str, Mapping[str, float]]) -> list[str]:
     """Sentences on trials in which an axis goes as much farther as another unit would make it.
 
-    Args:
-        spans: what each axis covers, by name of the trial and of the axis.
+    ``spans``: what each axis covers, by name of the trial and of the axis.
     """
     said = []
     for name, own in spans.items():
@@ -314,10 +307,6 @@ def read_sound_trial(
     session: Session, entry: TrialEntry, limits: CleaningLimits, largest_bytes: int
 ) -> CleanTrial:
     """One sound trial in SI units.
-
-    Args:
-        session: what its columns mean; entry: what kind of trial it is.
-        limits: what counts as sound; largest_bytes: what it may take in memory.
 
     Raises:
         InputError: the trial is to be set aside, with the reason.

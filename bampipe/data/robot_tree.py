@@ -315,16 +315,11 @@ class LumpedBodies:
 def put_bodies(
     tree: Tree, base: str, tip: str, bodies: Mapping[str, Body], limits: Mapping[str, DriveLimits]
 ) -> Tree:
-    """The tree with other bodies and limits on the joints of a chain, the same to its motion.
+    """The tree with other bodies and limits, by joint of a chain, the same to its motion.
 
     What was joined to make the body of a joint is parted again: links on fixed joints get no mass,
     which is in that of the link behind the joint; those on joints that are held keep theirs, which
     is taken off there.
-
-    Args:
-        tree: from which the chain was selected.
-        base, tip: of the chain.
-        bodies, limits: by joint of the chain.
     """
     # A joint that follows one beside the chain is held, too, and has no body of its own.
     path = [joint for joint in tree.path(base, tip) if joint.kind != "fixed"]

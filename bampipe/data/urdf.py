@@ -109,11 +109,7 @@ def _joint(entry: ElementTree.Element, where: str) -> TreeJoint:
 
 
 def urdf_text(name: str, tree: Tree, comment: str) -> str:
-    """A URDF of links and joints, without shapes.
-
-    Args:
-        name: of the robot; tree: its links and joints; comment: what to say at its head.
-    """
+    """A URDF of links and joints, without shapes; ``comment`` is said at its head."""
     robot = ElementTree.Element("robot", name=name)
     for link, body in tree.bodies.items():
         _put_inertial(ElementTree.SubElement(robot, "link", name=link), body)
@@ -143,11 +139,7 @@ def urdf_text(name: str, tree: Tree, comment: str) -> str:
 
 
 def changed_urdf(path: Path, before: Tree, after: Tree, comment: str) -> str:
-    """The text of a URDF with other bodies and losses, all else as it is.
-
-    Args:
-        path: of the URDF; before: as it was read from there; after: as it shall be.
-        comment: what to say at its head.
+    """The text of a URDF with other bodies and losses than it was read with, all else as it is.
 
     Raises:
         InputError: the file cannot be read.

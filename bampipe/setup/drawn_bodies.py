@@ -429,10 +429,7 @@ def describe_heavy(
 ) -> str:
     """Say which body is heavier than drawn; of the last one, with the payload that it suggests.
 
-    Args:
-        compared: drives with the drawn bodies; mounting: of the joints and the base.
-        found: the body.
-        in_tip: makes of a place in the frame of the last joint, (3,), one in that of the tip.
+    ``in_tip`` makes of a place in the frame of the last joint, (3,), one in that of the tip.
     """
     robot = compared.robot
     said, joint = robot.describe_mass(found.place, found.factor), robot.joints[found.place]

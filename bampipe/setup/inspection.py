@@ -32,12 +32,7 @@ _MANY = 8
 def inspect_setup(
     system: System, session: IngestResult, motions: Sequence[Motion], band: Band, folds: Folds
 ) -> SetupResult:
-    """Hold the set-up of a session against some of its trials.
-
-    Args:
-        system: the bare device; session: as ingested.
-        motions: some trials, with every input of the device; band: of the residual.
-        folds: which of these trials are fitted, which are left out together.
+    """Hold the set-up of a session against some of its trials, with every input of the device.
 
     Raises:
         InputError: the device leaves the scale of its equation open.
@@ -214,12 +209,7 @@ def describe_correction(correction: Correction, session: IngestResult) -> str:
 def describe_evidence(
     system: System, axes: list[int], before: Plausibility, after: Plausibility, drawn: bool
 ) -> str:
-    """What setting it right changes: errors, and parameters that were not believable.
-
-    Args:
-        system: the device; axes: whose errors; before, after: what is explained.
-        drawn: whether that is with bodies as they are drawn.
-    """
+    """What setting it right changes: errors of ``axes``, and parameters that were unbelievable."""
     parts = [
         f"error of {system.coordinates[i]} falls from {_fall(i, before, after)}"
         for i in axes

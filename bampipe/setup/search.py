@@ -97,16 +97,14 @@ def conclude(
     placeholders: Sequence[str] = (),
     drawn: bool = False,
 ) -> tuple[Finding, ...]:
-    """The mistakes among corrections that were found together, the one that gains most first.
+    """The mistakes among corrections that were ``chosen`` together, the one that gains most first.
 
     Those without which hardly more is left are no mistakes. None is one if some axis is not
     explained in the end, or is worse than as stated.
 
     Args:
-        judge: what is explained with some corrections; chosen: what was found.
         others: corrections that may do in the place of one that was.
-        placeholders: signals whose scale stands at exactly 1.
-        drawn: whether all that is with bodies as drawn.
+        placeholders: signals whose scale stands at exactly 1; drawn: with bodies as drawn.
     """
     found: list[Finding] = []
     while chosen:
@@ -215,8 +213,7 @@ class Search:
     def find_mistakes(self, placeholders: Sequence[str] = ()) -> tuple[Finding, ...]:
         """The mistakes of the set-up, the one that gains most first.
 
-        Args:
-            placeholders: signals whose scale stands at exactly 1.
+        ``placeholders`` are signals whose scale stands at exactly 1.
         """
         chosen: Corrections = ()
         tried: list[Correction] = []

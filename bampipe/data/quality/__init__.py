@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from bampipe.data.quality import channels, clock, encoders, faulty_readings
 from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable, thin, thinning_factor
-from bampipe.data.readers import RawTrial
+from bampipe.data.readers.trial import RawTrial
 from bampipe.data.session import Session, TrialEntry
 
 __all__ = ["CleanTrial", "CleaningLimits", "clean", "thin", "thinning_factor"]
@@ -19,13 +19,7 @@ __all__ = ["CleanTrial", "CleaningLimits", "clean", "thin", "thinning_factor"]
 def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLimits) -> CleanTrial:
     """Check and repair one trial and bring it to SI units.
 
-    The arrays of ``raw`` are used up.
-
-    Args:
-        raw: from :func:`bampipe.data.readers.read_trial`.
-        session: what its columns mean.
-        entry: what kind of trial it is.
-        limits: what counts as sound.
+    The arrays of ``raw``, from :func:`bampipe.data.readers.read_trial`, are used up.
 
     Raises:
         InputError: the trial must be set aside; says why, and where in the file.

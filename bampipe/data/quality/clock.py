@@ -42,10 +42,7 @@ _SEAM = 3.0
 
 
 def unroll(t: Array) -> tuple[Array, int, NDArray[np.intp]]:
-    """Undo the roll-over of a counter of 16, 24 or 32 bits, in whatever unit its stamps are.
-
-    Args:
-        t: (T,) stamps.
+    """Undo the roll-over of a counter of 16, 24 or 32 bits, in whatever unit its stamps (T,) are.
 
     Returns:
         Stamps (T,) that go on, the bits of the counter, 0 where none rolls over, and the rows of
@@ -72,17 +69,14 @@ def unroll(t: Array) -> tuple[Array, int, NDArray[np.intp]]:
 
 
 def spread_stamps(t: Array) -> tuple[Array, float]:
-    """Stamps of evenly sampled rows that were rounded, spread evenly again.
+    """Stamps (T,) of evenly sampled rows that were rounded, spread evenly again.
 
     A line through rows and stamps that no stamp leaves by more than its rounding is the clock;
     where rows were lost, rows that share a stamp are spread up to the next.
 
-    Args:
-        t: (T,) stamps that do not decrease.
-
     Returns:
         Stamps (T,) and what they were rounded to; as they stand and 0 where they are fine enough,
-        or do not tell.
+        decrease, or do not tell.
     """
     steps = np.diff(t)
     step = float(np.sum(steps)) / max(len(steps), 1)
@@ -119,12 +113,9 @@ def spread_stamps(t: Array) -> tuple[Array, float]:
 def find_fresh_rows(columns: Sequence[Array]) -> NDArray[np.intp] | None:
     """Rows with new readings, where a logger that is faster than its source repeats them.
 
-    Args:
-        columns: (T,) readings that belong together, such as positions.
-
-    Returns:
-        Numbers of the rows to keep; where all rests, those at the rate of the source. None where
-        rows are not held at regular intervals, or are an encoder's that moves slowly.
+    Of readings (T,) that belong together, such as positions. Where all rests, rows at the rate of
+    the source. None where rows are not held at regular intervals, or are an encoder's that moves
+    slowly.
     """
     if not columns or len(columns[0]) < 8:
         return None

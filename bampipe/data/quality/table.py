@@ -9,7 +9,7 @@ import numpy as np
 from pydantic.dataclasses import dataclass as checked_dataclass
 from scipy.signal import firwin, resample_poly
 
-from bampipe.data.readers import RawTrial
+from bampipe.data.readers.trial import RawTrial
 from bampipe.data.session import Session, TrialEntry
 from bampipe.errors import InputError
 from bampipe.results.ingest import DeadStretch
@@ -173,15 +173,11 @@ def thinning_factor(announced_hz: float, fastest_hz: float) -> int:
 
 
 def thin(trial: CleanTrial, every: int, sampled: Collection[str]) -> CleanTrial:
-    """Keep one sample of every few.
+    """Keep one sample of every few, by `thinning_factor`.
 
     Inputs go through a zero-phase low-pass at half the new rate first: noise from above it must not
-    fold into what is kept. Positions, brake commands and set-points do not: counts stay counts, and
-    steps steps.
-
-    Args:
-        trial: a sound trial; every: from `thinning_factor`.
-        sampled: columns that are not low-passed in any case, beside positions and brakes.
+    fold into what is kept. Positions, brake commands, set-points and columns that are ``sampled``
+    do not: counts stay counts, and steps steps.
     """
     if every == 1:
         return trial

@@ -21,17 +21,6 @@ from bampipe.data.readers import arrays, bag, hdf5, mat, objects, parquet, tdms,
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, Wanted
 from bampipe.errors import InputError
 
-__all__ = [
-    "EXTENSIONS",
-    "LARGEST_BYTES",
-    "TEXTS",
-    "Dialect",
-    "RawTrial",
-    "Wanted",
-    "columns_of",
-    "read_trial",
-]
-
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
 """File extensions of tables as text."""
 _READERS: dict[str, ModuleType] = {

@@ -27,8 +27,7 @@ def read_arrays(
 
     Args:
         arrays: by name, of numbers or of texts that are moments; None for what is neither.
-        wanted: columns.
-        name: what to call the file in messages; what: its arrays.
+        wanted: columns; name, what: of the file and of its arrays, in messages.
 
     Raises:
         InputError: an array is missing, not a vector of numbers, or not as long as the others.
@@ -125,10 +124,8 @@ def _join_runs(
 ) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, ...]]]:
     """Vectors of one name in all structs of a list, end to end: ``runs[:].q`` of ``runs[0].q``.
 
-    Of structs that each have a time, or are as long as no other; others are rather joints.
-
-    Returns:
-        All arrays, and by the name of each that was joined the samples before which one begins.
+    Of structs that each have a time, or are as long as no other; others are rather joints. All
+    arrays, and by the name of each that was joined the samples before which one begins.
     """
     found = {label: array for label, array in arrays.items() if array is not None}
     begun: dict[str, tuple[int, ...]] = {}
@@ -153,9 +150,6 @@ def recorded(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
     """Labels of the variables that were recorded together, and of numbers that stand alone.
 
     Beside a log a file may keep what belongs to no sample: gains by axis, a table of settings.
-
-    Args:
-        shapes: by name of the variable.
     """
     by_length: dict[int, list[str]] = {}
     for name, shape in shapes.items():

@@ -108,13 +108,9 @@ def cells(text: str, delimiter: str) -> list[str]:
 
 
 def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str) -> TableLayout:
-    """Layout of the text file that begins with ``head``.
+    """Layout of the text file that begins with ``head``: its first 64 kB, or all of it, as UTF-8.
 
-    Args:
-        head: its first 64 kB, or all of it where it is shorter, as UTF-8.
-        columns: names that the header must have; empty to take any header.
-        dialect: what the session says about it.
-        name: what to call the file in messages.
+    The header must have ``columns``; any will do where these are empty.
 
     Raises:
         InputError: no header, a column missing, or a layout that can be read in two ways.

@@ -133,8 +133,7 @@ def role_of(name: str) -> str:
 def describe_loops(t: np.ndarray, columns: Mapping[str, np.ndarray]) -> str:
     """Say how late every joint of a data set follows its goal; "" where it has no joints.
 
-    Args:
-        t: time stamps of an episode, (T,), s; columns: of it by name, each (T,).
+    ``t``: time stamps of an episode, (T,), s; ``columns``: of it by name, each (T,).
     """
     said = []
     for name, state in columns.items():

@@ -127,11 +127,7 @@ def propose(
 
 
 def _refuse_goals(folder: Path, found: Survey) -> None:
-    """Refuse a data set of LeRobot in which goals are all that is known of the drives.
-
-    Raises:
-        InputError: it is so.
-    """
+    """Refuse a data set of LeRobot in which goals are all that is known of the drives."""
     columns = {column.name: column.values for column in found.columns}
     if not any(name.startswith(lerobot.STATE) for name in columns):
         return
@@ -231,14 +227,7 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
 def _trials_tables(
     device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes
 ) -> list[str]:
-    """Propose the trials and their kinds; a single long record is cut at rests of its first axis.
-
-    Args:
-        device: whose axes a locked trial may name.
-        axes: columns of the positions.
-        match: the logs and their time.
-        notes: where guesses and what is left open are noted.
-    """
+    """Propose the trials and their kinds; a long single record is cut at rests of its axis."""
     trials = match.found.trials
     cuts: list[float] = []
     if len(trials) == 1 and axes:

@@ -21,6 +21,8 @@ _LIKELY_RATE_HZ = 100.0
 """Assumed for the other guesses where nothing shows the rate."""
 _COUNTERS = frozenset(["tick", "ticks", "cycle", "cycles", "timestep", "timesteps", "cyccnt"])
 """Words in the name of a clock that counts at a rate of its own."""
+_SECONDS = {"sec", "secs", "seconds"}
+_NANOSECONDS = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
 _FALLING = 0.9
 """Share of steps at which the time of a log that is written backwards falls, the least."""
 _SLOW_HZ = 40.0
@@ -52,8 +54,10 @@ def clock_of(found: Survey, notes: Notes) -> ProposedClock:
     counters = [c for c in found.columns if not c.role and not _COUNTERS.isdisjoint(words(c.name))]
     unnamed = [c for c in found.columns if not c.role and c not in counters and _counts_on(c)]
     times = [*found.of("time"), *counters, *unnamed]
-    seconds = [c for c in times if _whole_seconds(c)]
-    rest = [c for c in times if _nanoseconds_on_top(c)]
+    whole = [(c, {*words(c.name)}) for c in times if c.is_integer]
+    seconds = [c for c, said in whole if said & _SECONDS and np.all(np.diff(c.values) >= 0)]
+    on_top = [c for c, said in whole if said & _NANOSECONDS]
+    rest = [c for c in on_top if np.all((c.values >= 0) & (c.values < 1e9))]
     if seconds and rest:
         return _in_two_columns(seconds[-1], rest[-1], notes)
     # When a message was recorded is the second best to when it was stamped.
@@ -174,18 +178,6 @@ def _stamped_rate(rate_hz: float, notes: Notes) -> str:
         doubt = "; motion is not logged so: is its unit right?"
     note = notes.guess(f"{rate_hz:g} Hz, from the time stamps{doubt}")
     return f"sample_rate_hz = {rate_hz:g}{note}"
-
-
-def _whole_seconds(column: SurveyedColumn) -> bool:
-    named = not {"sec", "secs", "seconds"}.isdisjoint(words(column.name))
-    return named and column.is_integer and bool(np.all(np.diff(column.values) >= 0))
-
-
-def _nanoseconds_on_top(column: SurveyedColumn) -> bool:
-    said = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
-    named = not said.isdisjoint(words(column.name))
-    within = (column.values >= 0) & (column.values < 1e9)
-    return named and column.is_integer and bool(np.all(within))
 
 
 def _increases(values: np.ndarray) -> bool:

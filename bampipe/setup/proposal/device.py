@@ -137,7 +137,6 @@ def with_motors(
     """A new device file of a robot with a table for each motor.
 
     Args:
-        folder: of the logs; chosen: the robot.
         motors: by joint, turns for one of the joint and, where currents are logged, N.m/A.
         reference: of constants that the drawing suggests, the joint whose constant the others are
             estimated by.

@@ -219,12 +219,9 @@ class RobotColumns:
 def find_robot_columns(
     folder: Path, device: Device, robot: Robot, found: Survey, t: Array, notes: Notes
 ) -> RobotColumns:
-    """Pair columns with joints and drives, and hold them against the drawing.
+    """Pair columns with joints and drives at ``t``, (T,) s, and hold them against the drawing.
 
-    Args:
-        folder: of the robot's file; device, robot: the robot.
-        found: the log; t: (T,) time, s.
-        notes: what is guessed is noted, and how sure it is.
+    What is guessed is noted, and how sure it is.
     """
     by_position, by_drive, some_drives = pair_joints(device, found)
     for what, groups in (("positions", by_position), ("drives", by_drive)):

@@ -14,7 +14,7 @@ from bampipe.physics.device import Coordinate, Device
 from bampipe.setup.proposal.device import ChosenDevice
 from bampipe.setup.proposal.matching import Match, Matcher
 from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
-from bampipe.setup.proposal.positions import in_counts, is_velocity
+from bampipe.setup.proposal.positions import FEWEST_COUNTS, in_counts, is_velocity
 
 _POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
 _SURE, _NEAR = 2.0, 0.025
@@ -27,7 +27,6 @@ _FORCES = frozenset(["force", "forc", "kraft", "loadcell", "fx", "fy", "fz"])
 _TORQUES = frozenset(["torque", "tau", "trq", "moment", "effort", "drehmoment"])
 _LOGGER = "who wrote the logger, or its manual"
 _QUANTITY = {"N": "force", "N.m": "torque", "A": "current", "V": "voltage"}
-_FEWEST_COUNTS = 100
 _MOST_VOLTS = 60.0
 """Of a supply: servos count theirs in tenths."""
 _FULL_DUTY = 1.05
@@ -102,9 +101,7 @@ def _encoder(
 def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -> tuple[str, str]:
     """Fields of an encoder that counts otherwise than a robot's drawing, and that in words.
 
-    Args:
-        axis: whose encoder it is; said: its unit; match: the columns.
-        turns: of what the encoder sits on, for one of the axis.
+    ``turns``: of what the encoder sits on, for one of the axis.
     """
     direction, zero = match.robot.counting.get(axis.name, (1.0, 0.0))
     fields, ways = "", []
@@ -278,7 +275,7 @@ def _is_force(column: SurveyedColumn) -> bool:
 
 def _needs_gain(column: SurveyedColumn) -> bool:
     """Whether the column of a force is a share or a count, by its name or by whole numbers."""
-    counts = column.is_integer and float(np.ptp(column.values)) > _FEWEST_COUNTS
+    counts = column.is_integer and float(np.ptp(column.values)) > FEWEST_COUNTS
     shares = not _SHARES.isdisjoint(words(column.name))
     return column.si == "" or (not column.unit and (counts or shares))
 
