@@ -22,7 +22,6 @@ from bampipe.files import write_text
 from bampipe.lists import join_names
 from bampipe.physics.device import Device
 from bampipe.setup.mounting import Mounting
-from bampipe.setup.proposal.clock import clock_of
 from bampipe.setup.proposal.device import (
     DEVICE,
     ChosenDevice,
@@ -35,7 +34,7 @@ from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import Notes, quoted
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
 from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
-from bampipe.setup.proposal.tables import encoders_table, input_tables
+from bampipe.setup.proposal.tables import clock_of, encoders_table, input_tables
 
 SESSION = "session.toml"
 
