@@ -46,9 +46,7 @@ class FileClock:
     """The time of one file.
 
     Attributes:
-        samples: how many it has.
-        column: name of the time column, "" where there is none.
-        unit: of the time column.
+        samples: how many it has; column: its time column, "" where there is none; unit: of that.
         t: (T,) s; start: its first stamp, s, on a clock that files may share.
     """
 

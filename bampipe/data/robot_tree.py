@@ -258,11 +258,7 @@ def identifier(name: str) -> str:
 
 @dataclass(frozen=True)
 class LumpedBodies:
-    """What the links of a chain carry: all that the chain does not move against them.
-
-    Attributes:
-        tree: all links and joints; moving: the joints of the chain that move.
-    """
+    """What the links of a chain carry: all that its joints ``moving`` do not move against them."""
 
     tree: Tree
     moving: Sequence[TreeJoint]

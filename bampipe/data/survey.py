@@ -227,8 +227,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
 class _Logs:
     """The files of a folder while it is found out which are logs, and which belong together.
 
-    Attributes:
-        found: columns and their units, by file; passed, remarks: see `Survey`.
+    ``found``: columns and their units, by file; ``passed``, ``remarks``: see `Survey`.
     """
 
     folder: Path

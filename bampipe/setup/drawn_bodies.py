@@ -342,11 +342,7 @@ def mean_left(drives: Sequence[Drive]) -> float:
 
 @dataclass(frozen=True)
 class HeavierBody:
-    """A body that explains the drives where it is heavier than drawn.
-
-    Attributes:
-        place: number of the body; factor: of its mass and inertia over those drawn.
-    """
+    """The number of a body, and how many times its mass and inertia are those drawn."""
 
     place: int
     factor: float

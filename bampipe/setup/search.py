@@ -76,9 +76,8 @@ class Finding:
     """One mistake with the two set-ups it lies between.
 
     Attributes:
-        correction: that sets it right; rivals: others that do so as well.
+        rivals: other corrections that set it right as well; gain: of the score.
         before, after: what the set-ups explain, with all other mistakes set right.
-        gain: of the score.
         drawn: whether both are with bodies as drawn.
     """
 
@@ -181,9 +180,7 @@ class Search:
     Parameters are free; all are tried on a small part of the trials, the best on more.
 
     Attributes:
-        system: the bare device; motions: the trials as they are stated, short enough.
-        band: of the residual; folds: of the trials; signals: of the session.
-        tested: number of set-ups tried.
+        motions: the trials as they are stated, short enough; tested: number of set-ups tried.
         heavier: the drawn body that alone is far heavier; None where none is.
         over_position: what the stated set-up explains with a torque over position that the device
             lacks, where that rather than a mistake is what spoils it; None else.

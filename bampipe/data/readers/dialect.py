@@ -51,9 +51,6 @@ class TableLayout:
     """Where the samples of a text file start and how they are written.
 
     Attributes:
-        delimiter: between columns.
-        decimal: decimal sign.
-        header: names of the columns.
         first_line: number of the line with the first sample, as an editor counts.
         start: bytes before that line.
         remarks: what is unlike a plain table with commas, a sentence each.

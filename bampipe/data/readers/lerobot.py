@@ -40,8 +40,7 @@ class DataSet:
     """A data set.
 
     Attributes:
-        episodes: numbers of the episodes in each file, in the order of their rows, by its path
-            relative to the data set.
+        episodes: their numbers in each file, in the order of their rows, by its relative path.
         chosen: numbers of those that are wanted.
     """
 

@@ -32,12 +32,9 @@ _DELIMITERS = (";", "\t", ",", "|")
 
 @dataclass(frozen=True)
 class Form:
-    """How the lines of a text become rows of a table.
+    """How the lines of a text, which ``said`` describes, become rows of a table.
 
-    Attributes:
-        said: what the text is, for its reader.
-        rewrite: the row for a line.
-        names: of the columns, where no line holds them.
+    ``names`` are those of the columns, where no line holds them.
     """
 
     said: str

@@ -162,10 +162,7 @@ def _head(stream: BinaryIO, name: str) -> bytes:
 
 @dataclass
 class _Samples:
-    """What has been read of a file: the wanted columns in parts, and how many rows.
-
-    Attributes: see :class:`RawTrial`.
-    """
+    """What has been read of a file: the wanted columns in parts, how many rows; see `RawTrial`."""
 
     wanted: Wanted
     nothing: list[str] = field(default_factory=list)

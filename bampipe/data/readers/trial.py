@@ -41,11 +41,9 @@ class Wanted:
     """What to read of a file.
 
     Attributes:
-        columns: names of the columns.
-        datetimes: columns that hold dates and times, with their format as of ``strptime``; ""
-            for ISO 8601. They are returned as s since the first.
-        dialect: of text files.
-        largest_bytes: refuse a trial that takes more than this in memory.
+        columns: their names; datetimes: those that hold dates and times, with their format as of
+            ``strptime``, "" for ISO 8601: they are returned as s since the first.
+        dialect: of text files; largest_bytes: that a trial may take in memory.
     """
 
     columns: tuple[str, ...]

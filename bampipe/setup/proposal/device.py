@@ -43,7 +43,6 @@ class ChosenDevice:
 
     Attributes:
         name: of a built-in device, or the path of a device file relative to the folder of logs.
-        device: the device.
         text: of a new device file, "" where there is one already.
         columns: what the inputs of a new device were made from, by the name of the input.
     """

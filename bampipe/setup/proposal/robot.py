@@ -57,13 +57,7 @@ _OTHER_UNITS = {"rad": ("deg", np.pi / 180.0), "m": ("mm", 1e-3)}
 
 @dataclass(frozen=True)
 class Gears:
-    """Motors that turn joints.
-
-    Attributes:
-        ratio: turns of each motor for one of its joint, (n,).
-        mounting: of the joints and the base.
-        drives: what they make of the drives.
-    """
+    """Turns of motors for one of each joint, (n,), and what these and a mounting make of drives."""
 
     ratio: Array
     mounting: Mounting

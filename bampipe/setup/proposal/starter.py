@@ -84,14 +84,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Starter:
-    """A device file to start from.
-
-    Attributes:
-        text: of the file.
-        axis: name of its axis.
-        input: name of the input that drives the axis.
-        placeholders: names of the constants that only its user knows.
-    """
+    """A device file, its axis and its input, and the constants that only its user knows."""
 
     text: str
     axis: str

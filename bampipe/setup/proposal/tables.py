@@ -58,10 +58,8 @@ class ProposedClock:
     """The time of the first log, and how the session file says it.
 
     Attributes:
-        t: (T,) time stamps, s.
-        columns: names of the columns that the time takes up.
-        lines: the table ``[time]``.
-        rate: the line on the sample rate, which stands above all tables.
+        t: (T,) time stamps, s; columns: that the time takes up.
+        lines: the table ``[time]``; rate: the line on the sample rate, above all tables.
     """
 
     t: np.ndarray
