@@ -1,10 +1,10 @@
 """On a cold start, code that later stages need is compiled by processes beside the run.
 
 Where nothing is compiled yet, the first stage that wants compiled code would wait for it, and the
-next one again. Instead, processes beside the run import the modules with most to compile, and so
-leave their code on disk. No function is compiled twice, for what one process is at, the others wait
-for (`bampipe.compiled`). They start unless there is a folder of code compiled from these sources. A
-process that fails leaves its part to the run, which then says what is wrong.
+next one again. Instead, processes beside the run compile the longest functions and leave their code
+on disk. No function is compiled twice, for what one process is at, the others wait for
+(`bampipe.compiled`). A process that fails leaves its part to the run, which then says what is
+wrong.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from pathlib import Path
 from bampipe.errors import InputError
 from bampipe.generated_code import compiled_folder
 
-_PARTS = (
-    ("bampipe.estimate.propagation", "bampipe.estimate.square_root"),
-    ("bampipe.estimate.triangular", "bampipe.estimate.simulation"),
+_PARTS: tuple[tuple[str, ...], ...] = (
+    ("simulation._count_steps", "simulation._run"),
+    ("square_root.filter_square_root",),
 )
-"""Modules whose import compiles, by process; what is waited for longest comes first."""
+"""Functions of `bampipe.estimate` by process, those that are waited for first in front."""
 
 _END_WITH_PARENT = (
     "import gc, os, sys, threading; gc.disable(); "
@@ -33,28 +33,39 @@ _END_WITH_PARENT = (
 
 
 @contextmanager
-def compiling_ahead(processes: int) -> Iterator[None]:
+def compiling_ahead(processes: int) -> Iterator[bool]:
     """Compile ahead during the block, where nothing is compiled yet.
 
     Args:
         processes: how many cores may be used, 0 for all; with one, nothing is started.
+
+    Yields:
+        Whether code is compiled for the first time.
     """
     running: list[subprocess.Popen[bytes]] = []
+    cold = False
     with suppress(InputError):  # no folder: the run itself says so, with what to do
-        compiled = compiled_folder(Path(__file__).with_name("estimate"))
-        if (processes or os.cpu_count() or 1) > 1 and not compiled.exists():
-            running = [_start(modules) for modules in _PARTS]
+        folder = compiled_folder(Path(__file__).with_name("estimate"))
+        cold = not folder.exists()
+        waiting = [part for part in _PARTS if not any(folder.glob(f"{part[-1]}-*.nbi"))]
+        spare = (processes or os.cpu_count() or 1) - 1
+        if 0 < spare < len(waiting):
+            waiting = [tuple(name for part in waiting for name in part)]
+        running = [_start(part) for part in waiting if spare > 0]
     try:
-        yield
+        yield cold or bool(running)
     finally:
         for process in running:
             process.terminate()
             process.wait()
 
 
-def _start(modules: tuple[str, ...]) -> subprocess.Popen[bytes]:
+def _start(functions: tuple[str, ...]) -> subprocess.Popen[bytes]:
     # The same places to import from, and nothing from the working folder.
-    code = f"{_END_WITH_PARENT}; sys.path[:] = {sys.path!r}; import {', '.join(modules)}"
+    code = f"{_END_WITH_PARENT}; sys.path[:] = {sys.path!r}"
+    for name in functions:
+        module = f"bampipe.estimate.{name.partition('.')[0]}"
+        code += f"; import {module}; bampipe.estimate.{name}.compile_promised()"
     return subprocess.Popen(
         [sys.executable, "-P", "-c", code],
         stdin=subprocess.PIPE,

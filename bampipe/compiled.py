@@ -12,7 +12,7 @@ Processes that start together share the work: what one of them is compiling, ano
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from inspect import isfunction
 from pathlib import Path
@@ -52,17 +52,41 @@ def njit(*signatures: Any, **options: Any) -> Any:
             with suppress(InputError, OSError):  # no folder: every process compiles for itself
                 dispatcher._cache = _Cache(function)
         if wanted:
-            with (
-                typeinfer.register_dispatcher(dispatcher),
-                _collector_at_rest(),
-                _one_process_at_a_time(dispatcher._cache),
-            ):
-                for signature in wanted:
-                    dispatcher.compile(signature)
-            dispatcher.disable_compile()
+            _promise(dispatcher, wanted)
+            if not options["no_cfunc_wrapper"]:
+                dispatcher.compile_promised()
         return dispatcher
 
     return decorate
+
+
+def _promise(dispatcher: Any, signatures: Sequence[Any]) -> None:
+    """Compile a function for its signatures when it is first called from Python."""
+
+    def compile_promised(*arguments: Any) -> Any:
+        del dispatcher._compile_for_args
+        with (
+            typeinfer.register_dispatcher(dispatcher),
+            _collector_at_rest(),
+            _one_process_at_a_time(dispatcher._cache),
+        ):
+            for signature in signatures:
+                dispatcher.compile(signature)
+        dispatcher.disable_compile()
+        return dispatcher  # what numba calls then
+
+    dispatcher.compile_promised = dispatcher._compile_for_args = compile_promised
+
+
+def part(*, fastmath: Any = False, **options: Any) -> Any:
+    """``njit`` of a function that compiled functions alone call: compiled where one of them is.
+
+    Args:
+        fastmath: as in numba, but for the default: numba takes that of the first that calls.
+        options: the others.
+    """
+    wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return numba.njit(fastmath=fastmath, **wrappers, **options)
 
 
 def record_type(record: type, *fields: Any) -> Any:
@@ -104,7 +128,7 @@ class _Locator(caching._CacheLocator):
     """A folder for each content of the sources; generated code names those that it calls."""
 
     def __init__(self, function: Callable[..., Any], path: str) -> None:
-        self._line = function.__code__.co_firstlineno
+        self._line, self._py_file = function.__code__.co_firstlineno, path
         self._folder = make_compiled_folder(
             function.__globals__.get("__sources__", Path(path).parent)
         )

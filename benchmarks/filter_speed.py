@@ -191,8 +191,8 @@ def by_filterpy(problem: Problem, compiled: bool, repeats: int) -> Measured:
 
 def body_of_derivative(system: System) -> list[str]:
     """Statements of the generated state derivative."""
-    source = system._whole.sources["compiled"].partition("def derivative(")[2]
-    return [line.strip() for line in source.partition("\n\n")[0].splitlines()[1:]]
+    source = system._whole.sources["derivative"].partition("def derivative(")[2]
+    return [line.strip() for line in source.splitlines()[1:]]
 
 
 def by_c(problem: Problem, folder: Path, options: list[str], repeats: int) -> Measured:

@@ -41,13 +41,20 @@ def test_they_run_beside_a_run_where_nothing_was_compiled_from_these_sources(
     started: Started, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path))
-    with compile_ahead.compiling_ahead(2):
-        assert len(started.codes) == len(compile_ahead._PARTS) and not started.ended
+    with compile_ahead.compiling_ahead(2) as cold:
+        assert len(started.codes) == 1 and cold and not started.ended
+    with compile_ahead.compiling_ahead(3):
+        assert len(started.codes) == 1 + len(compile_ahead._PARTS)
     assert started.ended == len(started.codes)
     started.codes.clear()
-    generated_code.make_compiled_folder(Path(compile_ahead.__file__).with_name("estimate"))
-    with compile_ahead.compiling_ahead(2):
-        assert not started.codes
+    estimate = Path(compile_ahead.__file__).with_name("estimate")
+    folder = generated_code.make_compiled_folder(estimate)
+    (folder / "simulation._run-1.py3.nbi").touch()
+    with compile_ahead.compiling_ahead(2) as cold:
+        assert len(started.codes) == 1 and "simulation" not in started.codes[0] and cold
+    (folder / "square_root.filter_square_root-1.py3.nbi").touch()
+    with compile_ahead.compiling_ahead(2) as cold:
+        assert len(started.codes) == 1 and not cold
 
 
 @pytest.mark.parametrize(("cores", "cache"), [(1, "."), (2, "file")])
@@ -61,20 +68,24 @@ def test_none_run_on_one_core_or_without_a_folder(
     assert not started.codes
 
 
-def test_what_they_import_is_kept_and_nothing_comes_from_the_working_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_they_compile_is_kept_and_nothing_comes_from_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: Started
 ) -> None:
+    monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "cache"))
     (tmp_path / "numba.py").write_text("raise SystemExit('imported from the working folder')")
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
-    names = ", ".join(name for part in compile_ahead._PARTS for name in part)
+    with compile_ahead.compiling_ahead(2):
+        compiling = started.codes[0].removeprefix(f"{compile_ahead._END_WITH_PARENT}; ")
+    monkeypatch.undo()
     noted = (
         "from bampipe import compiled; "
         "compiled._Cache.save_overload = lambda self, *_: print(self._impl.filename_base)"
     )
     for before in ("pass", noted):
-        code = f"import sys; sys.path[:] = {sys.path!r}; {before}; import {names}"
+        path, _, functions = compiling.partition("; ")
         done = subprocess.run(
-            [sys.executable, "-P", "-c", code], cwd=tmp_path, capture_output=True, text=True
-        )
+            [sys.executable, "-P", "-c", f"import sys; {path}; {before}; {functions}"],
+            cwd=tmp_path, capture_output=True, text=True,
+        )  # fmt: skip
         assert done.returncode == 0, done.stderr
     assert done.stdout == "", "compiled again"

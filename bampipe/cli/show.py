@@ -358,6 +358,8 @@ class Watcher:
             note(f"bampipe: {holder} is at work in {event.run}; waiting for it")
         elif event.kind == "taken over":
             note(f"bampipe: {event.message} was killed in {event.run}; going on from there")
+        elif event.kind == "compiling":
+            note("bampipe: the numerical code is compiled now, once for this machine")
         elif self.bars is None:
             self._write(event, name)
         else:

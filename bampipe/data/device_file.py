@@ -12,11 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
-from bampipe.data.chain import read_chain
-from bampipe.data.robot_tree import Body, DriveLimits, Tree, fixed_joint, symmetric, tree_of_tables
+from bampipe.data.robot_tree import (
+    Body,
+    DriveLimits,
+    Tree,
+    fixed_joint,
+    symmetric,
+    tree_of_tables,
+)
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 
@@ -59,6 +64,8 @@ def complete_device(table: dict[str, Any], folder: Path, where: str) -> dict[str
     source = ""
     file = _robot_file(robot, where)
     if file is not None:
+        from bampipe.data.chain import read_chain  # slow to import, and for robots alone
+
         payload = robot.get("payload")
         chain = read_chain(
             folder / file,
@@ -141,6 +148,8 @@ def tree_of_robot(robot: Mapping[str, Any]) -> Tree:
 
 def _frame_of_row(row: Mapping[str, Any]) -> tuple[Array, Array]:
     """Rotation and place of a row's frame, seen from where its joint is."""
+    from scipy.spatial.transform import Rotation
+
     d, a, alpha = (float(row.get(key, 0.0)) for key in ("d", "a", "alpha"))
     return Rotation.from_euler("x", alpha).as_matrix(), np.array([a, 0.0, d])
 
@@ -150,6 +159,8 @@ def _from_dh(rows: Mapping[str, Any]) -> dict[str, dict[str, Any]] | None:
 
     A row's frame lies behind its joint; joint and body are put where the motion is.
     """
+    from scipy.spatial.transform import Rotation
+
     found: dict[str, dict[str, Any]] = {}
     turn, offset, before = np.eye(3), np.zeros(3), ""
     for name, row in rows.items():

@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
 from bampipe.errors import InputError
@@ -217,6 +216,8 @@ def hold_beside(tree: Tree, base: str, tip: str) -> Tree:
 
 def tree_of_tables(tables: Mapping[str, Mapping[str, Any]]) -> Tree:
     """Links and joints of the tables of ``[robot.joints]``: ``base``, and one link a joint."""
+    from scipy.spatial.transform import Rotation  # slow to import, and for robots alone
+
     bodies, joints = {"base": Body()}, []
     for name, table in tables.items():
         link, after = f"{name}_link", table.get("after")
@@ -243,6 +244,8 @@ def tree_of_tables(tables: Mapping[str, Mapping[str, Any]]) -> Tree:
 
 def fixed_joint(name: str, parent: str, child: str, turn: Array, offset: Array) -> TreeJoint:
     """A joint that does not move, between two links."""
+    from scipy.spatial.transform import Rotation
+
     roll, pitch, yaw = (float(v) for v in Rotation.from_matrix(turn).as_euler("xyz"))
     axis = [0.0, 0.0, 1.0]
     return TreeJoint(

@@ -9,7 +9,7 @@ import numpy as np
 from numba import float64, int64, void
 
 from bampipe.arrays import Array, Indices
-from bampipe.compiled import njit, record_type
+from bampipe.compiled import njit, part, record_type
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.simulation import MAX_STEP_S, PLANT, make_plant, require_finite, stable_steps
 from bampipe.model_functions import COMMAND, DERIVATIVE, MEASURE
@@ -41,7 +41,7 @@ class _Controller(NamedTuple):
 _CONTROLLER = record_type(_Controller, int64[::1], int64, _V, _M, _V, _V, _V, _V)
 
 
-@njit(void(COMMAND, _CONTROLLER, _V, _V, float64), cache=True)
+@part()
 def _act(command, controller, y, r, dt):  # type: ignore[no-untyped-def]
     """Command from readings and references, and advance the states of the controller by ``dt``."""
     states, limits, out = controller.states, controller.limits, controller.out

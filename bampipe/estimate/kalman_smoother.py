@@ -20,11 +20,11 @@ from math import factorial
 from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float64, int64, void
+from numba import boolean, float64, int64, types, void
 from scipy.optimize import minimize_scalar
 
 from bampipe.arrays import Array, Flags
-from bampipe.compiled import njit, record_type
+from bampipe.compiled import njit, part, record_type
 from bampipe.estimate.differentiation import Derivatives
 
 ORDERS = (3, 4)
@@ -56,8 +56,8 @@ def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
     return float((2.0 * np.pi * bandwidth_hz / rate_hz) ** (2 * order))
 
 
-@njit(void(_V, _M, _M, _M, _M), cache=True)
-def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None:
+@part()
+def _predict(x, p, step, noise, work):  # type: ignore[no-untyped-def]
     """Advance state ``x`` (n,) and covariance ``p`` (n, n) by one sample, in place."""
     n = x.shape[0]
     for i in range(n):
@@ -80,11 +80,8 @@ def _predict(x: Array, p: Array, step: Array, noise: Array, work: Array) -> None
             p[j, i] = total
 
 
-@njit(
-    "UniTuple(float64, 2)(float64[::1], float64[:, ::1], float64, float64[::1])",
-    cache=True,
-)
-def _update(x: Array, p: Array, y: float, gain: Array) -> tuple[float, float]:
+@part()
+def _update(x, p, y, gain):  # type: ignore[no-untyped-def]
     """Take in one sample ``y`` of noise 1, in place; return innovation and its variance."""
     n = x.shape[0]
     spread = p[0, 0] + 1.0
@@ -125,16 +122,7 @@ def _allocate_pass(count: int, order: int) -> _Pass:
 
 
 @njit(void(_V, _FLAGS, _M, _M, _V, _M, _PASS, _M), cache=True)
-def _filter(
-    y: Array,
-    present: Flags,
-    step: Array,
-    noise: Array,
-    x: Array,
-    p: Array,
-    passed: _Pass,
-    work: Array,
-) -> None:
+def _filter(y, present, step, noise, x, p, passed, work):  # type: ignore[no-untyped-def]
     """Run the filter from prior ``x``, ``p`` for the first sample and note what it passes.
 
     ``work`` (n, n) is scratch.
@@ -152,15 +140,7 @@ def _filter(
 
 
 @njit(void(_FLAGS, _M, _PASS, _M, _M, _M, _M), cache=True)
-def _smooth(
-    present: Flags,
-    step: Array,
-    passed: _Pass,
-    variances: Array,
-    vectors: Array,
-    weight: Array,
-    left: Array,
-) -> None:
+def _smooth(present, step, passed, variances, vectors, weight, left):  # type: ignore[no-untyped-def]
     """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n).
 
     ``vectors`` (2, n) and ``weight`` (n, n), zeros, and ``left`` (n, n) are scratch.
@@ -221,22 +201,8 @@ def _smooth(
                 weight[j, i] = total
 
 
-@njit(
-    "Tuple((float64, float64, int64))(float64[::1], boolean[::1], float64[:, ::1], "
-    "float64[:, ::1], float64[::1], float64[:, ::1], int64, float64[:, ::1], float64[::1])",
-    cache=True,
-)
-def _evidence(
-    y: Array,
-    present: Flags,
-    step: Array,
-    noise: Array,
-    x: Array,
-    p: Array,
-    skip: int,
-    work: Array,
-    gain: Array,
-) -> tuple[float, float, int]:
+@njit(types.Tuple((float64, float64, int64))(_V, _FLAGS, _M, _M, _V, _M, int64, _M, _V), cache=True)
+def _evidence(y, present, step, noise, x, p, skip, work, gain):  # type: ignore[no-untyped-def]
     """Return sums of log S and v²/S over the innovations after ``skip``, and their count.
 
     Once the covariance has settled it is kept until a sample is missing. ``work`` (n, n) and
@@ -349,15 +315,7 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
 
 
 @njit(int64(_M, _M, _M, _M, float64[:, :, ::1], _V, _M), cache=True)
-def _settle(
-    step: Array,
-    noise: Array,
-    p: Array,
-    gains: Array,
-    covariances: Array,
-    spreads: Array,
-    work: Array,
-) -> int:
+def _settle(step, noise, p, gains, covariances, spreads, work):  # type: ignore[no-untyped-def]
     """Write gains (K, n), covariances (K, n, n) and variances (K,) until they settle; count them.
 
     They do not depend on the samples. ``p`` (n, n) is the covariance of the first state; it is
@@ -380,16 +338,7 @@ def _settle(
 
 
 @njit(void(_V, _M, _M, float64[:, :, ::1], _V, _M, _V, _V), cache=True)
-def _smooth_mean(
-    y: Array,
-    step: Array,
-    gains: Array,
-    covariances: Array,
-    spreads: Array,
-    states: Array,
-    innovations: Array,
-    adjoint: Array,
-) -> None:
+def _smooth_mean(y, step, gains, covariances, spreads, states, innovations, adjoint):  # type: ignore[no-untyped-def]
     """Smoothed states (T, n) of samples that are all there; ``adjoint`` (n,) holds zeros.
 
     The same recursions as `_filter` and `_smooth`, without what is the same for all samples.

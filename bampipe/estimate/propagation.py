@@ -3,11 +3,11 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import boolean, float64, int64, void
+from numba import boolean, float64, int64
 
 from bampipe.arrays import Array, Flags, Indices
-from bampipe.compiled import njit, record_type
-from bampipe.model_functions import DERIVATIVE_ROWS, MEASURE_ROWS, ROWS
+from bampipe.compiled import part, record_type
+from bampipe.model_functions import ROWS
 
 _V = float64[::1]
 _M = float64[:, ::1]
@@ -66,11 +66,7 @@ def allocate_points(nx: int, nu: int, p: Array, nw: int) -> Array:
     return points
 
 
-@njit(
-    void(_V, int64, float64, float64, _V, int64, int64, int64, int64, int64),
-    cache=True,
-    fastmath={"contract"},
-)
+@part(fastmath={"contract"})
 def _spread(out, offset, centre, reach, root, n, pairs, first, count, padded):  # type: ignore[no-untyped-def]
     """Write one coordinate of the sigma points ``first`` to ``first + count`` of all."""
     for r in range(padded):
@@ -81,11 +77,7 @@ def _spread(out, offset, centre, reach, root, n, pairs, first, count, padded):  
         out[offset + row - first] = centre - reach * root[row - pairs]
 
 
-@njit(
-    void(ESTIMATED, _V, _M, float64, int64, int64, int64, int64, _V),
-    cache=True,
-    fastmath={"contract"},
-)
+@part(fastmath={"contract"})
 def _spread_parameters(estimated, mean, factor, reach, pairs, first, count, padded, p):  # type: ignore[no-untyped-def]
     """Write the estimated parameters of sigma points into ``p``, within their range."""
     n, nx = mean.shape[0], estimated.n_states
@@ -105,11 +97,7 @@ def _spread_parameters(estimated, mean, factor, reach, pairs, first, count, padd
                 p[r] = np.exp(p[r])
 
 
-@njit(
-    void(DERIVATIVE_ROWS, int64, int64, int64, float64, int64, _M),
-    cache=True,
-    fastmath={"contract"},
-)
+@part(fastmath={"contract"})
 def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, points):  # type: ignore[no-untyped-def]
     """Advance many states by ``dt``, as `bampipe.estimate.runge_kutta` advances one.
 
@@ -150,10 +138,7 @@ def _runge_kutta_rows(derivative, count, nx, nu, dt, substeps, points):  # type:
                         probe[r] = x[r] + ahead * rate[r]
 
 
-@njit(
-    void(DERIVATIVE_ROWS, ESTIMATED, _V, _M, float64, _V, _V, _V, _V, _V, float64, int64, _M, _M),
-    cache=True,
-)
+@part()
 def propagate_points(  # type: ignore[no-untyped-def]
     derivative,
     estimated,
@@ -222,7 +207,7 @@ def propagate_points(  # type: ignore[no-untyped-def]
                 images[i, first + r] = x[i * ROWS + r]
 
 
-@njit(void(MEASURE_ROWS, ESTIMATED, _V, _M, float64, _V, _M, _M), cache=True)
+@part()
 def measure_points(measure, estimated, mean, factor, reach, u, images, points):  # type: ignore[no-untyped-def]
     """Draw sigma points of (state, parameters) afresh and take the measurement of each.
 

@@ -2,13 +2,13 @@
 
 from numba import float64, int64, void
 
-from bampipe.compiled import njit
+from bampipe.compiled import njit, part
 from bampipe.model_functions import DERIVATIVE
 
 _V = float64[::1]
 
 
-@njit(void(_V, _V, _V, _V, float64, float64, _V), cache=True)
+@part()
 def _read_input(u0, u1, c0, c1, dt, share, u):  # type: ignore[no-untyped-def]
     """Write the input ``u`` (nu,) after a share of the interval."""
     rest = 1.0 - share

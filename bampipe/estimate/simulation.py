@@ -18,7 +18,7 @@ from numba import float64, int64, void
 from scipy.interpolate import CubicSpline
 
 from bampipe.arrays import Array, Indices
-from bampipe.compiled import njit, record_type
+from bampipe.compiled import njit, part, record_type
 from bampipe.errors import InputError
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.triangular import cholesky, forward_substitute
@@ -124,7 +124,7 @@ _ARM = record_type(_Arm, _I, _I, _I, _I, _I, float64, float64, float64)
 _WORKSPACE = record_type(_Workspace, _M, _M, _M, _M, _V, _V, _V, _V)
 
 
-@njit(int64(DERIVATIVE, _V, _V, PLANT, float64, _M), cache=True)
+@part()
 def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-def]
     """Number of Runge-Kutta steps that ``dt`` needs from state ``x`` on.
 
@@ -164,7 +164,16 @@ def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-
     return min(int(np.ceil(dt * fastest)), _MOST_STEPS)
 
 
-@njit(void(DERIVATIVE, _V, _V, PLANT, _ARM, _V, _V, _WORKSPACE), cache=True)
+@njit(int64(DERIVATIVE, _M, _M, PLANT, float64, _M), cache=True)
+def _count_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-def]
+    """Sum of `stable_steps` over states (K, nx) and inputs (K, nu)."""
+    total = 0
+    for k in range(x.shape[0]):
+        total += stable_steps(derivative, x[k], u[k], plant, dt, work)
+    return total
+
+
+@part()
 def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, work):  # type: ignore[no-untyped-def]
     """Handle force that alone would give the acceleration which the arm demands: ``work.goal``."""
     p, w, force, out = plant.p, plant.w, arm.force, work.goal
@@ -411,8 +420,8 @@ def count_steps(
         x: (K, nx) states; u: (K, nu) inputs there; the others as in `simulate`.
     """
     plant, work = make_plant(p, n_noise, width, max_step), np.zeros((9, x.shape[1]))
-    rows = zip(np.ascontiguousarray(x), np.ascontiguousarray(u), strict=True)
-    return float(np.mean([stable_steps(derivative, a, b, plant, dt, work) for a, b in rows]))
+    rows = np.ascontiguousarray(x), np.ascontiguousarray(u)
+    return float(_count_steps(derivative, *rows, plant, dt, work) / len(x))
 
 
 def require_finite(x: Array, dt: float) -> None:

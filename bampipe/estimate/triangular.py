@@ -4,9 +4,7 @@ All matrices are float64 and C-contiguous. The loops replace LAPACK because at 1
 and its allocations cost more than the arithmetic.
 """
 
-from numba import boolean, float64, int64, void
-
-from bampipe.compiled import njit
+from bampipe.compiled import part
 
 _REASSOCIATE = {"reassoc", "nsz", "contract"}  # lets sums use vector registers; NaN stays NaN
 
@@ -23,7 +21,7 @@ def padded(n: int) -> int:
     return (n + _LANES - 1) // _LANES * _LANES
 
 
-@njit(boolean(float64[:, ::1], float64[:, ::1]), cache=True, fastmath=_REASSOCIATE)
+@part(fastmath=_REASSOCIATE)
 def cholesky(covariance, factor):  # type: ignore[no-untyped-def]
     """Write the lower Cholesky factor of ``covariance`` (n, n) into ``factor`` (n, n).
 
@@ -57,7 +55,7 @@ def cholesky(covariance, factor):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(void(float64[:, ::1], int64, float64[:, ::1], int64), cache=True, fastmath=_REASSOCIATE)
+@part(fastmath=_REASSOCIATE)
 def append_rows(upper, n, columns, n_rows):  # type: ignore[no-untyped-def]
     """Replace the triangular R by that of R^T R + A^T A, by Householder reflections.
 
@@ -97,14 +95,7 @@ def append_rows(upper, n, columns, n_rows):  # type: ignore[no-untyped-def]
             upper[j, k] = sign * (upper[j, k] - projection * pivot)
 
 
-@njit(
-    void(
-        float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1],
-        float64[::1],
-    ),
-    cache=True,
-    fastmath={"contract"},
-)  # fmt: skip
+@part(fastmath={"contract"})
 def condition(upper, noise, cross, gain, cosine, sine):  # type: ignore[no-untyped-def]
     """Triangularise the joint root of readings and state, by Givens rotations.
 
@@ -154,7 +145,7 @@ def condition(upper, noise, cross, gain, cosine, sine):  # type: ignore[no-untyp
                 noise[k, i] = s * old + c * noise[k, i]
 
 
-@njit(void(float64[:, ::1], int64, float64[::1]), cache=True)
+@part()
 def forward_substitute(factor, n, vector):  # type: ignore[no-untyped-def]
     """Replace ``vector`` (>= n,) by L^-1 vector, L the leading (n, n) block of ``factor``."""
     for i in range(n):
@@ -164,7 +155,7 @@ def forward_substitute(factor, n, vector):  # type: ignore[no-untyped-def]
         vector[i] = total / factor[i, i]
 
 
-@njit(void(float64[:, ::1], int64, float64[::1]), cache=True)
+@part()
 def rank_one_update(upper, n, vector):  # type: ignore[no-untyped-def]
     """Replace R by the factor of R^T R + vector vector^T; ``vector`` (>= n,) is destroyed.
 
@@ -192,7 +183,7 @@ def rank_one_update(upper, n, vector):  # type: ignore[no-untyped-def]
             vector[i] = cosine * vector[i] - sine * upper[k, i]
 
 
-@njit(void(float64[:, ::1], float64[:, ::1]), cache=True)
+@part()
 def transpose(upper, factor):  # type: ignore[no-untyped-def]
     """Write the transpose of the upper triangular R (n, >= n) into ``factor`` (n, n)."""
     n = upper.shape[0]
@@ -203,7 +194,7 @@ def transpose(upper, factor):  # type: ignore[no-untyped-def]
             factor[i, j] = 0.0
 
 
-@njit(void(float64[:, ::1], float64[:, ::1]), cache=True, fastmath=_REASSOCIATE)
+@part(fastmath=_REASSOCIATE)
 def covariance_of(upper, covariance):  # type: ignore[no-untyped-def]
     """Write R^T R into ``covariance`` (n, n), R upper triangular (n, >= n), zeros below."""
     n = upper.shape[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,7 +51,8 @@ class Estimate:
         held_out: by trial, (n_p + 1,) the parameters without the trials that it is left out with.
         details: by parameter, further fields of its record.
         report: further fields of the result.
-        tabulate: makes the tables of the states and of the parameters along the data.
+        tabulate: makes the tables of the states, trial by trial or all in one, and the table of the
+            parameters along the data.
         doubts: why it may not be believed, a clause each; none where nothing speaks against it.
         notes: what else to know before believing it, a sentence each.
     """
@@ -64,7 +65,7 @@ class Estimate:
     held_out: Sequence[Array]
     details: Sequence[dict[str, float]]
     report: dict[str, Any]
-    tabulate: Callable[[], tuple[pd.DataFrame, pd.DataFrame]]
+    tabulate: Callable[[], tuple[Iterable[pd.DataFrame], pd.DataFrame]]
     doubts: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 

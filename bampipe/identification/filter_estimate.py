@@ -128,6 +128,7 @@ class _Filtering:
             ),
             len(self.motions),
             lambda trial: int(trial.t.size),
+            in_all=sum(self.sizes),
         )
         timing = squares.free.size > self.count
         self.model = build_filter_model(task.system, self.trials, task.start, timing, squares.p[-1])
@@ -274,7 +275,7 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
         details=[{"filter_sd": tight[k], "smoothing_sd": smoothing[k]} for k in range(count)],
         report=report,
         tabulate=lambda: (
-            tabulate_states(system, motions, found, p[:-1], rows),
+            [tabulate_states(system, motions, found, p[:-1], rows)],
             tabulate_trace(names, model, motions, found, rows),
         ),
         doubts=_doubts(nis.mean),

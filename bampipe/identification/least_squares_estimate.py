@@ -98,9 +98,12 @@ class SquaresFit:
             for left in every
         )
 
-    @cached_property
+    @property
     def rows(self) -> tuple[tuple[Array, Array], ...]:
-        """By axis: slopes (n, P) by the determined unknowns, what is left (n,); both weighted."""
+        """By axis: slopes (n, P) by the determined unknowns, what is left (n,); both weighted.
+
+        Made anew each time: kept, they would double the memory of the problem.
+        """
         pairs = zip(self.fit.problem.base, self._left, strict=True)
         return tuple((x / scale, left / scale) for x, (left, scale) in pairs)
 
@@ -231,7 +234,7 @@ class SquaresFit:
     def bias(self) -> Array:
         """What filters and friction that stops would move the parameters by, (n,), if left in."""
         unknowns = self.fit.problem.to_parameters.shape[0]
-        factors = range(unknowns - 2 * len(self.rows), unknowns)
+        factors = range(unknowns - 2 * len(self._left), unknowns)
         return self.respond(self.fit.bias, factors)
 
 
@@ -329,7 +332,7 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
             "residual_sd": dict(zip(system.coordinates, residual, strict=True)),
         },
         tabulate=lambda: (
-            pd.concat([as_filtered(system, m, squares.p[:-1]) for m in motions], ignore_index=True),
+            (as_filtered(system, m, squares.p[:-1]) for m in motions),
             pd.DataFrame(trace()),
         ),
     )

@@ -13,7 +13,7 @@ from typing import Any
 from numba import types
 from numba.extending import intrinsic
 
-from bampipe.compiled import njit
+from bampipe.compiled import part
 
 # Adding 1.5 * 2^52 rounds to the nearest integer and leaves it in the lowest bits.
 _ROUND = 6755399441055744.0
@@ -38,7 +38,7 @@ _bits = _same_bits(types.float64, types.int64)
 _double = _same_bits(types.int64, types.float64)
 
 
-@njit(fastmath=_FUSED, error_model="numpy", forceinline=True)
+@part(fastmath=_FUSED, error_model="numpy", forceinline=True)
 def _exponential_parts(x):  # type: ignore[no-untyped-def]
     """Return a, b and 2^k with e^x = 2^k (b + a) / (b - a), and k; |x| at most 700."""
     shifted = x * 1.4426950408889634 + _ROUND
@@ -53,7 +53,7 @@ def _exponential_parts(x):  # type: ignore[no-untyped-def]
     return a, b, _double((_bits(shifted) << 52) + (1023 << 52)), k
 
 
-@njit(fastmath=_FUSED, error_model="numpy", forceinline=True)
+@part(fastmath=_FUSED, error_model="numpy", forceinline=True)
 def exp(x):  # type: ignore[no-untyped-def]
     """e^x; 0 below x = -708, infinite from 709 on, where doubles end."""
     inside = x if x < 709.0 else 709.0
@@ -65,7 +65,7 @@ def exp(x):  # type: ignore[no-untyped-def]
     return value if x == x else x
 
 
-@njit(fastmath=_FUSED, error_model="numpy", forceinline=True)
+@part(fastmath=_FUSED, error_model="numpy", forceinline=True)
 def tanh(x):  # type: ignore[no-untyped-def]
     """Hyperbolic tangent."""
     size = abs(x)
@@ -80,7 +80,7 @@ def tanh(x):  # type: ignore[no-untyped-def]
     return value if size == size else x
 
 
-@njit(fastmath=_FUSED, error_model="numpy", forceinline=True)
+@part(fastmath=_FUSED, error_model="numpy", forceinline=True)
 def _circle(x):  # type: ignore[no-untyped-def]
     """Sine and cosine of what x leaves beside a multiple of a quarter turn; the multiple's bits."""
     shifted = x * 0.63661977236758134308 + _ROUND
@@ -101,7 +101,7 @@ def _circle(x):  # type: ignore[no-untyped-def]
     return sine, cosine, _bits(shifted)
 
 
-@njit(fastmath=_FUSED, error_model="numpy", forceinline=True)
+@part(fastmath=_FUSED, error_model="numpy", forceinline=True)
 def sin(x):  # type: ignore[no-untyped-def]
     """Sine of x rad."""
     sine, cosine, quarter = _circle(x)
@@ -109,7 +109,7 @@ def sin(x):  # type: ignore[no-untyped-def]
     return value if quarter & 2 == 0 else -value
 
 
-@njit(fastmath=_FUSED, error_model="numpy", forceinline=True)
+@part(fastmath=_FUSED, error_model="numpy", forceinline=True)
 def cos(x):  # type: ignore[no-untyped-def]
     """Cosine of x rad."""
     sine, cosine, quarter = _circle(x)
@@ -117,20 +117,20 @@ def cos(x):  # type: ignore[no-untyped-def]
     return value if (quarter + 1) & 2 == 0 else -value
 
 
-@njit(fastmath=_FUSED, error_model="numpy", forceinline=True)
+@part(fastmath=_FUSED, error_model="numpy", forceinline=True)
 def tan(x):  # type: ignore[no-untyped-def]
     """Tangent of x rad."""
     sine, cosine, quarter = _circle(x)
     return sine / cosine if quarter & 1 == 0 else -cosine / sine
 
 
-@njit(error_model="numpy", forceinline=True)
+@part(fastmath=_FUSED, error_model="numpy", forceinline=True)
 def sign(x):  # type: ignore[no-untyped-def]
     """-1, 0 or 1."""
     return 1.0 if x > 0.0 else (-1.0 if x < 0.0 else x)
 
 
-@njit(error_model="numpy", forceinline=True)
+@part(fastmath=_FUSED, error_model="numpy", forceinline=True)
 def heaviside(x, half):  # type: ignore[no-untyped-def]
     """0 below, 1 above, ``half`` at 0."""
     return 1.0 if x > 0.0 else (half if x == 0.0 else 0.0)

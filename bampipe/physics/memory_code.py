@@ -19,7 +19,7 @@ _FEWEST = 3
 # compiled where what calls it is, and not again by every process that finds that in the cache.
 BETWEEN = '''
 
-@njit
+@part()
 def between(q, qd, qdd, u, i, h, share, x, v, w):
     """Fills x, v, w with positions, rates and inputs between samples i and i + 1, h apart."""
     for j in range(len(x)):

@@ -17,8 +17,8 @@ from bampipe.physics.codegen import (
     bodies_at_state,
     dynamics_source,
     residual_source,
-    rows_source,
-    scalar_source,
+    rows_sources,
+    scalar_sources,
     slopes_source,
 )
 from bampipe.physics.derivation import derive
@@ -92,14 +92,13 @@ def whole_code(model: Model) -> Generation:
     sources = {
         "slopes": slopes,
         "dynamics": dynamics_source(equations),
-        "rows": rows_source(equations, ROWS),
+        **rows_sources(equations, ROWS),
     }
     sources["residual"], title = residual_source(equations, along.names), ""
     if along.names:
         sources["bodies"], sources["compiled_bodies"] = along.source, here.source
         title = generated_code.module_title("compiled_bodies", here.source)
-    sources["compiled"] = scalar_source(equations, here, title)
-    return facts, sources
+    return facts, sources | scalar_sources(equations, here, title)
 
 
 def moved_first(e: Equations, forces: list[Any]) -> list[list[int]]:

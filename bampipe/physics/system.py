@@ -180,12 +180,12 @@ class System:
     @cached_property
     def derivative(self) -> Callable[..., None]:
         """f(x, u, p, w, dx): numba-compiled state derivative (eq 14)."""
-        return self._whole.module("compiled").derivative
+        return self._whole.module("derivative").derivative
 
     @cached_property
     def measure(self) -> Callable[..., None]:
         """h(x, u, p, y): numba-compiled encoder readings, positions then rates."""
-        return self._whole.module("compiled").measure
+        return self._whole.module("measure").measure
 
     @cached_property
     def derivative_rows(self) -> Callable[..., None]:
@@ -193,12 +193,12 @@ class System:
 
         Quantity i of row r is at ``[i*ROWS + r]``; equal to `derivative` but for rounding.
         """
-        return self._whole.module("rows").derivative_rows
+        return self._whole.module("derivative_rows").derivative_rows
 
     @cached_property
     def measure_rows(self) -> Callable[..., None]:
         """h(count, x, u, p, y): `measure` of many states at once; see `derivative_rows`."""
-        return self._whole.module("rows").measure_rows
+        return self._whole.module("measure_rows").measure_rows
 
     def encoder_readings(self, x: Array, u: Array, p: Array) -> Array:
         """What the encoders read of states ``x`` (T, n_x): positions, then rates, (T, 2 n_q).

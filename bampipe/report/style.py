@@ -168,7 +168,7 @@ def render_svg(figure: Figure) -> str:
 def _part_labels(figure: Figure) -> None:
     """Take fewer ticks along horizontal axes whose labels touch."""
     for most in _FEWER_TICKS:
-        figure.draw_without_rendering()
+        figure.get_layout_engine().execute(figure)  # type: ignore[union-attr]
         touching = [axes for axes in figure.axes if _touch(axes)]
         if not touching:
             return

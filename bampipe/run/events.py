@@ -13,7 +13,8 @@ class Event:
     Attributes:
         run: name of the run folder.
         step: a stage, or ``stage:model``.
-        kind: "waiting", "taken over", "start", "progress", "done", "unchanged" or "failed".
+        kind: "waiting", "taken over", "compiling", "start", "progress", "done", "unchanged" or
+            "failed".
         fraction: how much of the step is done, 0 to 1.
         message: what is under way, why the step runs, what went wrong, or who holds or held the
             run folder.

@@ -135,13 +135,17 @@ class _Runner:
 
 def run_session(request: Request, listen: Listener = unheard) -> Outcome:
     """Run the selected stages of one session; bad input leaves earlier results as they were."""
-    selected(request)
+    stages = selected(request)
     fresh = not request.root.exists()
     with record.lock(request.root, request.wait, listen):
         runner = _Runner(request, listen)
         staging.recover(runner.state)
         try:
-            with compiling_ahead(request.processes):
+            if "identify" not in stages:
+                return runner.run()
+            with compiling_ahead(request.processes) as cold:
+                if cold:
+                    listen(Event(request.root.name, "", "compiling"))
                 return runner.run()
         except InputError:
             if fresh and not runner.state.records:

@@ -15,7 +15,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import FILTERED, INGESTED, MOVING, RunFolder
-from bampipe.data.store import ParquetAppender, read_parquet
+from bampipe.data.store import ParquetAppender, read_parquet, row_count
 from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother
@@ -294,7 +294,7 @@ def _motions(
     def read(number: int) -> Motion:
         return read_motion_of(path, names[number], system, left_out.get(names[number], ()))
 
-    return TrialCache(read, len(names), n_samples, names=names)
+    return TrialCache(read, len(names), n_samples, names=names, in_all=row_count(path, names))
 
 
 def _describe_offsets(

@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
-from bampipe.data.store import write_parquet
+from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recipe
 from bampipe.diagnosis.sign_width import SignWidth, choose_sign_width
 from bampipe.diagnosis.start import search_start
@@ -174,7 +174,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         ],
     )
     states, trace = estimate.tabulate()
-    write_parquet(out / f"models/{config.model}/states.parquet", states)
+    with ParquetAppender(out / f"models/{config.model}/states.parquet") as file:
+        for frame in states:
+            file.append(frame)
     write_parquet(out / f"models/{config.model}/trace.parquet", trace)
     return result.write(out)
 

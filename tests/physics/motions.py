@@ -23,10 +23,11 @@ def run_as_python(system, *modules):
     scope = {}
     for name in modules:
         sources = system._whole.sources
-        for text in (sources.get(f"{name}_bodies", ""), sources[name]):
+        bodies = sources.get("compiled_bodies", "") if name == "derivative" else ""
+        for text in (bodies, sources[name]):
             lines = [line for line in text.splitlines() if not line.startswith("from bampipe_")]
-            plain = "njit = lambda *_, **__: lambda function: function"
-            text = "\n".join(lines).replace("from bampipe.compiled import njit", plain)
+            plain = "njit = part = lambda *_, **__: lambda function: function"
+            text = "\n".join(lines).replace("from bampipe.compiled import njit, part", plain)
             exec(text, scope)
     return SimpleNamespace(**scope)
 

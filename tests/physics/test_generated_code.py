@@ -73,7 +73,7 @@ def rates_and_readings(functions, system, x, u, p, w):
 def test_columns_and_functions_of_one_state_agree(device, effects):
     """The same residual, acceleration and reading from both, to 1e-12 of their size."""
     system = compile_model(Model(device, effects))
-    printed = run_as_python(system, "compiled", "residual")
+    printed = run_as_python(system, "derivative", "measure", "residual")
     count, n = 40, len(system.coordinates)
     q, qd, qdd = random_motion(device, count, 21, speed=0.5)
     qd[::4] *= 1e-3
@@ -118,7 +118,9 @@ def test_what_is_compiled_is_what_is_printed(machine, effects):
     system = compile_model(Model(device, effects))
     count = 30
     x, u, p, w = states_of(system, count, 41)
-    expected = rates_and_readings(run_as_python(system, "compiled"), system, x, u, p, w)
+    expected = rates_and_readings(
+        run_as_python(system, "derivative", "measure"), system, x, u, p, w
+    )
     found = rates_and_readings(system, system, x, u, p, w)
 
     def laid_out(values):
@@ -159,7 +161,7 @@ def test_reading_of_the_encoders_is_its_offset_from_the_motion(name):
             change[:, k] = u[:, system.inputs.index(derivative(force, 1))]
     later, sooner = (system.offset(q + by * qd, u + by * change, p) for by in (1e-6, -1e-6))
     true = q + system.offset(q, u, p), qd + (later - sooner) / 2e-6
-    measure = run_as_python(system, "compiled").measure
+    measure = run_as_python(system, "measure").measure
     for i in range(20):
         x = np.concatenate([true[0][i], true[1][i], np.zeros(len(system.memory_names))])
         read = np.empty(2 * len(system.coordinates))
@@ -245,7 +247,7 @@ def test_generated_code_holds_no_name_from_a_file(tmp_path, monkeypatch):
     assert compile_model(Model(device, ("presliding:wandering", "force_drift:pushing"))).lasting
     files = [json.loads(f.read_text())["sources"] for f in tmp_path.rglob("model_*.json")]
     sources = [text for found in files for text in found.values()]
-    assert len(sources) == 7
+    assert len(sources) == 9
     for word in ("wandering", "pushing", "heaviness", "presliding", "deflection", "drift"):
         assert not any(word in text for text in sources)
     assert all(set(text) <= set(string.printable) for text in sources)

@@ -135,7 +135,7 @@ def test_all_models_of_a_robot_take_its_bodies_from_the_same_compiled_text() -> 
     some = [compile_model(Model(device, effects)) for effects in ((), (f"stribeck:{first}",))]
     for kind in ("compiled_bodies", "bodies"):
         assert len({system._whole.sources[kind] for system in some}) == 1
-    for kind in ("compiled", "residual"):
+    for kind in ("derivative", "residual"):
         texts = [system._whole.sources[kind] for system in some]
         assert len(set(texts)) == 2
         assert not any("inertia" in text or "r_9 =" in text for text in texts)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydantic.dataclasses import dataclass as checked_dataclass
-from scipy.signal import firwin, resample_poly
 
 from bampipe.data.readers.trial import RawTrial
 from bampipe.data.session import Session, TrialEntry
@@ -181,6 +180,8 @@ def thin(trial: CleanTrial, every: int, sampled: Collection[str]) -> CleanTrial:
     """
     if every == 1:
         return trial
+    from scipy.signal import firwin, resample_poly  # slow to import, and for fast logs alone
+
     length = 2 * _HALF_LENGTH * every + 1
     low_pass = firwin(length, _HALF_POWER / every, window=("kaiser", _KAISER))
     columns = {
