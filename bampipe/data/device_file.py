@@ -14,14 +14,7 @@ from typing import Any
 import numpy as np
 
 from bampipe.arrays import Array
-from bampipe.data.robot_tree import (
-    Body,
-    DriveLimits,
-    Tree,
-    fixed_joint,
-    symmetric,
-    tree_of_tables,
-)
+from bampipe.data.robot_tree import Body, DriveLimits, Tree, fixed_joint, symmetric, tree_of_tables
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 

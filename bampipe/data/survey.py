@@ -13,14 +13,7 @@ import numpy as np
 
 from bampipe.data.guesses import describe, find_roles, is_time
 from bampipe.data.parts import are_axes, join_parts
-from bampipe.data.readers import (
-    EXTENSIONS,
-    TEXTS,
-    columns_of,
-    lerobot,
-    objects,
-    read_trial,
-)
+from bampipe.data.readers import EXTENSIONS, TEXTS, columns_of, lerobot, objects, read_trial
 from bampipe.data.readers.trial import Dialect, RawTrial
 from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
