@@ -504,8 +504,7 @@ def _by_looks(
 ) -> tuple[tuple[SurveyedColumn, ...], list[str]]:
     """Columns whose names say nothing with the roles that they look like, and that in words.
 
-    Raises:
-        InputError: no column has a name, and none looks like a position.
+    InputError where no column has a name, and none looks like a position.
     """
     unnamed = [c for c in columns if not c.role and not c.is_constant]
     if any(c.role in ("position", "velocity") for c in columns) or not unnamed:

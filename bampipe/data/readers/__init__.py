@@ -119,8 +119,7 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
 def _safely(path: Path, name: str) -> Iterator[None]:
     """Let this process take as much memory as the file may; where Linux is not, it takes any.
 
-    Raises:
-        InputError: it does not suffice, or the library that reads such files fails.
+    InputError where it does not suffice, or the library that reads such files fails.
     """
     try:
         import resource
@@ -158,8 +157,7 @@ def _safely(path: Path, name: str) -> Iterator[None]:
 def _checked_extension(path: Path, name: str) -> str:
     """Extension of the file, after a look at whether its first bytes agree with it.
 
-    Raises:
-        InputError: cannot be read, empty, an unsupported extension, or of another kind.
+    InputError where it cannot be read, is empty, unsupported, or of another kind.
     """
     extension = path.suffix.lower()
     try:

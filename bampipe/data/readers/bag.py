@@ -244,8 +244,7 @@ def _field(column: str, name: str) -> Field:
 def _messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of recording (ns) and message, in the order of recording; all if no topics.
 
-    Raises:
-        InputError: not installed, damaged, or a topic is missing.
+    InputError where a library or a topic is missing, or the file is damaged.
     """
     highlevel = need("rosbags.highlevel", "ros", name)
     if path.suffix.lower() == ".mcap":
