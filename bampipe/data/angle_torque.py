@@ -1,4 +1,4 @@
-"""What of a drive follows the angle of its axis: weight, a spring, both, or nothing that shows."""
+"""A motion smoothed for regressions, and what of a drive follows the angle of its axis."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ from typing import Literal
 import numpy as np
 from scipy.special import fdtrc
 
+from bampipe.arrays import Array
+
+_SMOOTHED_S = 0.06
+"""Length of the window over which motion and input are smoothed before they are compared, s."""
 Reading = Literal["gravity", "either", "both", "spring", "nothing"]
 
 _LEFT = 0.8
@@ -20,6 +24,49 @@ _PLAINLY = 0.9
 in their place: friction that is fitted roughly leaves a little that resembles one."""
 _WINDOW = 5.0
 """Correlation is summed up to so many times what it sums up to (Sokal 1997)."""
+
+
+@dataclass(frozen=True)
+class SmoothedMotion:
+    """The motion of one axis.
+
+    What one filter takes off the motion, `smooth` takes off what is compared with it.
+
+    Attributes:
+        window: (W,) weights; inner: samples that its ends do not reach.
+        moving: (T, 3) acceleration, velocity and its sign; position: (T,).
+    """
+
+    window: Array
+    inner: slice
+    moving: Array
+    position: Array
+
+    @classmethod
+    def of(cls, t: Array, q: Array) -> SmoothedMotion | None:
+        """Smooth a position ``q`` (T,) at ``t`` (T,), s; None where it is too short."""
+        step = float(np.median(np.diff(t)))
+        width = max(5, round(_SMOOTHED_S / step) | 1)
+        if len(t) < 4 * width + 20:
+            return None
+        window = np.hanning(width + 2)[1:-1]
+        window = window / window.sum()
+        once = _convolve(q, window)
+        qd = np.gradient(once, step)
+        sides = [np.gradient(qd, step), qd, np.sign(qd), once]
+        *moving, position = (_convolve(values, window) for values in sides)
+        inner = slice(2 * width, -2 * width or None)
+        return cls(window, inner, np.column_stack(moving), position)
+
+    def smooth(self, values: Array) -> Array:
+        """``values`` (T,) smoothed as often as the motion."""
+        return _convolve(_convolve(values, self.window), self.window)
+
+
+def _convolve(values: Array, window: Array) -> Array:
+    from scipy.signal import oaconvolve  # it takes half of the time in which ingest starts
+
+    return np.asarray(oaconvolve(values, window, "same"))
 
 
 @dataclass(frozen=True)
@@ -45,10 +92,9 @@ class AngleTorque:
 
 
 def angle_torque(moving: np.ndarray, angle: np.ndarray, drive: np.ndarray) -> AngleTorque:
-    """Regress a drive on its motion with sine and cosine of the angle, with the angle, with both.
+    """Regress a drive (T,) on its motion with sine and cosine of the angle, with it, with both.
 
-    Args:
-        moving: acceleration, velocity, its sign and 1, (T, 4); angle: (T,) rad; drive: (T,).
+    ``moving``: acceleration, velocity, its sign and 1, (T, 4); ``angle``: (T,) rad.
     """
     line, wave = angle[:, None], np.column_stack([np.sin(angle), np.cos(angle)])
     swinging, resting = np.column_stack([moving, wave]), np.column_stack([moving, line])
@@ -88,9 +134,7 @@ def least_squares(design: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, n
 def _chance(before: np.ndarray, after: np.ndarray, columns: int, more: int) -> float:
     """Probability (F test) that ``more`` columns, which mean nothing, leave as little as they do.
 
-    Args:
-        before, after: residuals without and with them, (T,).
-        columns: of the regression with them.
+    ``before`` and ``after``: residuals (T,) without and with them; ``columns``: of both together.
     """
     left = float(after @ after)
     if left <= 0.0:

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
 from bampipe.data.mjcf import mjcf_tree
-from bampipe.data.rigid_body import Body
 from bampipe.data.robot_tree import (
     MOVING,
+    Body,
     DriveLimits,
     LumpedBodies,
     Tree,
@@ -47,12 +47,10 @@ class Branches(InputError):
 
 @dataclass(frozen=True)
 class Chain:
-    """The moving joints between two links.
+    """The moving joints between the links ``base`` and ``tip``.
 
     Attributes:
-        joints: by name, tables as of ``[robot.joints]``.
-        limits: by name.
-        base, tip: the links.
+        joints: by name, tables as of ``[robot.joints]``; limits: by name.
         notes: what was left out or joined, one sentence each.
         gravity: in the base's frame, m/s2; None where it is not known.
         gravity_note: where that is from, or why it is not known, if that is not plain.

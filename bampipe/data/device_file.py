@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from bampipe.arrays import Array
-from bampipe.data.rigid_body import Body, symmetric
-from bampipe.data.robot_tree import DriveLimits, Tree, fixed_joint, tree_of_tables
+from bampipe.data.robot_tree import Body, DriveLimits, Tree, fixed_joint, symmetric, tree_of_tables
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 

@@ -1,18 +1,25 @@
-"""Guesses from the data themselves: time unit, rate, what follows what, and what drives what."""
+"""Guesses from the data themselves: units, rates, what a column is, and what drives what."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from bampipe.data.angle_torque import AngleTorque, angle_torque, correlated, least_squares
+from bampipe.arrays import Array
+from bampipe.data.angle_torque import (
+    AngleTorque,
+    SmoothedMotion,
+    angle_torque,
+    correlated,
+    least_squares,
+)
 from bampipe.data.quality.clock import rate_of
 from bampipe.data.session import SECONDS
-from bampipe.data.smoothing import SmoothedMotion
 from bampipe.data.units import spelled
 
 RATES_HZ = (4.0, 30_000.0)
@@ -32,6 +39,15 @@ _LEAST_SIGN_BIT, _SIGN_GAP = 7, 0.7
 empty range below the bit shows it."""
 
 _NICE = (1, 1.2, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 7.5, 8)
+_DERIVATIVE = 0.98
+"""Correlation of a column with the integral of another, both without a line, to be that of it."""
+DRIVEN = 0.5
+"""Share of a column that the motion must explain for it to pass as what drives it."""
+_MOVED, _CLEARLY = 0.8, 0.5
+"""Of two columns, the share of one that the motion of the other must explain, and how much less it
+may leave than the other way round."""
+_STEADY = 50.0
+"""Of the median step: the longest one of a time."""
 
 
 def time_unit(t: np.ndarray, said: str) -> str:
@@ -255,11 +271,7 @@ def find_register(values: np.ndarray) -> Register | None:
 
 
 def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:
-    """Where to cut one record into parts, s: at rests near even spacing; none if it is short.
-
-    Args:
-        t: (T,) s from 0; q: (T,) position.
-    """
+    """Where to cut one record, (T,) positions at (T,) s from 0: at rests near even spacing, s."""
     parts = min(5, int(t[-1] // 4.0))
     if parts < 2:
         return []
@@ -270,3 +282,91 @@ def stretches(t: np.ndarray, q: np.ndarray) -> list[float]:
         slowest = np.flatnonzero(near)[int(np.argmin(speed[near]))]
         cuts.append(round(float(t[slowest]), 2))
     return cuts
+
+
+def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
+    """Roles of columns (T,) by what they look like, those that look like nothing left out.
+
+    ``t``: (T,) time, None where no column is known to be one. Roles are "time", "position",
+    "velocity", "acceleration" or "force" (what drives the motion).
+    """
+    found: dict[str, str] = {}
+    sound = {name: v[:_MOST_ROWS] for name, v in values.items() if np.all(np.isfinite(v))}
+    if t is None:
+        clock = next((name for name, v in sound.items() if is_time(v)), "")
+        found |= {clock: "time"} if clock else {}
+        t = sound.pop(clock, None)
+    if len(sound) < 2:
+        return found
+    matrix = np.column_stack(list(sound.values()))
+    t = np.arange(len(matrix), dtype=float) if t is None else t[:_MOST_ROWS]
+    if not np.all(np.isfinite(t)):
+        return found
+    names = list(sound)
+    derivative = _derivatives(matrix, t)
+    rates = set(derivative.values())
+    for k, rate in derivative.items():
+        if k not in rates:
+            found |= {names[k]: "position", names[rate]: "velocity"}
+            if rate in derivative:
+                found[names[derivative[rate]]] = "acceleration"
+    positions = [k for k in derivative if k not in rates]
+    left = [k for k, name in enumerate(names) if name not in found]
+    if len(positions) == 1:
+        q, unit = matrix[:, positions[0]], time_unit(t, "")
+        seconds = (t - t[0]) * SECONDS.get(unit, 1.0)
+        share = {
+            k: driven(seconds, q, matrix[:, k]).share
+            for k in left
+            if abs(float(np.corrcoef(q, matrix[:, k])[0, 1])) < _DERIVATIVE
+        }
+        best = max(share, key=lambda k: share[k], default=-1)
+        if best >= 0 and share[best] >= DRIVEN:
+            found[names[best]] = "force"
+    elif positions and len(left) == len(positions):
+        found |= {names[k]: "force" for k in left}
+    elif not positions and len(left) == 2:
+        seconds = (t - t[0]) * SECONDS.get(time_unit(t, ""), 1.0)
+        explained = [driven(seconds, matrix[:, k], matrix[:, 1 - k]).share for k in left]
+        moved = int(explained[1] > explained[0])
+        least, most = sorted(explained)
+        if most >= _MOVED and 1.0 - most < _CLEARLY * (1.0 - least):
+            found |= {names[moved]: "position", names[1 - moved]: "force"}
+    return found
+
+
+def describe(name: str, values: Array) -> str:
+    """What is seen of a column, for a person who knows what was logged."""
+    known = values[np.isfinite(values)]
+    if is_time(known):
+        return f"{name} increases as a time does"
+    return f"{name} from {known.min():.4g} to {known.max():.4g}" if len(known) else f"{name} empty"
+
+
+def is_time(values: Array) -> bool:
+    """Whether readings (T,) rise evenly."""
+    steps = np.diff(values)
+    rises = len(steps) > 3 and bool(np.all(steps > 0))
+    return rises and float(steps.max()) < _STEADY * float(np.median(steps))
+
+
+def _derivatives(matrix: Array, t: Array) -> dict[int, int]:
+    """Columns (T, n) by the column that is their derivative, the likeliest each.
+
+    A column is held against the integrals of the others: noise spoils derivatives.
+    """
+    since = t - t[0]
+    middle = 0.5 * (matrix[1:] + matrix[:-1]) * np.diff(since)[:, None]
+    integrals = np.concatenate([np.zeros((1, matrix.shape[1])), np.cumsum(middle, axis=0)])
+    base, _ = np.linalg.qr(np.column_stack([np.ones_like(since), since]))
+    p, i = (each - base @ (base.T @ each) for each in (matrix, integrals))
+    size = np.outer(np.linalg.norm(p, axis=0), np.linalg.norm(i, axis=0))
+    alike = np.divide(p.T @ i, size, out=np.zeros_like(size), where=size > 0.0)
+    np.fill_diagonal(alike, 0.0)
+    found: dict[int, int] = {}
+    for k, rate in zip(*np.unravel_index(np.argsort(-alike, axis=None), alike.shape), strict=True):
+        if alike[k, rate] < _DERIVATIVE:
+            break
+        if int(k) not in found and int(rate) not in found.values():
+            found[int(k)] = int(rate)
+    return found

@@ -66,15 +66,9 @@ TABLES: dict[str, dict[str, pa.DataType]] = {
 
 
 def write(folder: Path, rows: Mapping[str, Sequence[Row]]) -> dict[str, int]:
-    """Write every table, in place of what was there.
+    """Write every table, in place of what was there; return the number of rows of each.
 
-    Args:
-        folder: the lab's folder.
-        rows: of each table, in the order in which they are stored. A row holds ``device``, and
-            any of the table's columns; what it lacks is null.
-
-    Returns:
-        The number of rows of each table.
+    A row holds ``device``, and any of the table's columns; what it lacks is null.
 
     Raises:
         InputError: a file cannot be written.

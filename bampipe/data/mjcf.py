@@ -15,8 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
-from bampipe.data.rigid_body import Body, symmetric
-from bampipe.data.robot_tree import DriveLimits, Tree, TreeJoint, fixed_joint
+from bampipe.data.robot_tree import Body, DriveLimits, Tree, TreeJoint, fixed_joint, symmetric
 from bampipe.data.robot_xml import document, number_list, numbers
 from bampipe.errors import InputError, did_you_mean
 from bampipe.lists import join_names
@@ -56,10 +55,8 @@ class Additions:
 def mjcf_text(name: str, tree: Tree, gravity: Sequence[float], comment: str, add: Additions) -> str:
     """An MJCF of bodies and joints without shapes, one body a link, one motor a joint that moves.
 
-    Args:
-        name: of the robot; tree: its links and joints, parents first.
-        gravity: in the frame of the link at the root, m/s2.
-        comment: what to say at its head; add: what else it has.
+    Parents come first in ``tree``; ``gravity`` is in the frame of its root, m/s2; ``comment`` is
+    said at the head, and ``add`` is what else it has.
     """
     root = ElementTree.Element("mujoco", model=name)
     ElementTree.SubElement(root, "compiler", angle="radian", inertiafromgeom="false")

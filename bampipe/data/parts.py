@@ -13,9 +13,9 @@ from typing import Literal, cast
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.readers import RawTrial, read_trial
+from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
-from bampipe.data.readers.trial import Dialect
+from bampipe.data.readers.trial import Dialect, RawTrial
 from bampipe.data.recording import MOST_APART
 from bampipe.data.session import SECONDS, Part, TrialEntry
 from bampipe.data.session.channels import TimeUnit
@@ -46,9 +46,7 @@ class FileClock:
     """The time of one file.
 
     Attributes:
-        samples: how many it has.
-        column: name of the time column, "" where there is none.
-        unit: of the time column.
+        samples: how many it has; column: its time column, "" where there is none; unit: of that.
         t: (T,) s; start: its first stamp, s, on a clock that files may share.
     """
 
@@ -65,10 +63,8 @@ def join_parts(
     """Put together the files that are one recording.
 
     Args:
-        folder: of the logs.
-        found: columns and their units by file.
+        folder, dialect: of the logs; found: columns and their units by file.
         role: of a column by its name and unit, see `bampipe.data.survey`.
-        dialect: of text files.
 
     Returns:
         The recordings, none where no files belong together, and for each file that seems to but
@@ -147,11 +143,7 @@ def _called(words: Sequence[str], own: frozenset[str], said: Sequence[str]) -> s
 
 
 def _part(main: str, other: str, called: str, first: FileClock, second: FileClock) -> Part:
-    """How ``other`` is joined to ``main``.
-
-    Raises:
-        InputError: neither length nor clock says how.
-    """
+    """How ``other`` is joined to ``main``; InputError where neither length nor clock says how."""
     counts = sorted((first.samples, second.samples))
     rows = counts[1] - counts[0] <= max(1, MOST_APART * counts[1])
     join: Literal["rows", "time", "start", ""] = "rows" if rows else ""

@@ -1,25 +1,81 @@
-"""The links of a robot and the joints between them, as a file draws them."""
+"""The links of a robot, as rigid bodies, and the joints between them, as a file draws them."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from bampipe.arrays import Array
-from bampipe.data.rigid_body import Body
 from bampipe.errors import InputError
 
+_BELOW_ZERO = 1e-6
+"""Share of the largest second moment of mass by which one may be below zero."""
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 """Kinds of joint that a chain moves by, and what a device file calls them."""
 UPRIGHT = (0.0, 0.0, -9.81)
 """Gravity where nothing else is said, m/s2."""
 _ROUNDING = 1e-6
 """Share of gravity by which a component of it may be off zero."""
+
+
+@dataclass
+class Body:
+    """Mass, centre (3,) and inertia about it (3, 3), in the axes of a frame."""
+
+    mass: float = 0.0
+    center: Array = field(default_factory=lambda: np.zeros(3))
+    inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+    @classmethod
+    def of_table(cls, table: Mapping[str, Any]) -> Body:
+        """As of a joint, or of a payload, in a device file."""
+        center = np.array(table.get("center", (0.0,) * 3), dtype=float)
+        inertia = symmetric(table.get("inertia", (0.0,) * 6))
+        return cls(float(table.get("mass", 0.0)), center, inertia)
+
+    def moved(self, turn: Array, offset: Array) -> Body:
+        """The same body seen from a frame in which its own lies at ``offset``, ``turn``."""
+        return Body(self.mass, turn @ self.center + offset, turn @ self.inertia @ turn.T)
+
+    def joined(self, other: Body) -> Body:
+        """Both as one."""
+        mass = self.mass + other.mass
+        if mass == 0.0:
+            return Body(0.0, self.center, self.inertia + other.inertia)
+        center = (self.mass * self.center + other.mass * other.center) / mass
+        return Body(mass, center, self.about(center) + other.about(center))
+
+    def without(self, other: Body) -> Body:
+        """What is left when a part of it is taken off."""
+        return self.joined(Body(-other.mass, other.center, -other.inertia))
+
+    def about(self, point: Array) -> Array:
+        """Inertia about a point, (3, 3)."""
+        r = self.center - point
+        return self.inertia + self.mass * ((r @ r) * np.eye(3) - np.outer(r, r))
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether a distribution of mass has these numbers."""
+        spread = 0.5 * np.trace(self.inertia) * np.eye(3) - self.inertia
+        moments = np.linalg.eigvalsh(spread)
+        return self.mass >= 0.0 and bool(moments[0] >= -_BELOW_ZERO * abs(moments[2]))
+
+    def table(self) -> dict[str, Any]:
+        """As of a joint in a device file."""
+        upper = [float(v) for v in self.inertia[np.triu_indices(3)]]
+        return {"mass": self.mass, "center": [float(v) for v in self.center], "inertia": upper}
+
+
+def symmetric(six: Any) -> Array:
+    """The matrix, (3, 3), of its upper triangle by rows."""
+    xx, xy, xz, yy, yz, zz = (float(v) for v in six)
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 @dataclass(frozen=True)
@@ -205,11 +261,7 @@ def identifier(name: str) -> str:
 
 @dataclass(frozen=True)
 class LumpedBodies:
-    """What the links of a chain carry: all that the chain does not move against them.
-
-    Attributes:
-        tree: all links and joints; moving: the joints of the chain that move.
-    """
+    """What the links of a chain carry: all that its joints ``moving`` do not move against them."""
 
     tree: Tree
     moving: Sequence[TreeJoint]
@@ -262,16 +314,11 @@ class LumpedBodies:
 def put_bodies(
     tree: Tree, base: str, tip: str, bodies: Mapping[str, Body], limits: Mapping[str, DriveLimits]
 ) -> Tree:
-    """The tree with other bodies and limits on the joints of a chain, the same to its motion.
+    """The tree with other bodies and limits, by joint of a chain, the same to its motion.
 
     What was joined to make the body of a joint is parted again: links on fixed joints get no mass,
     which is in that of the link behind the joint; those on joints that are held keep theirs, which
     is taken off there.
-
-    Args:
-        tree: from which the chain was selected.
-        base, tip: of the chain.
-        bodies, limits: by joint of the chain.
     """
     # A joint that follows one beside the chain is held, too, and has no body of its own.
     path = [joint for joint in tree.path(base, tip) if joint.kind != "fixed"]

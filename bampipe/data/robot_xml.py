@@ -19,11 +19,7 @@ DEEPEST = 200
 
 
 def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
-    """The root of an XML file.
-
-    Args:
-        path: of the file.
-        to_write: whether it is written again: comments are kept, and prefixes of namespaces.
+    """The root of an XML file; ``to_write``: with its comments and prefixes of namespaces.
 
     Raises:
         InputError: no XML, one with a document type or entities, or too deep.

@@ -23,11 +23,7 @@ MOVING = ("free", "viscous")
 
 @dataclass(frozen=True)
 class RunFolder:
-    """Read access to the run folder of one session.
-
-    Attributes:
-        root: the run folder.
-    """
+    """Read access to the run folder ``root`` of one session."""
 
     root: Path
 

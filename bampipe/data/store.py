@@ -212,9 +212,7 @@ def _footer(path: Path) -> tuple[pq.FileMetaData, Mapping[str, Sequence[int]]]:
     """Metadata of a file and its row groups by their trial, read once while it is the same file.
 
     Reading it takes time in proportion to the number of trials: once a trial would be too often.
-
-    Raises:
-        InputError: no such file, or not a sound Parquet file.
+    InputError where there is no such file, or not a sound Parquet file.
     """
     if not path.is_file():
         raise InputError("no such file", where=str(path))

@@ -106,13 +106,11 @@ class SampleStream:
     """Lines of text turned into samples; a partial last line waits for its end.
 
     Attributes:
-        descriptor: of the open file or pipe.
-        name: what messages call it.
+        descriptor: of the open file or pipe; name: what messages call it.
         layouts: what its header may look like, the first that fits counts.
         strict: raise at the first bad line instead of skipping it.
         complain: called with each of the first few lines that are skipped.
-        ended: whether the last read found no more bytes.
-        bad_lines: how many were skipped.
+        ended: whether the last read found no more bytes; bad_lines: how many were skipped.
     """
 
     descriptor: int

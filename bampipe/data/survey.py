@@ -11,18 +11,10 @@ from unicodedata import combining, normalize
 
 import numpy as np
 
-from bampipe.data.looks import describe, find_roles, is_time
+from bampipe.data.guesses import describe, find_roles, is_time
 from bampipe.data.parts import are_axes, join_parts
-from bampipe.data.readers import (
-    EXTENSIONS,
-    TEXTS,
-    RawTrial,
-    columns_of,
-    lerobot,
-    objects,
-    read_trial,
-)
-from bampipe.data.readers.trial import Dialect
+from bampipe.data.readers import EXTENSIONS, TEXTS, columns_of, lerobot, objects, read_trial
+from bampipe.data.readers.trial import Dialect, RawTrial
 from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
 from bampipe.data.session.channels import CLOCK_UNITS
@@ -193,10 +185,7 @@ class Survey:
 def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Survey:
     """Look through the logs in ``folder`` and the folders in it.
 
-    Args:
-        folder: of the logs.
-        names: of the columns, where they are texts without a header.
-        episodes: of a data set of LeRobot, those that are wanted; see `lerobot.open_dataset`.
+    ``names``: of the columns of texts without a header; ``episodes``: see `lerobot.open_dataset`.
 
     Raises:
         InputError: no such folder, no log in it, too many, or none that can be read.
@@ -231,8 +220,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
 class _Logs:
     """The files of a folder while it is found out which are logs, and which belong together.
 
-    Attributes:
-        found: columns and their units, by file; passed, remarks: see `Survey`.
+    ``found``: columns and their units, by file; ``passed``, ``remarks``: see `Survey`.
     """
 
     folder: Path
@@ -283,18 +271,15 @@ class _Logs:
                 columns = columns_of(path, name=name, dialect=self.dialect)
                 if not columns:
                     raise InputError(f"no column of numbers in it{_like(path)}")
-                rows = (
-                    len(self._read_one(name, columns, next(iter(columns))))
-                    if (len(columns) > _MOST_COLUMNS)
-                    else 0
-                )
-                if 0 < 10 * rows < len(columns):
+                small = path.stat().st_size < _SMALL and path.suffix.lower() in TEXTS
+                wide, first = len(columns) > _MOST_COLUMNS, next(iter(columns))
+                rows = len(self._read_one(name, columns, first)) if small or wide else 2
+                if wide and 0 < 10 * rows < len(columns):
                     raise InputError(
                         f"{rows} rows of {len(columns)} columns are no log",
                         remedy="has it a channel a row? write a sample a row",
                     )
-                small = path.stat().st_size < _SMALL and path.suffix.lower() in TEXTS
-                if small and len(self._read_one(name, columns, next(iter(columns)))) < 2:
+                if small and rows < 2:
                     raise InputError("one row of numbers is no log")
                 self.found[name] = columns
             except InputError as error:
@@ -380,11 +365,7 @@ class _Logs:
         return labels
 
     def _refuse_parted(self, first: str, reasons: Sequence[str]) -> None:
-        """Refuse logs that have their positions in one file and what drives them in another.
-
-        Raises:
-            InputError: they are so.
-        """
+        """Refuse logs that have their positions in one file and what drives them in another."""
         roles = {n: {_role(*column) for column in c.items()} for n, c in self.found.items()}
         for here, there in (({"position"}, set(DRIVERS)), (set(DRIVERS), {"position"})):
             if here & roles[first] and not (there | {"reference"}) & roles[first]:
@@ -523,8 +504,7 @@ def _by_looks(
 ) -> tuple[tuple[SurveyedColumn, ...], list[str]]:
     """Columns whose names say nothing with the roles that they look like, and that in words.
 
-    Raises:
-        InputError: no column has a name, and none looks like a position.
+    InputError where no column has a name, and none looks like a position.
     """
     unnamed = [c for c in columns if not c.role and not c.is_constant]
     if any(c.role in ("position", "velocity") for c in columns) or not unnamed:

@@ -9,8 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
-from bampipe.data.rigid_body import Body, symmetric
-from bampipe.data.robot_tree import DriveLimits, Tree, TreeJoint
+from bampipe.data.robot_tree import Body, DriveLimits, Tree, TreeJoint, symmetric
 from bampipe.data.robot_xml import document, number_list, numbers, read_xml
 from bampipe.errors import InputError
 
@@ -110,11 +109,7 @@ def _joint(entry: ElementTree.Element, where: str) -> TreeJoint:
 
 
 def urdf_text(name: str, tree: Tree, comment: str) -> str:
-    """A URDF of links and joints, without shapes.
-
-    Args:
-        name: of the robot; tree: its links and joints; comment: what to say at its head.
-    """
+    """A URDF of links and joints, without shapes; ``comment`` is said at its head."""
     robot = ElementTree.Element("robot", name=name)
     for link, body in tree.bodies.items():
         _put_inertial(ElementTree.SubElement(robot, "link", name=link), body)
@@ -144,11 +139,7 @@ def urdf_text(name: str, tree: Tree, comment: str) -> str:
 
 
 def changed_urdf(path: Path, before: Tree, after: Tree, comment: str) -> str:
-    """The text of a URDF with other bodies and losses, all else as it is.
-
-    Args:
-        path: of the URDF; before: as it was read from there; after: as it shall be.
-        comment: what to say at its head.
+    """The text of a URDF with other bodies and losses than it was read with, all else as it is.
 
     Raises:
         InputError: the file cannot be read.

@@ -13,15 +13,16 @@ from bampipe.arrays import Array
 from bampipe.data.chain import read_tree
 from bampipe.data.device_file import tree_of_robot
 from bampipe.data.mjcf import mjcf_text
-from bampipe.data.rigid_body import Body, symmetric
 from bampipe.data.robot_tree import (
     UPRIGHT,
+    Body,
     DriveLimits,
     Tree,
     gravity_at,
     hold_beside,
     identifier,
     put_bodies,
+    symmetric,
 )
 from bampipe.data.robot_xml import number_list, read_xml
 from bampipe.data.run_folder import RunFolder

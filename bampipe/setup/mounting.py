@@ -100,12 +100,10 @@ def find_mounting(
     """The quarter turns, directions and gravity that let the drawing explain most.
 
     One of them is changed at a time, or two: the second of two that are off hides what the first
-    gains.
+    gains. Joints that do not turn can only be counted the other way round.
 
     Args:
-        turning: whether each joint turns; those that slide can only be counted the other way round.
-        drawn: as everything is stated.
-        judge: sum over the joints of the logarithm of what is left, with a mounting.
+        drawn: as everything is stated; judge: what `Comparison.misfit` gives.
         stands: whether gravity is as stated, as where reductions are unknown, too.
     """
 

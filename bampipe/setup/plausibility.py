@@ -78,8 +78,7 @@ def judge_setup(
     """Fit the bare device by least squares; None where it cannot be computed with.
 
     Args:
-        system: the bare device; motions: as the set-up has them; band: of the residual.
-        folds: which trials are fitted, which left out together; steps: of the fit, the most.
+        system: the bare device; band: of the residual; steps: of the fit, the most.
         posed: numbers of axes that are given a torque over their own position beside the device.
     """
     with np.errstate(all="ignore"):

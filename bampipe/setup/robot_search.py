@@ -14,14 +14,21 @@ from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
 from bampipe.physics.robot import Robot
 from bampipe.setup import hypotheses
-from bampipe.setup.drawn_bodies import Bounds, Comparison, Drive, JointMotion, keep
-from bampipe.setup.finding import LEAST_GAIN
-from bampipe.setup.heavier import find_heavy, with_heavier_body
+from bampipe.setup.drawn_bodies import (
+    Bounds,
+    Comparison,
+    Drive,
+    JointMotion,
+    find_heavy,
+    keep,
+    with_heavier_body,
+)
 from bampipe.setup.hypotheses import Correction
 from bampipe.setup.mounting import Mounting, find_mounting
 from bampipe.setup.plausibility import FARTHEST, WEIGHT, Plausibility
 from bampipe.setup.search import (
     DECADES,
+    LEAST_GAIN,
     MOST_AXES,
     Corrections,
     Family,

@@ -19,9 +19,9 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.device_file import find_robot_file
 from bampipe.data.quality import CleaningLimits, CleanTrial, thin, thinning_factor
+from bampipe.data.recording import describe_spans, find_copies, read_sound_trial
 from bampipe.data.run_folder import INGESTED, MOVING, RunFolder
 from bampipe.data.session import Session, TrialEntry, read_session
-from bampipe.data.session_trials import describe_spans, find_copies, read_sound_trial
 from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.declarations.session_device import placeholders, session_device
 from bampipe.errors import InputError

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bampipe.data.readers import Dialect, columns_of, read_trial
+from bampipe.data.readers import columns_of, read_trial
+from bampipe.data.readers.trial import Dialect
 from bampipe.errors import InputError
 
 T = np.arange(40) / 100.0

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import scipy.io
 
+from bampipe.data.quality.clock import spread_stamps
 from bampipe.data.quality.encoders import unwrapped
-from bampipe.data.quality.stamps import spread_stamps
 from bampipe.data.readers import columns_of, read_trial
-from bampipe.data.recording import read_recording
+from bampipe.data.recording import describe_spans, read_recording
 from bampipe.data.session import Clock, TrialEntry
-from bampipe.data.session_trials import describe_spans
 from bampipe.data.survey import survey, words
 from bampipe.data.units import unit
 from bampipe.errors import InputError

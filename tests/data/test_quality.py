@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean, thin, thinning_factor
 from bampipe.data.quality.clock import rate_of
-from bampipe.data.readers import RawTrial
+from bampipe.data.readers.trial import RawTrial
 from bampipe.data.session import session_from
 from bampipe.errors import InputError
 

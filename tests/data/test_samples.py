@@ -8,8 +8,8 @@ import pytest
 
 from bampipe.data.guesses import find_register, find_turning
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean
-from bampipe.data.quality.stamps import find_fresh_rows, spread_stamps, unroll
-from bampipe.data.readers import RawTrial
+from bampipe.data.quality.clock import find_fresh_rows, spread_stamps, unroll
+from bampipe.data.readers.trial import RawTrial
 from bampipe.data.session import session_from
 from bampipe.errors import InputError
 

@@ -10,11 +10,10 @@ from bampipe.data.device_file import complete_device
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
-from bampipe.setup.finding import Finding, conclude
 from bampipe.setup.hypotheses import scaled
 from bampipe.setup.plausibility import Plausibility
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch
-from bampipe.setup.search import shorten
+from bampipe.setup.search import Finding, conclude, shorten
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals

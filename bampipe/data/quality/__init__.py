@@ -8,10 +8,9 @@ noticed is a sentence in ``notes``. Nothing is altered without one.
 
 from __future__ import annotations
 
-from bampipe.data.quality import channels, clock, encoders, faulty_readings, motion
-from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable
-from bampipe.data.quality.thinning import thin, thinning_factor
-from bampipe.data.readers import RawTrial
+from bampipe.data.quality import channels, clock, encoders, faulty_readings
+from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable, thin, thinning_factor
+from bampipe.data.readers.trial import RawTrial
 from bampipe.data.session import Session, TrialEntry
 
 __all__ = ["CleanTrial", "CleaningLimits", "clean", "thin", "thinning_factor"]
@@ -20,13 +19,7 @@ __all__ = ["CleanTrial", "CleaningLimits", "clean", "thin", "thinning_factor"]
 def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLimits) -> CleanTrial:
     """Check and repair one trial and bring it to SI units.
 
-    The arrays of ``raw`` are used up.
-
-    Args:
-        raw: from :func:`bampipe.data.readers.read_trial`.
-        session: what its columns mean.
-        entry: what kind of trial it is.
-        limits: what counts as sound.
+    The arrays of ``raw``, from :func:`bampipe.data.readers.read_trial`, are used up.
 
     Raises:
         InputError: the trial must be set aside; says why, and where in the file.
@@ -60,7 +53,7 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
     faulty_readings.note_dead_stretches(table)
     faulty_readings.leave_out_rails(table)
     columns = channels.to_si(table)
-    motion.refuse_wrong_motion(table, columns)
-    motion.refuse_wrong_brakes(table, columns)
+    encoders.refuse_wrong_motion(table, columns)
+    encoders.refuse_wrong_brakes(table, columns)
     rate = clock.rate_of(table.t)
     return CleanTrial(table.t, columns, rate, table.repairs, table.notes, table.dead)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from bampipe.arrays import Flags
-from bampipe.data.angle_torque import least_squares
+from bampipe.data.angle_torque import SmoothedMotion, least_squares
 from bampipe.data.quality.channels import fill_missing, take_out
 from bampipe.data.quality.table import TrialTable, find_runs, longest_run
-from bampipe.data.smoothing import SmoothedMotion
 from bampipe.results.ingest import DeadStretch
 
 POSITION, INPUT = (0.95, 20.0), (0.5, 40.0)
@@ -48,14 +47,7 @@ _BEYOND = 2.0
 
 
 def find_spikes(values: np.ndarray, rule: tuple[float, float]) -> np.ndarray:
-    """Tell which readings are wild.
-
-    Args:
-        values: (T,) finite readings; rule: `POSITION` or `INPUT`.
-
-    Returns:
-        (T,) bool.
-    """
+    """Tell which of finite readings (T,) are wild by a rule, `POSITION` or `INPUT`; (T,) bool."""
     wild = np.zeros(values.size, dtype=bool)
     if values.size < _LONGEST_SPIKE + 4:
         return wild
@@ -110,10 +102,9 @@ def note_dead_stretches(table: TrialTable) -> None:
 
 
 def find_equal_runs(values: np.ndarray, t: np.ndarray) -> list[tuple[int, int]]:
-    """First and the one after the last sample of runs of equal readings that chance does not give.
+    """First and the one after the last of runs of equal readings (T,) that chance does not give.
 
-    Args:
-        values: (T,) readings; t: (T,) time stamps, s.
+    ``t``: (T,) time stamps, s.
     """
     changes = np.diff(values)
     moved = changes[changes != 0.0]

@@ -17,20 +17,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
-from bampipe.data.readers import bag, hdf5, mat, numpy_file, objects, parquet, tdms, text
+from bampipe.data.readers import arrays, bag, hdf5, mat, objects, parquet, tdms, text
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, Wanted
 from bampipe.errors import InputError
-
-__all__ = [
-    "EXTENSIONS",
-    "LARGEST_BYTES",
-    "TEXTS",
-    "Dialect",
-    "RawTrial",
-    "Wanted",
-    "columns_of",
-    "read_trial",
-]
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
 """File extensions of tables as text."""
@@ -42,7 +31,7 @@ _READERS: dict[str, ModuleType] = {
     **dict.fromkeys((".json", ".jsonl", ".ndjson"), objects),
     ".tdms": tdms,
     **dict.fromkeys((".bag", ".mcap", ".db3"), bag),
-    **dict.fromkeys((".npy", ".npz"), numpy_file),
+    **dict.fromkeys((".npy", ".npz"), arrays),
 }
 EXTENSIONS = tuple(_READERS)
 """File extensions that can be read."""
@@ -130,8 +119,7 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
 def _safely(path: Path, name: str) -> Iterator[None]:
     """Let this process take as much memory as the file may; where Linux is not, it takes any.
 
-    Raises:
-        InputError: it does not suffice, or the library that reads such files fails.
+    InputError where it does not suffice, or the library that reads such files fails.
     """
     try:
         import resource
@@ -169,8 +157,7 @@ def _safely(path: Path, name: str) -> Iterator[None]:
 def _checked_extension(path: Path, name: str) -> str:
     """Extension of the file, after a look at whether its first bytes agree with it.
 
-    Raises:
-        InputError: cannot be read, empty, an unsupported extension, or of another kind.
+    InputError where it cannot be read, is empty, unsupported, or of another kind.
     """
     extension = path.suffix.lower()
     try:

@@ -1,9 +1,14 @@
-"""Variables that are vectors, or columns of a matrix named as ``X[0]``."""
+"""Variables that are vectors, or columns of a matrix named as ``X[0]``; arrays as NumPy saves them.
+
+Of ``.npy`` with one array, and ``.npz`` with several by name; fields of a structured array are
+columns, too. Pickled objects, which may run any program, are not read.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Container, Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -22,8 +27,7 @@ def read_arrays(
 
     Args:
         arrays: by name, of numbers or of texts that are moments; None for what is neither.
-        wanted: columns.
-        name: what to call the file in messages; what: its arrays.
+        wanted: columns; name, what: of the file and of its arrays, in messages.
 
     Raises:
         InputError: an array is missing, not a vector of numbers, or not as long as the others.
@@ -120,10 +124,8 @@ def _join_runs(
 ) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, ...]]]:
     """Vectors of one name in all structs of a list, end to end: ``runs[:].q`` of ``runs[0].q``.
 
-    Of structs that each have a time, or are as long as no other; others are rather joints.
-
-    Returns:
-        All arrays, and by the name of each that was joined the samples before which one begins.
+    Of structs that each have a time, or are as long as no other; others are rather joints. All
+    arrays, and by the name of each that was joined the samples before which one begins.
     """
     found = {label: array for label, array in arrays.items() if array is not None}
     begun: dict[str, tuple[int, ...]] = {}
@@ -148,9 +150,6 @@ def recorded(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
     """Labels of the variables that were recorded together, and of numbers that stand alone.
 
     Beside a log a file may keep what belongs to no sample: gains by axis, a table of settings.
-
-    Args:
-        shapes: by name of the variable.
     """
     by_length: dict[int, list[str]] = {}
     for name, shape in shapes.items():
@@ -159,3 +158,38 @@ def recorded(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
     samples = max(longer, key=lambda length: (len(by_length[length]), length), default=1)
     kept = {*by_length.get(1, ()), *by_length.get(samples, ())}
     return [x for name, shape in shapes.items() for x in labels(name, shape) if x in kept]
+
+
+def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
+    """The wanted arrays; ``data[0]`` is the first column of the one array of a ``.npy``.
+
+    Raises:
+        InputError: damaged, pickled, an array missing, or not a vector of numbers.
+    """
+    return read_arrays(_arrays(path, name), wanted, name, "array")
+
+
+def columns(path: Path, name: str) -> dict[str, str]:
+    """Names of the vectors of numbers that were recorded together, or of columns; no units."""
+    return columns_of_arrays(_arrays(path, name))
+
+
+def _arrays(path: Path, name: str) -> dict[str, np.ndarray | None]:
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        stored = {"data": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+    except ValueError as error:
+        raise InputError(
+            "not sound, or pickled Python objects, which are not read",
+            where=name,
+            remedy="save arrays of numbers: np.savez(FILE, t=t, q=q, tau=tau)",
+        ) from error
+    found: dict[str, np.ndarray | None] = {}
+    for key, array in stored.items():
+        fields = array.dtype.names
+        parts = {f"{key}.{part}": array[part] for part in fields} if fields else {key: array}
+        for label, part in parts.items():
+            stamped = part.dtype.kind == "M"
+            part = part.astype(str).astype(object) if stamped else np.atleast_1d(part)
+            found[label] = part if stamped or part.dtype.kind in "iufb" else None
+    return found

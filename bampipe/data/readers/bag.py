@@ -19,7 +19,7 @@ import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,14 +41,8 @@ _LISTS = ("position", "velocity", "effort")
 """Of a message with names of joints: what may be empty."""
 
 
-@dataclass(frozen=True)
-class Field:
-    """One number of the messages of a topic.
-
-    Attributes:
-        topic: name of the topic.
-        path: of the number in the message, such as ``wrench.force.x`` or ``position[elbow]``.
-    """
+class Field(NamedTuple):
+    """One number of the messages of a topic, by its path, such as ``position[elbow]``."""
 
     topic: str
     path: str
@@ -57,11 +51,6 @@ class Field:
     def is_time(self) -> bool:
         """Whether it says when the message was recorded or stamped."""
         return self.path in (RECORDED, STAMP)
-
-    @property
-    def is_spread(self) -> bool:
-        """Whether every message has many samples of it."""
-        return "[:]" in self.path or "::" in self.path
 
 
 @dataclass(eq=False)
@@ -123,7 +112,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     fields = {column: _field(column, name) for column in wanted.columns}
     clock_column, clock = next(iter(fields.items()))
     streams = _read_streams(path, fields, wanted, name)
-    if not (clock.is_time or clock.is_spread):
+    if not (clock.is_time or "[:]" in clock.path or "::" in clock.path):
         raise InputError(
             "is no time",
             where=f"{name}, column '{clock_column}'",
@@ -255,8 +244,7 @@ def _field(column: str, name: str) -> Field:
 def _messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of recording (ns) and message, in the order of recording; all if no topics.
 
-    Raises:
-        InputError: not installed, damaged, or a topic is missing.
+    InputError where a library or a topic is missing, or the file is damaged.
     """
     highlevel = need("rosbags.highlevel", "ros", name)
     if path.suffix.lower() == ".mcap":

@@ -51,9 +51,6 @@ class TableLayout:
     """Where the samples of a text file start and how they are written.
 
     Attributes:
-        delimiter: between columns.
-        decimal: decimal sign.
-        header: names of the columns.
         first_line: number of the line with the first sample, as an editor counts.
         start: bytes before that line.
         remarks: what is unlike a plain table with commas, a sentence each.
@@ -108,13 +105,9 @@ def cells(text: str, delimiter: str) -> list[str]:
 
 
 def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str) -> TableLayout:
-    """Layout of the text file that begins with ``head``.
+    """Layout of the text file that begins with ``head``: its first 64 kB, or all of it, as UTF-8.
 
-    Args:
-        head: its first 64 kB, or all of it where it is shorter, as UTF-8.
-        columns: names that the header must have; empty to take any header.
-        dialect: what the session says about it.
-        name: what to call the file in messages.
+    The header must have ``columns``; any will do where these are empty.
 
     Raises:
         InputError: no header, a column missing, or a layout that can be read in two ways.
@@ -198,7 +191,7 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
 
 
 def _is_number(cell: str, decimal: str) -> bool:
-    return bool((_POINT if decimal == "." else _COMMA).match(cell) or _POINT.match(cell))
+    return bool(_POINT.match(cell) or (decimal == "," and _COMMA.match(cell)))
 
 
 def _mark(head: bytes) -> int:
@@ -373,14 +366,14 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
 def _is_sparse(row: list[str], width: int) -> bool:
     """Whether a line is a sample in which cells are empty: numbers and moments, nothing else."""
     return len(row) == width > 1 and all(
-        cell in NULLS or _POINT.match(cell) or _COMMA.match(cell) or is_moment(cell) for cell in row
+        cell in NULLS or _is_number(cell, ",") or is_moment(cell) for cell in row
     )
 
 
 def _number_cells(row: list[str], delimiter: str) -> int:
     """How many cells of a line are numbers or moments; a comma inside one is a decimal sign."""
-    signs = (_POINT,) if delimiter == "," else (_POINT, _COMMA)
-    return sum(any(sign.match(cell) for sign in signs) or is_moment(cell) for cell in row)
+    decimal = "." if delimiter == "," else ","
+    return sum(_is_number(cell, decimal) or is_moment(cell) for cell in row)
 
 
 def _above(lines: list[Line], first: int, delimiter: str) -> int:
@@ -425,11 +418,7 @@ def _padded(header: list[str], body: list[Line], delimiter: str) -> list[str]:
 def _decimal(
     body: list[Line], header: list[str], columns: Sequence[str], delimiter: str, name: str
 ) -> str:
-    """Decimal sign of the first lines.
-
-    Raises:
-        InputError: both signs, or digits that may be grouped in thousands.
-    """
+    """Decimal sign of the first lines; InputError where there are both, or digits in thousands."""
     indices = [n for n, column in enumerate(header) if column in columns or not columns]
     seen: dict[str, tuple[str, int]] = {}
     plain = False

@@ -40,8 +40,7 @@ class DataSet:
     """A data set.
 
     Attributes:
-        episodes: numbers of the episodes in each file, in the order of their rows, by its path
-            relative to the data set.
+        episodes: their numbers in each file, in the order of their rows, by its relative path.
         chosen: numbers of those that are wanted.
     """
 
@@ -133,8 +132,7 @@ def role_of(name: str) -> str:
 def describe_loops(t: np.ndarray, columns: Mapping[str, np.ndarray]) -> str:
     """Say how late every joint of a data set follows its goal; "" where it has no joints.
 
-    Args:
-        t: time stamps of an episode, (T,), s; columns: of it by name, each (T,).
+    ``t``: time stamps of an episode, (T,), s; ``columns``: of it by name, each (T,).
     """
     said = []
     for name, state in columns.items():

@@ -40,8 +40,7 @@ def nanoseconds(
     Args:
         values: text, or numpy datetime64.
         form: as of ``strptime``; "" for ISO 8601 or times of day, which are of 1970-01-01.
-        where: file and column, for messages.
-        first_row: number of the first row, for messages.
+        where, first_row: file and column, and the number of the first row, for messages.
 
     Raises:
         InputError: a cell is no date and time of that form.
@@ -109,11 +108,7 @@ def _iso_of_local(text: pd.Series) -> pd.Series:
 
 
 def seconds(moments: np.ndarray) -> np.ndarray:
-    """Seconds since the first moment, (T,) float64, NaN where missing; midnight is no step back.
-
-    Args:
-        moments: from :func:`nanoseconds`.
-    """
+    """Seconds since the first of moments (T,), ns; NaN where missing; midnight is no step back."""
     missing = moments == np.iinfo(np.int64).min
     known = np.flatnonzero(~missing)
     if len(known) == 0:

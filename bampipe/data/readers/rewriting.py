@@ -6,7 +6,6 @@ with their units or with lists, and tables with the names of signals in a column
 
 from __future__ import annotations
 
-import csv
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+from bampipe.data.readers.dialect import cells
 from bampipe.data.units import unit
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -32,12 +32,9 @@ _DELIMITERS = (";", "\t", ",", "|")
 
 @dataclass(frozen=True)
 class Form:
-    """How the lines of a text become rows of a table.
+    """How the lines of a text, which ``said`` describes, become rows of a table.
 
-    Attributes:
-        said: what the text is, for its reader.
-        rewrite: the row for a line.
-        names: of the columns, where no line holds them.
+    ``names`` are those of the columns, where no line holds them.
     """
 
     said: str
@@ -70,7 +67,7 @@ def find_form(head: str) -> Form | None:
     if pairs := _pairs(lines):
         return pairs
     for delimiter in _DELIMITERS:
-        table = [_split(line, delimiter) for line in (*whole[:_TRIED], *lines)]
+        table = [cells(line, delimiter) for line in (*whole[:_TRIED], *lines)]
         width = Counter(map(len, table)).most_common(1)[0][0]
         rows = [row for row in table if len(row) == width > 1]
         if len(rows) > _MOST * len(table) and (found := _cells(rows[0], rows[1:], delimiter)):
@@ -80,10 +77,6 @@ def find_form(head: str) -> Form | None:
 
 def _are(kind: re.Pattern[str], lines: Sequence[str]) -> bool:
     return sum(kind.search(line) is not None for line in lines) > _MOST * len(lines)
-
-
-def _split(line: str, delimiter: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
 
 
 def _stamped(lines: Sequence[str]) -> Form:
@@ -144,7 +137,7 @@ def _cells(header: list[str], rows: list[list[str]], delimiter: str) -> Form | N
         names = list(signals)
 
         def rewrite(line: str) -> str:
-            row = _split(line, delimiter)
+            row = cells(line, delimiter)
             places = [row[2] if row[1] == name else "" for name in names] if len(row) == 3 else []
             return delimiter.join(
                 [row[0], *(names if row == header else places)] if places else row
@@ -158,7 +151,7 @@ def _by_cell(
     delimiter: str, of: Sequence[Any], act: Callable[[str, Any], list[str]]
 ) -> Callable[[str], str]:
     def rewrite(line: str) -> str:
-        row = _split(line, delimiter)
+        row = cells(line, delimiter)
         if len(row) != len(of):
             return line
         pairs = zip(row, of, strict=True)

@@ -82,8 +82,7 @@ def _opened(
 ) -> Iterator[tuple[BinaryIO, Dialect, tuple[str, ...]]]:
     """The file as a table in UTF-8, itself or a copy in memory; its dialect, and what to say of it.
 
-    Raises:
-        InputError: it is not in the encoding that it claims.
+    InputError where it is not in the encoding that it claims.
     """
     with path.open("rb") as stream:
         head = stream.read(HEAD)
@@ -162,10 +161,7 @@ def _head(stream: BinaryIO, name: str) -> bytes:
 
 @dataclass
 class _Samples:
-    """What has been read of a file: the wanted columns in parts, and how many rows.
-
-    Attributes: see :class:`RawTrial`.
-    """
+    """What has been read of a file: the wanted columns in parts, how many rows; see `RawTrial`."""
 
     wanted: Wanted
     nothing: list[str] = field(default_factory=list)
@@ -223,8 +219,7 @@ def _read_samples(
 ) -> None:
     """Read the samples before byte ``end``, past lines of text that hold none.
 
-    Raises:
-        InputError: a row is damaged, or too many lines are text.
+    InputError where a row is damaged, or too many lines are text.
     """
     while True:
         rows, parts = samples.rows, max(map(len, samples.parts.values()), default=0)

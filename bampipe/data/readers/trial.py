@@ -41,11 +41,9 @@ class Wanted:
     """What to read of a file.
 
     Attributes:
-        columns: names of the columns.
-        datetimes: columns that hold dates and times, with their format as of ``strptime``; ""
-            for ISO 8601. They are returned as s since the first.
-        dialect: of text files.
-        largest_bytes: refuse a trial that takes more than this in memory.
+        columns: their names; datetimes: those that hold dates and times, with their format as of
+            ``strptime``, "" for ISO 8601: they are returned as s since the first.
+        dialect: of text files; largest_bytes: that a trial may take in memory.
     """
 
     columns: tuple[str, ...]
@@ -137,15 +135,10 @@ def check_columns(found: Sequence[str], wanted: Sequence[str], name: str) -> Non
 
 
 def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np.ndarray]:
-    """The columns, all of one length; a single number is a column that does not change.
-
-    Args:
-        values: (T,) or (1,) a column.
-        name: the file, for messages.
-        what: what its columns are called.
+    """The columns (T,), all of one length; a single number (1,) is a column that does not change.
 
     Raises:
-        InputError: a column is of another length.
+        InputError: a column, which the file ``name`` calls a ``what``, is of another length.
     """
     first = max(values, key=lambda column: len(values[column]) > 1, default="")
     count = len(values[first]) if values else 0
@@ -173,13 +166,8 @@ def interpolated(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.nd
 def need(module: str, extra: str, name: str) -> ModuleType:
     """The module, which belongs to an optional extra of bampipe.
 
-    Args:
-        module: full name of what to import.
-        extra: the extra of bampipe that brings it.
-        name: the file that needs it, for the message.
-
     Raises:
-        InputError: it is not installed; names the pip command.
+        InputError: it is not installed and the file ``name`` needs it; names the pip command.
     """
     try:
         return importlib.import_module(module)

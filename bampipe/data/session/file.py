@@ -411,12 +411,7 @@ def read_session(path: Path) -> Session:
 
 
 def session_from(table: Mapping[str, Any], root: Path, where: str = FILE_NAME) -> Session:
-    """Check the parsed session file ``table`` of the folder ``root``.
-
-    Args:
-        table: what TOML parsing gave.
-        root: the session folder; only a device file is looked for in it.
-        where: the file, for messages.
+    """Check the parsed session file ``table`` of the folder ``root``, where a device file may be.
 
     Raises:
         InputError: any mistake, named by field.

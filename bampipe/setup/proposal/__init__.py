@@ -22,7 +22,6 @@ from bampipe.files import write_text
 from bampipe.lists import join_names
 from bampipe.physics.device import Device
 from bampipe.setup.mounting import Mounting
-from bampipe.setup.proposal.clock import clock_of
 from bampipe.setup.proposal.device import (
     DEVICE,
     ChosenDevice,
@@ -31,12 +30,11 @@ from bampipe.setup.proposal.device import (
     with_gravity,
     with_motors,
 )
-from bampipe.setup.proposal.encoders import encoders_table
-from bampipe.setup.proposal.inputs import input_tables
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import Notes, quoted
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
 from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
+from bampipe.setup.proposal.tables import clock_of, encoders_table, input_tables
 
 SESSION = "session.toml"
 
@@ -128,11 +126,7 @@ def propose(
 
 
 def _refuse_goals(folder: Path, found: Survey) -> None:
-    """Refuse a data set of LeRobot in which goals are all that is known of the drives.
-
-    Raises:
-        InputError: it is so.
-    """
+    """Refuse a data set of LeRobot in which goals are all that is known of the drives."""
     columns = {column.name: column.values for column in found.columns}
     if not any(name.startswith(lerobot.STATE) for name in columns):
         return
@@ -232,14 +226,7 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
 def _trials_tables(
     device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes
 ) -> list[str]:
-    """Propose the trials and their kinds; a single long record is cut at rests of its first axis.
-
-    Args:
-        device: whose axes a locked trial may name.
-        axes: columns of the positions.
-        match: the logs and their time.
-        notes: where guesses and what is left open are noted.
-    """
+    """Propose the trials and their kinds; a long single record is cut at rests of its axis."""
     trials = match.found.trials
     cuts: list[float] = []
     if len(trials) == 1 and axes:

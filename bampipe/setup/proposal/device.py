@@ -43,7 +43,6 @@ class ChosenDevice:
 
     Attributes:
         name: of a built-in device, or the path of a device file relative to the folder of logs.
-        device: the device.
         text: of a new device file, "" where there is one already.
         columns: what the inputs of a new device were made from, by the name of the input.
     """
@@ -87,10 +86,7 @@ def _robot(folder: Path, found: Survey) -> ChosenDevice | None:
     """The robot of the URDF or MJCF in the folder, its drives logged as torque or as current.
 
     Where joints branch, as fingers do, it ends with the last one that has a column, else before
-    them.
-
-    Raises:
-        InputError: the file cannot be used, is a xacro file, or there are several.
+    them. InputError where the file cannot be used, is a xacro file, or there are several.
     """
     urdfs = sorted(folder.glob("*.urdf")) or [
         path for path in sorted(folder.glob("*.xml")) if _is_mjcf(path)
@@ -137,7 +133,6 @@ def with_motors(
     """A new device file of a robot with a table for each motor.
 
     Args:
-        folder: of the logs; chosen: the robot.
         motors: by joint, turns for one of the joint and, where currents are logged, N.m/A.
         reference: of constants that the drawing suggests, the joint whose constant the others are
             estimated by.
@@ -259,9 +254,10 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
 def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bool:
     """Whether a current beside a force is that of a coil or a brake, rather than of the drive."""
     currents = [c for c in match.found.of("current") if not c.is_constant]
-    alike = [c for c in currents if driver is not None and _go_together(c.values, driver.values)]
+    if driver is None:
+        return bool(currents)
+    alike = [c for c in currents if _go_together(c.values, driver.values)]
     for current in alike:
-        assert driver is not None
         match.used.add(current.name)
         notes.check.append(
             f"{current.name} goes with {driver.name}: both are of the drive, and {driver.name} is"

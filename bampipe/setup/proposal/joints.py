@@ -62,12 +62,7 @@ def pair_joints(
 
 
 def chain_logged(chains: Mapping[str, Sequence[tuple[str, str]]], found: Survey) -> str:
-    """The link at which the chain ends whose joints the columns name most; "" where they name none.
-
-    Args:
-        chains: joints with the links behind them, as of `Branches`.
-        found: the log.
-    """
+    """The link at which the chain ends whose joints the columns name most; "" if they name none."""
     said = [_tokens(column.name) for column in found.of("position")]
 
     def is_logged(joint: str) -> bool:

@@ -15,9 +15,6 @@ from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import travelled
 from bampipe.setup.proposal.robot import RobotColumns
 
-_DRIVEN = 0.5
-"""Share of a column that the motion must explain for it to pass as what drives it."""
-
 _MANY = 6
 _NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
 _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
@@ -60,12 +57,9 @@ class Matcher:
         return None
 
     def position(self, axis: str, axes: int, notes: Notes) -> SurveyedColumn | None:
-        """The measured position of an axis; a guess is noted where it was one of several.
+        """The measured position of an axis, "" for any; a guess is noted if it is one of several.
 
-        Args:
-            axis: name of the axis, "" for any.
-            axes: how many axes there are: of several, only the name tells which is which.
-            notes: where a guess is noted.
+        Of several ``axes``, only the name tells which is which.
         """
         named = self.named(axis, "position") if axis else None
         if named is not None or axes > 1:
@@ -89,12 +83,7 @@ class Matcher:
     def inputs(
         self, wanted: Mapping[str, str], axes: tuple[SurveyedColumn, ...]
     ) -> dict[str, Match]:
-        """The column of every input, and why it is thought so where that is not by its name.
-
-        Args:
-            wanted: inputs with their SI units.
-            axes: columns of the positions.
-        """
+        """The column of every input, given with its SI unit; why, where that is not by its name."""
         given: dict[str, Match] = {}
         # Those with a unit first: what has none could be anything.
         for name, si in sorted(wanted.items(), key=lambda item: not item[1]):
@@ -151,16 +140,15 @@ class Matcher:
         share = {}
         for column in self.found.columns:
             free = column.name not in self.used and column.role not in _NEVER_DRIVES
-            if not free or column.is_constant or column is position:
+            of_axis = column is position or column.si in ("rad", "m")
+            if not free or column.is_constant or of_axis:
                 continue
             values = np.nan_to_num(column.values)
-            if column.si in ("rad", "m"):  # of another axis
-                continue
             if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:
                 continue
             share[column.name] = guesses.driven(self.t, travelled(position, self.t), values).share
         roles = {column.name: column.role for column in self.found.columns}
-        fitting = [name for name in share if share[name] >= _DRIVEN]
+        fitting = [name for name in share if share[name] >= guesses.DRIVEN]
         # A velocity of an unknown name fits itself. Of several joints without a drawing, a drive
         # has the number of its position.
         fitting = [name for name in fitting if roles[name] in DRIVERS] or fitting

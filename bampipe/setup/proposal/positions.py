@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.quality.clock import find_fresh_rows
 from bampipe.data.quality.encoders import integral, unwrapped
 from bampipe.data.quality.faulty_readings import INPUT, POSITION, find_spikes
-from bampipe.data.quality.stamps import find_fresh_rows
 from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
 from bampipe.data.units import unit
 from bampipe.setup.proposal.notes import Notes
 
 SLIDING = frozenset(["stroke", "displacement", "disp", "dist", "weg", "hub", "carriage", "piston"])
-_FEWEST_COUNTS = 100
+FEWEST_COUNTS = 100
 _MOST_WILD = 0.01
 """Share of the readings that are wild or missing, the most."""
 
@@ -27,7 +27,7 @@ def is_velocity(column: SurveyedColumn) -> bool:
 
 def in_counts(column: SurveyedColumn) -> bool:
     """Whether a position is in whole counts of no known unit."""
-    return column.si is None and column.is_integer and bool(np.ptp(column.values) > _FEWEST_COUNTS)
+    return column.si is None and column.is_integer and bool(np.ptp(column.values) > FEWEST_COUNTS)
 
 
 def slides(column: SurveyedColumn, found: Survey) -> bool:
@@ -40,9 +40,7 @@ def slides(column: SurveyedColumn, found: Survey) -> bool:
 def travelled(column: SurveyedColumn, t: np.ndarray) -> np.ndarray:
     """Position (T,) as the column has it; the integral over ``t`` (T,), s, of a velocity."""
     values: np.ndarray = np.nan_to_num(column.values)
-    if not is_velocity(column):
-        return values
-    return integral(t, values)
+    return integral(t, values) if is_velocity(column) else values
 
 
 def position_in_si(column: SurveyedColumn, t: np.ndarray, si: str) -> np.ndarray:

@@ -84,14 +84,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Starter:
-    """A device file to start from.
-
-    Attributes:
-        text: of the file.
-        axis: name of its axis.
-        input: name of the input that drives the axis.
-        placeholders: names of the constants that only its user knows.
-    """
+    """A device file, its axis and its input, and the constants that only its user knows."""
 
     text: str
     axis: str
@@ -106,9 +99,6 @@ def weight_of(
 
     A joint whose mounting is not known is more likely to carry weight than not, and an axis
     whose model lacks gravity has its weight explained by springs and unbalance.
-
-    Args:
-        position: of the axis; fit: of its drive; linear: whether it slides; found: the log.
     """
     if linear:
         return None, ""
@@ -148,12 +138,9 @@ def starter_device(
     weight: Weight | None = None,
     sign_width: float = 0.0,
 ) -> Starter:
-    """Write a device file of one axis.
+    """Write a device file of one axis, which the column of its position may name.
 
     Args:
-        position: column of the position; its name may name the axis.
-        linear: whether the axis slides rather than turns.
-        drive: what drives it.
         found: sizes by a rough fit, SI, from which the priors are taken.
         weight: gravity on the axis, None where it carries none.
         sign_width: of the sign of the velocity, rad/s or m/s; 0 for the usual one.

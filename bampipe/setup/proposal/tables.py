@@ -1,0 +1,535 @@
+"""The tables of a proposal that say what its columns are, ``[time]`` to ``[channels]``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bampipe.data import guesses
+from bampipe.data.quality.clock import spread_stamps, unroll
+from bampipe.data.session import SECONDS
+from bampipe.data.survey import Survey, SurveyedColumn, words
+from bampipe.data.units import bare, spelled, unit
+from bampipe.errors import InputError
+from bampipe.lists import join_names
+from bampipe.physics.device import Coordinate, Device
+from bampipe.setup.proposal.device import ChosenDevice
+from bampipe.setup.proposal.matching import Match, Matcher
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
+from bampipe.setup.proposal.positions import FEWEST_COUNTS, in_counts, is_velocity
+
+_RECORDED = ":@time"
+"""End of the name under which the reader of ROS bags has the time of recording."""
+_LIKELY_RATE_HZ = 100.0
+"""Assumed for the other guesses where nothing shows the rate."""
+_COUNTERS = frozenset(["tick", "ticks", "cycle", "cycles", "timestep", "timesteps", "cyccnt"])
+"""Words in the name of a clock that counts at a rate of its own."""
+_SECONDS = {"sec", "secs", "seconds"}
+_NANOSECONDS = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
+_FALLING = 0.9
+"""Share of steps at which the time of a log that is written backwards falls, the least."""
+_SLOW_HZ = 40.0
+"""Below, accelerations of a joint that stops within a tenth of a second are not seen."""
+_OF_ROWS = (
+    "the logger's set-up has it; else the number of rows over the seconds that the recording took"
+)
+_POSITION_UNITS = ("rad", "deg", "mrad", "rev", "m", "mm", "cm", "um", "in")
+_SURE, _NEAR = 2.0, 0.025
+"""Standard errors, and share, within which a power of two, as most encoders count, is what a turn
+counts."""
+_SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
+_FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "kip", "V")
+_SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])
+_FORCES = frozenset(["force", "forc", "kraft", "loadcell", "fx", "fy", "fz"])
+_TORQUES = frozenset(["torque", "tau", "trq", "moment", "effort", "drehmoment"])
+_LOGGER = "who wrote the logger, or its manual"
+_QUANTITY = {"N": "force", "N.m": "torque", "A": "current", "V": "voltage"}
+_MOST_VOLTS = 60.0
+"""Of a supply: servos count theirs in tenths."""
+_FULL_DUTY = 1.05
+"""A duty cycle as a share goes to 1, and a little over by rounding."""
+
+
+@dataclass(frozen=True)
+class ProposedClock:
+    """The time of the first log, and how the session file says it.
+
+    Attributes:
+        t: (T,) time stamps, s; columns: that the time takes up.
+        lines: the table ``[time]``; rate: the line on the sample rate, above all tables.
+    """
+
+    t: np.ndarray
+    columns: tuple[str, ...]
+    lines: tuple[str, ...]
+    rate: str
+
+
+def clock_of(found: Survey, notes: Notes) -> ProposedClock:
+    """Propose a clock: by stamps in one column or two, else by counting samples."""
+    counters = [c for c in found.columns if not c.role and not _COUNTERS.isdisjoint(words(c.name))]
+    unnamed = [c for c in found.columns if not c.role and c not in counters and _counts_on(c)]
+    times = [*found.of("time"), *counters, *unnamed]
+    whole = [(c, {*words(c.name)}) for c in times if c.is_integer]
+    seconds = [c for c, said in whole if said & _SECONDS and np.all(np.diff(c.values) >= 0)]
+    on_top = [c for c, said in whole if said & _NANOSECONDS]
+    rest = [c for c in on_top if np.all((c.values >= 0) & (c.values < 1e9))]
+    if seconds and rest:
+        return _in_two_columns(seconds[-1], rest[-1], notes)
+    # When a message was recorded is the second best to when it was stamped.
+    topics = {c.name.partition(":")[0] for c in found.of("position") if c.name[:1] == "/"}
+
+    def rank(c: SurveyedColumn) -> tuple[bool, bool, bool]:
+        # Motion that is interpolated is worse off than what drives it.
+        beside = c.name.partition(":")[0] in topics or not topics
+        return c.name.endswith(_RECORDED), "stamp" not in words(c.name), not beside
+
+    stamped = [*sorted(found.of("time"), key=rank), *counters, *unnamed]
+    column = next((c for c in stamped if _increases(c.values)), None)
+    return _count_samples(found, notes) if column is None else _in_one_column(column, notes)
+
+
+def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
+    start = column.values[np.isfinite(column.values)][0]
+    stamps = column.values - start
+    known, rows = np.isfinite(stamps), np.arange(len(stamps))
+    stamps = np.interp(rows, rows[known], spread_stamps(unroll(stamps[known])[0])[0])
+    named = f"column = {quoted(column.name)}"
+    counter = not _COUNTERS.isdisjoint(words(column.name)) or column.role != "time"
+    kind = "" if counter else guesses.time_unit(stamps + start, column.unit)
+    tick = re.search(r"(?<!\d)(\d+) ?_?(ns|us|ms)(?![A-Za-z])", column.name)
+    if counter and tick:
+        size = float(tick[1]) * SECONDS[tick[2]]
+        note = notes.guess(f"a count of {column.name} is {tick[0]}, by its name")
+        table = _table(named, 'unit = "ticks"', f"ticks_per_s = {1.0 / size:.10g}{note}")
+        rate = _stamped_rate(guesses.sample_rate(stamps * size), notes)
+        return ProposedClock(stamps * size, (column.name,), table, rate)
+    if not kind:
+        if counter:
+            step = float(np.median(np.diff(stamps)))
+            note = notes.ask(
+                f"ticks_per_s, what {column.name} counts in a second, and sample_rate_hz, a"
+                f" {step:.6g}th of it",
+                "the clock of the timer or processor, in its data sheet or firmware; else what it"
+                " counted over the seconds that the recording took",
+            )
+            table = _table(named, 'unit = "ticks"', f"ticks_per_s = 0.0{note}")
+        else:
+            note = notes.ask("the unit of time: no unit gives a likely rate", _OF_ROWS)
+            table = _table(named, f'unit = "{UNKNOWN}"{note}')
+        rate = f'sample_rate_hz = "{UNKNOWN}"'
+        samples = np.arange(len(stamps)) / _LIKELY_RATE_HZ
+        return ProposedClock(samples, (column.name,), table, rate)
+    t = stamps * SECONDS.get(kind, 1.0)
+    said = kind == "datetime" or spelled(column.unit, tuple(SECONDS)) == kind
+    note = "" if said else notes.guess(f"time in {kind}, by the rate that it gives")
+    rate = _stamped_rate(guesses.sample_rate(t), notes)
+    return ProposedClock(t, (column.name,), _table(named, f'unit = "{kind}"{note}'), rate)
+
+
+def _in_two_columns(seconds: SurveyedColumn, rest: SurveyedColumn, notes: Notes) -> ProposedClock:
+    """Whole seconds and the nanoseconds on top of them, as ROS has them."""
+    t = seconds.values - seconds.values[0] + 1e-9 * (rest.values - rest.values[0])
+    rate_hz = guesses.sample_rate(t)
+    note = notes.guess(f"seconds in {seconds.name}, nanoseconds on top in {rest.name}")
+    lines = (
+        f"column = {quoted(seconds.name)}",
+        'unit = "s"',
+        f"nanoseconds = {quoted(rest.name)}{note}",
+    )
+    return ProposedClock(
+        t, (seconds.name, rest.name), _table(*lines), _stamped_rate(rate_hz, notes)
+    )
+
+
+def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
+    """No column is a clock; a number beside the samples may give the rate."""
+    samples = np.arange(len(found.columns[0].values))
+    steps = [
+        (guesses.interval_of(column.name, float(column.values[0])), column.name)
+        for column in found.columns
+        if column.is_constant
+    ]
+    step_s, name = max(steps, default=(0.0, ""))
+    if step_s > 0.0:
+        note = notes.guess(f"samples are counted, and {name} sets the rate")
+        rate = f"sample_rate_hz = {1.0 / step_s:g}"
+        return ProposedClock(step_s * samples, (name,), _table(f'unit = "samples"{note}'), rate)
+    stamps = next((column for column in found.of("time") if not column.is_constant), None)
+    if stamps is not None and _FALLING < np.mean(np.diff(stamps.values) < 0.0):
+        raise InputError(
+            f"{stamps.name} falls from row to row: the log is written backwards",
+            where=found.trials[0].file,
+            remedy="turn the order of its rows round",
+        )
+    why = "no column increases like a time" if stamps is None else _describe_stamps(stamps)
+    note = notes.guess(f"samples are counted: {why}")
+    rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, rows a second", _OF_ROWS)
+    return ProposedClock(samples / _LIKELY_RATE_HZ, (), _table(f'unit = "samples"{note}'), rate)
+
+
+def _describe_stamps(column: SurveyedColumn) -> str:
+    """Why the stamps of a column that is called a time are none."""
+    steps = np.diff(column.values[np.isfinite(column.values)])
+    falls, stops = int(np.sum(steps < 0)), int(np.sum(steps == 0))
+    what = f"falls at {falls}" if falls > stops else f"does not change at {stops}"
+    return f"{column.name} {what} of {len(steps)} steps"
+
+
+def _counts_on(column: SurveyedColumn) -> bool:
+    """Whether a column whose name says nothing rises evenly, otherwise than as a number of rows."""
+    steps = np.diff(column.values)
+    rises = len(steps) > 3 and bool(np.all(steps > 0.0))
+    return rises and bool(np.ptp(steps) < np.median(steps)) and float(np.median(steps)) != 1.0
+
+
+def _table(*lines: str) -> tuple[str, ...]:
+    return ("[time]", *lines, "")
+
+
+def _stamped_rate(rate_hz: float, notes: Notes) -> str:
+    slowest, fastest = guesses.RATES_HZ
+    doubt = "" if rate_hz > _SLOW_HZ else "; too slow for inertia and quick reversals: log faster"
+    if not slowest <= rate_hz <= fastest:
+        doubt = "; motion is not logged so: is its unit right?"
+    note = notes.guess(f"{rate_hz:g} Hz, from the time stamps{doubt}")
+    return f"sample_rate_hz = {rate_hz:g}{note}"
+
+
+def _increases(values: np.ndarray) -> bool:
+    known = values[np.isfinite(values)]
+    known = spread_stamps(unroll(known)[0])[0] if len(known) > 3 else known
+    return len(known) > 3 and float(np.mean(np.diff(known) > 0)) > 0.9
+
+
+def encoders_table(
+    device: Device, match: Matcher, notes: Notes
+) -> tuple[list[str], dict[str, SurveyedColumn]]:
+    """Propose the column of every axis; its lines, and the columns found, by axis."""
+    lines = ["[encoders]"]
+    axes: dict[str, SurveyedColumn] = {}
+    for axis in device.coordinates:
+        column = match.position(axis.name, len(device.coordinates), notes)
+        if column is None:
+            note = notes.ask_column(axis.name, axis.unit, "position")
+            lines.append(f"{axis.name} = {entry(UNKNOWN, axis.unit)}{note}")
+            continue
+        axes[axis.name] = column
+        match.used.add(column.name)
+        alone = len(device.coordinates) == 1
+        table = _encoder(axis, alone, column, match, notes)
+        register = match.registers.get(column.name)
+        if register is not None:
+            table = table.replace(" }", f"{register.fields} }}", 1)
+            notes.check.append(f"{column.name} is {register.words}")
+        lines.append(f"{axis.name} = {table}")
+    return [*lines, ""], axes
+
+
+def _encoder(
+    axis: Coordinate, alone: bool, column: SurveyedColumn, match: Matcher, notes: Notes
+) -> str:
+    if is_velocity(column):
+        return _integrated(axis, column, notes)
+    if in_counts(column):
+        return _counted(axis, column, match, notes)
+    worth = match.turning.get(column.name)
+    if worth is not None and column.si is not None:
+        turns, sd = (column.scale * part for part in (worth.size, worth.sd))
+        said = spelled(column.unit, _POSITION_UNITS)
+        fields = f", gear_ratio = {turns:.4g}, zero_counts = {worth.zero:.4g}"
+        return entry(column.name, said, fields) + notes.guess(
+            f"{column.name} is the position of the motor of {axis.name}, which turns {turns:.4g} ±"
+            f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
+            " the angle; put in the ratio of the gear"
+        )
+    right, geared = column.si == axis.unit, axis.name in match.robot.gears
+    if (column.by_looks or column.is_foreign) and not right:
+        stated = f"stated as '{column.stated}'" if column.is_foreign else ""
+        note = notes.ask(
+            f"the unit of {column.name}, "
+            + (stated or f"which looks like the position of {axis.name}"),
+            "who wrote the logger, or by how far the machine moves; rad, deg, m and mm are usual",
+        )
+        return entry(column.name, UNKNOWN, _velocity_beside(axis, alone, match, notes)) + note
+    by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
+    said = (spelled(column.unit, _POSITION_UNITS) if right else by_size) or axis.unit
+    fields, how = _counting(axis, said, match, match.robot.gears.get(axis.name, 1.0))
+    fields += "" if geared else _velocity_beside(axis, alone, match, notes)
+    guess = f"is the position of {axis.name}, in {said}" + (", by its size" if by_size else "")
+    if geared:
+        guess = f"is the position of the motor of {axis.name}, in {said}"
+    elif right:
+        guess = "" if column.stated or how else f"in {column.unit}"
+    guess += ("; it " if guess and how else "") + how
+    return entry(column.name, said, fields) + (
+        notes.guess(f"{column.name} {guess}") if guess else ""
+    )
+
+
+def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -> tuple[str, str]:
+    """Fields of an encoder that counts otherwise than a robot's drawing, and that in words.
+
+    ``turns``: of what the encoder sits on, for one of the axis.
+    """
+    direction, zero = match.robot.counting.get(axis.name, (1.0, 0.0))
+    fields, ways = "", []
+    if direction * turns != 1.0:
+        fields = f", gear_ratio = {direction * turns:.10g}"
+    if direction < 0.0:
+        ways.append("counts the other way than the drawing")
+    if zero:
+        known = unit(said)
+        reading = -direction * zero * turns / (known.scale if known is not None else 1.0)
+        fields += f", zero_counts = {reading:.5g}"
+        ways.append(f"reads {reading:.4g} {said} where the drawing has 0")
+    why = ", by weight and inertia as drawn: look it up in the controller's manual"
+    return fields, " and ".join(ways) + why if ways else ""
+
+
+def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
+    si = f"{axis.unit}/s"
+    if column.is_foreign:
+        note = notes.ask(
+            f"the unit of {column.name}, stated as '{column.stated}', which is integrated",
+            "who wrote the logger; rad/s, rev/min and mm/s are usual",
+        )
+        return entry(column.name, UNKNOWN) + note
+    said = spelled(column.unit, _SPEED_UNITS) if column.si == si else ""
+    return entry(column.name, said or si) + notes.guess(
+        f"no position was recorded: that of {axis.name} is the integral of {column.name}"
+    )
+
+
+def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: Notes) -> str:
+    """The entry of an encoder that counts; the weight of a joint may show what a count is worth."""
+    worth = match.turning.get(column.name)
+    zero = worth.zero if worth is not None else float(np.median(column.values))
+    turn, sd = (2.0 * np.pi * x for x in ((worth.size, worth.sd) if worth is not None else (0, 0)))
+    power = 2.0 ** round(np.log2(turn)) if turn > 0.0 else 0.0
+    is_power = abs(turn - power) < max(_SURE * sd, _NEAR * power)
+    size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}" if turn > 0.0 else "0.0"
+    counting = f"counts_per_unit = {size}, zero_counts = {zero:.0f}"
+    table = f'{{ column = {quoted(column.name)}, {counting}, unit = "{axis.unit}" }}'
+    if worth is not None:
+        taken = f" ({power:.0f}, a power of two, is taken)" if is_power else ""
+        return table + notes.guess(
+            f"{column.name} counts {turn:.5g} ± {_rounded(sd)} a turn of {axis.name}{taken}, and"
+            f" {zero:.0f} where it hangs, by its weight, which goes with the sine of the angle; put"
+            " in the encoder's counts a turn, times the gear, by 2 pi"
+        )
+    return table + notes.ask(
+        f"counts_per_unit of {axis.name}, the counts in one {axis.unit}; zero_counts is a guess",
+        "counts a turn in the encoder's data sheet, times the gear, by 2 pi"
+        if axis.unit == "rad"
+        else "the scale's data sheet",
+    )
+
+
+def _rounded(sd: float) -> str:
+    return f"{float(f'{sd:.1g}'):g}"
+
+
+def _velocity_beside(axis: Coordinate, alone: bool, match: Matcher, notes: Notes) -> str:
+    """The field of a recorded velocity, against which the position is checked; "" without one."""
+    for column in match.found.of("velocity"):
+        fits = column.si == f"{axis.unit}/s" and not column.is_constant
+        if fits and (alone or axis.name in words(column.name)):
+            match.used.add(column.name)
+            notes.check.append(f"{column.name} is used to check the position only")
+            return f", velocity = {entry(column.name, bare(column.unit))}"
+    return ""
+
+
+def input_tables(
+    chosen: ChosenDevice, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes
+) -> list[str]:
+    """Propose the column of every input; the lines of those tables that have something to say."""
+    device = chosen.device
+    wanted = {**dict.fromkeys(device.forces, device.force_unit), **device.channels}
+    given = match.inputs(wanted, tuple(axes.values()))
+    given |= {name: (c, "") for name, c in chosen.columns.items() if name in wanted}
+    lines = []
+    sensed = all(name.startswith("force_") for name in device.forces)
+    forces = [column for name in device.forces if (column := given[name][0]) is not None]
+    if sensed and len(forces) in (0, len(device.forces)):
+        match.used |= {column.name for column in forces}
+        lines += _force_table(device, forces, given[device.forces[0]][1], notes)
+        wanted = dict(device.channels)
+    lines += _brakes_table(device, match, notes)
+    return lines + _channels_table(wanted, given, match, notes)
+
+
+def _force_table(
+    device: Device, columns: list[SurveyedColumn], why: str, notes: Notes
+) -> list[str]:
+    names = [column.name for column in columns] or [UNKNOWN] * len(device.forces)
+    components = ", ".join(f'"{name}"' for name in device.components)
+    which = " and ".join(device.forces)
+    ask = "" if columns else notes.ask_column(which, device.force_unit)
+    stated = [f'unit = "{device.force_unit}"']
+    return [
+        "[force]",
+        f"columns = [{', '.join(quoted(name) for name in names)}]{ask}",
+        f"components = [{components}]",
+        *(_force_unit(device, columns, why, notes) if columns else stated),
+        "",
+    ]
+
+
+def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: Notes) -> list[str]:
+    """The unit that all force columns share, and what makes forces of volts or of counts."""
+    units = {spelled(bare(column.unit), _FORCE_UNITS) for column in columns}
+    common = units.pop() if len(units) == 1 else ""
+    known = unit(common)
+    names = ", ".join(quoted(column.name) for column in columns)
+    if known is not None and known.si == device.force_unit and common:
+        stated = all(column.stated for column in columns)
+        return [
+            f'unit = "{common}"'
+            + ("" if stated else notes.guess(f"{names} is a {_QUANTITY[known.si]} in {common}"))
+        ]
+    if len({unit(column.unit) for column in columns if column.unit}) > 1:
+        note = notes.ask(
+            f"one unit of {names}, which are logged in {join_names([c.unit for c in columns])}",
+            "export them in one, as a force has one unit; it goes here",
+        )
+        return [f'unit = "{UNKNOWN}"{note}']
+    needs_gain = any(_needs_gain(column) for column in columns)
+    if common == "V" or needs_gain:
+        row = f"[{', '.join(['0.0'] * len(columns))}]"
+        rows = f"[{', '.join([row] * len(columns))}]"
+        ask = notes.ask(
+            f"calibration_n_per_v, {device.force_unit} for one "
+            + (f"of {names}" if needs_gain else "volt"),
+            "the sensor's certificate or the driver's manual, or hang a known weight on it",
+        )
+        if needs_gain:
+            volts = notes.guess(f"{names} counts or is a share: like volts it gets a calibration")
+            zero = notes.guess(f"{names} is 0 without force")
+        else:
+            volts = notes.guess("the force channels are volts, by their names")
+            zero = notes.ask("zero_v, the volts without force", "a log of the unloaded sensor")
+        return [f'unit = "V"{volts}', f"calibration_n_per_v = {rows}{ask}", f"zero_v = {row}{zero}"]
+    odd = next((column for column in columns if column.is_foreign), None)
+    if odd is not None or any(c.by_looks or not (c.role or c.unit or why) for c in columns):
+        looks = "which looks like what drives the motion"
+        note = notes.ask(
+            f"the unit of {names}, " + (f"stated as '{odd.stated}'" if odd is not None else looks),
+            "who wrote the logger; N.m or N of a sensor, V with calibration_n_per_v of counts",
+        )
+        return [f'unit = "{UNKNOWN}"{note}']
+    if device.force_unit == "N.m" and any(_is_force(column) for column in columns):
+        note = "" if common else notes.guess(f"{names} is a force in N")
+        if any(column.si == "kg" for column in columns):
+            common = next(unit for unit in ("kgf", "gf") if columns[0].unit.startswith(unit[:-1]))
+            note = notes.guess(f"{names} is the weight of a mass: a force in {common}")
+        ask = notes.ask(
+            f"lever_m, how far from the axis {names} acts, m",
+            "measure it on the machine, or take it from the drawing; if the column is a torque"
+            ' already, put unit = "N.m" and take lever_m out',
+        )
+        return [f'unit = "{common or "N"}"{note}', f"lever_m = 0.0{ask}"]
+    note = notes.guess(f"{names} is a {_QUANTITY[device.force_unit]} in {device.force_unit}{why}")
+    return [f'unit = "{device.force_unit}"{note}']
+
+
+def _is_force(column: SurveyedColumn) -> bool:
+    """Whether the column of a drive is a force rather than a torque, by its unit or its name."""
+    said = set(words(column.name))
+    if column.si is not None:
+        return column.si in ("N", "kg")
+    return bool(said & _FORCES) and not said & _TORQUES
+
+
+def _needs_gain(column: SurveyedColumn) -> bool:
+    """Whether the column of a force is a share or a count, by its name or by whole numbers."""
+    counts = column.is_integer and float(np.ptp(column.values)) > FEWEST_COUNTS
+    shares = not _SHARES.isdisjoint(words(column.name))
+    return column.si == "" or (not column.unit and (counts or shares))
+
+
+def _brakes_table(device: Device, match: Matcher, notes: Notes) -> list[str]:
+    named = {axis: match.named(name, "brake") for axis, name in device.brakes.items()}
+    brakes = {axis: column for axis, column in named.items() if column is not None}
+    if not brakes:
+        return []
+    match.used |= {column.name for column in brakes.values()}
+    units = ", ".join(device.coordinate(axis).torque_unit for axis in brakes)
+    return [
+        "[brakes]",
+        f"columns = [{', '.join(quoted(column.name) for column in brakes.values())}]",
+        f'unit = "{units}"' + notes.guess("brake commands are in SI units"),
+        "",
+    ]
+
+
+def _channels_table(
+    wanted: Mapping[str, str], given: Mapping[str, Match], match: Matcher, notes: Notes
+) -> list[str]:
+    """Lines for the inputs ``wanted``, by name, with their SI units; none if nothing is."""
+    if not wanted:
+        return []
+    lines = ["[channels]"]
+    for name, si in wanted.items():
+        column, why = given[name]
+        if column is None:
+            lines.append(f"{name} = {entry(UNKNOWN, si)}{notes.ask_column(name, si)}")
+            continue
+        match.used.add(column.name)
+        lines.append(f"{name} = {_channel(name, si, column, why, match, notes)}")
+    return [*lines, ""]
+
+
+def _channel(
+    name: str, si: str, column: SurveyedColumn, why: str, match: Matcher, notes: Notes
+) -> str:
+    """Column and unit of one input; its register or its scale, where the unit does not do."""
+    register = match.registers.get(column.name)
+    fields = register.fields if register else ""
+    fields += ", scale = -1.0" if name in match.robot.turned else ""
+    slides = (column.si, si) == ("N", "N.m")  # the drive of a sliding joint
+    if column.si == si or slides:
+        table = entry(column.name, bare(column.unit), fields)
+        if column.stated and not why and register is None:
+            return table
+        return table + notes.guess(f"{column.name} is {name}{why}{_unscaled(si, column, register)}")
+    if column.is_foreign and si and not register:
+        note = notes.ask(f"the unit of {column.name}, stated as '{column.stated}'", _LOGGER)
+        return entry(column.name, UNKNOWN, fields) + note
+    if register and si and not column.unit:
+        note = notes.ask(
+            f"the unit of {column.name}, what one count is, such as 2.69mA; {register.words}",
+            "the drive's table of registers",
+        )
+        return entry(column.name, UNKNOWN, fields) + note
+    likely = si if register else guesses.likely_unit(si, column.values) or si
+    if name == "supply" and column.is_integer and float(np.nanmedian(column.values)) > _MOST_VOLTS:
+        likely = "0.1V"
+    if name == "duty" and not column.unit:
+        most = float(np.nanmax(np.abs(column.values)))
+        if most > 100.0:
+            table = entry(column.name, "", f"{fields}, scale = 0.0")
+            said = f", {register.words}" if register else ""
+            return table + notes.ask(
+                f"the scale of {name}, 1 over the reading of {column.name} at full duty{said}",
+                "the servo's table of registers: in steps of 0.1 % it is 0.001",
+            )
+        if most > _FULL_DUTY:
+            likely = "%"
+    where = f" in {likely}" if si else ""
+    doubt = "" if likely[:1].isdigit() else _unscaled(si, column, register)
+    return entry(column.name, likely, fields) + notes.guess(
+        f"{column.name} is {name}{where}{why}{doubt}"
+    )
+
+
+def _unscaled(si: str, column: SurveyedColumn, register: guesses.Register | None) -> str:
+    """What to add of a column that may be in counts, or is a register."""
+    if register:
+        return f", {register.words}: give its scale"
+    counts = column.is_integer and not column.unit and si
+    return "; if in counts, give their scale too" if counts else ""
