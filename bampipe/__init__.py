@@ -11,8 +11,6 @@ What is exported here is loaded when it is first used: ``import bampipe`` itself
 beyond the standard library.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING
 

@@ -1,7 +1,5 @@
 """Kinds of arrays, as signatures name them; docstrings say their shapes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

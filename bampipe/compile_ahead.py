@@ -7,8 +7,6 @@ on disk. No function is compiled twice, for what one process is at, the others w
 wrong.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -9,8 +9,6 @@ costs time, nothing more.
 Processes that start together share the work: what one of them is compiling, another waits for.
 """
 
-from __future__ import annotations
-
 import gc
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress

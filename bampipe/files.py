@@ -5,8 +5,6 @@ too large, or not what is asked for (JSON, TOML) raises :class:`bampipe.errors.I
 names it, and the line.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

@@ -5,8 +5,6 @@ depends on, and what is compiled in one folder for each content of the sources, 
 Where the folder cannot be made, used or written, an `InputError` says so.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

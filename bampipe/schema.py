@@ -1,7 +1,5 @@
 """One declaration of each file: a pydantic model, its faults in plain words, its JSON Schema."""
 
-from __future__ import annotations
-
 import ast
 import json
 import math

@@ -1,7 +1,5 @@
 """The stages as functions, through the same cache as the command line."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A run folder as an object: every result as a table or a plain record, read on demand."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """`bampipe accept`: accept a session's values as the reference for later ones."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """The program: its commands, in the order in which help lists them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated

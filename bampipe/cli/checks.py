@@ -1,7 +1,5 @@
 """``bampipe status`` and ``bampipe verify``: the state of steps, and files that were changed."""
 
-from __future__ import annotations
-
 import typer
 
 from bampipe.cli import places, show

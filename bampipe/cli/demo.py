@@ -1,7 +1,5 @@
 """``bampipe demo``: the whole loop on the session that ships for it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

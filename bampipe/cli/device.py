@@ -1,7 +1,5 @@
 """``bampipe device``: devices, their equations of motion, and device files checked."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """The entry point: signals and errors as exit codes."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """`bampipe export`: an identified model for other programs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

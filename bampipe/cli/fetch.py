@@ -1,7 +1,5 @@
 """`bampipe fetch`: published runs back into a folder of runs."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

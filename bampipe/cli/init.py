@@ -1,7 +1,5 @@
 """``bampipe init``: a session file proposed for a folder of logs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

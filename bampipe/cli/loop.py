@@ -1,7 +1,5 @@
 """``bampipe diagnose``, ``draft``, ``extend`` and ``demo``: the loop as commands."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

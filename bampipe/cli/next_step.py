@@ -1,7 +1,5 @@
 """The next command or action, from the results of a run; in a command, ``RUN`` stands for it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bampipe.cli import show

@@ -1,7 +1,5 @@
 """Which session and which run an argument means."""
 
-from __future__ import annotations
-
 import glob
 from collections.abc import Sequence
 from pathlib import Path

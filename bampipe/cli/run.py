@@ -1,7 +1,5 @@
 """``bampipe run``: sessions from raw log to report."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

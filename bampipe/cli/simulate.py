@@ -1,7 +1,5 @@
 """``bampipe simulate``: a session with known effects hidden in it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """The stages as commands of their own: ingest to report."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A chain of joints out of a robot's file, as the plain tables that a device file holds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile

@@ -4,8 +4,6 @@ A robot needs no more than ``[robot] urdf = "arm.urdf"``. Coordinates, inputs, f
 are those of its joints; what the file says itself stands.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

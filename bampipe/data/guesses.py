@@ -1,7 +1,5 @@
 """Guesses from the data themselves: units, rates, what a column is, and what drives what."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

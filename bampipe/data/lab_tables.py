@@ -5,8 +5,6 @@ way Hive does it, so that pandas, DuckDB, Polars and Spark read a whole table in
 is written whole or not at all; the same rows give the same bytes.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime

@@ -3,8 +3,6 @@
 Source: MuJoCo's documentation, XML reference.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Which files of a folder are parts of one recording, by their names, lengths and clocks."""
 
-from __future__ import annotations
-
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """One recording: a log, one of several in a file, or several files joined; and a sound trial."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """XML as files of robots have it: one element, numbers in attributes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Read access to the run folder of one session."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar

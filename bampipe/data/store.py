@@ -4,8 +4,6 @@ They have fixed options and no metadata that varies. A file that cannot be read 
 :class:`bampipe.errors.InputError` naming it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache

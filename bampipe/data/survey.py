@@ -1,7 +1,5 @@
 """What a folder of logs holds, before anyone has said what its columns mean."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

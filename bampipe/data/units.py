@@ -1,7 +1,5 @@
 """Units that logs are written in, and what makes coherent SI units of them."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """URDF files: what their links and joints say, and a robot written as one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from xml.etree import ElementTree
 

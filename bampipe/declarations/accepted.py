@@ -1,7 +1,5 @@
 """The file ``accepted/<device>.json``: what later sessions of a device are held against."""
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 from pydantic import Field

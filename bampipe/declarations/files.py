@@ -5,8 +5,6 @@ of the equations of motion: each step is taken only where the one before found n
 all that it finds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

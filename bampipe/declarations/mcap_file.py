@@ -3,8 +3,6 @@
 Source: mcap.dev, specification; docs.foxglove.dev, message schemas Log and FrameTransforms.
 """
 
-from __future__ import annotations
-
 import io
 import json
 from typing import Any

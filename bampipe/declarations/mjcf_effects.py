@@ -1,7 +1,5 @@
 """Effects of a robot's model as MuJoCo has them: polynomial joints, tendons, motors, bristles."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

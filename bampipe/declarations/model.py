@@ -1,7 +1,5 @@
 """The file ``models/<name>/model.toml``: a device, its effects, and the model it came from."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Literal

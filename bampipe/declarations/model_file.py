@@ -1,7 +1,5 @@
 """The model that a run folder names: device, effects, a lab's own files among them, estimates."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """What viewers of recordings show of a run: torques by every model, markers, and the robot."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A recording as an .rrd file, as the viewer of Rerun reads it."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

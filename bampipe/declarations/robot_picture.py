@@ -1,7 +1,5 @@
 """A robot as it is declared, drawn at position zero: from the side and from above, as SVG."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape

@@ -1,7 +1,5 @@
 """The device of a session: found, held against the session's channels, and what it leaves open."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 from bampipe.data.device_file import read_device_file

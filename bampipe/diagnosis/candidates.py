@@ -1,7 +1,5 @@
 """Candidate effects: which there are, and the model in which each is compiled."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

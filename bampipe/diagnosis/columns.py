@@ -1,7 +1,5 @@
 """What a candidate adds to the residual of a fitted model: columns of a linear problem."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.arrays import Array

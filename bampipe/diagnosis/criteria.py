@@ -1,7 +1,5 @@
 """The numbers that decide a verdict: one record, passed to whatever judges."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

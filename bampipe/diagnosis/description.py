@@ -1,7 +1,5 @@
 """The shape of a residual in one sentence: what it varies with, where, which way round."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Columns of candidates: what each adds to the residual, over a grid of its shapes, made once."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ shows decides nothing (pseudo-Bayesian model averaging with a bootstrap, after Y
 and Gelman 2018, Bayesian Analysis 13, 917).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The selection of effects: search, fit what was found, and search again from there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The shape of a residual: maps of it, worst windows, explainable share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

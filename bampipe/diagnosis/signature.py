@@ -1,7 +1,5 @@
 """What an effect leaves in the residual of a model that lacks it, along a standard motion."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

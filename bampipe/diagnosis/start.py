@@ -5,8 +5,6 @@ test bench gives the motion nothing is integrated along the sign, and any width 
 with which trials that were left out are likeliest.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -5,8 +5,6 @@ other axes, even and odd in the direction of motion, with a normal prior: a Gaus
 knots. Its evidence is integrated over the strengths and the best of a few sizes is taken.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

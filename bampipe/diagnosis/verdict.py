@@ -1,7 +1,5 @@
 """The rule: what is said of each axis, from the probabilities, the sizes and the noise floor."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

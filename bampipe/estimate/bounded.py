@@ -10,8 +10,6 @@ Coefficients with equal bounds are held at that value. A nonlinear fit wraps the
 reached in an `Iterate` and calls `descend`.
 """
 
-from __future__ import annotations
-
 from typing import Protocol, Self, TypeVar
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Butterworth filter without phase, and central differences."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Machine and controller simulated together: the motion in closed loop."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

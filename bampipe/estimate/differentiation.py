@@ -7,8 +7,6 @@ central differences (:mod:`bampipe.estimate.butterworth`), Savitzky-Golay polyno
 (:mod:`bampipe.estimate.kalman_smoother`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

@@ -6,8 +6,6 @@ how much those stretches disagree, beside how much they should, is the sandwich 
 holds whatever the noise is, as long as stretches are independent of each other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

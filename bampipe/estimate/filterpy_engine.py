@@ -5,8 +5,6 @@ state: carried as a state that each step forgets, with its variance put back by 
 filterpy draws the sigma points afresh after adding Q, as the compiled engine does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Wind-up and play of a gear, from the difference of the encoders on its two sides."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -12,8 +12,6 @@ the next, and deflection is regressed on torque; the torque's own noise is taken
 regression (Fuller 1987, eq. 1.2.3), else it would make the axis look stiff.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -7,8 +7,6 @@ times slope over spectrum. Its inverse is the Cramér-Rao bound on the covarianc
 estimate. Everything here sees arrays and callables only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """How far each stretch of time moves the parameters of a least-squares fit."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ predicts (Kailath 1968; Mehra 1970). With tens of thousands of samples a test of
 rejects every filter on earth, so each test also says how much is predictable: its share.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -11,8 +11,6 @@ so that the one quantity left is the dimensionless ratio of process to measureme
 ``ratio`` = density * step**(2 order - 1) / noise_sd**2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

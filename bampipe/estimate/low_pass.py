@@ -1,7 +1,5 @@
 """Zero-phase low-pass of many columns at a few kept samples: the inner loop of every comparison."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

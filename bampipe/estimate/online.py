@@ -1,7 +1,5 @@
 """The unscented filter fed sample by sample: the batch filter's numbers, in bounded memory."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ After Krasnosel'skii and Pokrovskii 1989, Systems with Hysteresis. What it leave
 the stop operator: an ideal spring that slips.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.arrays import Array

@@ -6,8 +6,6 @@ pseudo-inertia, a symmetric 4 by 4 matrix linear in the ten numbers, has no nega
 logarithmic Cholesky factor, every value is possible (Rucker and Wensing 2022, ibid. 7(2)).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.arrays import Array

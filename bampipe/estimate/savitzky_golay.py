@@ -1,7 +1,5 @@
 """Savitzky-Golay: a polynomial fitted by least squares to a sliding window."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.signal import savgol_filter
 

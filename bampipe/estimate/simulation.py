@@ -7,8 +7,6 @@ interval is divided as finely as this rate demands, and only while an axis is cl
 standstill to stop within the interval: the rate is probed on the model itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ Second differences keep a signal that is smooth over a few samples out of their 
 sine are taken at the time stamps as they are, so that uneven stamps tell it from its aliases.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

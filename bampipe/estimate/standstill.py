@@ -3,8 +3,6 @@
 At standstill Coulomb friction is whatever balances the load, and the sign of the velocity is noise.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.arrays import Array, Flags

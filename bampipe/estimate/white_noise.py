@@ -7,8 +7,6 @@ samples. A hum is neither: where the sampling is slow, no difference takes it ou
 to nothing at the frequencies of the motion. It is fitted and taken off first.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.arrays import Array

@@ -1,7 +1,5 @@
 """The inertial numbers of a robot: possible ones, and the combinations that the trials show."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the uncertainty of sensors and drawings adds to parameters, source by source."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace

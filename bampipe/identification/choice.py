@@ -15,8 +15,6 @@ the machine answers the measured forces. It is published where all of this is so
 Else least squares are. `benchmarks/recovery.py` holds both against the truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

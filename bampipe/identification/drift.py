@@ -5,8 +5,6 @@ whole trial says little about the model. Over a tenth of a second to two seconds
 filtered state at many moments, the model runs under the recorded inputs alone, without controller.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass

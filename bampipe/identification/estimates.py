@@ -1,7 +1,5 @@
 """An estimate of a model's parameters, whatever method made it, and what identify.json says."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Raw samples through the unscented filter: a search for the region of the answer, then all."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

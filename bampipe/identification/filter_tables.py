@@ -1,7 +1,5 @@
 """What a filter found, as tables and summaries: states, convergence, consistency, innovations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np

@@ -6,8 +6,6 @@ model alone (open loop), which says something only where the mechanism forgets w
 without a restoring force any error of the force is integrated for ever.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal

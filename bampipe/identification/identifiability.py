@@ -1,7 +1,5 @@
 """What these trials can and cannot say of a model's numbers, in numbers and in words."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np

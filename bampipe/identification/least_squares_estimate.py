@@ -4,8 +4,6 @@ Weights of samples, the bias of filters and of friction that stops, and the timi
 are those of `bampipe.trials.likelihood`: what is a nuisance there is one here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Settings of the filter, noise of the sensors, and the levels that suit it best (likelihood)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal

@@ -1,7 +1,5 @@
 """What each term of an identified model contributes to the force, sample by sample and in bins."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

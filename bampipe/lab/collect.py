@@ -1,7 +1,5 @@
 """Collect the runs of a lab: tables, trends and a report, from all stages that have run."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager

@@ -11,8 +11,6 @@ so that a session known only roughly has wider limits. sigma_MR is the median mo
 Clifford 1959): up to a quarter of the sessions may be off without hiding one another.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The place of a lab's folder, and whether it is up to date; imports nothing slow."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bampipe.errors import InputError

@@ -1,7 +1,5 @@
 """From one run folder to its rows in the tables of the lab."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

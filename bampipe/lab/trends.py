@@ -6,8 +6,6 @@ parameter itself moved. A missing effect biases the parameters: if the parameter
 limits in the session's own model with that effect, the device has not changed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The filter on live samples: state, parameters, and an alarm when they become inconsistent."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The start of a monitor: from an identified run, or from the priors of a device."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """A design as a sentence that a student can follow."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The expected gain of a proposed trial, as it is stored."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

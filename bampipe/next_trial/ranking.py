@@ -1,7 +1,5 @@
 """Ranking of designs: followed exactly, in other surroundings, and roughly, as people do."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ People follow a sentence roughly: each version of a design has its own speeds, t
 passes through the sensors and filters of the session.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

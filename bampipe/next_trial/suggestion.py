@@ -1,7 +1,5 @@
 """The alternatives that a diagnosis left undecided, and the trial that would decide."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Phrases and sentences on a diagnosis, made from its record alone."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """A forecast compared with its outcome, once the proposed trial has been recorded."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path

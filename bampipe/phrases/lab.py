@@ -1,7 +1,5 @@
 """Phrases on the sessions of a lab and on their control charts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 from bampipe.lists import join_names

@@ -1,7 +1,5 @@
 """Two sessions of one device, in sentences."""
 
-from __future__ import annotations
-
 from bampipe.lists import join_names
 from bampipe.phrases.diagnosis import probability
 from bampipe.results.pair import Journey, PairResult

@@ -1,7 +1,5 @@
 """Sentences on a proposed trial: the reason for it and the expected gain."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 
 from bampipe.lists import join_names

@@ -1,7 +1,5 @@
 """Phrases on a session, its set-up, its identified and its validated models."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 from bampipe.results.floor import FLOOR_WRONG, FloorStatus

@@ -4,8 +4,6 @@ Found numerically: along a rich motion the columns of all numbers are taken one 
 from the base to the tip, and each that depends on those before it is joined to them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

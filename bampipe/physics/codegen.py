@@ -4,8 +4,6 @@ The same text serves two ways: over numpy columns for whole trials, and compiled
 state at a time. Both are printed from one set of equations, so they cannot disagree.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, reduce

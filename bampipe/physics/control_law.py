@@ -1,7 +1,5 @@
 """The compiled control law of a device: the command from measured motion, references and gains."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 A free run, a simulation of machine and controller together, needs it; nothing else does.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

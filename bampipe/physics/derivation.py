@@ -5,8 +5,6 @@ Q_other from friction (eq 20), brakes (eq 18), compensators and the effects of k
 The bodies of a robot enter by Newton and Euler's equations instead: `newton_euler`.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

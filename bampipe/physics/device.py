@@ -1,7 +1,5 @@
 """A device: coordinates, energies, inputs, friction, all declared in one TOML file."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property

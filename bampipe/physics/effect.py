@@ -1,7 +1,5 @@
 """An effect: one physical term that a model may have, declared in one TOML file."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Collection, Iterator, Mapping

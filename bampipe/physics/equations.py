@@ -1,7 +1,5 @@
 """The equations of motion of a model as symbols, and what its effects add to them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -4,8 +4,6 @@ The text is parsed by Python's own grammar, walked against a whitelist and rebui
 a sympy expression; nothing of it is ever evaluated.
 """
 
-from __future__ import annotations
-
 import ast
 import keyword
 import math

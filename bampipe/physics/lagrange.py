@@ -1,7 +1,5 @@
 """Lagrange's equation on energies (eqs 9-14), and what may stand in a mechanical model."""
 
-from __future__ import annotations
-
 from functools import cache
 from itertools import combinations_with_replacement
 from typing import Any

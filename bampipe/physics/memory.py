@@ -1,7 +1,5 @@
 """The internal states of effects along a motion: which steps generated code takes, and how many."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Source code of the internal states of effects along a motion, and the loops that follow them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A model: a device plus the effects that it is taken to have."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable

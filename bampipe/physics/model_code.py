@@ -3,8 +3,6 @@
 In two parts, for of most candidates for an effect that a model lacks only the first is needed.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import sympy as sp

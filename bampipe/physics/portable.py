@@ -4,8 +4,6 @@ The text is that of the compiled model, its parameters put in as numbers, in Pyt
 nothing but the mathematics that comes with the language.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """A device's equations of motion as a person would write them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The built-in effects and devices: the folders beside this file, nothing else to edit."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping
 from functools import cache

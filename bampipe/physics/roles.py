@@ -1,7 +1,5 @@
 """What parts of a model are for: what balances gravity, and what shifts a force in time."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import sympy as sp

@@ -1,7 +1,5 @@
 """Whether a model has numbers to give along a motion, and if not, why, in physical words."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.arrays import Array

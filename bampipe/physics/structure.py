@@ -6,8 +6,6 @@ factors, never their parts (the base parameters of Gautier and Khalil 1990, IEEE
 Robotics and Automation 6(3)). The scale is that of the measured force.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

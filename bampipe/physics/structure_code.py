@@ -1,7 +1,5 @@
 """Derivation of which numbers of a model no motion can tell apart; see `structure`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

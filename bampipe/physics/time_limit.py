@@ -1,7 +1,5 @@
 """A limit on the processor time that a computation in pure Python may take."""
 
-from __future__ import annotations
-
 import ctypes
 import threading
 import time

@@ -1,7 +1,5 @@
 """A Cartesian viscous field rendered by the brakes, as an effect: K_d = J^T K J (section IV)."""
 
-from __future__ import annotations
-
 import ast
 import re
 

@@ -1,7 +1,5 @@
 """From names in declarations to symbols: what an expression of a device or an effect may say."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """The report over all sessions of a lab: verdicts, control charts, errors, trials."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A document as one self-contained page for a browser, light and dark."""
 
-from __future__ import annotations
-
 import html
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Two sessions of one device: tables for page and terminal, and the residual by state."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.report import style

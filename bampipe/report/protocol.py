@@ -1,7 +1,5 @@
 """A plan of trials as one printed page for the bench."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from bampipe.report import typeset

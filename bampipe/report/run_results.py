@@ -1,7 +1,5 @@
 """Read access to the results in a run folder, each file read at most once."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -3,8 +3,6 @@
 Colours are those of Okabe and Ito (2008). Lines that matter also differ in dash or width.
 """
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Sequence

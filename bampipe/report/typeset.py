@@ -1,7 +1,5 @@
 """A document as a PDF, made by typst with the fonts of its wheel."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

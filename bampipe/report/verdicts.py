@@ -1,7 +1,5 @@
 """The verdict on a session, from what the stages stored, worst axis first."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from bampipe.lists import join_names

@@ -1,7 +1,5 @@
 """Numbers, units and names as they are printed."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """``models/<model>/diagnose.json``: effects that the model lacks, by axis, with probabilities."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field

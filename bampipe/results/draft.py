@@ -1,7 +1,5 @@
 """``models/<model>/draft.json``: a formula for a residual that no effect explains."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field

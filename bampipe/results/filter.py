@@ -1,7 +1,5 @@
 """``filter/filter.json``: how the motion was differentiated, and how well."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field

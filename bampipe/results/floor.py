@@ -3,8 +3,6 @@
 Validate, diagnose and compare store it; reports, gates, the lab and the command line read it.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """``models/<model>/identify.json``: parameters of a model with uncertainties."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """``ingest/session.json``: channels and sensors of the session, in SI units."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field

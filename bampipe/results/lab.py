@@ -1,7 +1,5 @@
 """``lab/lab.json`` and ``lab/trends.json``: a lab's sessions, and control charts over them."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field

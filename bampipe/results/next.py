@@ -1,7 +1,5 @@
 """``models/<model>/next.json``: the trial to record next, and its expected result."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import ClassVar, Literal
 

@@ -1,7 +1,5 @@
 """The comparison of two sessions of one device by `bampipe compare A B`."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from bampipe.results.diagnose import AxisVerdict, ResidualMap

@@ -1,7 +1,5 @@
 """``models/<model>/performance.json``: the device at its handle, and its constants."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from pydantic import Field

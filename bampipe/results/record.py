@@ -1,7 +1,5 @@
 """Base classes of records: typed, immutable, read and written whole."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self

@@ -1,7 +1,5 @@
 """Numbers rounded to their uncertainty, for sentences in results."""
 
-from __future__ import annotations
-
 import math
 
 _MOST_DECIMALS = 9

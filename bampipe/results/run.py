@@ -1,7 +1,5 @@
 """``run.json``: steps, settings, inputs and outputs of a run."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field

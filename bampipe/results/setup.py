@@ -1,7 +1,5 @@
 """``filter/setup.json``: whether the recorded signals mean what session and device file say."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """``stiffness/stiffness.json``: stiffness of the axes that were locked and loaded."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """``models/<model>/terms.json``: the equations of a model and the force of each term."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """``<session>.truth.json``: the truth about a session made by `bampipe simulate`."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field

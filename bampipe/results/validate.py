@@ -1,7 +1,5 @@
 """``models/<model>/validate.json``: predicted against measured torque and force."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field

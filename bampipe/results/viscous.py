@@ -1,7 +1,5 @@
 """``models/<model>/viscous.json``: damping at the handle in the viscous trials."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """Several sessions: one after another, or in worker processes; one failure stops no other."""
 
-from __future__ import annotations
-
 import os
 import traceback
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What happens in a run, for whoever shows it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Content hashes: of files, of configuration, of sessions, of the code that made a result."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import importlib.util
 import platform

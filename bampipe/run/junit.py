@@ -1,7 +1,5 @@
 """The verdicts of the gates as JUnit XML, which every continuous integration reads."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable
 

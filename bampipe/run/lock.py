@@ -1,7 +1,5 @@
 """One process at a time in a folder; a lock whose holder was killed is free, and that is said."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

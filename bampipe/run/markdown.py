@@ -1,7 +1,5 @@
 """What came of a run, in Markdown: for a pull request or the summary of a CI job."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from bampipe.data.run_folder import RunFolder

@@ -1,7 +1,5 @@
 """Run the stages of one session: order, cache by content, whole files, provenance."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import time

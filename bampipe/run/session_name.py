@@ -1,7 +1,5 @@
 """The name of a session, after which its run folder is called."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """From settings in a file or on the command line to the typed configuration of a stage."""
 
-from __future__ import annotations
-
 import dataclasses
 import tomllib
 from collections.abc import Mapping

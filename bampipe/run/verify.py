@@ -1,7 +1,5 @@
 """Every hash that a run records, computed again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from bampipe.files import digest_file, digest_input, refuse_links

@@ -1,7 +1,5 @@
 """Set-ups that a person may have meant: what each says of the signals, cheapest mistakes first."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

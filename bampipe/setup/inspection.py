@@ -1,7 +1,5 @@
 """The set-up of a session held against its trials: mistakes in words, for stages and readers."""
 
-from __future__ import annotations
-
 import ast
 import math
 from collections.abc import Mapping, Sequence

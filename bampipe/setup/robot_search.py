@@ -1,7 +1,5 @@
 """The mistakes that a robot's bodies as drawn show: `init`'s search, from what a session states."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial

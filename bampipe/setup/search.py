@@ -1,7 +1,5 @@
 """The search for set-up mistakes: one after the other, each by what setting it right changes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """The log of a simulated machine: encoder counts, volts of the force sensor, brake commands."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -5,8 +5,6 @@ input and measurement act on the readings of its sensors. The truth goes into a 
 session folder, never inside.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import asdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The specimen of a device, with hidden effects, that a simulated session records."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

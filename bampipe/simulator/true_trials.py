@@ -1,7 +1,5 @@
 """True motion and force of simulated trials: free, locked, and in a viscous field."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

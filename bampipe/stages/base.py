@@ -24,8 +24,6 @@ The runner creates the parents of all declared outputs below ``out`` beforehand 
 files into the run folder once ``execute`` has returned. No stage calls another.
 """
 
-from __future__ import annotations
-
 import importlib
 from dataclasses import dataclass
 from pathlib import Path

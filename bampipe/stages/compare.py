@@ -1,7 +1,5 @@
 """Stage compare: the ladder of model versions on the same held-out trials."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

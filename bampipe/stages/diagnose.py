@@ -1,7 +1,5 @@
 """Stage diagnose: what the model lacks, axis by axis, and how sure that is."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import replace

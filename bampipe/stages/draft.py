@@ -1,7 +1,5 @@
 """Stage draft: a formula for what no effect explains, as an effect file, with its p-value."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stage filter: velocity and acceleration from encoders, on a uniform grid, with error bands."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stage identify: the parameters of a model, with uncertainties, from the free trials."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path

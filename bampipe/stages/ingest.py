@@ -4,8 +4,6 @@ Trials are read, checked, repaired where that is safe, and written one at a time
 cannot be trusted is set aside with a reason (file, row, column), and the others go on.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

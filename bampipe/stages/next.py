@@ -1,7 +1,5 @@
 """Stage next: the trial to record next, in one sentence, and what it is expected to give."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

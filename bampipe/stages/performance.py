@@ -1,7 +1,5 @@
 """Stage performance: what a hand feels at the handle, from what was identified (Table VIII)."""
 
-from __future__ import annotations
-
 from itertools import product
 from pathlib import Path
 from typing import Annotated

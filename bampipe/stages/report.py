@@ -1,7 +1,5 @@
 """Stage report: the stored results as a PDF, two pages for the browser, and figures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pydantic.dataclasses import dataclass as checked_dataclass

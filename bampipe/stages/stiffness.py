@@ -1,7 +1,5 @@
 """Stage stiffness: of axes that were locked and loaded (Fig. 3), of gears with two encoders."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Stage validate: inverse-dynamics torque and handle force against the measured ones (Fig. 9)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby

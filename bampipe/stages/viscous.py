@@ -1,7 +1,5 @@
 """Stage viscous: the Cartesian damping that the brakes rendered, against the command (Fig. 8)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The band in which a session's residuals are compared, found from its motion and force."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Trials fetched when they are wanted: memory grows with the longest of them, not their number."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar, overload

@@ -1,7 +1,5 @@
 """What the samples of a session say of its channels, noted one trial at a time."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a model requires against what was measured, by trial: residuals, and errors by axis."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

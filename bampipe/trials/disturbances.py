@@ -5,8 +5,6 @@ many times that of the rest, while the same motion leaves an ordinary error at o
 an event; left in, it moves estimates and floors, and passes for a physical effect.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

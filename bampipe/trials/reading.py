@@ -1,7 +1,5 @@
 """Trials of a run folder as motions: which there are, and which of them a fit may see."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

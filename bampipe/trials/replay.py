@@ -9,8 +9,6 @@ would carry away. What it does is read by the same sensors and goes through
 the same filters.
 """
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 import weakref

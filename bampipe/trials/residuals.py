@@ -5,8 +5,6 @@ standstill and invents delays; so the residual as a whole, the sign of the veloc
 goes through one low-pass before anything is fitted, and is thinned to what that leaves independent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial

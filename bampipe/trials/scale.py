@@ -4,8 +4,6 @@ The residual is taken on the other side of the equation. Its density is that of 
 where log |d residual / d force| is added to it: nothing is explained by making both sides small.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

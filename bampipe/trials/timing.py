@@ -1,7 +1,5 @@
 """By how much the inputs of a robot were sampled after its positions, drive by drive."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

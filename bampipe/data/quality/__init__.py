@@ -6,8 +6,6 @@ trial is set aside. Whatever was changed or left out is a sentence in ``repairs`
 noticed is a sentence in ``notes``. Nothing is altered without one.
 """
 
-from __future__ import annotations
-
 from bampipe.data.quality import channels, clock, encoders, faulty_readings
 from bampipe.data.quality.table import CleaningLimits, CleanTrial, TrialTable, thin, thinning_factor
 from bampipe.data.readers.trial import RawTrial

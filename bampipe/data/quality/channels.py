@@ -1,7 +1,5 @@
 """Force, brake and other channels: units, signs, missing, frozen or saturated samples."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

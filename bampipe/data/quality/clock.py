@@ -1,7 +1,5 @@
 """Time stamps: seconds from whatever was logged, without steps back, gaps or a rolled counter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

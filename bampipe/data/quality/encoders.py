@@ -1,7 +1,5 @@
 """Encoder readings: whole counts, no wraps, no jumps; and motion as the kind of trial has it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.arrays import Array, Indices

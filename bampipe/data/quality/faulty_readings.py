@@ -1,7 +1,5 @@
 """Readings that are none: wild ones, dead stretches, and what stands at a rail."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from bampipe.arrays import Flags

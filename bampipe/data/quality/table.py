@@ -1,7 +1,5 @@
 """A trial while it is being cleaned, what still counts as sound, and a sound trial thinned."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 

@@ -8,8 +8,6 @@ ROS bags apart, which have to be held as a whole. A small file can unpack to gig
 because somebody made it so: no reader gets more memory than its file can be worth.
 """
 
-from __future__ import annotations
-
 import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence

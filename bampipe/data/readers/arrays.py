@@ -4,8 +4,6 @@ Of ``.npy`` with one array, and ``.npz`` with several by name; fields of a struc
 columns, too. Pickled objects, which may run any program, are not read.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Container, Mapping
 from pathlib import Path

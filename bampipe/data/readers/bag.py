@@ -13,8 +13,6 @@ message. Several nodes may publish on a topic: messages with other names, or wit
 empty, are a stream of their own, and a column is taken from that with most of what is wanted.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ commas as decimal signs, with lines of remarks above the header and a line of un
 can be read in two ways is refused, with the setting that decides: a guess must not change numbers.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 from collections import Counter

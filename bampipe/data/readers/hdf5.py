@@ -4,8 +4,6 @@ A column is the path of a dataset (``log/force``), a field of a compound one (``
 or a column of a matrix (``log/pose[2]``). What lies outside the file is not followed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

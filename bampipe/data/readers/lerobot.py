@@ -7,8 +7,6 @@ is the column ``observation.state.elbow.pos``; element 3 of a vector without nam
 Source: huggingface/lerobot, ``src/lerobot/datasets/utils.py``.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

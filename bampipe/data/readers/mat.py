@@ -1,7 +1,5 @@
 """MATLAB files of version 5 to 7.2, and of 7.3 (:mod:`.hdf5`)."""
 
-from __future__ import annotations
-
 import math
 import re
 import struct

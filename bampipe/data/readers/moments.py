@@ -1,7 +1,5 @@
 """Dates and times as seconds."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

@@ -3,8 +3,6 @@
 For parsed JSON and for the message objects of rosbags alike.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from typing import Any

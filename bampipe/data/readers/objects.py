@@ -5,8 +5,6 @@ Arrays are columns, those of rows a column each, as in MATLAB files: ``data[0]``
 as many names stands beside them, they have these.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Mapping

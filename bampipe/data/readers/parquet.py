@@ -1,7 +1,5 @@
 """Parquet files: one row a sample; columns of vectors element by element."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ Such are ``q=0.1 tau=2`` of a terminal, the stamps that a serial monitor puts be
 with their units or with lists, and tables with the names of signals in a column of their own.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence

@@ -4,8 +4,6 @@ A column is ``Group/Channel``; ``Group/Channel@time`` is the time of its samples
 properties give it, for files without a time channel.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager

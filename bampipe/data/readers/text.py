@@ -3,8 +3,6 @@
 Rows are counted as an editor does: the first line of the file is row 1.
 """
 
-from __future__ import annotations
-
 import codecs
 import io
 import re

@@ -1,7 +1,5 @@
 """The tables of a session file that say what the columns mean, and what follows in SI units."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter

@@ -4,8 +4,6 @@ A `FormDictionary` stands where a `Dictionary` of compiled effects does. Nothing
 columns are made at a few times the rate of the thinned residual, and pass the same low-pass.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from itertools import combinations, product

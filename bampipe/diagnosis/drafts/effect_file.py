@@ -1,7 +1,5 @@
 """A drafted term as the text of an effect file: what a person renames, edits and keeps."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any

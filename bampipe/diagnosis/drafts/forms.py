@@ -3,8 +3,6 @@
 A form is a few words of a grammar, and an effect file like any other once its numbers are found.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Quantities that the residual of an axis may follow, and their ranges."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from bampipe.physics.device import Device

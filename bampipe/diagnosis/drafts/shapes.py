@@ -3,8 +3,6 @@
 Arguments of functions are ratios, so that every strength is a force or torque.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

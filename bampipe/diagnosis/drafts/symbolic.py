@@ -5,8 +5,6 @@ each is a sum of products whose leading factors are forces and whose other numbe
 `Form` like any other, with itself less each of its parts beside it.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 from collections.abc import Mapping, Sequence

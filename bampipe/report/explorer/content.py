@@ -1,7 +1,5 @@
 """Content of the page for exploring a run: stored records as plain tables, columns packed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any

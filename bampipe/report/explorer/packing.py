@@ -4,8 +4,6 @@ A channel keeps every sample, each to 1/65534 of the channel's range; times keep
 `assets/data.js` unpacks.
 """
 
-from __future__ import annotations
-
 import base64
 import zlib
 from dataclasses import dataclass, field

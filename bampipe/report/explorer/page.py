@@ -1,7 +1,5 @@
 """The page for exploring as one self-contained file: records, channels, style, scripts."""
 
-from __future__ import annotations
-
 import html
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The device: numbers taken from drawings, with their sources, and what they do (Table II)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 from bampipe.report.document import Block, Section, Table

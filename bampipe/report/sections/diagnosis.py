@@ -1,7 +1,5 @@
 """Diagnosis: verdict by axis, candidate effects, where the residual is, the trial to add."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Drafts: formulas over residuals that no effect explains, and over the null distribution."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 

@@ -1,7 +1,5 @@
 """Effects: a description of each one found, its curve, errors before and after, alternatives."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

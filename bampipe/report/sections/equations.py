@@ -1,7 +1,5 @@
 """The model: its equations of motion with the identified numbers in them."""
 
-from __future__ import annotations
-
 from bampipe.report.document import Formulas, Paragraph, Section
 from bampipe.report.run_results import Results
 from bampipe.results.terms import TermsResult

@@ -1,7 +1,5 @@
 """Identification: Table VII, Table VI, convergence (Fig. 7), torques and motion (Fig. 6)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The ladder: held-out error of each model version against the floor, and its parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np

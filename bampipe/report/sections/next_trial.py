@@ -1,7 +1,5 @@
 """The trial to record next, its expected gain, and the limits of the present trials."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts

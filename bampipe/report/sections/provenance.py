@@ -4,8 +4,6 @@ Nothing here depends on when or where the stages ran: equal results give equal r
 the machine are in ``run.json``, and ``bampipe status`` prints them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from bampipe.report.document import Block, Paragraph, Section, Subheading, Table

@@ -1,7 +1,5 @@
 """The device's paper and this session, side by side."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

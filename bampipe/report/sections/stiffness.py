@@ -1,7 +1,5 @@
 """Stiffness: Table I, the hysteresis loops of Fig. 3, bandwidth in both units."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

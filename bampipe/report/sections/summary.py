@@ -1,7 +1,5 @@
 """Summary: the verdict, the trials and the model, the key numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Data: the trials, their repairs, those set aside, and how the motion was differentiated."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

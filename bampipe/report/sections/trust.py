@@ -1,7 +1,5 @@
 """Trust in the estimates: weak directions, trials, tests of the innovations."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from bampipe.report.document import Block, Bullets, Paragraph, Section, Table

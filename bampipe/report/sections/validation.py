@@ -1,7 +1,5 @@
 """Validation: measured and predicted force (Fig. 9), error without friction (Fig. 4), tables."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

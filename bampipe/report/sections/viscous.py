@@ -1,7 +1,5 @@
 """Viscous field: the damping that the brakes rendered, against the command (Fig. 8)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

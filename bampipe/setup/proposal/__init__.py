@@ -4,8 +4,6 @@ Every guess is marked in the text. What no look at the data can tell, such as ho
 a radian, is left at a value that the session reader refuses with a line saying what to fill in.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The device of a session: one named or in the folder, a built-in one that fits, or a new one."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@ Columns that belong together have names alike but for the joint: its name, or a 
 with a column for every joint count, so no joint gets what is left over from another.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

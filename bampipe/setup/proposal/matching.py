@@ -1,7 +1,5 @@
 """Which column of a log is which: by name and unit first, then by what the data show."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field

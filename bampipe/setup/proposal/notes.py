@@ -1,7 +1,5 @@
 """The comments of a proposal, which are printed once more for its reader, and TOML values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from bampipe.lists import join_names

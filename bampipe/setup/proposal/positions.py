@@ -1,7 +1,5 @@
 """What the readings of a log stand for, and positions in SI."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The columns of a robot's log held against its drawing: order, units, signs, sizes, reductions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A device file to start from: one axis with friction, driven by what was recorded."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The tables of a proposal that say what its columns are, ``[time]`` to ``[channels]``."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
