@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -153,34 +154,15 @@ def select_effects(
                 gains = {key[0]: none - cost for cost, key in beside}
             room = session.criteria.most_effects - len(current.recipe.effects) + len(recipe.effects)
             pool = _explore(search, room, deep=room if number == 0 else min(_DEEP, room))
-            moved: Fit | None = None
+            moved, kept = None, dict[tuple[str, ...], float]()
             last |= number >= _MOST_ROUNDS - 1
-            better = [k for c, k in sorted(pool.values()) if c < none - _WORTH]
-            better += _without_weakest(search, recipe.effects)
-            broken: list[set[Key]] = []
-            kept: dict[tuple[str, ...], float] = {}
-            for keys in [] if last else better:
-                if len(broken) == _TRIED:
-                    break
-                # A larger set promises no more than the one in it whose fit fell short.
-                if any(one <= {*keys} for one in broken):
-                    continue
-                wider = change_set(current.recipe, keys)
-                members = frozenset(wider.effects)
-                if fresh := members not in fits:
-                    progress(0.15 + 0.1 * number, f"fitting {', '.join(names(keys))}")
-                    fits[members] = session.try_fit(wider, start_of(search, keys, wider))
-                moved = fits[members]
-                if moved is not None:
-                    kept[names(keys)] = gain_when_fitted(current, moved, search, keys)
-                    if kept[names(keys)] > _WORTH:
-                        # By its own noise a set fitted before is not the better one: the last.
-                        last |= not fresh
-                        break
-                broken.append({*keys})
-                moved = None
-                if fresh:
-                    fits[members] = None
+            if not last:
+                better = [k for c, k in sorted(pool.values()) if c < none - _WORTH]
+                better += _without_weakest(search, recipe.effects)
+                tell = partial(progress, 0.15 + 0.1 * number)
+                moved, kept = _fit_better(session, search, current, better, fits, tell)
+                # By its own noise a set fitted before is not the better one: the last.
+                last |= any(moved is one for one in steps)
             if moved is None:
                 # What has been fitted counts by what it kept, not by its linear problem.
                 pool = {
@@ -210,6 +192,46 @@ def select_effects(
         current = moved
         steps.append(current)
     raise AssertionError("the last round returns")
+
+
+def _fit_better(
+    session: Session,
+    search: Search,
+    current: Fit,
+    better: Sequence[tuple[Key, ...]],
+    fits: dict[frozenset[str], Fit | None],
+    tell: Callable[[str], None],
+) -> tuple[Fit | None, dict[tuple[str, ...], float]]:
+    """Fit sets in turn until one is better than the current model when fitted, too.
+
+    Args:
+        better: sets, the most promising first; fits: by members, those that were made.
+
+    Returns:
+        The fit, None where none is better; and by the names of each set what it kept, nats.
+    """
+    broken: list[set[Key]] = []
+    kept: dict[tuple[str, ...], float] = {}
+    for keys in better:
+        if len(broken) == _TRIED:
+            break
+        # A larger set promises no more than the one in it whose fit fell short.
+        if any(one <= {*keys} for one in broken):
+            continue
+        wider = change_set(current.recipe, keys)
+        members = frozenset(wider.effects)
+        if fresh := members not in fits:
+            tell(f"fitting {', '.join(names(keys))}")
+            fits[members] = session.try_fit(wider, start_of(search, keys, wider))
+        moved = fits[members]
+        if moved is not None:
+            kept[names(keys)] = gain_when_fitted(current, moved, search, keys)
+            if kept[names(keys)] > _WORTH:
+                return moved, kept
+        broken.append({*keys})
+        if fresh:
+            fits[members] = None
+    return None, kept
 
 
 def _without_weakest(search: Search, given: Collection[str]) -> list[tuple[Key, ...]]:

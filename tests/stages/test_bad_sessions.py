@@ -284,14 +284,14 @@ ASIDE: dict[str, tuple[Damage, str]] = {
     ),
     "column twice": (
         renamed(",".join(COLUMNS).replace("enc_pitch", "enc_yaw")),
-        "no column 'enc_pitch'|column 'enc_yaw' stands twice, as columns 2 and 3",
+        r"row 1: no column 'enc_yaw', did you mean 'enc_yaw \(2\)'\?",
     ),
     "encoder and force swapped": (swapped("enc_yaw", "force_x_v"), "columns swapped"),
     "time and encoder swapped": (swapped("time_us", "enc_yaw"), "column 'time_us'"),
     "text in a cell": (
-        cell(30, "enc_pitch", "oops"),
-        r"^trials/t01.csv, row 30, column 'enc_pitch': found 'oops', expected a number; "
-        r'if that means no reading, say missing = \["oops"\] under \[csv\]$',
+        cell(30, "enc_pitch", "x1"),
+        r"^trials/t01.csv, row 30, column 'enc_pitch': found 'x1', expected a number; "
+        r'if that means no reading, say missing = \["x1"\] under \[csv\]$',
     ),
     "two lines in one": (
         text(lambda s: "\n".join(s.split("\n")[:400]) + "".join(s.split("\n")[400:])),

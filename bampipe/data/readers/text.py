@@ -400,6 +400,8 @@ def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> I
         remedy = 'is it the time? then say unit = "datetime" under [time]'
     elif re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?\s+[^\d\s]\S*", value.strip(), re.IGNORECASE):
         remedy = "export numbers without their units"
+    elif shown == value and re.fullmatch(r"[^\"\\]*[^\W\d][^\"\\]*", value.strip()):
+        remedy = f'if that means no reading, say missing = ["{value.strip()}"] under [csv]'
     return InputError(
         f"found '{shown}', expected a number", where=f"{name}{at}, column '{column}'", remedy=remedy
     )
