@@ -294,7 +294,7 @@ def _add(
         return child
     why = "the held-out error does not fall"
     if ladder[child].has_lost_its_floor(ladder[model]):
-        why = "no noise floor could be computed with it, so that its error cannot be judged"
+        why = "there is no noise floor, or the error is far below it and cannot be judged"
     tell(f"{', '.join(effects)}: {why}, stopped at {model}")
     return ""
 

@@ -204,11 +204,7 @@ def _fit_better(
 ) -> tuple[Fit | None, dict[tuple[str, ...], float]]:
     """Fit sets in turn until one is better than the current model when fitted, too.
 
-    Args:
-        better: sets, the most promising first; fits: by members, those that were made.
-
-    Returns:
-        The fit, None where none is better; and by the names of each set what it kept, nats.
+    Of the sets ``better``, the most promising first; with what each kept when fitted, nats.
     """
     broken: list[set[Key]] = []
     kept: dict[tuple[str, ...], float] = {}
@@ -257,9 +253,7 @@ def _leave_out(
     out = {e for e in own if weighed.effects.get(e, 0.0) < least}
     if not out:
         return None
-    best = weighed.sets[0].keys
-    if not (out & gone(best)):
-        best = ()
+    best = weighed.sets[0].keys if out & gone(weighed.sets[0].keys) else ()
     keys = tuple(sorted({*best, *((f"-{e}", ()) for e in out)}))
     less = change_set(fit.recipe, keys)
     if np.isfinite(search.cost(keys)):

@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from bampipe.results.floor import FloorStatus
+from bampipe.results.floor import FLOOR_WRONG, FloorStatus, compare_with_floor
 from bampipe.results.record import Names, Record, Result, Size
 from bampipe.results.validate import AxisDrift, FreeRunError
 
@@ -58,8 +58,8 @@ class Rung(Record):
     def improves_on(self, other: Rung) -> bool:
         """Return whether its held-out error is lower and can still be judged.
 
-        A version that has lost its noise floor is no better, whatever its error: most often its
-        replicates run away, and the error that sensors alone would leave is unknown.
+        A version that has lost its noise floor is no better, whatever its error: its replicates run
+        away, or it fits far below what sensors alone leave, by making both sides small.
         """
         return self.has_lower_error_than(other) and not self.has_lost_its_floor(other)
 
@@ -69,11 +69,13 @@ class Rung(Record):
         return math.prod(ratios) < 1.0 - NOTICEABLE
 
     def has_lost_its_floor(self, other: Rung) -> bool:
-        """Whether it has no noise floor on an axis where ``other`` has one."""
-        return any(
-            floor is not None and self.noise_floor.get(axis) is None
-            for axis, floor in other.noise_floor.items()
-        )
+        """Whether no floor judges its error on an axis where one judges that of ``other``."""
+        axes = other.noise_floor
+        return any(self._floor_is_wrong(a) and not other._floor_is_wrong(a) for a in axes)
+
+    def _floor_is_wrong(self, axis: str) -> bool:
+        error, floor = self.held_out_rmse.get(axis, math.nan), self.noise_floor.get(axis)
+        return compare_with_floor(error, floor) in FLOOR_WRONG
 
 
 def horizons_of(rungs: Iterable[Rung]) -> list[float]:

@@ -44,13 +44,8 @@ def slopes_by_force(
     """Derivative of what the effects of a model add by each measured force, by trial.
 
     By a force that is more all the time, so that internal states which follow it have come to rest.
-
-    Args:
-        system: the model; motions: the trials; band: the low-pass.
-        probes: parameters, m times (n_p,), that give the same internal states.
-
-    Returns:
-        Each (K, n_q, n_forces, m), at the thinned samples.
+    At parameters ``probes``, m times (n_p,), that give the same internal states; each
+    (K, n_q, n_forces, m), at the thinned samples.
     """
     shape = len(system.coordinates), len(system.model.device.forces), len(probes)
     kept = [band.thinned_rows(len(m.t)) for m in motions]
@@ -96,13 +91,11 @@ def log_scale(
 ) -> tuple[Array, Array]:
     """The mean log of what a model's effects leave of the measured quantity, and its slopes.
 
+    By axis, (n_q,), and (n_q, n_free). Filters, which pass a constant force, leave all of it.
+
     Args:
-        system, motions, band: the model on its trials.
         used: which samples count, by trial, each (K, n_q).
         p: parameters, (n_p,); free: numbers of those by which slopes are taken.
-
-    Returns:
-        By axis, (n_q,), and (n_q, n_free). Filters, which pass a constant force, leave all of it.
     """
     nothing = np.zeros(len(system.coordinates)), np.zeros((len(system.coordinates), len(free)))
     if not system.parameters_by_force:
@@ -135,9 +128,7 @@ def log_scale(
 def gain_of_filter(before: Sequence[Array], after: Sequence[Array], band: Band) -> Array:
     """Share of the variance of white noise of a force that a filter leaves in the band, (n_q,).
 
-    Args:
-        before, after: the applied force without and with it, low-passed, by trial, each (K, n_q).
-        band: the low-pass.
+    Of the applied force ``before`` and ``after`` it, low-passed, by trial.
     """
     passed = band.passed_power(_SEGMENT // 2)
     found = np.ones(before[0].shape[1])

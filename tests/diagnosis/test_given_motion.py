@@ -24,9 +24,8 @@ from bampipe.trials.scale import log_scale
 
 def plain_trials(trials: MeasuredTrials, recipe: Recipe) -> list[ModelOnTrial]:
     """The model as given, at its priors, on each trial."""
-    model = system_of(recipe)
-    count = len(trials.motions)
-    return [ModelOnTrial(model, model.prior, trials.motions, k) for k in range(count)]
+    model, motions = system_of(recipe), trials.motions
+    return [ModelOnTrial(model, model.prior, motions, k) for k in range(len(motions))]
 
 
 def test_delays_shorter_than_the_true_one_promise_what_they_can_at_their_bounds(

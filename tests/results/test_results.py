@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
+from bampipe.results.compare import Rung
 from bampipe.results.ingest import IngestResult
 from bampipe.results.validate import AxisError, ForceError, JudgedError, TrialError, ValidateResult
 
@@ -108,3 +109,11 @@ def test_what_another_version_added_is_passed_over(tmp_path: Path) -> None:
 def test_a_result_that_is_not_there_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"run `bampipe ingest .*` first"):
         RunFolder(tmp_path).read(IngestResult)
+
+
+def test_a_version_far_below_its_floor_is_no_better() -> None:
+    before, near, below, without = (
+        Rung.model_construct(held_out_rmse={"joint": error}, noise_floor={"joint": floor})
+        for error, floor in ((2.7, 1.0), (1.0, 1.0), (0.1, 1.0), (0.1, None))
+    )
+    assert [r.improves_on(before) for r in (near, below, without)] == [True, False, False]

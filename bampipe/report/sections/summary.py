@@ -106,7 +106,7 @@ def _explain_rejection(results: Results, compared: CompareResult) -> str:
     refused = validated is not None and validated.is_refused
     why = "its parameters are refused" if refused else "the version it builds on is not confirmed"
     if better[-1].has_lost_its_floor(first):
-        why = "no noise floor could be computed for it, so that its error cannot be judged"
+        why = "it has no noise floor, or an error far below it, which cannot be judged"
     return (
         f"With `{better[-1].added}` the error would be lower than that of `{first.model}`, but that"
         f" version does not count: {why}."
