@@ -14,7 +14,8 @@ from bampipe.diagnosis.ranges import MachineScale, SearchRange
 from bampipe.physics.system import System
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import Samples, take_samples
-from bampipe.trials.scale import NO_SLOPE, gain_of_filter, slopes_by_force
+from bampipe.trials.residuals import ModelOnTrial
+from bampipe.trials.scale import NO_SLOPE, find_spectra, gain_of_filter, slopes_by_force
 
 _ALONE, _SEVERAL = 7, 5
 """Values of a shape on the grid: of an effect with one, and of each of an effect with several."""
@@ -170,21 +171,21 @@ class Dictionary:
         """
         if slopes or item.linear_indices or not item.system.force_fed:
             return np.ones(len(self.samples))
-        after = self._applied(item.system, p)
-        return gain_of_filter(self._applied_by_model, after, self.evidence.band)
+        before, after = self._applied_by_model, self._applied(item.system, p)
+        return gain_of_filter(before, self._spectra, after, self.evidence.band)
 
     @cached_property
     def _applied_by_model(self) -> list[Array]:
         """The applied force by the model, low-passed, by trial, each (K, n_q)."""
         return [self.evidence.band.thin(fitted.applied) for fitted in self.evidence.fitted]
 
+    @cached_property
+    def _spectra(self) -> list[Array]:
+        return find_spectra(self._applied_by_model)
+
     def _applied(self, system: System, p: Array) -> list[Array]:
-        found = []
-        for motion in self.evidence.motions:
-            u = motion.inputs(system.inputs)
-            z = system.memory(*motion.kinematics, u, p, motion.t)
-            found.append(self.evidence.band.thin(system.applied(*motion.kinematics, z, u, p)))
-        return found
+        e = self.evidence
+        return [e.band.thin(ModelOnTrial(system, p, [motion]).applied) for motion in e.motions]
 
     def scale_without(
         self, name: str, absence: Mapping[int, float]
@@ -205,8 +206,8 @@ class Dictionary:
         )
         if slopes or all(e.system.linear[i] for i in moved):
             return slopes, unchanged
-        before = self._applied(e.system, p)
-        return slopes, 1.0 / gain_of_filter(before, self._applied_by_model, e.band)
+        before, after = self._applied(e.system, p), self._applied_by_model
+        return slopes, 1.0 / gain_of_filter(before, find_spectra(before), after, e.band)
 
 
 _MULTIPLE = (0.5, 2.0)

@@ -112,7 +112,7 @@ class Evidence:
         See `scale.log_scale`, (n_q,) and (n_q, n), by the same parameters as `slopes`.
         """
         value, slopes = log_scale(
-            self.system, self.motions, self.band, self.used, self.p, self.free
+            self.system, self.motions, self.band, self.used, self.p, self.free, self.slopes_by_force
         )
         return value, np.pad(slopes, ((0, 0), (0, 1 if self.by_timing else 0)))
 

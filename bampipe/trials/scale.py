@@ -88,6 +88,7 @@ def log_scale(
     used: Sequence[Flags],
     p: Array,
     free: Sequence[int],
+    added: Sequence[Array],
 ) -> tuple[Array, Array]:
     """The mean log of what a model's effects leave of the measured quantity, and its slopes.
 
@@ -96,21 +97,21 @@ def log_scale(
     Args:
         used: which samples count, by trial, each (K, n_q).
         p: parameters, (n_p,); free: numbers of those by which slopes are taken.
+        added: slopes by the forces there, each (K, n_q, n_forces).
     """
     nothing = np.zeros(len(system.coordinates)), np.zeros((len(system.coordinates), len(free)))
     if not system.parameters_by_force:
         return nothing
     bare = bare_slopes(system, motions, band, p)
 
-    def mean_log(p: Array) -> Array | None:
-        added = slopes_by_force(system, motions, band, [p])
+    def mean_log(added: Sequence[Array]) -> Array | None:
         if all((np.abs(slope) <= NO_SLOPE).all() for slope in added):
             return None
-        logs = [log_of_share(a, b[..., 0]) for a, b in zip(bare, added, strict=True)]
+        logs = [log_of_share(a, b) for a, b in zip(bare, added, strict=True)]
         total = sum(np.sum(x * moves, axis=0) for x, moves in zip(logs, used, strict=True))
         return np.asarray(total / np.maximum(sum(moves.sum(axis=0) for moves in used), 1))
 
-    here = mean_log(p)
+    here = mean_log(added)
     if here is None:
         return nothing
     slopes = nothing[1]
@@ -119,23 +120,31 @@ def log_scale(
             q, moved = system.parameters[number], p.copy()
             step = _STEP * max(abs(p[number]), q.sd)
             moved[number] += step if p[number] + step <= q.upper else -step
-            there = mean_log(moved)
+            rows = slopes_by_force(system, motions, band, [moved])
+            there = mean_log([r[..., 0] for r in rows])
             if there is not None:
                 slopes[:, k] = (there - here) / (moved[number] - p[number])
     return here, slopes
 
 
-def gain_of_filter(before: Sequence[Array], after: Sequence[Array], band: Band) -> Array:
+def find_spectra(applied: Sequence[Array]) -> list[Array]:
+    """Power spectrum of the applied force of each axis, low-passed, by trial, each (K, n_q)."""
+    axes = range(applied[0].shape[1])
+    return [np.abs(sum(_spectrum(x[:, a], x[:, a]) for x in applied)) for a in axes]
+
+
+def gain_of_filter(
+    before: Sequence[Array], spectra: Sequence[Array], after: Sequence[Array], band: Band
+) -> Array:
     """Share of the variance of white noise of a force that a filter leaves in the band, (n_q,).
 
-    Of the applied force ``before`` and ``after`` it, low-passed, by trial.
+    Of the applied force ``before`` it, with ``spectra``, and ``after`` it, as in `find_spectra`.
     """
     passed = band.passed_power(_SEGMENT // 2)
     found = np.ones(before[0].shape[1])
-    for axis in range(len(found)):
+    for axis, power in enumerate(spectra):
         pairs = [(x[:, axis], y[:, axis]) for x, y in zip(before, after, strict=True)]
         if any(not np.array_equal(x, y) for x, y in pairs):
-            power = np.abs(sum(_spectrum(x, x) for x, _ in pairs))
             gain = np.abs(sum(_spectrum(x, y) for x, y in pairs)) / np.maximum(power, 1e-300)
             found[axis] = np.average(np.clip(gain, 1e-2, 1.0) ** 2, weights=passed[:, axis])
     return found

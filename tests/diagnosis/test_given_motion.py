@@ -19,7 +19,7 @@ from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import device_from
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 from bampipe.trials.residuals import ModelOnTrial
-from bampipe.trials.scale import log_scale
+from bampipe.trials.scale import log_scale, slopes_by_force
 
 
 def plain_trials(trials: MeasuredTrials, recipe: Recipe) -> list[ModelOnTrial]:
@@ -83,7 +83,8 @@ def test_a_sagging_drive_leaves_the_scale_that_its_curve_has(tmp_path: Path) -> 
     used = [np.abs(r.applied) > 0.5 * np.abs(r.applied).max() for r in plain_trials(trials, recipe)]
     used = [u[trials.band.thinned_rows(len(u))] for u in used]
     place = len(p) - 1
-    scale, slopes = log_scale(model, trials.motions, trials.band, used, p, [0, place])
+    added = [r[..., 0] for r in slopes_by_force(model, trials.motions, trials.band, [p])]
+    scale, slopes = log_scale(model, trials.motions, trials.band, used, p, [0, place], added)
     force = np.concatenate(
         [
             np.abs(r.applied[trials.band.thinned_rows(len(r.applied))][u])
