@@ -48,7 +48,7 @@ class Chain:
     """The moving joints between the links ``base`` and ``tip``.
 
     Attributes:
-        joints: by name, tables as of ``[robot.joints]``; limits: by name.
+        joints: by name, the entries of ``[robot.joints]``; limits: by name.
         notes: what was left out or joined, one sentence each.
         gravity: in the base's frame, m/s2; None where it is not known.
         gravity_note: where that is from, or why it is not known, if that is not plain.

@@ -33,7 +33,7 @@ class Body:
 
     @classmethod
     def of_table(cls, table: Mapping[str, Any]) -> Body:
-        """As of a joint, or of a payload, in a device file."""
+        """The body that the entry of a joint or payload in a device file describes."""
         center = np.array(table.get("center", (0.0,) * 3), dtype=float)
         inertia = symmetric(table.get("inertia", (0.0,) * 6))
         return cls(float(table.get("mass", 0.0)), center, inertia)
@@ -67,7 +67,7 @@ class Body:
         return self.mass >= 0.0 and bool(moments[0] >= -_BELOW_ZERO * abs(moments[2]))
 
     def table(self) -> dict[str, Any]:
-        """As of a joint in a device file."""
+        """The entries that describe it for a joint in a device file."""
         upper = [float(v) for v in self.inertia[np.triu_indices(3)]]
         return {"mass": self.mass, "center": [float(v) for v in self.center], "inertia": upper}
 

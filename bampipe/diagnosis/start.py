@@ -60,7 +60,7 @@ def _fit(session: Session, recipe: Recipe, start: Array) -> Fit:
 
 @dataclass(frozen=True)
 class SignWidth:
-    """A width and what it does.
+    """The chosen width of the sign in Coulomb friction, and its held-out errors.
 
     Attributes:
         factor: times the device's; 1 where nothing speaks for a narrower one.

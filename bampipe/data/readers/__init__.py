@@ -78,8 +78,8 @@ def read_trial(
             called there.
         name: what to call the file in messages (default: its path).
         largest_bytes: refuse a trial that takes more than this in memory.
-        datetimes: columns that hold dates and times, with their format as of ``strptime``, ""
-            for ISO 8601; returned as s since the first.
+        datetimes: ``strptime`` format of each column that holds dates and times, "" for ISO 8601;
+            returned as s since the first.
         dialect: what is known about the layout of a text file.
 
     Raises:

@@ -26,7 +26,7 @@ _DEEPEST = 8
 _MOST_FIELDS = 4096
 _NAMES = ("name", "label", "signalname", "channel")
 _VALUES = ("values", "value", "data")
-"""Fields of a struct that say what it is called, and that hold its readings."""
+"""Fields that hold the name of a signal, and its samples."""
 
 
 def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
@@ -120,7 +120,7 @@ def _called(
         inner = label.rpartition(".")[0]
         fitting = (own for x, own in lists.items() if x.rpartition(".")[0] == inner)
         own = next((own for own in fitting if len(set(own.values())) == min(sides) > 1), {})
-        if own and isinstance(value, np.ndarray):  # as of importdata
+        if own and isinstance(value, np.ndarray):  # column headers, as importdata stores them
             del found[label]
             table = value if sides[0] >= sides[1] else value.T
             found |= {f"{label}.{own[k]}": table[:, k] for k in sorted(own)}

@@ -13,7 +13,7 @@ LONGEST = 256
 """Characters of the longest text that is taken for a date and time."""
 _DAY = 86_400 * NANOSECONDS
 _MOMENT = re.compile(r"\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?\s*\Z")
-"""Date and time as of ISO 8601."""
+"""ISO 8601 date and time."""
 _OF_DAY = re.compile(r"\s*\d{1,2}:\d\d:\d\d([.,]\d+)?\s*\Z")
 _LOCAL = re.compile(
     r"\s*(?:(?P<a>\d{1,2})(?P<sep>[./-])(?P<b>\d{1,2}|[A-Z][a-z]{2})(?P=sep)(?P<year>\d{4})[T ]+)?"
@@ -75,7 +75,7 @@ def nanoseconds(
 
 
 def _iso_of_local(text: pd.Series) -> pd.Series:
-    """Dates and times as people write them as of ISO 8601; others, and doubtful ones, as they are.
+    """Convert local dates and times to ISO 8601; leave others, and ambiguous ones, unchanged.
 
     Whether 03/10 is in March or October shows where a date beyond the 12th stands in the column, or
     does not matter where it is the only date.

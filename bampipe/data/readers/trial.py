@@ -41,8 +41,8 @@ class Wanted:
     """What to read of a file.
 
     Attributes:
-        columns: their names; datetimes: those that hold dates and times, with their format as of
-            ``strptime``, "" for ISO 8601: they are returned as s since the first.
+        columns: their names; datetimes: ``strptime`` format of each that holds dates and times, ""
+            for ISO 8601: they are returned as s since the first.
         dialect: of text files; largest_bytes: that a trial may take in memory.
     """
 
