@@ -228,7 +228,7 @@ class Search:
             return Solution(np.inf)
         # The cost has what its own parameters leave of the scale in second order, absent ones, too.
         places_of, change = list(absent), np.array([*absent.values()])
-        first = self._own_log_scale[:, places_of] @ change
+        first = self.dictionary.evidence.log_scale[1][:, places_of] @ change
         volume = volume - p.independent * (first - 0.5 * first**2)
         sizes: tuple[float, ...] = ()
         # What an effect of the model costs is not in the cost of the model as it is.
@@ -336,11 +336,6 @@ class Search:
             float(np.sqrt(max(float(strength @ square @ strength), 0.0) / self.applied[axis]))
             for axis, square in self._squares[key].items()
         )
-
-    @property
-    def _own_log_scale(self) -> Array:
-        """Slopes of the mean log of what the model leaves of the scale, (n_q, n)."""
-        return self.dictionary.evidence.log_scale[1]
 
     def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
         """`Solution.volume` of a set with the parameters of a model that was fitted with it."""

@@ -50,12 +50,7 @@ class StateGroup:
     commands: Sequence[int]
     parameters: Sequence[int]
 
-    def integrate(
-        self,
-        module: ModuleType,
-        along: tuple[Array, Array, Array, Array, Array, Array],
-        z0: Array,
-    ) -> Array:
+    def integrate(self, module: ModuleType, along: Sequence[Array], z0: Array) -> Array:
         """Return the states along the motion of one trial, (T, n); see `System.memory`.
 
         Args:

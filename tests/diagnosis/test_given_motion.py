@@ -82,9 +82,8 @@ def test_a_sagging_drive_leaves_the_scale_that_its_curve_has(tmp_path: Path) -> 
     p = np.append(system_of(recipe).prior, 0.01)
     used = [np.abs(r.applied) > 0.5 * np.abs(r.applied).max() for r in plain_trials(trials, recipe)]
     used = [u[trials.band.thinned_rows(len(u))] for u in used]
-    place = len(p) - 1
     added = [r[..., 0] for r in slopes_by_force(model, trials.motions, trials.band, [p])]
-    scale, slopes = log_scale(model, trials.motions, trials.band, used, p, [0, place], added)
+    scale, slopes = log_scale(model, trials.motions, trials.band, used, p, [0, len(p) - 1], added)
     force = np.concatenate(
         [
             np.abs(r.applied[trials.band.thinned_rows(len(r.applied))][u])
