@@ -133,7 +133,7 @@ def weigh_sets(
             sets = with_unknown
     far = np.sqrt(_squares(search, ()) / np.maximum(search.p.count, 1)) > criteria.doubt
     unknown[far] = 1.0
-    doubtful = unknown >= criteria.probability
+    doubtful = (unknown >= criteria.probability) & fit.is_above_floor
     for effect in own if doubtful.any() else ():
         # In doubt is not absent: the model keeps it, and the report mentions it.
         most = max(_share_explained(search, effect, doubtful), 1.0 - criteria.probability)

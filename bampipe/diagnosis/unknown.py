@@ -22,7 +22,8 @@ _KNOTS, _KNOTS_OF_OTHERS = (9, 33), (5,)
 """Of each spline of what the axis does itself, and of the position of the others."""
 _SIZES = (0.003, 0.01, 0.03, 0.1)
 """Standard deviations of the function at a knot, over the applied force of the axis."""
-_REWEIGHTS = 4
+_REWEIGHTS = 2
+"""From the weights of the function with one spline less."""
 _OWN = 5
 """Of the quantities, those of the axis itself."""
 
@@ -116,20 +117,12 @@ def _hats(values: Array, knots: Array) -> Array:
 def weigh_unknown(search: Search, splines: Splines, keys: tuple[Key, ...] = ()) -> Unknown:
     """The evidence of an unknown function beside a set, of effects of the model taken away."""
     model = _ModelWithout(search, splines, keys)
-    chosen: dict[int, float] = {}
-    best: _Solution | None = None
-    while True:
-        wider = [
-            {**chosen, function: size}
-            for function in range(len(splines.functions))
-            if function not in chosen
-            for size in _SIZES
-        ]
-        found = min(map(model.solve, wider), key=lambda one: one.cost, default=None)
-        if found is None or (best is not None and found.cost >= best.cost):
+    best = model.add_best({}, search.solve(keys).weight)
+    while len(best.sizes) < len(splines.functions):
+        found = model.add_best(best.sizes, best.weight)
+        if found.cost >= best.cost:
             break
-        best, chosen = found, found.sizes
-    assert best is not None
+        best = found
     return model.describe(best)
 
 
@@ -161,18 +154,27 @@ class _ModelWithout:
         self.moment = self.free.T @ (p.moment - p.precision @ self.fixed)
         bx, self.xx, xy = splines.products
         self.bx, self.xy = self.free.T @ bx, xy + bx.T @ self.fixed
-        self.weight, self.penalty = search.solve(keys).weight, search.penalty_of(keys)
-        self.before = search.residual_rows(keys)[axis]
+        self.penalty, self.before = search.penalty_of(keys), search.residual_rows(keys)[axis]
         self.force = float(np.sqrt(np.mean(p.likelihood.applied[axis] ** 2)))
 
-    def solve(self, sizes: dict[int, float]) -> _Solution:
-        """The best strengths of functions of given sizes, and the cost."""
+    def add_best(self, sizes: dict[int, float], weight: Array) -> _Solution:
+        """With the function and the size that take most off the cost beside those of ``sizes``."""
+        wider = [
+            {**sizes, function: size}
+            for function in range(len(self.splines.functions))
+            if function not in sizes
+            for size in _SIZES
+        ]
+        return min((self.solve(one, weight) for one in wider), key=lambda one: one.cost)
+
+    def solve(self, sizes: dict[int, float], weight: Array) -> _Solution:
+        """The best strengths of functions of given sizes, and the cost; from ``weight`` on."""
         p, axis, functions = self.p, self.splines.axis, self.splines.functions
         at = np.concatenate([functions[k] for k in sizes])
         known = np.concatenate(
             [np.full(len(functions[k]), (size * self.force) ** -2) for k, size in sizes.items()]
         )
-        bx, xx, xy, weight = self.bx[:, at], self.xx[np.ix_(at, at)], self.xy[at], self.weight
+        bx, xx, xy = self.bx[:, at], self.xx[np.ix_(at, at)], self.xy[at]
         for _ in range(_REWEIGHTS):
             own, w = np.tensordot(weight, self.bb, 1) + self.precision, weight[axis]
             right = np.column_stack([w * bx, self.moment - weight @ self.by])
