@@ -1,7 +1,6 @@
 """Runs published on file systems that fsspec knows: whole or not at all, and fetched back."""
 
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -209,26 +208,3 @@ def test_an_address_of_no_use_is_said_before_the_run(
     assert code == 2 and said.count("\n") == 1 and "no such file system" in said
     assert toy.ran() == []
     assert command("fetch", url, "--runs", toy.runs)[0] == 2
-
-
-@pytest.mark.parametrize("kind", ["fifo", "endless", "folder"])
-def test_what_is_no_file_is_not_fetched(tmp_path: Path, kind: str) -> None:
-    url = f"file://{tmp_path / 'published'}"
-    publish(make_run(tmp_path / "runs/s1"), url)
-    for path in [
-        *(tmp_path / "published/s1").glob("*/run.json"),
-        tmp_path / "published/s1" / CURRENT,
-    ]:
-        content = path.read_bytes()
-        path.unlink()
-        if kind == "fifo":
-            os.mkfifo(path)
-        elif kind == "folder":
-            path.mkdir()
-        else:
-            path.symlink_to("/dev/zero")
-        with pytest.raises(InputError, match=r"not a file|cannot be fetched"):
-            fetch(url, "s1", tmp_path / "elsewhere")
-        path.rmdir() if kind == "folder" else path.unlink()
-        path.write_bytes(content)
-    assert fetch(url, "s1", tmp_path / "elsewhere").is_dir()
