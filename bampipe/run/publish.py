@@ -89,7 +89,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
     """Fetch the published run of ``session`` into ``runs``, every file held against its hash.
 
     Args:
-        url: as for :func:`publish`; runs: folder of run folders.
+        url: as for :func:`publish`; session: as `published` lists it; runs: folder of run folders.
         force: replace a run folder that says something else.
 
     Returns:
@@ -98,8 +98,6 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
     Raises:
         InputError: nothing published, a file does not match its hash, or there is another run.
     """
-    if not is_name(session):
-        raise InputError(f"{session!r} is no name of a session", where=url)
     system, base = _open(url)
     here, root = f"{base}/{session}", runs / session
     with _driver("cannot be fetched", url):
