@@ -30,6 +30,7 @@ from bampipe.results.draft import (
 )
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
+from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd, significant
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials
@@ -138,8 +139,8 @@ def _effect(term: Term, file: str) -> DraftedEffect:
     constants = {
         name: FittedConstant(
             value=value,
-            low=value - 1.96 * term.sd[name],
-            high=value + 1.96 * term.sd[name],
+            low=value - NORMAL_95 * term.sd[name],
+            high=value + NORMAL_95 * term.sd[name],
             unit=units[name],
         )
         for name, value in term.values.items()
@@ -162,8 +163,8 @@ def _effect(term: Term, file: str) -> DraftedEffect:
             unit=unit,
             at=at,
             mean=mean,
-            low=mean - 1.96 * sd,
-            high=mean + 1.96 * sd,
+            low=mean - NORMAL_95 * sd,
+            high=mean + NORMAL_95 * sd,
             beside={quantity.words: span.high for quantity, span in form.beside},
         ),
     )

@@ -8,6 +8,7 @@ import numpy as np
 
 from bampipe.diagnosis.drafts.forms import rounded
 from bampipe.diagnosis.drafts.search import Term
+from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd
 
 _PLACE_IN_WIDTHS = 2.0
@@ -30,7 +31,9 @@ def declare(term: Term, source: str) -> dict[str, Any]:
     for name, entry in term.form.entries().items():
         entries[name] = dict(entry)
         if name in term.values:
-            interval = f"{round_with_sd(term.values[name], 1.96 * term.sd[name])} {entry['unit']}"
+            interval = (
+                f"{round_with_sd(term.values[name], NORMAL_95 * term.sd[name])} {entry['unit']}"
+            )
             entries[name]["description"] += f"; drafted as {interval}".rstrip()
             entries[name] |= _numbers(term, name, entry)
     return term.form.declaration(source, entries)

@@ -7,7 +7,6 @@ refined, and the best of these fitted with all parameters of the model.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
@@ -20,12 +19,11 @@ from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
 from bampipe.diagnosis.drafts import symbolic
 from bampipe.diagnosis.drafts.columns import FormDictionary
 from bampipe.diagnosis.drafts.forms import Form
+from bampipe.diagnosis.probability import chance_of
 from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.session import Fit, Session, shared, system_of, workers
 from bampipe.physics.recipe import Recipe
 from bampipe.results.draft import ChanceOfDraft
-from bampipe.results.floor import compare_with_floor
-from bampipe.trials.evidence import gather_evidence
 
 Progress = Callable[[float, str], None]
 """Called with a fraction of the work done and what is being done."""
@@ -36,14 +34,10 @@ _PARTS = 8
 """Tasks a process into which columns are divided."""
 _REFINED, _FITTED = 12, 4
 """Forms whose shapes are refined, and of those the ones that are fitted with the model."""
-_PROMISING = 8
-"""Forms weighed exactly on each replay, those that gain most at given weights."""
 _TRIES = 90
 """Evaluations in refining one."""
 _STEPS = {"place": 0.02, "length": 0.03, "time": 0.03, "wavenumber": 2e-4, "number": 0.003}
 """Of its range: the first step in refining a shape, by kind."""
-_SEED = 11
-"""First number, after the user's, of the seed by which replays are recombined."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +108,7 @@ class FoundDraft:
     Attributes:
         terms: found, at most `MOST_TERMS`.
         chance: of the first term, and of the next where one was looked for.
-        noise_floor: error of replays of the final model, N.m or N.
+        noise_floor: of the final model, N.m or N.
         options: everything that was fitted, the model as given first.
         chosen: the final model.
         wants_formulas: whether the structured forms left much, and pyoperon is not installed.
@@ -141,21 +135,6 @@ class FormSearch(Search):
             made = spread(_make_columns, [keys[k::parts] for k in range(parts)])
             atoms = {key: atom for part in made for key, atom in part}
         super().__init__(fit.problem, known, forms.make_all, session.criteria, atoms)
-
-    def on_replay(self, y: tuple[Array, ...]) -> FormSearch:
-        """The same on another residual along the same course, by axis, (n,), in units of noise."""
-        other = copy.copy(self)
-        other.p = replace(self.p, y=y)
-        other.bb, other.by, other.yy = other.p.sums()
-        other.xy = [x.T @ v for x, v in zip(self.columns, y, strict=True)]
-        other._with_base, other._solved = {}, {}
-        other._weight = other.p.independent / np.maximum(other.yy, 1e-300)
-        return other
-
-    def gain_of_best_form(self) -> float:
-        """Log evidence that the best form on the grid adds, nats; 0 where none adds any."""
-        best = self.best_beside((), _PROMISING, shapes=1)
-        return max(self.cost(()) - best[0][0], 0.0) if best else 0.0
 
     def best_forms(self, count: int, jobs: int) -> list[Key]:
         """The forms that gain most, their shapes refined, best first."""
@@ -238,36 +217,41 @@ class _AxisSearch:
 
     def run(self, recipe: Recipe, start: Array, progress: Progress) -> FoundDraft:
         """Add terms to a model as long as one beats chance and lowers the held-out error."""
-        bare = self.session.fit(recipe, start)
-        given = Option((), self.held_out(bare), 0.0, recipe, bare.evidence.p)
+        bare, least = self.session.fit(recipe, start), self.session.criteria.largest_p_value
+        given = Option((), self._error_of(bare), 0.0, recipe, bare.evidence.p)
         options, chances, stand = [given], [], (bare, given)
         for number in range(MOST_TERMS):
             progress(0.05 + 0.4 * number, "holding every form against the residual")
             search, before = self._open(stand[0]), stand[1]
             progress(0.15 + 0.4 * number, "searching replays for as good a formula")
-            chances.append(weigh_chance(self.session, search))
-            if chances[-1].p_value > self.session.criteria.largest_p_value:
+            chances.append(weigh_chance(search))
+            if chances[-1].p_value > least:
                 break
             progress(0.3 + 0.4 * number, "fitting the best forms with the model")
             tried = self._fit_forms(search, before)
             options += tried
             stand = self._take(stand, tried)
-            if stand[1] is before or not self._leaves_much(*stand):
+            if stand[1] is before or not stand[0].is_above_floor[self.axis]:
                 break
-        wanted = not self.curves and chances[0].p_value <= self.session.criteria.largest_p_value
-        wanted = wanted and self._leaves_much(*stand)
+        wanted = not self.curves and chances[0].p_value <= least
+        wanted = wanted and bool(stand[0].is_above_floor[self.axis])
         if wanted and symbolic.is_available():
             progress(0.85, "symbolic regression")
             tried = self._fit_forms(self._open(bare, bred=True), given)
             options += tried
             stand = self._take(stand, tried)
         fit, chosen = stand
-        chosen = replace(chosen, held_out_rmse=self.held_out(fit), p=fit.evidence.p)
+        chosen = replace(chosen, held_out_rmse=self._error_of(fit), p=fit.evidence.p)
         options = [chosen if o.terms == chosen.terms else o for o in options]
         return FoundDraft(
-            self.axis, _terms(fit, chosen), tuple(chances), self._floor(fit), tuple(options),
-            chosen, wanted and not symbolic.is_available(),
+            self.axis, _terms(fit, chosen), tuple(chances),
+            float(fit.noise_floor.level[self.axis]), tuple(options), chosen,
+            wanted and not symbolic.is_available(),
         )  # fmt: skip
+
+    def _error_of(self, fit: Fit) -> float:
+        """Held-out error on the axis, N.m or N."""
+        return float(fit.held_out_rmse[self.axis])
 
     def _open(self, fit: Fit, bred: bool = False) -> FormSearch:
         """A search over the forms of the grammar, or over formulas that are bred."""
@@ -287,19 +271,6 @@ class _AxisSearch:
         if best is chosen:
             return stand
         return self.session.fit(best.recipe, best.p), best
-
-    def _floor(self, fit: Fit) -> float:
-        replays = fit.likelihood.noise.residuals[self.axis]
-        return float(np.median(np.sqrt(np.mean(replays**2, axis=1))))
-
-    def held_out(self, fit: Fit) -> float:
-        """Error of a model on trials that its parameters have not seen, N.m or N."""
-        t, e = self.session.trials, fit.evidence
-        found = gather_evidence(e.system, t.motions, t.band, e.p, t.folds, most_iterations=0)
-        return float(found.held_out_rmse[self.axis])
-
-    def _leaves_much(self, fit: Fit, option: Option) -> bool:
-        return compare_with_floor(option.held_out_rmse, self._floor(fit)) == "above_floor"
 
     def _fit_forms(self, search: FormSearch, current: Option) -> list[Option]:
         """The model with each of the best forms, all parameters fitted together."""
@@ -336,35 +307,15 @@ def _fit_form(task: tuple[Recipe, Array]) -> tuple[float, float, Array]:
     """Cost and held-out error of a model with a form, and its parameters."""
     search, noise = shared()
     fit = search.session.fit(*task, noise)
-    return fit.solved.cost, search.held_out(fit), fit.evidence.p
+    return fit.solved.cost, float(fit.held_out_rmse[search.axis]), fit.evidence.p
 
 
-def weigh_chance(session: Session, search: FormSearch) -> ChanceOfDraft:
-    """Hold the gain of the best form against that on replays of the model, which lacks nothing.
-
-    There are as many replays as the smallest chance that decides takes, recombined from those of
-    the noise: what each left around the bias of the others, stretch by stretch.
-    """
-    noise, samples = search.fit.likelihood.noise, search.fit.likelihood.samples
-    replays = len(noise.residuals[0])
-    around = [
-        r - np.array([noise.without(k)[axis] for k in range(replays)])
-        for axis, r in enumerate(noise.residuals)
-    ]
-    blocks = 1 + max(int(s.block.max(initial=0)) for s in samples)
-    random = np.random.default_rng((session.seed, _SEED, search.forms.axis))
-    gains = []
-    for _ in range(int(np.ceil(1.0 / session.criteria.largest_p_value)) - 1):
-        of = random.integers(replays, size=blocks)
-        y = tuple(
-            (noise.bias[axis] + around[axis][of[s.block], np.arange(len(s.rows))])
-            * search.fit.likelihood.root[axis]
-            for axis, s in enumerate(samples)
-        )
-        gains.append(search.on_replay(y).gain_of_best_form())
-    gain = search.gain_of_best_form()
-    p_value = (1 + sum(g >= gain for g in gains)) / (1 + len(gains))
-    return ChanceOfDraft(gain=gain, gains=tuple(gains), p_value=p_value)
+def weigh_chance(search: FormSearch) -> ChanceOfDraft:
+    """Hold the gain of the best form against that on replays of the model, which lacks nothing."""
+    replays = range(search.criteria.replicates)
+    gains = tuple(search.of_replay(k).largest_gain()[0] for k in replays)
+    gain, _ = search.largest_gain()
+    return ChanceOfDraft(gain=gain, gains=gains, p_value=chance_of(gain, gains))
 
 
 def _start(search: FormSearch, wider: Recipe, values: dict[str, float], base: Array) -> Array:
