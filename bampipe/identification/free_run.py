@@ -1,29 +1,32 @@
-"""Free runs: the identified model left to itself over a trial, against the measured position.
+"""Free runs: the identified model left to itself, against the measured position.
 
 Where the device declares its controller and the session recorded what that needs, machine and
-controller run together from the reference (closed loop). Otherwise the recorded inputs drive the
-model alone (open loop), which says something only where the mechanism forgets where it started:
-without a restoring force any error of the force is integrated for ever.
+controller run together over whole trials from the reference (closed loop). Otherwise the recorded
+inputs drive the model alone (open loop), which says something of a whole trial only where the
+mechanism forgets where it started: without a restoring force any error of the force is integrated
+for ever. Over a tenth of a second to two seconds it always does (drift): from the filtered state at
+many moments, the model runs under the recorded inputs.
 """
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
-from bampipe.arrays import Array
+from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
-from bampipe.estimate.simulation import simulate
-from bampipe.identification.drift import why_not_free
+from bampipe.estimate.simulation import MAX_STEP_S, Runaway, simulate
 from bampipe.physics import System
 from bampipe.physics.control_law import ControlLaw, compile_law
 from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.results.ingest import IngestResult
-from bampipe.results.validate import CommandError, FreeRun, FreeRunError
+from bampipe.results.validate import AxisDrift, CommandError, Drift, FreeRun, FreeRunError
 from bampipe.trials.motion import Motion
+from bampipe.trials.replay import is_stiff
 
 CLOSED: Final = "closed_loop"
 OPEN: Final = "open_loop"
@@ -31,6 +34,27 @@ _PUSHED = 0.1
 """How far the start is displaced to see whether it is forgotten, in spreads of the motion."""
 _FORGOTTEN = 0.5
 """Share of that which may be left over the last fifth of a trial."""
+HORIZONS_S = (0.1, 0.5, 2.0)
+"""A reversal, a movement, several movements of a hand."""
+_STARTS = 100
+"""Over all trials together; neighbours overlap, so that more would hardly say more."""
+_STARTS_OF_ROBOT = 20
+"""A robot's light joints stop and start a hundred times more slowly to integrate: 0.3 s a start."""
+_LEAST = 10
+"""Windows in which an axis moves, for quantiles that mean anything."""
+_MARGIN_S = 0.2
+"""Lost to the filters at both ends of a trial."""
+_MOVES = 0.01
+"""Share of its range in the trial by which an axis must move within a window to count there."""
+_RUNS_AWAY = 0.1
+"""Share of windows that may run away."""
+_STEPS_S = (1e-3, 1e-4)
+"""Longest steps of integration, the next where a motion runs away with one: friction that builds up
+within micrometres is stiffer than an axis, and runs away by the step alone."""
+
+
+_Reach = tuple[Array, Array, Flags]
+"""A run at one horizon: error, infinite if run away, displacement, is it a move, (n_q,) each."""
 
 
 @dataclass(frozen=True)
@@ -132,16 +156,10 @@ def _closed(run: RunFolder, system: System, motion: Motion, p: Array, law: Contr
 
 def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -> _Run:
     start, u = _start(system, motion, p), motion.inputs(system.inputs)
-    n = motion.q.shape[1]
     if push is not None:
-        start[:n] += push
-    x = simulate(
-        system.derivative, start, u, p[: len(system.parameters)], float(motion.t[1] - motion.t[0]),
-        width=system.sign_widths, n_noise=len(system.noise), smooth=system.forced,
-    )  # fmt: skip
-    readings = np.empty((len(x), 2 * n))
-    for i in range(len(x)):
-        system.measure(x[i], u[i], p, readings[i])
+        start[: len(push)] += push
+    x = _simulate(system, start, u, p, float(motion.t[1] - motion.t[0]))
+    readings = system.encoder_readings(x, u, p)
     none = np.zeros((len(x), 0))
     return _Run(motion.trial_id, np.hstack([motion.q, motion.qd]), readings, none, none)
 
@@ -183,3 +201,130 @@ def _percent(error: Array, size: Array) -> float:
     """Norm of the error over the norm of the measured quantity, per cent."""
     norm = float(np.linalg.norm(size))
     return 100.0 * float(np.linalg.norm(error)) / norm if norm > 0.0 else 100.0
+
+
+def find_drift(
+    system: System, motions: Sequence[Motion], parameters: Sequence[Array], judged: Sequence[bool]
+) -> dict[str, AxisDrift]:
+    """Run the model from many starts of every trial and say how far it drifts.
+
+    Args:
+        parameters: for each trial, (>= n_p,) parameters that have not seen it.
+        judged: which trials count; all where none does.
+
+    Returns:
+        By axis: the drift at each horizon, and why some horizons are absent.
+    """
+    axes = list(zip(system.coordinates, system.coordinate_units, strict=True))
+    why = why_not_free(system, motions, parameters)
+    if why:
+        return {axis: AxisDrift(unit=unit, horizons=(), reason=why) for axis, unit in axes}
+    chosen = [k for k, counts in enumerate(judged) if counts] or range(len(motions))
+    starts = _STARTS_OF_ROBOT if system.model.device.robot is not None else _STARTS
+    if len(chosen) > starts:  # one from each of so many, spread over the session
+        chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, starts).round().astype(int)]
+    usable = [max(motions[k].t[-1] - motions[k].t[0] - 2.0 * _MARGIN_S, 0.0) for k in chosen]
+    spacing = sum(usable) / starts
+    runs = [
+        run
+        for k, length in zip(chosen, usable, strict=True)
+        for run in _let_go(
+            system, motions[k], parameters[k], length, length if len(chosen) == starts else spacing
+        )
+    ]
+    found = {axis: AxisDrift(unit=unit, horizons=()) for axis, unit in axes}
+    for horizon in HORIZONS_S:
+        if all(entry.reason for entry in found.values()):
+            break  # the longest runs, which cost most, would say nothing of any axis
+        reached = [reach for run in runs if (reach := next(run, None)) is not None]
+        for i, (axis, _) in enumerate(axes):
+            if not found[axis].reason:
+                found[axis] = found[axis].model_copy(
+                    update=_drift(reached, i, horizon, found[axis])
+                )
+    return found
+
+
+def why_not_free(system: System, motions: Sequence[Motion], parameters: Sequence[Array]) -> str:
+    """Why a model does not run by the measured force alone; "" where it may."""
+    if system.model.device.prescribed:
+        return "A machine prescribes the motion, and the force is what that takes."
+    robot = system.model.device.robot is not None
+    if not robot and is_stiff(system, parameters[0][: len(system.parameters)], motions[0]):
+        return (
+            "Friction would stop the machine within a small part of a sample: its drive gives the"
+            " motion, and the force is what that takes."
+        )
+    return ""
+
+
+def _let_go(
+    system: System, motion: Motion, parameters: Array, length: float, spacing: float
+) -> list[Iterator[_Reach]]:
+    """Runs from many samples of a trial; ``length`` and ``spacing`` of the starts, s."""
+    p = np.ascontiguousarray(parameters[: len(system.parameters)])
+    u = motion.inputs(system.inputs)
+    dt = float(motion.t[1] - motion.t[0])
+    true = motion.of_mechanism(system, u, p)
+    states = np.hstack([true.q, true.qd, system.memory(*true.kinematics, u, p, true.t)])
+    last = len(motion.t) - 1 - round(_MARGIN_S / dt)
+
+    def run(start: int, state: Array | None) -> Iterator[_Reach]:
+        """Let the model run on to each horizon that the trial holds."""
+        at = start
+        for horizon in HORIZONS_S:
+            end = start + round(horizon / dt)
+            if end > last:
+                return
+            if state is not None:
+                state = _simulate_from(system, state, u[at : end + 1], p, dt)
+            at, measured = end, motion.q[start : end + 1]
+            error = np.full(motion.q.shape[1], np.inf)
+            if state is not None:
+                reading = system.encoder_readings(state[None], u[[end]], p)[0]
+                error = np.abs(reading[: error.size] - measured[-1])
+            moves = np.ptp(measured, axis=0) > _MOVES * np.ptp(motion.q, axis=0)
+            yield error, np.abs(measured[-1] - measured[0]), moves
+
+    count = int(length / spacing) if spacing > 0.0 else 0
+    starts = (round((_MARGIN_S + (number + 0.5) * spacing) / dt) for number in range(count))
+    return [run(k, states[k]) for k in starts]
+
+
+def _simulate_from(system: System, state: Array, u: Array, p: Array, dt: float) -> Array | None:
+    """The state (nx,) at the last of the inputs (T, n_u); None if the motion runs away."""
+    for step in _STEPS_S:
+        with contextlib.suppress(Runaway):
+            return np.asarray(_simulate(system, state, u, p, dt, step)[-1])
+    return None
+
+
+def _simulate(
+    system: System, state: Array, u: Array, p: Array, dt: float, step: float = MAX_STEP_S
+) -> Array:
+    """States (T, nx) under the inputs (T, n_u) alone, from ``state`` on."""
+    return simulate(
+        system.derivative, state, u, p[: len(system.parameters)], dt, width=system.sign_widths,
+        n_noise=len(system.noise), smooth=system.forced, max_step=step,
+    )  # fmt: skip
+
+
+def _drift(
+    reached: Sequence[_Reach], axis: int, horizon: float, shorter: AxisDrift
+) -> dict[str, object]:
+    """Return what a horizon, s, adds to what shorter ones say of one axis, or why it is absent."""
+    used = [(error[axis], way[axis]) for error, way, moves in reached if moves[axis]]
+    error = np.array([error for error, _ in used])
+    if len(used) < _LEAST:
+        return {"reason": f"In {len(used)} windows of {horizon:g} s the axis moves: too few."}
+    if np.mean(np.isinf(error)) > _RUNS_AWAY:
+        return {"reason": f"Within {horizon:g} s the simulated motion runs away."}
+    median, most = np.quantile(error, [0.5, 0.9], method="inverted_cdf")
+    displacement = float(np.median([way for _, way in used]))
+    if median > displacement or not np.isfinite(most):
+        return {"reason": f"In {horizon:g} s the model drifts further than the axis moves."}
+    drift = Drift(
+        horizon_s=horizon, median=median, quantile_90=most, displacement=displacement,
+        windows=len(used),
+    )  # fmt: skip
+    return {"horizons": (*shorter.horizons, drift)}

@@ -16,8 +16,7 @@ from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_m
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session
 from bampipe.errors import InputError
-from bampipe.identification.drift import find_drift
-from bampipe.identification.free_run import free_runs
+from bampipe.identification.free_run import find_drift, free_runs
 from bampipe.identification.terms import describe_terms
 from bampipe.phrases.results import find_failed_checks
 from bampipe.physics import System, compile_model

@@ -7,8 +7,8 @@ import pytest
 from independent_runs import record_trials
 
 from bampipe.diagnosis.session import system_of
-from bampipe.identification import drift
-from bampipe.identification.drift import HORIZONS_S, find_drift
+from bampipe.identification import free_run
+from bampipe.identification.free_run import HORIZONS_S, find_drift
 from bampipe.physics import Model, compile_model, registry
 from bampipe.trials.motion import Motion
 
@@ -103,7 +103,7 @@ def test_the_true_model_stays_close_to_an_independent_simulator(tmp_path):
 
 
 def test_of_more_trials_than_starts_each_of_so_many_has_one(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(drift, "_STARTS", 12)
+    monkeypatch.setattr(free_run, "_STARTS", 12)
     trials = [motion(seconds=4.0)] * 30
     found = find_drift(SLIDER, trials, [parameters()] * 30, [True] * 30)["carriage"]
     assert found.horizons[0].windows == 12
