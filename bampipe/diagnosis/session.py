@@ -34,7 +34,6 @@ from bampipe.trials.likelihood import (
     describe_noise,
     dry_friction,
     lay_out_samples,
-    sign_widths,
     solve_bounded,
     take_samples,
 )
@@ -434,7 +433,7 @@ def _residuals_of_replay(seed: tuple[int, ...]) -> list[Array]:
 def _narrower_friction(evidence: Evidence) -> list[Array]:
     """What Coulomb friction leaves whose sign is narrower than the model's, by trial, (K, n_q)."""
     e = evidence
-    width = sign_widths(e)
+    width = e.system.sign_widths
     rows = [
         dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width))
         for dry, m in zip(dry_friction(e), e.motions, strict=True)

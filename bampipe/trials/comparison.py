@@ -11,6 +11,7 @@ from bampipe.physics import System
 from bampipe.results.validate import AxisError
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.motion import force_columns
 from bampipe.trials.replay import UNLIKE, StandIn, replay_motions
 from bampipe.trials.residuals import ModelOnTrial, rms
 
@@ -54,7 +55,6 @@ def compare_trial(evidence: Evidence, number: int, p: Array, late_s: float = 0.0
     band, folds = evidence.band, evidence.folds
     u = motion.inputs(system.inputs)
     applied = ModelOnTrial(system, p, [motion]).applied
-    force = [system.inputs.index(name) for name in system.model.device.forces]
     rows = band.thinned_rows(len(motion.t))
     residual = band.thin(ModelOnTrial(system, p, timed).residual)
     return ComparedTrial(
@@ -65,7 +65,7 @@ def compare_trial(evidence: Evidence, number: int, p: Array, late_s: float = 0.0
         residual=residual,
         residual_held_out=evidence.held_out_residual(number),
         residual_without_friction=band.thin(ModelOnTrial(system, frictionless, timed).residual),
-        force=band.thin_input(u[:, force]),
+        force=band.thin_input(u[:, force_columns(system)]),
         force_residual=system.least_force(motion.q[rows], residual, u[rows], p),
         judged=folds.judged[number] and not folds.nothing_held_out,
     )

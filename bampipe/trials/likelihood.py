@@ -17,7 +17,7 @@ beta and gamma of each axis, and the time by which inputs were sampled late.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -26,7 +26,6 @@ import numpy as np
 from bampipe.arrays import Array, Flags, Indices
 from bampipe.physics.effect import BoundEffect
 from bampipe.trials.evidence import Evidence
-from bampipe.trials.motion import Motion
 from bampipe.trials.scale import bare_slopes
 
 _SPEEDS = 12
@@ -141,7 +140,8 @@ def describe_noise(
         stopping: the same of a replay whose friction truly stops it.
         evidence: the model on the measured trials; samples: of it that count.
     """
-    speeds = _by_row(evidence, lambda motion, kept: np.abs(motion.qd[kept]))
+    thinned = evidence.band.thinned_rows
+    speeds = [np.abs(m.qd[thinned(len(m.t))]) for m in evidence.motions]
     biases, variances, by_axis, classes = [], [], [], []
     for axis, here in enumerate(samples):
         left = np.array([take_samples(r, here, axis) for r in residuals])
@@ -156,12 +156,6 @@ def describe_noise(
         classes.append(at)
     stops = tuple(take_samples(stopping, here, axis) for axis, here in enumerate(samples))
     return Noise(tuple(biases), tuple(variances), stops, tuple(by_axis), tuple(classes))
-
-
-def _by_row(evidence: Evidence, values: Callable[[Motion, Indices], Array]) -> list[Array]:
-    """Values of each trial at the thinned samples, (K, n_q)."""
-    band = evidence.band
-    return [values(m, band.thinned_rows(len(m.t))) for m in evidence.motions]
 
 
 @dataclass(frozen=True)
@@ -446,14 +440,9 @@ def _error_of_turning(evidence: Evidence) -> list[Array]:
     By trial, each (T, n_q), N.m or N: the change of friction from sample to sample, times the
     standard deviation of a moment that lies evenly between two of them.
     """
-    width = sign_widths(evidence)
+    width = evidence.system.sign_widths
     jumps = [np.gradient(np.tanh(m.qd / width), axis=0) for m in evidence.motions]
     return [d * j / np.sqrt(12.0) for d, j in zip(dry_friction(evidence), jumps, strict=True)]
-
-
-def sign_widths(evidence: Evidence) -> Array:
-    """Width of the sign of each axis' velocity, (n_q,), rad/s or m/s."""
-    return np.array([c.sign_width for c in evidence.system.model.device.coordinates])
 
 
 def dry_friction(evidence: Evidence) -> list[Array]:
@@ -461,7 +450,7 @@ def dry_friction(evidence: Evidence) -> list[Array]:
 
     Half the difference between moving slowly one way and the other, brakes included.
     """
-    found, slow = [], _SLOW * sign_widths(evidence)
+    found, slow = [], _SLOW * evidence.system.sign_widths
     for at in evidence.fitted:
         q, qd, qdd = at.mechanism.kinematics
         back, on = (

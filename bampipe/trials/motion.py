@@ -165,6 +165,11 @@ def input_derivatives(name: str) -> tuple[str, ...]:
     return tuple(derivative(name, order) for order in range(1, len(INPUT_ORDERS)))
 
 
+def force_columns(system: System) -> list[int]:
+    """Columns of the inputs of a model that are measured forces."""
+    return [system.inputs.index(name) for name in system.model.device.forces]
+
+
 def n_samples(motion: Motion) -> int:
     """Return the number of samples of a trial."""
     return int(motion.t.size)

@@ -9,6 +9,7 @@ would carry away. What it does is read by the same sensors and goes through
 the same filters.
 """
 
+import pickle
 import shutil
 import tempfile
 import weakref
@@ -17,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -31,10 +32,9 @@ from bampipe.physics.device import derivative
 from bampipe.trials.cache import MOST_SAMPLES, TrialCache
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import (
-    SAMPLED,
-    EncoderFilters,
     Motion,
     Recording,
+    force_columns,
     input_derivatives,
     n_samples,
     trial_sizes,
@@ -124,27 +124,25 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     """
     u = motion.inputs(system.inputs)
     fitted = ModelOnTrial(system, p, [motion])
-    if _is_motion_given(fitted, u):
-        return Course(motion.q, _required_force(fitted, u, rate_hz))
+    if _is_motion_given(fitted):
+        return Course(motion.q, _required_force(fitted, rate_hz))
     q, qd = _reference(system, p, motion, u, rate_hz)
     start = np.concatenate([q[0], qd[0], system.initial_memory(q[0], u[0], p)])
     at = {name: i for i, name in enumerate(system.inputs)}
     forces = system.model.device.forces
-    columns = [at[f] for f in forces]
+    columns = force_columns(system)
     # A delay by derivatives holds within the band of a residual; a simulated machine feels what is
     # beyond it, too, such as the jumps of a drive. So its forces are moved, and it has no delay.
-    late = _lateness(fitted, u) * rate_hz
+    late = _lateness(fitted) * rate_hz
     acting, prompt = u.copy(), _without_delays(system, p)
     for force, samples in zip(forces, late, strict=True):
         for name in (force, *input_derivatives(force)):
             if name in at:
                 acting[:, at[name]] = _shifted(u[:, at[name]], -samples)
-    widths = np.array([c.sign_width for c in system.model.device.coordinates])
     try:
         x, total = simulate_tracking(
             system.derivative, start, acting, prompt, 1.0 / rate_hz, q, qd,
-            width=widths, n_noise=len(system.noise),
-            force=columns,
+            width=system.sign_widths, n_noise=len(system.noise), force=columns,
             rate=[at.get(derivative(f, 1), -1) for f in forces],
             curvature=[at.get(derivative(f, 2), -1) for f in forces],
             smooth=system.forced, moved_first=system.moved_first,
@@ -152,10 +150,10 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     except Runaway:
         if not _is_controlled(system):
             raise
-        return Course(motion.q, _required_force(fitted, u, rate_hz))
+        return Course(motion.q, _required_force(fitted, rate_hz))
     strayed = np.abs(x[:, : q.shape[1]] - q).max(axis=0) > _FARTHEST * np.ptp(q, axis=0)
     if _is_controlled(system) and strayed.any():  # no likeness of a held robot
-        return Course(motion.q, _required_force(fitted, u, rate_hz))
+        return Course(motion.q, _required_force(fitted, rate_hz))
     seen = system.encoder_readings(x, total, prompt)[:, : len(system.coordinates)]
     arm = total[:, columns] - acting[:, columns]
     logged = [_shifted(pull, samples) for pull, samples in zip(arm.T, late, strict=True)]
@@ -177,14 +175,13 @@ def steps_to_follow(
     return count_steps(
         system.derivative, np.hstack([true.q, true.qd, memory])[rows], u[rows],
         np.ascontiguousarray(p), float(motion.t[1] - motion.t[0]),
-        width=np.array([c.sign_width for c in system.model.device.coordinates]),
-        n_noise=len(system.noise), max_step=longest_step_s,
+        width=system.sign_widths, n_noise=len(system.noise), max_step=longest_step_s,
     )  # fmt: skip
 
 
-def _lateness(fitted: ModelOnTrial, u: Array) -> Array:
+def _lateness(fitted: ModelOnTrial) -> Array:
     """Time by which each force acts after it was logged, (n_f,), s; negative if it acts before."""
-    system, p, motion = fitted.system, fitted.p, fitted.motion
+    system, p, motion, u = fitted.system, fitted.p, fitted.motion, fitted.inputs
     found = np.zeros(len(system.model.device.forces))
     if not system.delays:
         return found
@@ -216,15 +213,15 @@ def _shifted(values: Array, samples: float) -> Array:
 
 def keep_motion(fitted: Sequence[ModelOnTrial]) -> bool:
     """Whether replays of a model keep the motion of every trial, and its turns, as measured."""
-    return all(_is_motion_given(each, each.motion.inputs(each.system.inputs)) for each in fitted)
+    return all(_is_motion_given(each) for each in fitted)
 
 
-def _is_motion_given(fitted: ModelOnTrial, u: Array) -> bool:
+def _is_motion_given(fitted: ModelOnTrial) -> bool:
     system = fitted.system
     if system.model.device.prescribed:
         return True
     if system.model.device.robot is not None:
-        return _is_controlled(system) and _jumps(fitted, u)
+        return _is_controlled(system) and _jumps(fitted)
     return is_stiff(system, fitted.p, fitted.motion)
 
 
@@ -239,16 +236,16 @@ def _is_controlled(system: System) -> bool:
     return system.model.device.robot is not None and not system.undriven
 
 
-def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
+def _jumps(fitted: ModelOnTrial) -> bool:
     """Whether the drives of a robot jump, within a sample, as friction does where a joint turns.
 
     Between two samples nothing says when they do: driven by such a log, a model would stick for as
     long as that, and be rougher than the machine. Of a drive that acts late they stand earlier in
     the log, of one that is read late they stand later, spread over two samples.
     """
-    system, motion = fitted.system, fitted.motion
-    forces = [system.inputs.index(name) for name in system.model.device.forces]
-    given = np.einsum("tqf,tf->tq", system.input_map(motion.q, u, fitted.p), u[:, forces])
+    motion, u = fitted.motion, fitted.inputs
+    gains = fitted.system.input_map(motion.q, u, fitted.p)
+    given = np.einsum("tqf,tf->tq", gains, u[:, force_columns(fitted.system)])
     logged, needed = np.diff(given, axis=0), np.diff(given - fitted.residual, axis=0)
     turns = np.diff(np.sign(motion.qd), axis=0) != 0.0
     wanted, count = needed * turns, len(turns)
@@ -262,15 +259,14 @@ def _jumps(fitted: ModelOnTrial, u: Array) -> bool:
     return bool(known.any() and np.all(made[known] > _JUMPS * whole[known]))
 
 
-def _required_force(fitted: ModelOnTrial, u: Array, rate_hz: float) -> Array:
+def _required_force(fitted: ModelOnTrial, rate_hz: float) -> Array:
     """The force that the model needs for the motion as measured, (T, n_f): none is left over.
 
     What acts late is logged as much earlier, sample by sample: a jump of friction then falls
     between other samples than those of the position, which no delay of the log as a whole gives.
     """
     system, motion = fitted.system, fitted.motion
-    forces = [system.inputs.index(name) for name in system.model.device.forces]
-    found, late = u[:, forces].copy(), _lateness(fitted, u) * rate_hz
+    found, late = fitted.inputs[:, force_columns(system)].copy(), _lateness(fitted) * rate_hz
     for samples in np.unique(late):
         at = fitted
         if late.any():
@@ -287,7 +283,7 @@ def _cancel_residual(fitted: ModelOnTrial) -> Array:
     its own, such as a lag, has no slope by the force of the moment; that is taken to be one.
     """
     system, motion, p = fitted.system, fitted.motion, fitted.p
-    columns = [system.inputs.index(name) for name in system.model.device.forces]
+    columns = force_columns(system)
     u, first = motion.inputs(system.inputs).copy(), 0.0
     for number in range(_CORRECTIONS):
         at = motion.of_mechanism(system, u, p).kinematics
@@ -409,39 +405,23 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
     """
     with temporary_space():
         folder = Path(tempfile.mkdtemp(prefix="bampipe-trials-"))
-    count, filters = 0, None
+    count = 0
     try:
         for count, motion in enumerate(motions, start=1):
-            arrays: dict[str, Any] = {f"channel {name}": x for name, x in motion.channels.items()}
-            for name in SAMPLED:
-                arrays[name] = getattr(motion, name)
-            filters = motion.filters
-            if motion.left_out is not None:
-                arrays["left_out"] = motion.left_out
             with temporary_space():
-                np.savez(folder / f"{count - 1}.npz", trial_id=motion.trial_id, **arrays)
+                stored = pickle.dumps(replace(motion, _columns={}), pickle.HIGHEST_PROTOCOL)
+                (folder / str(count - 1)).write_bytes(stored)
     except BaseException:
         shutil.rmtree(folder)
         raise
-    trials = TrialCache(
-        lambda number: _stored_motion(folder / f"{number}.npz", filters), count, n_samples
-    )
+
+    def fetch(number: int) -> Motion:
+        motion: Motion = pickle.loads((folder / str(number)).read_bytes())
+        return motion
+
+    trials = TrialCache(fetch, count, n_samples)
     weakref.finalize(trials, shutil.rmtree, folder)
     return trials
-
-
-def _stored_motion(path: Path, filters: EncoderFilters | None) -> Motion:
-    with np.load(path) as stored:
-        channels = {
-            name.removeprefix("channel "): stored[name]
-            for name in stored.files
-            if name.startswith("channel ")
-        }
-        arrays = {name: stored[name] for name in SAMPLED}
-        trial_id, left_out = str(stored["trial_id"]), stored.get("left_out")
-        return Motion(
-            trial_id=trial_id, channels=channels, left_out=left_out, filters=filters, **arrays
-        )
 
 
 def _reference(

@@ -111,17 +111,18 @@ def test_the_jumps_of_a_drive_that_acts_or_is_read_late_are_seen(late: float) ->
         inputs=("drive",), input_map=lambda q, u, p: np.ones((len(q), 1, 1)),
         model=SimpleNamespace(device=SimpleNamespace(forces=("drive",))),
     )  # fmt: skip
-    columns = [x[:, None] for x in (q, qd, qdd)]
-    motion = SimpleNamespace(q=columns[0], qd=columns[1])
-    fitted = SimpleNamespace(
-        system=system, motion=motion, p=np.zeros(1), residual=(given - needed)[:, None]
-    )
-    assert replay._jumps(fitted, given[:, None])
-    built_up = np.convolve(given, np.ones(10) / 10.0, mode="same")[:, None]
-    slow = SimpleNamespace(
-        system=system, motion=motion, p=np.zeros(1), residual=built_up - needed[:, None]
-    )
-    assert not replay._jumps(slow, built_up)
+    motion = SimpleNamespace(q=q[:, None], qd=qd[:, None])
+
+    def jumps(force) -> bool:
+        return replay._jumps(
+            SimpleNamespace(
+                system=system, motion=motion, p=np.zeros(1), inputs=force[:, None],
+                residual=(force - needed)[:, None],
+            )
+        )  # fmt: skip
+
+    assert jumps(given)
+    assert not jumps(np.convolve(given, np.ones(10) / 10.0, mode="same"))
 
 
 @pytest.mark.parametrize("machine", ["axis", "joint"])
@@ -165,9 +166,8 @@ def test_the_force_that_a_motion_needs_leaves_no_residual(fitted, effect, values
         [values[q.name.removeprefix(f"{head}.")] for q in system.parameters[len(evidence.p) :]],
     )
     motion = trials.motions[0]
-    u = motion.inputs(system.inputs)
     measured = ModelOnTrial(system, p, [motion])
-    force = replay._required_force(measured, u, trials.sensors.rate_hz)
+    force = replay._required_force(measured, trials.sensors.rate_hz)
     named = dict(zip(system.model.device.forces, force.T, strict=True))
     needed = ModelOnTrial(system, p, [motion.with_channels(named)])
     before, after = (
@@ -188,5 +188,5 @@ def test_how_late_a_force_acts_is_read_off_the_model(fitted, effect, late) -> No
     motion = trials.motions[0]
     derivatives = {name: np.zeros(motion.t.size) for name in system.inputs}
     motion = motion.with_channels(derivatives | dict(motion.channels))
-    found = replay._lateness(ModelOnTrial(system, p, [motion]), motion.inputs(system.inputs))
+    found = replay._lateness(ModelOnTrial(system, p, [motion]))
     np.testing.assert_allclose(found, [late], atol=1e-9)
