@@ -24,11 +24,11 @@ from bampipe.identification.filter_run import (
     Attempt,
     FilterRun,
     MotionLost,
+    TrialFilter,
     build_filter_model,
     choose_stride,
     clear_of_reversal_mask,
     load_filter_trial,
-    run_filter,
 )
 from bampipe.identification.filter_tables import (
     check_innovations,
@@ -190,22 +190,16 @@ class _Filtering:
 
     def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
         """Filter all trials from the first of some starts that holds on to the motion."""
-        names = trial_names(self.motions)
-
-        def report_progress(done: int, place: int) -> None:
-            self.report_progress(0.35 + 0.6 * done / (len(names) + 1), names[place])
-
-        def lost_error(what: str, place: int) -> MotionLost:
-            remedy = (
-                "try --method least-squares, or set the trial aside if its sensors jumped there"
-            )
-            message = what.format(names[place])
-            return MotionLost(message, where=f"model {self.task.name}", remedy=remedy)
-
-        return run_filter(
-            self.model, self.trials, attempts, settings, self.choice, report_progress, lost_error,
+        return TrialFilter(
+            self.model,
+            self.trials,
+            self.choice,
+            trial_names(self.motions),
             self.task.system.coordinates,
-        )  # fmt: skip
+            f"model {self.task.name}",
+            "try --method least-squares, or set the trial aside if its sensors jumped there",
+            lambda fraction, message: self.report_progress(0.35 + 0.6 * fraction, message),
+        ).run(attempts, settings)
 
     def find(self) -> tuple[FilterRun, _Width | None]:
         """The run that counts, and the narrower width of the sign if readings ask for one."""

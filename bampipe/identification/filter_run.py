@@ -1,6 +1,6 @@
 """Raw samples through the unscented filter: a search for the region of the answer, then all."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,9 +12,9 @@ from bampipe.estimate.differentiation import spline_curvature
 from bampipe.estimate.filter_uncertainty import at_block_ends
 from bampipe.estimate.innovations import average_stretches
 from bampipe.estimate.unscented import (
-    FilteredTrial,
     FilterFailure,
     FilterModel,
+    FilterOutcome,
     FilterSettings,
     Stored,
     Trial,
@@ -22,6 +22,7 @@ from bampipe.estimate.unscented import (
 )
 from bampipe.identification.sensor_noise import FilterChoice, Noise
 from bampipe.physics import System
+from bampipe.progress import Progress
 from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.reading import input_columns, read_samples
 
@@ -252,102 +253,103 @@ def build_filter_model(
     )
 
 
-def run_filter(
-    model: FilterModel,
-    trials: Sequence[Trial],
-    attempts: Sequence[Attempt],
-    settings: FilterSettings,
-    choice: FilterChoice,
-    report_progress: Callable[[int, int], None],
-    lost_error: Callable[[str, int], MotionLost],
-    axes: Sequence[str],
-) -> FilterRun:
-    """Converge on the first trial, then filter all trials; the first attempt that holds counts.
+@dataclass(frozen=True)
+class TrialFilter:
+    """The filter over all trials of a session.
 
-    A filter that trusts its model far from the truth does not find back. The first trial is
-    filtered with much process noise, which adds next to no information, and filtered again at
-    the end in its own right.
-
-    Args:
-        attempts: where to start, one after the other.
-        report_progress: called with the number of trials done and the index of the next.
-        lost_error: makes the error from what happened and the index of the trial.
-        axes: names of the readings, for messages.
-
-    Raises:
-        MotionLost: no attempt followed the motion.
+    Attributes:
+        model, trials, choice: of the filter; names: of the trials; axes: of the readings.
+        where, remedy: said where the motion is lost.
+        report_progress: called with the share of the trials that is done and the next one's name.
     """
-    engine = filter_trials
-    if choice.engine == "filterpy":
-        from bampipe.estimate.filterpy_engine import filter_trials_by_filterpy as engine
-    order = (*range(1, len(trials)), 0)
-    failure: tuple[int, FilterFailure] | None = None
-    found: FilterRun | None = None
-    for restarts, (value, sd, factor) in enumerate(attempts):
-        mean, spread = model.to_estimated(value, sd)
-        level = replace(settings, noise_sd=factor * settings.noise_sd)
-        report_progress(0, 0)
-        place = 0
-        try:
-            search = engine(
-                model, trials[:1], mean, np.diag(spread**2),
-                replace(level, noise_sd=_COARSE * level.noise_sd),
+
+    model: FilterModel
+    trials: Sequence[Trial]
+    choice: FilterChoice
+    names: Sequence[str]
+    axes: Sequence[str]
+    where: str
+    remedy: str
+    report_progress: Progress
+
+    def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
+        """Converge on the first trial, then filter all trials; the first attempt that holds counts.
+
+        A filter that trusts its model far from the truth does not find back. The first trial is
+        filtered with much process noise, which adds next to no information, and filtered again at
+        the end in its own right.
+
+        Args:
+            attempts: where to start, one after the other.
+
+        Raises:
+            MotionLost: no attempt followed the motion.
+        """
+        engine, trials = filter_trials, self.trials
+        if self.choice.engine == "filterpy":
+            from bampipe.estimate.filterpy_engine import filter_trials_by_filterpy as engine
+        order = (*range(1, len(trials)), 0)
+        why, found = "", None
+        for restarts, (value, sd, factor) in enumerate(attempts):
+            mean, spread = self.model.to_estimated(value, sd)
+            level = replace(settings, noise_sd=factor * settings.noise_sd)
+            coarse = replace(level, noise_sd=_COARSE * level.noise_sd)
+            place = 0
+            try:
+                self._report(0, place)
+                search = engine(self.model, trials[:1], mean, np.diag(spread**2), coarse)
+                theta, covariance, passes = search.theta, search.covariance, []
+                for done, place in enumerate(order, start=1):
+                    one = engine(self.model, [trials[place]], theta, covariance, level)
+                    theta, covariance = one.theta, one.covariance
+                    passes.append(self._summarise(one, place))
+                    self._report(done, place)
+                    if _is_lost(passes[-1]):
+                        break  # whatever the other trials say
+            except FilterFailure as lost:
+                t = trials[place].t[min(lost.sample, trials[place].t.size - 1)]
+                why = f"the filter lost the motion of trial {self.names[place]} at {t:.2f} s:"
+                why += f" {lost.reason}"
+                continue
+            found = FilterRun(
+                self._summarise(search, 0), search.theta, search.covariance, tuple(passes),
+                theta, covariance, level, order, restarts,
             )  # fmt: skip
-            theta, covariance, passes = search.theta, search.covariance, []
-            for done, place in enumerate(order, start=1):
-                trial = trials[place]
-                one = engine(model, [trial], theta, covariance, level)
-                theta, covariance = one.theta, one.covariance
-                passes.append(_summarise_pass(one.trials[0], trial, choice.block_s))
-                report_progress(done, place)
-                if _is_lost(passes[-1]):
-                    break  # whatever the other trials say
-        except FilterFailure as lost_motion:
-            failure = (place, lost_motion)
-            continue
-        found = FilterRun(
-            _summarise_pass(search.trials[0], trials[0], choice.block_s),
-            search.theta, search.covariance, tuple(passes),
-            theta, covariance, level, order, restarts,
-        )  # fmt: skip
-        if not _is_lost(passes[-1]):
-            return found
-    if found is not None:
-        worst = int(np.argmax([trial.nis for trial in found.trials]))
-        ratio = found.trials[worst].ratio
-        axis = (*axes, *axes)[int(np.argmax(ratio))]
-        raise lost_error(
-            f"the filter does not follow trial {{}}: its prediction of {axis} one sample ahead errs"
-            f" {ratio.max():.0f} times more than noise explains",
-            found.order[worst],
+            if not _is_lost(passes[-1]):
+                return found
+        if found is not None:
+            worst = int(np.argmax([trial.nis for trial in found.trials]))
+            ratio = found.trials[worst].ratio
+            axis = (*self.axes, *self.axes)[int(np.argmax(ratio))]
+            why = (
+                f"the filter does not follow trial {self.names[found.order[worst]]}: its prediction"
+                f" of {axis} one sample ahead errs {ratio.max():.0f} times more than noise explains"
+            )
+        raise MotionLost(why, where=self.where, remedy=self.remedy)
+
+    def _report(self, done: int, place: int) -> None:
+        self.report_progress(done / (len(self.names) + 1), self.names[place])
+
+    def _summarise(self, filtered: FilterOutcome, place: int) -> Pass:
+        """What later steps need of the one trial that was filtered, the trial of that place."""
+        one, trial = filtered.trials[0], self.trials[place]
+        size = np.asarray(one.innovation / one.innovation_sd)
+        present = ~np.isnan(one.nis)
+        samples = max(1, round(STRETCH_S / float(np.median(np.diff(trial.t)))))
+        return Pass(
+            t=one.t,
+            mean=one.mean,
+            variance=np.diagonal(one.covariance, axis1=1, axis2=2).copy(),
+            ends=at_block_ends(one, self.choice.block_s),
+            nis=float(one.nis[present].mean()) if present.any() else np.inf,
+            counted=int(present.sum()),
+            log_likelihood=float(np.nansum(one.log_likelihood)),
+            ratio=np.sqrt(np.nanmean(size**2, axis=0)),
+            stretches=average_stretches(size, samples),
+            inputs=average_stretches(trial.u, samples),
+            stretch_samples=samples,
         )
-    assert failure is not None
-    place, error = failure
-    t = trials[place].t[min(error.sample, trials[place].t.size - 1)]
-    raise lost_error(
-        f"the filter lost the motion of trial {{}} at {t:.2f} s: {error.reason}", place
-    )
 
 
 def _is_lost(one: Pass) -> bool:
     return not one.nis / len(one.ratio) < _LARGEST_NIS
-
-
-def _summarise_pass(filtered: FilteredTrial, trial: Trial, block_s: float) -> Pass:
-    """What later steps need of a filtered trial."""
-    size = np.asarray(filtered.innovation / filtered.innovation_sd)
-    present = ~np.isnan(filtered.nis)
-    samples = max(1, round(STRETCH_S / float(np.median(np.diff(trial.t)))))
-    return Pass(
-        t=filtered.t,
-        mean=filtered.mean,
-        variance=np.diagonal(filtered.covariance, axis1=1, axis2=2).copy(),
-        ends=at_block_ends(filtered, block_s),
-        nis=float(filtered.nis[present].mean()) if present.any() else np.inf,
-        counted=int(present.sum()),
-        log_likelihood=float(np.nansum(filtered.log_likelihood)),
-        ratio=np.sqrt(np.nanmean(size**2, axis=0)),
-        stretches=average_stretches(size, samples),
-        inputs=average_stretches(trial.u, samples),
-        stretch_samples=samples,
-    )

@@ -20,11 +20,10 @@ from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.identification.filter_run import (
     Attempt,
     FilterRun,
-    MotionLost,
+    TrialFilter,
     build_filter_model,
     choose_stride,
     load_filter_trial,
-    run_filter,
 )
 from bampipe.identification.filter_tables import tabulate_trace
 from bampipe.identification.sensor_noise import FilterChoice, sensor_noise, untuned_settings
@@ -37,7 +36,7 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.rounding import round_with_sd
 from bampipe.results.viscous import Damping, ViscousResult
 from bampipe.schema import STRICT, Positive
-from bampipe.trials.motion import Motion
+from bampipe.trials.motion import Motion, trial_names
 from bampipe.trials.reading import read_kinematics, read_motion, read_sensors
 
 SUMMARY = "Cartesian damping that the brakes rendered in the viscous trials, against the command"
@@ -138,18 +137,17 @@ def _estimated(
     sd = np.array([known[item.name].sd if item.name in known else item.sd for item in free])
     sd = np.maximum(sd, 1e-9 * np.maximum(np.abs(value), 1e-6))
 
-    def report_progress(done: int, place: int) -> None:
-        progress(0.2 + 0.75 * done / (len(readings) + 1), motions[place].trial_id)
-
-    def lost_error(what: str, place: int) -> MotionLost:
-        remedy = "set the trial aside, or identify with an effect of the brakes"
-        message = what.format(motions[place].trial_id)
-        return MotionLost(message, where=f"model {config.model}", remedy=remedy)
-
     attempts: list[Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
-    found = run_filter(
-        model, readings, attempts, settings, config, report_progress, lost_error, system.coordinates
-    )
+    found = TrialFilter(
+        model,
+        readings,
+        config,
+        trial_names(motions),
+        system.coordinates,
+        f"model {config.model}",
+        "set the trial aside, or identify with an effect of the brakes",
+        lambda fraction, message: progress(0.2 + 0.75 * fraction, message),
+    ).run(attempts, settings)
     estimate, slope = model.to_physical(found.theta)
     names = [item.name for item in free]
     field = [i for i, name in enumerate(names) if name.startswith(f"{FIELD}.")]

@@ -81,15 +81,6 @@ class _Blocks:
 
 
 @dataclass(frozen=True)
-class _Stretch:
-    """What one axis says of a stretch, from the words "the error" on."""
-
-    start_s: float
-    end_s: float
-    words: str
-
-
-@dataclass(frozen=True)
 class _Samples:
     """Thinned samples of all trials, one after the other.
 
@@ -112,8 +103,10 @@ class _Samples:
     excess: Array
     used: Flags
 
-    def judge(self, axis: int, first: int, last: int, undisturbed: Flags) -> _Stretch | None:
+    def judge(self, axis: int, first: int, last: int, undisturbed: Flags) -> Disturbance | None:
         """Blocks ``first`` to ``last`` as a stretch to leave out; None if its error comes back.
+
+        The reason is in words that go on from "the error".
 
         ``undisturbed`` (B,) are the blocks outside all such stretches of the axis.
         """
@@ -133,14 +126,10 @@ class _Samples:
         if not again and _rms(excess[inside]) < _ALONE * _rms(excess[outside]):
             return None
         size, rest = (_rms(self.error[part, axis]) for part in (inside, outside))
-        coordinate = self.system.model.device.coordinates[axis]
-        unit = coordinate.torque_unit
+        name, unit = self.system.coordinates[axis], self.system.torque_units[axis]
         when = "the same motion included" if again else "where it moves otherwise"
-        words = (
-            f"of {coordinate.name} is {size:.3g} {unit}, {rest:.3g} {unit} at all other times,"
-            f" {when}"
-        )
-        return _Stretch(start, end, words)
+        words = f"of {name} is {size:.3g} {unit}, {rest:.3g} {unit} at all other times, {when}"
+        return Disturbance(start_s=start, end_s=end, reason=words)
 
 
 def find_disturbances(
@@ -150,8 +139,7 @@ def find_disturbances(
 
     The bare device is fitted to the trials numbered ``fitted``. Stretches are in the order of time.
     """
-    samples = _gather(system, motions, band, fitted)
-    stretches: dict[str, list[_Stretch]] = {}
+    samples, stretches = _gather(system, motions, band, fitted), dict[str, list[Disturbance]]()
     if samples is None:
         return {}
     mean_square = samples.blocks.mean_square(samples.excess, samples.used)
@@ -166,7 +154,7 @@ def find_disturbances(
             if found is not None:
                 name = motions[int(samples.blocks.trial[first])].trial_id
                 stretches.setdefault(name, []).append(found)
-    return {name: _joined(found) for name, found in stretches.items()}
+    return {name: _join(found) for name, found in stretches.items()}
 
 
 def _gather(
@@ -226,9 +214,9 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _joined(stretches: list[_Stretch]) -> tuple[Disturbance, ...]:
+def _join(stretches: list[Disturbance]) -> tuple[Disturbance, ...]:
     """The stretches of one trial in the order of time, those that touch as one."""
-    groups: list[list[_Stretch]] = []
+    groups: list[list[Disturbance]] = []
     for one in sorted(stretches, key=lambda one: one.start_s):
         if groups and one.start_s <= max(other.end_s for other in groups[-1]):
             groups[-1].append(one)
@@ -238,7 +226,7 @@ def _joined(stretches: list[_Stretch]) -> tuple[Disturbance, ...]:
         Disturbance(
             start_s=round(group[0].start_s, 3),
             end_s=round(max(one.end_s for one in group), 3),
-            reason=f"the error {'; '.join(one.words for one in group)}: a hit, a fault of a sensor"
+            reason=f"the error {'; '.join(one.reason for one in group)}: a hit, a fault of a sensor"
             " or a start",
         )
         for group in groups
@@ -262,21 +250,14 @@ def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Mot
             if end - start >= _SHORTEST_S * rate_hz or end - start == motion.t.size:
                 rows.append(slice(start, end))
                 of_trial.append(number)
-    if len(rows) == len(motions) and all(
-        part.stop - part.start == size
-        for part, size in zip(rows, trial_sizes(motions), strict=True)
-    ):
+    if [part.stop - part.start for part in rows] == trial_sizes(motions):
         return motions, of_trial
-    names = trial_names(motions)
-    return (
-        TrialCache(
-            lambda k: motions[of_trial[k]].rows(rows[k]),
-            len(rows),
-            n_samples,
-            names=[names[number] for number in of_trial],
-        ),
-        of_trial,
+    known = trial_names(motions)
+    names = [known[number] for number in of_trial]
+    parts = TrialCache(
+        lambda k: motions[of_trial[k]].rows(rows[k]), len(rows), n_samples, names=names
     )
+    return parts, of_trial
 
 
 def _cut(times: Sequence[Array], ends_s: Sequence[float], band: Band) -> _Blocks:

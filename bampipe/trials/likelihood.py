@@ -504,31 +504,29 @@ def _pose(
         likelihood, tuple(y), tuple(x @ to for x in full), to.T @ (precision[:, None] * to),
         to.T @ (precision * known), log_scale, by_parameters @ to, to, lower, upper,
         {item.name: _absence(evidence, item) for item in effects},
-        {item.name: _spread(item) for item in effects},
-        {item.name: _shapes(evidence, item) for item in effects},
+        {
+            item.name: np.array([q.sd for q in item.parameters if q.strength and not q.fixed])
+            for item in effects
+        },
+        {item.name: tuple(_places(evidence, item, strengths=False)) for item in effects},
         0.5 * float(precision @ known**2), loose,
     )  # fmt: skip
 
 
-def _spread(item: BoundEffect) -> Array:
-    return np.array([q.sd for q in item.parameters if q.strength and not q.fixed])
-
-
-def _shapes(evidence: Evidence, item: BoundEffect) -> tuple[int, ...]:
-    names = {q.name for q in item.parameters if q.shape}
+def _places(evidence: Evidence, item: BoundEffect, *, strengths: bool) -> list[int]:
+    """Places among the free parameters of the strengths of an effect, or of its shapes."""
+    names = {q.name for q in item.parameters if (q.strength if strengths else q.shape)}
     parameters = evidence.system.parameters
-    return tuple(k for k, number in enumerate(evidence.free) if parameters[number].name in names)
+    return [k for k, number in enumerate(evidence.free) if parameters[number].name in names]
 
 
 def _absence(evidence: Evidence, item: BoundEffect) -> dict[int, float]:
-    strengths = {q.name for q in item.parameters if q.strength}
     away = {
-        place: -float(evidence.p[number])
-        for place, number in enumerate(evidence.free)
-        if evidence.system.parameters[number].name in strengths
+        place: -float(evidence.p[evidence.free[place]])
+        for place in _places(evidence, item, strengths=True)
     }
     # Without its strength a shape says nothing: it does not move to where it was expected.
-    return away | dict.fromkeys(_shapes(evidence, item), 0.0)
+    return away | dict.fromkeys(_places(evidence, item, strengths=False), 0.0)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.drafts import symbolic
 from bampipe.diagnosis.drafts.columns import FormDictionary
 from bampipe.diagnosis.drafts.effect_file import write_toml
-from bampipe.diagnosis.drafts.quantities import coordinates
+from bampipe.diagnosis.drafts.forms import list_quantities
 from bampipe.diagnosis.drafts.search import FormSearch
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.estimate.low_pass import low_pass_at
@@ -54,7 +54,7 @@ def forms_of(fit):
 def test_a_bred_expression_and_its_form_have_the_same_value(arm, text):
     _, recipe, fit = arm
     names = ("position", "extension velocity", "direction")
-    known = {q.words: q for q in coordinates(recipe.model().device, 0)}
+    known = {q.words: q for q in list_quantities(recipe.model().device, 0)}
     x = np.random.default_rng(1).uniform(-1.0, 1.0, (50, 3))
     parts = symbolic._read(text, 3)
     form, at = symbolic.write_form(forms_of(fit), [known[n] for n in names], list(parts))

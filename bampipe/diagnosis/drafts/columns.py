@@ -19,9 +19,10 @@ from bampipe.diagnosis.drafts.forms import (
     INERTIA,
     READING,
     Form,
+    Span,
     list_forms,
+    list_quantities,
 )
-from bampipe.diagnosis.drafts.quantities import Span, coordinates
 from bampipe.estimate.low_pass import low_pass_at
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import Samples
@@ -206,7 +207,7 @@ class FormDictionary:
             sign = np.tanh(qd[:, axis] / device.coordinates[axis].sign_width)
             values = {_APPLIED: applied, FRICTION: sign}
             values |= {DAMPING: qd[:, axis], INERTIA: qdd[:, axis]}
-            for c in coordinates(device, axis):
+            for c in list_quantities(device, axis):
                 by_quantity = {
                     "position": q[:, c.axis],
                     "speed": np.abs(qd[:, c.axis]),
@@ -249,7 +250,7 @@ class FormDictionary:
     @cached_property
     def spans(self) -> dict[str, Span]:
         """The range of each coordinate that varies."""
-        words = [c.words for c in coordinates(self.evidence.system.model.device, self.axis)]
+        words = [c.words for c in list_quantities(self.evidence.system.model.device, self.axis)]
         ends = {n: np.quantile(np.concatenate(self._signals[n]), _RANGE) for n in words}
         return {n: Span(float(a), float(b)) for n, (a, b) in ends.items() if b - a > 1e-9}
 

@@ -10,7 +10,6 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from bampipe.diagnosis.drafts.quantities import Quantity, Span, coordinates
 from bampipe.diagnosis.drafts.shapes import KNOTS, SHAPES, Shape
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate as Axis
@@ -71,6 +70,84 @@ _ACTS_AND_SHOWS = {
     INERTIA: ("Inertia on the axis", "in proportion to acceleration"),
     READING: ("An error of the sensor", "as an error of what the force is read to be"),
 }
+
+
+_NEAR = 2
+"""Axes whose motion may matter, in the order of the coordinates; see `effect.pairs`."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity that a residual may follow.
+
+    Attributes:
+        words: what it is, such as ``position``, ``extension speed``.
+        text: in an expression of an effect.
+        quantity: ``position``, ``speed``, ``velocity``, ``direction``, ``load``, ``time``,
+            ``command`` (of a brake or of an input that is no force), ``reading`` (of a force).
+        axis: number of the coordinate that it is of; of the axis itself where of no other.
+        unit: SI.
+        channel: of a command or a reading, where it is logged.
+    """
+
+    words: str
+    text: str
+    quantity: str
+    axis: int
+    unit: str
+    channel: str = ""
+
+    @property
+    def name(self) -> str:
+        """Its words as part of a name."""
+        return self.words.removesuffix(" command").replace(" ", "_")
+
+
+@dataclass(frozen=True)
+class Span:
+    """The range of a quantity in the trials."""
+
+    low: float
+    high: float
+
+    @property
+    def width(self) -> float:
+        """From end to end."""
+        return self.high - self.low
+
+    @property
+    def middle(self) -> float:
+        """Half-way."""
+        return 0.5 * (self.low + self.high)
+
+
+def list_quantities(device: Device, axis: int) -> tuple[Quantity, ...]:
+    """What the residual of ``axis`` may follow."""
+    own, brake = device.coordinates[axis], device.brakes.get(device.coordinates[axis].name)
+    found = [
+        Quantity("position", "q", "position", axis, own.unit),
+        Quantity("speed", "abs(qd)", "speed", axis, f"{own.unit}/s"),
+        Quantity("velocity", "qd", "velocity", axis, f"{own.unit}/s"),
+        Quantity("direction", "sgn(qd)", "direction", axis, ""),
+        Quantity("load", "load", "load", axis, own.torque_unit),
+        Quantity("time", "t", "time", axis, "s"),
+    ]
+    if brake is not None:
+        found.append(Quantity("brake command", "brake", "command", axis, own.torque_unit, brake))
+    for name, unit in device.channels.items():
+        found.append(Quantity(name, name, "command", axis, unit, name))
+    for name, channel in zip(device.components, device.forces, strict=True):
+        unit = device.force_unit
+        found.append(Quantity(f"{name} reading", "f", "reading", axis, unit, channel))
+    for k, other in enumerate(device.coordinates):
+        if 0 < abs(k - axis) <= _NEAR:
+            n, u = other.name, other.unit
+            found += [
+                Quantity(f"{n} position", n, "position", k, u),
+                Quantity(f"{n} speed", f"abs(qd_{n})", "speed", k, f"{u}/s"),
+                Quantity(f"{n} velocity", f"qd_{n}", "velocity", k, f"{u}/s"),
+            ]
+    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -322,7 +399,7 @@ def list_forms(
         curves: curves through points in place of formulas.
     """
     grammar = _CURVED if curves else _GRAMMAR
-    for coordinate in coordinates(device, axis):
+    for coordinate in list_quantities(device, axis):
         if coordinate.words not in spans:
             continue
         for (quantity, own, factor), shapes in grammar.items():

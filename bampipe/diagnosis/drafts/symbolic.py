@@ -15,8 +15,7 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.drafts.columns import FormDictionary
-from bampipe.diagnosis.drafts.forms import FORCE, Form
-from bampipe.diagnosis.drafts.quantities import Quantity, coordinates
+from bampipe.diagnosis.drafts.forms import FORCE, Form, Quantity, list_quantities
 from bampipe.diagnosis.drafts.shapes import Shape
 from bampipe.errors import InputError
 from bampipe.physics.expression import build, parse
@@ -50,7 +49,9 @@ def breed(forms: FormDictionary, problem: Problem) -> None:
     """Add formulas for what a model leaves on the axis of ``forms``, (n,) of ``problem``."""
     device, axis = forms.evidence.system.model.device, forms.axis
     known = [
-        q for q in coordinates(device, axis) if q.quantity in _FOLLOWED and q.words in forms.spans
+        q
+        for q in list_quantities(device, axis)
+        if q.quantity in _FOLLOWED and q.words in forms.spans
     ]
     x = np.column_stack([_ratios(forms, q) for q in known])
     root, base = problem.likelihood.root[axis], problem.base[axis]
