@@ -77,7 +77,6 @@ def assess_identifiability(
     total[:n, :n] += np.diag(problem.precision)
     own = total[:n, :n]
     covariance = cramer_rao_bound(own)
-    sd = np.sqrt(np.diag(covariance))
     value = p[problem.free]
     estimated = [i for i, name in enumerate(names) if name != TIMING]
     # Of inertial numbers, which all hide each other, see `BaseEstimate`.
@@ -93,42 +92,39 @@ def assess_identifiability(
     parted = [w for w in weak if not any({names[i] for i in w.members} <= g for g in groups)]
     growth = growth_without([part[:n, :n] for part in joint])[:, estimated]
     numbers = tuple(
-        _number(number, total, n, n + j, names, value, estimated)
+        _describe_number(number, total, n, n + j, names, value, estimated)
         for j, number in enumerate(known.numbers)
     )
     half = problem.upper[-1]  # of a sample: all that is assumed of the timing
     assumed = np.array([system.parameters[i].sd if i < n_p else half for i in problem.free])
-    place = np.ix_(estimated, estimated)
-    parameters = {names[i]: _entry(own, covariance, i, names) for i in estimated}
     trials = {
         name: TrialGrowth(
             growth=min(row.max(initial=0.0), 1e9), parameter=names[estimated[int(np.argmax(row))]]
         )
         for name, row in zip(trial_names(motions), growth, strict=True)
     }
+    sd = np.sqrt(np.diag(covariance))
     report = IdentifiabilityReport(
-        parameters=parameters,
+        parameters={names[i]: _describe_bound(own, covariance, i, names) for i in estimated},
         weak_directions=tuple(
-            WeakDirection(
-                members=tuple(names[i] for i in w.members), parts=w.parts, strength=w.strength
-            )
-            for w in weak
+            WeakDirection.of(w, members=tuple(names[i] for i in w.members)) for w in weak
         ),
         numbers=numbers,
-        together=tuple(
-            Combined(members=tuple(g.members), combinations=tuple(g.combinations))
-            for g in known.together
-        ),
+        together=tuple(map(Combined.of, known.together)),
         trials=trials,
         sentences=(
-            *(_together(group.members, group.combinations) for group in known.together),
-            *(_moving(w, names, value, covariance) for w in parted),
-            *_unsaid([names[i] for i in separable], sd[separable], assumed[separable]),
-            *_idle(trials),
-            *_leaning(numbers),
+            *(
+                f"{_list(group.members)} enter the equations only as {_list(group.combinations)}:"
+                " no motion tells the parts apart."
+                for group in known.together
+            ),
+            *(_describe_weak(w, names, value, covariance) for w in parted),
+            *_describe_unsaid([names[i] for i in separable], sd[separable], assumed[separable]),
+            *_describe_idle(trials),
+            *_describe_leaning(numbers),
         ),
     )
-    return report, undetermined_covariance(own, assumed)[place]
+    return report, undetermined_covariance(own, assumed)[np.ix_(estimated, estimated)]
 
 
 def find_information(
@@ -189,19 +185,19 @@ def _stiffness(system: System, motion: Motion, z: Array, u: Array, p: Array) -> 
     return found
 
 
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _entry(own: Array, covariance: Array, i: int, names: Sequence[str]) -> ParameterBound:
+def _describe_bound(own: Array, covariance: Array, i: int, names: Sequence[str]) -> ParameterBound:
     """Return bound, bound were all others known, and the parameter that most looks alike."""
     partner, correlation = _partner(covariance, i, names)
     return ParameterBound(
-        bound_sd=_finite(np.sqrt(covariance[i, i])),
-        alone_sd=_finite(1.0 / np.sqrt(own[i, i])) if own[i, i] > 0.0 else None,
+        bound_sd=_finite_sd(covariance[i, i]),
+        alone_sd=float(1.0 / np.sqrt(own[i, i])) if own[i, i] > 0.0 else None,
         partner=partner,
         correlation=None if partner is None else correlation,
     )
+
+
+def _finite_sd(variance: float) -> float | None:
+    return float(np.sqrt(variance)) if np.isfinite(variance) else None
 
 
 def _partner(covariance: Array, i: int, names: Sequence[str]) -> tuple[str | None, float]:
@@ -217,7 +213,7 @@ def _partner(covariance: Array, i: int, names: Sequence[str]) -> tuple[str | Non
     return names[place], float(correlation[place])
 
 
-def _number(
+def _describe_number(
     number: DeterminableNumber,
     total: Array,
     n: int,
@@ -238,29 +234,19 @@ def _number(
         for i in estimated
         if sd[i] < _KNOWN * abs(value[i])
     }
-    return DeviceNumber(
-        name=number.name,
-        value=number.value,
-        unit=number.unit,
-        bound_sd=_finite(np.sqrt(covariance[n, n])),
+    return DeviceNumber.of(
+        number,
+        bound_sd=_finite_sd(covariance[n, n]),
         partner=partner,
         correlation=correlation,
         moves_percent=per_cent,
     )
 
 
-def _together(members: Sequence[str], combinations: Sequence[str]) -> str:
-    return (
-        f"{join_names(_quoted(members))} enter the equations only as "
-        f"{join_names(_quoted(combinations))}: no motion tells the parts apart."
-    )
-
-
-def _moving(weak: Weak, names: Sequence[str], value: Array, covariance: Array) -> str:
+def _describe_weak(weak: Weak, names: Sequence[str], value: Array, covariance: Array) -> str:
     """Say which parameters move together, and for a pair how well sum and difference are known."""
-    members = join_names(_quoted([names[i] for i in weak.members]))
     pair = list(weak.members)
-    start = f"{members} move together here"
+    start = f"{_list([names[i] for i in pair])} move together here"
     if (
         len(pair) != 2
         or np.any(value[pair] == 0.0)
@@ -276,7 +262,7 @@ def _moving(weak: Weak, names: Sequence[str], value: Array, covariance: Array) -
     )
 
 
-def _unsaid(names: Sequence[str], sd: Array, prior: Array) -> list[str]:
+def _describe_unsaid(names: Sequence[str], sd: Array, prior: Array) -> list[str]:
     return [
         f"These trials say next to nothing of `{name}`: what was assumed of it stands."
         if not np.isfinite(bound_sd)
@@ -287,7 +273,7 @@ def _unsaid(names: Sequence[str], sd: Array, prior: Array) -> list[str]:
     ]
 
 
-def _idle(trials: Mapping[str, TrialGrowth]) -> list[str]:
+def _describe_idle(trials: Mapping[str, TrialGrowth]) -> list[str]:
     idle = [name for name, entry in trials.items() if entry.growth < _NOTHING]
     if len(trials) < 2 or not idle:
         return []
@@ -299,7 +285,7 @@ def _idle(trials: Mapping[str, TrialGrowth]) -> list[str]:
     return [f"Trials {which} add next to nothing: without any one of them {alone}"]
 
 
-def _leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
+def _describe_leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
     """Say which numbers of the device file the estimates rest on, and which they resemble."""
     sentences = []
     for number in numbers:
@@ -318,5 +304,5 @@ def _leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
     return sentences
 
 
-def _quoted(names: Sequence[str]) -> list[str]:
-    return [f"`{name}`" for name in names]
+def _list(names: Sequence[str]) -> str:
+    return join_names([f"`{name}`" for name in names])

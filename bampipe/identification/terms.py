@@ -1,7 +1,7 @@
 """What each term of an identified model contributes to the force, sample by sample and in bins."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,7 +9,6 @@ from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.shape import Variable, number_bins, variables
 from bampipe.errors import InputError
 from bampipe.physics import System
-from bampipe.physics.effect import Effect
 from bampipe.results.identify import Covariance
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
@@ -25,25 +24,13 @@ _STEP = 1e-4
 """Of a parameter's size, for its derivative."""
 
 
-@dataclass(frozen=True)
-class _Part:
+class _Part(NamedTuple):
     """Some parameters by number, of which ``strengths`` at 0 take the term out of the model."""
 
     name: str
     text: EffectText
     parameters: tuple[int, ...]
     strengths: tuple[int, ...]
-
-
-def effect_text(effect: Effect) -> EffectText:
-    """Return what the file of ``effect`` says of it."""
-    return EffectText(
-        summary=effect.summary,
-        formulas=effect.formulas,
-        looks_like=effect.looks_like,
-        on_the_machine=effect.on_the_machine,
-        source=effect.source,
-    )
 
 
 def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: str) -> TermsResult:
@@ -105,7 +92,7 @@ def _parts(system: System) -> Iterator[_Part]:
     for bound in system.model.effects:
         own = [numbers[item.name] for item in bound.parameters]
         strengths = [numbers[item.name] for item in bound.parameters if item.strength]
-        yield _Part(bound.name, effect_text(bound.effect), tuple(own), tuple(strengths))
+        yield _Part(bound.name, EffectText.of(bound.effect), tuple(own), tuple(strengths))
 
 
 def _residual(evidence: Evidence, p: Array) -> Array:
