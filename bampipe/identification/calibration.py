@@ -14,6 +14,7 @@ from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.results.ingest import IngestResult
 from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.signals import ZERO_OF, Signals, calibration_changes
 
 _Source = tuple[str, System, Callable[[Motion], Motion]]
@@ -47,11 +48,9 @@ def propagate_calibration(
 def _residual(system: System, motion: Motion, squares: SquaresFit) -> Array:
     """Residual (T, n_q) of a trial, of functions that are not compiled: they serve once."""
     p = squares.fit.evidence.p
-    timed = motion.with_input_timing(squares.trials.late_s)
-    u = timed.inputs(system.inputs)
-    at = timed.of_mechanism(system, u, p).kinematics
-    z = system.memory(*at, u, p, timed.t)
-    return system.applied(*at, z, u, p) - system.required(*at, z, u, p)
+    here = ModelOnTrial(system, p, [motion.with_input_timing(squares.trials.late_s)])
+    at = here.mechanism.kinematics
+    return here.applied - system.required(*at, here.memory, here.inputs, p)
 
 
 def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate:

@@ -149,7 +149,7 @@ def find_information(
     """
     own = p[:-1]
     n = len(system.coordinates)
-    u = motion.timed_inputs(system.inputs, float(p[-1]))
+    u = motion.with_input_timing(float(p[-1])).inputs(system.inputs)
     motion = motion.of_mechanism(system, u, own)
     z = system.memory(*motion.kinematics, u, own, motion.t)
     slope = residual_and_slopes(problem, trial, p)[1]

@@ -147,22 +147,24 @@ class Evidence:
         By the normal equations at the fit to all where the model is linear in its parameters; by
         refits from there where it is not: a Gauss-Newton step alone leads shapes astray.
         """
-        if self.is_linear or self.folds.nothing_held_out:
-            return self.folds.solve(self.sums, self.weight, self.lower, self.upper)
-        problem = problem_of(self.system, self.motions, self.band)
-        start, free = np.append(self.p, 0.0), list(self.free)
-        steps: dict[int, Array] = {}
-        for group in sorted(set(self.folds.groups)):
-            others = [k for k in self.folds.fitted_trials if self.folds.groups[k] != group]
+        folds, free, steps = self.folds, list(self.free), dict[int, Array]()
+        problem = None if self.is_linear else problem_of(self.system, self.motions, self.band)
+        for group in sorted(set(folds.groups)):
+            others = [k for k in folds.fitted_trials if folds.groups[k] != group]
             steps[group] = np.zeros(len(free))
-            if len(others) < len(self.folds.fitted_trials):
+            if not others or folds.nothing_held_out:
+                continue  # nothing is left out
+            if problem is None:
+                rest = self.sums.subset(others)
+                steps[group] = rest.solve(self.weight, self.lower, self.upper)
+            elif len(others) < len(folds.fitted_trials):
                 here = [Stacked(self.residual[k], self.jacobian[k], self.used[k]) for k in others]
                 refit = minimise(
-                    problem, start, others, _REFITS, tolerance=_CONVERGED,
+                    problem, np.append(self.p, 0.0), others, _REFITS, tolerance=_CONVERGED,
                     at_start=here if problem.multiplied is None else None,
                 )  # fmt: skip
                 steps[group] = refit.p[free] - self.p[free]
-        return tuple(steps[group] for group in self.folds.groups)
+        return tuple(steps[group] for group in folds.groups)
 
     @cached_property
     def held_out_rmse(self) -> Array:

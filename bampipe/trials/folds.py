@@ -67,25 +67,6 @@ class Folds:
         """Whether there is one group only, so that the error is that of the fit."""
         return len(set(self.groups)) == 1
 
-    def solve(
-        self, sums: NormalEquations, weight: Array, lower: Array, upper: Array
-    ) -> tuple[Array, ...]:
-        """Coefficients (P,) for each trial, fitted to the other groups.
-
-        Where there is but one group, or no other trial to fit, nothing is left out: zeros, the
-        coefficients of the fit to all.
-
-        ``sums`` are linearised at the fit to the fitted trials; ``weight`` (n_q,) is by axis.
-        """
-        found: dict[int, Array] = {}
-        for group in sorted(set(self.groups)):
-            others = [k for k in self.fitted_trials if self.groups[k] != group]
-            if others and not self.nothing_held_out:
-                found[group] = sums.subset(others).solve(weight, lower, upper)
-            else:
-                found[group] = np.zeros(lower.size)
-        return tuple(found[group] for group in self.groups)
-
     def error(self, sums: NormalEquations, values: Sequence[Array]) -> Array:
         """Root mean square by axis over the judged trials, (n_q,); ``values`` (P,) by trial."""
         squares, count = np.zeros(sums.yy.shape[1]), np.zeros(sums.yy.shape[1])

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from typing import Protocol
 
 import numpy as np
@@ -129,35 +130,16 @@ class Motion:
         """
         if late_s == 0.0:
             return self
-        return self.with_channels(dict(self._moved(late_s)))
-
-    def timed_inputs(self, names: Sequence[str], late_s: float) -> Array:
-        """What `inputs` gives after `with_input_timing`, (T, len(names)); do not write to it."""
-        plain = self.inputs(names)
-        if late_s == 0.0:
-            return plain
-        found = plain.copy()
-        for name, values in self._moved(late_s, names):
-            found[:, list(names).index(name)] = values
-        return found
-
-    def _moved(
-        self, late_s: float, among: Sequence[str] | None = None
-    ) -> Iterator[tuple[str, Array]]:
-        """Channels with time derivatives, and those, of inputs moved back by ``late_s``, (T,)."""
+        moved = {}
         for name in self.channels:
-            orders = [name]
-            for further in input_derivatives(name):
-                if further not in self.channels:
-                    break
-                orders.append(further)
+            orders = [name, *takewhile(self.channels.__contains__, input_derivatives(name))]
             for k, order in enumerate(orders[:-1]):
-                if among is None or order in among:
-                    total, factor = self.channels[order].copy(), 1.0
-                    for power, term in enumerate(orders[k + 1 : k + 1 + TIMING_ORDERS], start=1):
-                        factor *= -late_s / power
-                        total += factor * self.channels[term]
-                    yield order, total
+                total, factor = self.channels[order].copy(), 1.0
+                for power, term in enumerate(orders[k + 1 : k + 1 + TIMING_ORDERS], start=1):
+                    factor *= -late_s / power
+                    total += factor * self.channels[term]
+                moved[order] = total
+        return self.with_channels(moved)
 
 
 def input_derivatives(name: str) -> tuple[str, ...]:

@@ -57,7 +57,7 @@ def problem_of(
         return moved.find(trial, p, lambda: motion.of_mechanism(system, u, p[:n]).kinematics)
 
     def inputs_at(motion: Motion, p: Array) -> Array:
-        return motion.timed_inputs(system.inputs, float(p[n]))
+        return motion.with_input_timing(float(p[n])).inputs(system.inputs)
 
     def left_out(trial: int) -> Flags:
         still = standstill_of(motions[trial], system, band.rate_hz)

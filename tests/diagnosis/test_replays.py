@@ -46,7 +46,7 @@ def test_a_replay_for_one_model_has_the_same_inputs(fitted) -> None:
     )  # fmt: skip
     np.testing.assert_array_equal(every.inputs(system.inputs), own.inputs(system.inputs))
     np.testing.assert_array_equal(
-        every.timed_inputs(system.inputs, 1e-3), own.timed_inputs(system.inputs, 1e-3)
+        *(m.with_input_timing(1e-3).inputs(system.inputs) for m in (every, own))
     )
     assert len(own.channels) < len(every.channels)
 

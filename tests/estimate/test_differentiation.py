@@ -244,5 +244,3 @@ def test_inputs_move_by_half_a_sample_up_to_the_highest_frequency_of_a_residual(
         moved = motion.with_input_timing(late_s)
         true = np.sin(w * (t - late_s))
         np.testing.assert_allclose(moved.channels["f"][inner], true[inner], atol=error)
-        timed = motion.timed_inputs(("f", "f_rate"), late_s)
-        np.testing.assert_array_equal(timed, moved.inputs(("f", "f_rate")))
