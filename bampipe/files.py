@@ -226,13 +226,16 @@ def toml_text(table: Mapping[str, Any]) -> str:
     """Return a table of text, numbers, booleans, lists and tables as TOML."""
     lines: list[str] = []
 
+    def quoted(key: str) -> str:
+        return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else json.dumps(key)
+
     def write(path: tuple[str, ...], content: Mapping[str, Any]) -> None:
         tables = {key: value for key, value in content.items() if isinstance(value, Mapping)}
         if path and (len(tables) < len(content) or not content):
-            lines.append("[" + ".".join(json.dumps(key) for key in path) + "]")
+            lines.extend(["", "[" + ".".join(map(quoted, path)) + "]"])
         for key, value in content.items():
             if key not in tables:
-                lines.append(f"{json.dumps(key)} = {json.dumps(value, ensure_ascii=False)}")
+                lines.append(f"{quoted(key)} = {json.dumps(value, ensure_ascii=False)}")
         for key, value in tables.items():
             write((*path, key), value)
 

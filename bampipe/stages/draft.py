@@ -10,11 +10,11 @@ from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.drafts import symbolic
-from bampipe.diagnosis.drafts.effect_file import declare, write_toml
+from bampipe.diagnosis.drafts.effect_file import declare
 from bampipe.diagnosis.drafts.search import FoundDraft, Term, draft_formulas
 from bampipe.diagnosis.session import Session
 from bampipe.errors import NothingToDoError
-from bampipe.files import write_text
+from bampipe.files import toml_text, write_text
 from bampipe.physics import compile_model
 from bampipe.progress import Progress
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, RankedEffect
@@ -101,7 +101,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         if not named.effects or one.chosen.held_out_rmse < named.rmse_after:
             for term in one.terms:
                 file = f"models/{config.model}/drafts/{term.form.name}.toml"
-                write_text(out / file, write_toml(declare(term, source)))
+                write_text(out / file, toml_text(declare(term, source)))
                 drafted[term.form.canonical] = _effect(term, file)
         rows = [row for row in diagnosis.ranking if row.axis == axis]
         entries[axis] = _axis(axis, one, drafted, named, rows)

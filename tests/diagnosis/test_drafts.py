@@ -13,7 +13,6 @@ from bampipe.declarations.files import effect_faults
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Dictionary
 from bampipe.diagnosis.drafts.columns import FormDictionary
-from bampipe.diagnosis.drafts.effect_file import write_toml
 from bampipe.diagnosis.drafts.search import (
     FormSearch,
     FoundDraft,
@@ -23,6 +22,7 @@ from bampipe.diagnosis.drafts.search import (
 )
 from bampipe.diagnosis.session import Session, candidates_of, system_of
 from bampipe.errors import InputError, NothingToDoError
+from bampipe.files import toml_text
 from bampipe.physics import Model
 from bampipe.physics.effect import effect_from
 from bampipe.progress import silent
@@ -262,7 +262,7 @@ def test_every_form_is_an_effect_file(clean):
         forms = FormDictionary(fit.evidence, fit.likelihood.samples, axis)
         forms.add_grammar()
         for form in forms.candidates.values():
-            text = write_toml(form.declaration("a test"))
+            text = toml_text(form.declaration("a test"))
             tried, faults = effect_faults(tomllib.loads(text), form.name, device)
             assert form.canonical in tried
             assert faults == []

@@ -11,11 +11,11 @@ from bampipe.declarations.files import effect_faults
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.drafts import symbolic
 from bampipe.diagnosis.drafts.columns import FormDictionary
-from bampipe.diagnosis.drafts.effect_file import write_toml
 from bampipe.diagnosis.drafts.forms import list_quantities
 from bampipe.diagnosis.drafts.search import FormSearch
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.estimate.low_pass import low_pass_at
+from bampipe.files import toml_text
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_what_two_axes_shape_is_found_by_symbolic_regression_alone(arm):
     scale = bred.solve((best,)).scale[0]
     assert scale < 0.05 * bred.solve(()).scale[0]
     form = forms.candidates[best[0]]
-    text = write_toml(form.declaration("a test"))
+    text = toml_text(form.declaration("a test"))
     tried, faults = effect_faults(tomllib.loads(text), "formula", recipe.model().device)
     assert form.canonical in tried
     assert faults == []

@@ -1,6 +1,5 @@
 """A drafted term as the text of an effect file: what a person renames, edits and keeps."""
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -66,27 +65,3 @@ def _numbers(term: Term, name: str, entry: Mapping[str, Any]) -> dict[str, float
         "upper": rounded(high),
         "typical": rounded(value),
     }
-
-
-def write_toml(declaration: Mapping[str, Any]) -> str:
-    """The text of an effect file."""
-    plain = {k: v for k, v in declaration.items() if not isinstance(v, Mapping)}
-    lines = [f"{key} = {_value(value)}" for key, value in plain.items()]
-    torque = declaration.get("torque")
-    tables = {"torque": torque} if isinstance(torque, Mapping) else {}
-    for group in ("parameters", "states"):
-        entries = declaration.get(group, {})
-        tables |= {f"{group}.{name}": entry for name, entry in entries.items()}
-    for head, entry in tables.items():
-        lines += ["", f"[{head}]", *(f"{key} = {_value(value)}" for key, value in entry.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{k} = {_value(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    return repr(float(value))
