@@ -186,7 +186,7 @@ class Session:
         narrow = system_of(recipe.with_sign_widths(_STOPPING_WIDTH))
         try:
             stand_in = StandIn(narrow, evidence.p, evidence.motions, t.sensors.rate_hz)
-            replays = replay_motions(stand_in, exact, t.kinematics, (self.seed,), alone=True)
+            replays = replay_motions(stand_in, exact, t.kinematics, (self.seed,))
         except Runaway:
             return nothing
         return residuals_of(evidence, replays)
@@ -426,7 +426,7 @@ def rms(values: Array) -> float:
 
 def _residuals_of_replay(seed: tuple[int, ...]) -> list[Array]:
     trials, evidence, stand_in = shared()
-    replays = replay_motions(stand_in, trials.sensors, trials.kinematics, seed, alone=True)
+    replays = replay_motions(stand_in, trials.sensors, trials.kinematics, seed)
     return residuals_of(evidence, replays)
 
 

@@ -124,7 +124,7 @@ def expected_published_ratio(
     published = StandIn(evidence.system, p, evidence.motions, trials.sensors.rate_hz)
     try:
         replays = replay_motions(
-            published, trials.sensors, trials.kinematics, (seed, _EXPECTED_SEED), alone=True
+            published, trials.sensors, trials.kinematics, (seed, _EXPECTED_SEED)
         )
         again = gather_evidence(evidence.system, replays, evidence.band, evidence.p, evidence.folds)
     except InputError:

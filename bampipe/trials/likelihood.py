@@ -284,22 +284,60 @@ class Likelihood:
             counted.append(replace(here, independent=here.independent * min(replays / ours, 1.0)))
         return tuple(counted)
 
-    def pose(
-        self,
-        evidence: Evidence,
-        residual: Sequence[Array] | None = None,
-        bias: Sequence[Array] | None = None,
-    ) -> Problem:
-        """Weight the residual of a model and join what is known of its parameters beforehand.
-
-        Args:
-            evidence: the model, linearised.
-            residual, bias: of a replay in place of the measured trials, by axis, each (n,).
-        """
-        y = residual or [
-            take_samples(evidence.residual, here, axis) for axis, here in enumerate(self.samples)
+    def pose(self, evidence: Evidence) -> Problem:
+        """Weight the residual of a linearised model; join what is known of its parameters."""
+        samples, n_q = self.samples, len(self.samples)
+        weights = self.root
+        if evidence.factors:  # in units of what is measured: small factors explain nothing
+            ratio = np.array(self.factors) / np.array(evidence.factors)
+            weights = tuple(root * by for root, by in zip(weights, ratio, strict=True))
+        timing = evidence.timing if evidence.by_timing else ()
+        slopes = evidence.slopes
+        n = slopes[0].shape[2]
+        full = []
+        for axis, here in enumerate(samples):
+            columns = np.zeros((len(here.rows), n + 2 * n_q))
+            columns[:, :n] = take_samples(slopes, here, axis)
+            columns[:, n + axis] = -self.noise.bias[axis]
+            columns[:, n + n_q + axis] = -self.noise.stopping[axis]
+            full.append(columns * weights[axis][:, None])
+        # What lies evenly between two bounds has a standard deviation of 0.29 of their distance.
+        of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
+        n_timing, none = len(of_timing), np.zeros(n_q)
+        precision = np.concatenate([evidence.precision, of_timing, none + 1.0, none + 1.0])
+        known = np.concatenate([evidence.known, np.zeros(n_timing), none + 1.0, none])
+        lower = np.concatenate([evidence.lower, timing[:1], none - np.inf, none])
+        upper = np.concatenate([evidence.upper, timing[1:], none + np.inf, none + _MOST_STOPPING])
+        y = [
+            take_samples(evidence.residual, here, axis) * weights[axis]
+            for axis, here in enumerate(samples)
         ]
-        return _pose(self, evidence, y, bias or self.noise.bias)
+        weight = [
+            s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)
+        ]
+        normal = sum(w * (x.T @ x) for w, x in zip(weight, full, strict=True)) + np.diag(precision)
+        # What changes nothing over its range stays, as a shape does whose strength is zero.
+        size, parameters = np.sqrt(np.diag(normal)), evidence.system.parameters
+        reach = np.ones(size.size)
+        reach[: len(evidence.free)] = [parameters[i].sd or 1.0 for i in evidence.free]
+        per_unit = np.divide(1.0, size, out=np.zeros_like(size), where=size * reach > NOTHING)
+        values, vectors = np.linalg.eigh(normal * per_unit * per_unit[:, None])
+        kept = values > _DETERMINED * values[-1]
+        to = vectors[:, kept] / np.sqrt(values[kept]) * per_unit[:, None]
+        loose = vectors[:, ~kept] * per_unit[:, None]
+        effects, (log_scale, by_parameters) = evidence.system.model.effects, evidence.log_scale
+        by_parameters = np.pad(by_parameters, ((0, 0), (0, 2 * n_q)))
+        return Problem(
+            self, tuple(y), tuple(x @ to for x in full), to.T @ (precision[:, None] * to),
+            to.T @ (precision * known), log_scale, by_parameters @ to, to, lower, upper,
+            {item.name: _absence(evidence, item) for item in effects},
+            {
+                item.name: np.array([q.sd for q in item.parameters if q.strength and not q.fixed])
+                for item in effects
+            },
+            {item.name: tuple(_places(evidence, item, strengths=False)) for item in effects},
+            0.5 * float(precision @ known**2), loose,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -459,58 +497,6 @@ def dry_friction(evidence: Evidence) -> list[Array]:
         )
         found.append(0.5 * (back - on))
     return found
-
-
-def _pose(
-    likelihood: Likelihood, evidence: Evidence, residual: Sequence[Array], bias: Sequence[Array]
-) -> Problem:
-    samples, n_q = likelihood.samples, len(likelihood.samples)
-    weights = likelihood.root
-    if evidence.factors:  # in units of what is measured: small factors explain nothing
-        ratio = np.array(likelihood.factors) / np.array(evidence.factors)
-        weights = tuple(root * by for root, by in zip(weights, ratio, strict=True))
-    timing = evidence.timing if evidence.by_timing else ()
-    slopes = evidence.slopes
-    n = slopes[0].shape[2]
-    full = []
-    for axis, here in enumerate(samples):
-        columns = np.zeros((len(here.rows), n + 2 * n_q))
-        columns[:, :n] = take_samples(slopes, here, axis)
-        columns[:, n + axis] = -bias[axis]
-        columns[:, n + n_q + axis] = -likelihood.noise.stopping[axis]
-        full.append(columns * weights[axis][:, None])
-    # What lies evenly between two bounds has a standard deviation of 0.29 of their distance.
-    of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
-    n_timing, none = len(of_timing), np.zeros(n_q)
-    precision = np.concatenate([evidence.precision, of_timing, none + 1.0, none + 1.0])
-    known = np.concatenate([evidence.known, np.zeros(n_timing), none + 1.0, none])
-    lower = np.concatenate([evidence.lower, timing[:1], none - np.inf, none])
-    upper = np.concatenate([evidence.upper, timing[1:], none + np.inf, none + _MOST_STOPPING])
-    y = [r * w for r, w in zip(residual, weights, strict=True)]
-    weight = [s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)]
-    normal = sum(w * (x.T @ x) for w, x in zip(weight, full, strict=True)) + np.diag(precision)
-    # What changes nothing over its range stays, as a shape does whose strength is zero.
-    size, parameters = np.sqrt(np.diag(normal)), evidence.system.parameters
-    reach = np.ones(size.size)
-    reach[: len(evidence.free)] = [parameters[i].sd or 1.0 for i in evidence.free]
-    per_unit = np.divide(1.0, size, out=np.zeros_like(size), where=size * reach > NOTHING)
-    values, vectors = np.linalg.eigh(normal * per_unit * per_unit[:, None])
-    kept = values > _DETERMINED * values[-1]
-    to = vectors[:, kept] / np.sqrt(values[kept]) * per_unit[:, None]
-    loose = vectors[:, ~kept] * per_unit[:, None]
-    effects, (log_scale, by_parameters) = evidence.system.model.effects, evidence.log_scale
-    by_parameters = np.pad(by_parameters, ((0, 0), (0, 2 * n_q)))
-    return Problem(
-        likelihood, tuple(y), tuple(x @ to for x in full), to.T @ (precision[:, None] * to),
-        to.T @ (precision * known), log_scale, by_parameters @ to, to, lower, upper,
-        {item.name: _absence(evidence, item) for item in effects},
-        {
-            item.name: np.array([q.sd for q in item.parameters if q.strength and not q.fixed])
-            for item in effects
-        },
-        {item.name: tuple(_places(evidence, item, strengths=False)) for item in effects},
-        0.5 * float(precision @ known**2), loose,
-    )  # fmt: skip
 
 
 def _places(evidence: Evidence, item: BoundEffect, *, strengths: bool) -> list[int]:

@@ -347,24 +347,18 @@ def replay_motion(
     sensors: Sensors,
     kinematics: Kinematics,
     rng: np.random.Generator,
-    *,
-    alone: bool = False,
 ) -> Motion:
     """Replay one trial and filter it as the measured one was.
 
-    Time derivatives are made of the forces alone; other channels are the measured ones.
-
-    Args:
-        rng: source of the noise and of where the encoders' counts fall.
-        alone: whether no other model is to see the replay, which may need more derivatives.
+    Time derivatives are made of the forces alone, those that the model needs; other channels are
+    the measured ones. ``rng`` is the source of the noise and of where the encoders' counts fall.
 
     Raises:
         Runaway: the simulated motion grows without bounds.
     """
     system, course = stand_in.system, stand_in.courses[trial]
     recording = read_by_sensors(system, stand_in.motions[trial], *course, sensors, rng)
-    wanted = system.inputs if alone else None
-    motion = kinematics.observe(recording, system.model.device.forces, wanted)
+    motion = kinematics.observe(recording, system.model.device.forces, system.inputs)
     return replace(motion, left_out=stand_in.rests[trial])
 
 
@@ -373,25 +367,19 @@ def replay_motions(
     sensors: Sensors,
     kinematics: Kinematics,
     seed: Sequence[int],
-    *,
-    force_noise: bool = True,
-    alone: bool = False,
 ) -> Sequence[Motion]:
     """Replay every trial; long sessions are stored on disk, so that few trials are in memory.
 
-    Args:
-        seed: of the sensor noise; the trial's number is added. alone: as for `replay_motion`.
+    ``seed`` is that of the sensor noise; the trial's number is added.
 
     Raises:
         Runaway: a simulated motion grows without bounds.
     """
-    if not force_noise:
-        sensors = replace(sensors, force_sd=np.zeros_like(sensors.force_sd))
 
     def replays() -> Iterator[Motion]:
         for trial in range(len(stand_in.motions)):
             rng = np.random.default_rng([*seed, trial])
-            yield replay_motion(stand_in, trial, sensors, kinematics, rng, alone=alone)
+            yield replay_motion(stand_in, trial, sensors, kinematics, rng)
 
     if sum(trial_sizes(stand_in.motions)) <= MOST_SAMPLES:
         return list(replays())

@@ -37,13 +37,11 @@ def test_a_replay_for_one_model_has_the_same_inputs(fitted) -> None:
     system = evidence.system
     logged = {name: trials.motions[0].channels[name] for name in system.inputs}
     motion = replace(trials.motions[0], channels=logged)
-    every, own = (
-        replay_motion(
-            StandIn(system, evidence.p, [motion], trials.sensors.rate_hz), 0,
-            trials.sensors, trials.kinematics, np.random.default_rng(3), alone=alone,
-        )
-        for alone in (False, True)
-    )  # fmt: skip
+    stand_in = StandIn(system, evidence.p, [motion], trials.sensors.rate_hz)
+    rngs, course = [np.random.default_rng(3) for _ in range(2)], stand_in.courses[0]
+    own = replay_motion(stand_in, 0, trials.sensors, trials.kinematics, rngs[0])
+    recording = replay.read_by_sensors(system, motion, *course, trials.sensors, rngs[1])
+    every = trials.kinematics.observe(recording, system.model.device.forces)
     np.testing.assert_array_equal(every.inputs(system.inputs), own.inputs(system.inputs))
     np.testing.assert_array_equal(
         *(m.with_input_timing(1e-3).inputs(system.inputs) for m in (every, own))

@@ -1,5 +1,6 @@
 """Next and its table judge as the diagnosis does: by its search, its record and its criteria."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -36,7 +37,8 @@ def search_beside(fit: Fit, residual, known: Search | None = None) -> Search:
     candidates = {item.name: item for item in candidates_of(fit.recipe, NAMES)}
     scale = MachineScale.of_trials(fit.evidence)
     dictionary = Dictionary(fit.evidence, fit.likelihood.samples, candidates, scale)
-    problem = fit.likelihood.pose(fit.evidence, residual)
+    y = tuple(r * root for r, root in zip(residual, fit.likelihood.root, strict=True))
+    problem = replace(fit.likelihood.pose(fit.evidence), y=y)
     atoms = known.atoms if known is not None else {}
     return Search(problem, dictionary, dictionary.make_all, CRITERIA, atoms)
 
