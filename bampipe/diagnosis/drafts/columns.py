@@ -13,16 +13,18 @@ import numpy as np
 from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.dictionary import Atom, Key
 from bampipe.diagnosis.drafts.forms import (
+    CURVED,
     DAMPING,
     FORCE,
     FRICTION,
+    GRAMMAR,
     INERTIA,
     READING,
     Form,
     Span,
-    list_forms,
     list_quantities,
 )
+from bampipe.diagnosis.drafts.shapes import SHAPES
 from bampipe.estimate.low_pass import low_pass_at
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import Samples
@@ -69,8 +71,20 @@ class FormDictionary:
         if left is not None:
             spans = {n: self._where_left(n, span, left) for n, span in spans.items()}
         device = self.evidence.system.model.device
-        for form in list_forms(device, self.axis, spans, self.times, self.scales, curves):
-            self.candidates[form.canonical] = form
+        for quantity in list_quantities(device, self.axis):
+            if quantity.words not in spans:
+                continue  # it does not vary
+            for (kind, own, factor), shapes in (CURVED if curves else GRAMMAR).items():
+                if (kind, own) != (quantity.quantity, quantity.axis == self.axis):
+                    continue
+                for shape in shapes:
+                    if shape == "ripple" and kind == "position" and own and device.drive:
+                        continue  # the library has the ripple of a motor
+                    form = Form(
+                        device.coordinates[self.axis], self.axis, factor, SHAPES[shape], quantity,
+                        spans[quantity.words], self.times, self.scales.get(factor, 1.0),
+                    )  # fmt: skip
+                    self.candidates[form.canonical] = form
 
     def grid(self, name: str) -> list[Key]:
         """The shapes of a form at which its columns are made to begin with."""

@@ -4,13 +4,13 @@ A form is a few words of a grammar, and an effect file like any other once its n
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
 
-from bampipe.diagnosis.drafts.shapes import KNOTS, SHAPES, Shape
+from bampipe.diagnosis.drafts.shapes import KNOTS, Shape
 from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate as Axis
 from bampipe.physics.device import Device
@@ -33,7 +33,7 @@ FACTORS: Mapping[Factor, str] = {
 # drafted again: springs and stops, rippling friction, drag, friction by load or by pose.
 _CURVES = ("parabola", "cubic", "bump", "snag", "step")
 _MEMORY = ("hysteresis", "two_hystereses")
-_GRAMMAR: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
+GRAMMAR: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
     ("position", True, FORCE): (*_CURVES, "dead_zone", "ripple", "relaxing", "play", *_MEMORY),
     ("position", True, FRICTION): ("slope", "parabola", "cubic", "bump", "step", "rise", "fall"),
     ("position", True, DAMPING): ("slope", "parabola", "bump", "step"),
@@ -57,7 +57,7 @@ _GRAMMAR: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
     ("command", True, DAMPING): ("slope", "parabola"),
     ("reading", True, READING): ("parabola", "cubic", "dead_zone", *_MEMORY),
 }
-_CURVED: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
+CURVED: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
     (quantity, own, factor): ("curve",)
     for quantity, own in (("position", True), ("position", False), ("speed", True))
     for factor in (FORCE, FRICTION)
@@ -380,35 +380,3 @@ KINDS_IN_WORDS = {
 def rounded(value: float) -> float:
     """Six digits: enough for any constant, and the same on every machine."""
     return float(f"{value:.6g}")
-
-
-def list_forms(
-    device: Device,
-    axis: int,
-    spans: Mapping[str, Span],
-    times: Span,
-    scales: Mapping[str, float],
-    curves: bool = False,
-) -> Iterator[Form]:
-    """Every form for one axis.
-
-    Args:
-        spans: of the coordinates in the trials, by their words; those without one do not vary.
-        times: time between samples and of a trial, s.
-        scales: of the factors ``damping`` and ``inertia``.
-        curves: curves through points in place of formulas.
-    """
-    grammar = _CURVED if curves else _GRAMMAR
-    for coordinate in list_quantities(device, axis):
-        if coordinate.words not in spans:
-            continue
-        for (quantity, own, factor), shapes in grammar.items():
-            if quantity != coordinate.quantity or own != (coordinate.axis == axis):
-                continue
-            for name in shapes:
-                if name == "ripple" and quantity == "position" and own and device.drive:
-                    continue  # the library has the ripple of a motor
-                yield Form(
-                    device.coordinates[axis], axis, factor, SHAPES[name], coordinate,
-                    spans[coordinate.words], times, scales.get(factor, 1.0),
-                )  # fmt: skip
