@@ -20,7 +20,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import stats
 
-from bampipe.arrays import Array
 from bampipe.identification.estimates import Estimate
 from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.lists import join_names
@@ -82,12 +81,13 @@ def tabulate_methods(
 
     ``lost`` says why there is no estimate of the filter, "" where there is one or none was sought.
     """
-    found: dict[Method, MethodTried] = {}
+    found, band = dict[Method, MethodTried](), squares.problem.band
     for each in (published, *others):
         names = [system.parameters[place].name for place in each.free]
         joint = 2.0 * np.hypot(each.sd, published.sd)
         apart = np.abs(each.value - published.value) > joint
-        error = held_out_error(squares, each)
+        unseen = (band.thin(squares.problem.residual(k, p)) for k, p in enumerate(each.held_out))
+        error = rms(unseen, squares.fit.evidence.used)
         found[each.method] = MethodTried(
             held_out_rmse=dict(zip(system.coordinates, error, strict=True)),
             parameters={
@@ -100,13 +100,6 @@ def tabulate_methods(
     if lost:
         found["ukf"] = MethodTried(doubts=(lost,))
     return found
-
-
-def held_out_error(squares: SquaresFit, estimate: Estimate) -> Array:
-    """Error (n_q,) of predictions of each trial by parameters that have not seen it, N.m or N."""
-    problem, evidence = squares.problem, squares.fit.evidence
-    pairs = enumerate(estimate.held_out)
-    return rms((problem.band.thin(problem.residual(k, p)) for k, p in pairs), evidence.used)
 
 
 def describe_methods(methods: Mapping[Method, MethodTried]) -> list[str]:
