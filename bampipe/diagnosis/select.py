@@ -11,7 +11,7 @@ from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
 from bampipe.diagnosis.probability import Weighed, weigh_sets
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.search import Pool, Search, added, gone, names
+from bampipe.diagnosis.search import Pool, Search
 from bampipe.diagnosis.session import (
     Fit,
     Session,
@@ -21,6 +21,7 @@ from bampipe.diagnosis.session import (
     without_members,
     workers,
 )
+from bampipe.diagnosis.set_cost import added, gone, names
 from bampipe.diagnosis.unknown import lay_splines, weigh_unknown
 from bampipe.physics.recipe import Recipe
 
