@@ -55,14 +55,39 @@ def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
 
 
 @part()
+def _advance(x, step):  # type: ignore[no-untyped-def]
+    """Advance state ``x`` (n,) by one sample, in place."""
+    for i in range(x.shape[0]):
+        total = 0.0
+        for j in range(i, x.shape[0]):
+            total += step[i, j] * x[j]
+        x[i] = total
+
+
+@part()
+def _carry_back(adjoint, step):  # type: ignore[no-untyped-def]
+    """Carry ``adjoint`` (n,) back by one sample, in place: F' adjoint."""
+    for i in range(adjoint.shape[0] - 1, -1, -1):
+        total = 0.0
+        for j in range(i + 1):
+            total += step[j, i] * adjoint[j]
+        adjoint[i] = total
+
+
+@part()
+def _multiply_row(matrix, i, vector):  # type: ignore[no-untyped-def]
+    """Row ``i`` of ``matrix`` (n, n) times ``vector`` (n,)."""
+    total = 0.0
+    for j in range(vector.shape[0]):
+        total += matrix[i, j] * vector[j]
+    return total
+
+
+@part()
 def _predict(x, p, step, noise, work):  # type: ignore[no-untyped-def]
     """Advance state ``x`` (n,) and covariance ``p`` (n, n) by one sample, in place."""
     n = x.shape[0]
-    for i in range(n):
-        total = 0.0
-        for j in range(i, n):
-            total += step[i, j] * x[j]
-        x[i] = total
+    _advance(x, step)
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -149,16 +174,10 @@ def _smooth(present, step, passed, variances, vectors, weight, left):  # type: i
     for t in range(states.shape[0] - 1, -1, -1):
         p = covariances[t]
         for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += p[i, j] * adjoint[j]
-            states[t, i] -= total
+            states[t, i] -= _multiply_row(p, i, adjoint)
             variance = p[i, i]
             for j in range(n):
-                total = 0.0
-                for k in range(n):
-                    total += weight[j, k] * p[k, i]
-                variance -= p[i, j] * total
+                variance -= p[i, j] * _multiply_row(weight, j, p[i])
             variances[t, i] = max(variance, 0.0)
         if present[t]:
             # adjoint <- C' adjoint - H' v/S, weight <- C' weight C + H' H/S, with C = I - K H
@@ -167,10 +186,7 @@ def _smooth(present, step, passed, variances, vectors, weight, left):  # type: i
                 share += gains[t, j] * adjoint[j]
             adjoint[0] -= share + innovations[t] / spreads[t]
             for i in range(n):
-                total = 0.0
-                for j in range(n):
-                    total += weight[i, j] * gains[t, j]
-                pull[i] = total
+                pull[i] = _multiply_row(weight, i, gains[t])
             share = 0.0
             for i in range(n):
                 share += gains[t, i] * pull[i]
@@ -179,11 +195,7 @@ def _smooth(present, step, passed, variances, vectors, weight, left):  # type: i
                 weight[i, 0] -= pull[i]
                 weight[0, i] -= pull[i]
         # adjoint <- F' adjoint, weight <- F' weight F
-        for i in range(n - 1, -1, -1):
-            total = 0.0
-            for j in range(i + 1):
-                total += step[j, i] * adjoint[j]
-            adjoint[i] = total
+        _carry_back(adjoint, step)
         for i in range(n):
             for j in range(n):
                 total = 0.0
@@ -211,11 +223,7 @@ def _evidence(y, present, step, noise, x, p, skip, work, gain):  # type: ignore[
     settled, spread = False, 1.0
     for t in range(y.shape[0]):
         if settled and present[t]:
-            for i in range(n):
-                total = 0.0
-                for j in range(i, n):
-                    total += step[i, j] * x[j]
-                x[i] = total
+            _advance(x, step)
             innovation = y[t] - x[0]
             for i in range(n):
                 x[i] += gain[i] * innovation
@@ -312,29 +320,6 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
 
 
-@njit(int64(_M, _M, _M, _M, float64[:, :, ::1], _V, _M), cache=True)
-def _settle(step, noise, p, gains, covariances, spreads, work):  # type: ignore[no-untyped-def]
-    """Write gains (K, n), covariances (K, n, n) and variances (K,) until they settle; count them.
-
-    They do not depend on the samples. ``p`` (n, n) is the covariance of the first state; it is
-    changed, as is ``work`` (n + 1, n).
-    """
-    n, x = step.shape[0], work[step.shape[0]]
-    for t in range(gains.shape[0]):
-        if t > 0:
-            _predict(x, p, step, noise, work)
-        _, spreads[t] = _update(x, p, 0.0, gains[t])
-        # They swing as they settle: one that stands still for a moment says nothing.
-        settled = t > 0
-        for i in range(n):
-            settled = settled and abs(gains[t, i] - gains[t - 1, i]) < _SETTLED * gains[t, i]
-            for j in range(n):
-                covariances[t, i, j] = p[i, j]
-        if settled:
-            return t + 1
-    return gains.shape[0]
-
-
 @njit(void(_V, _M, _M, float64[:, :, ::1], _V, _M, _V, _V), cache=True)
 def _smooth_mean(y, step, gains, covariances, spreads, states, innovations, adjoint):  # type: ignore[no-untyped-def]
     """Smoothed states (T, n) of samples that are all there; ``adjoint`` (n,) holds zeros.
@@ -342,16 +327,13 @@ def _smooth_mean(y, step, gains, covariances, spreads, states, innovations, adjo
     The same recursions as `_filter` and `_smooth`, without what is the same for all samples.
     """
     count, n, last = y.shape[0], step.shape[0], spreads.shape[0] - 1
-    states[0, 0] = y[0]
-    for i in range(1, n):
-        states[0, i] = 0.0
+    for i in range(n):
+        states[0, i] = y[0] if i == 0 else 0.0
     for t in range(count):
         if t > 0:
             for i in range(n):
-                total = 0.0
-                for j in range(i, n):
-                    total += step[i, j] * states[t - 1, j]
-                states[t, i] = total
+                states[t, i] = states[t - 1, i]
+            _advance(states[t], step)
         innovations[t] = y[t] - states[t, 0]
         for i in range(n):
             states[t, i] += gains[min(t, last), i] * innovations[t]
@@ -359,29 +341,31 @@ def _smooth_mean(y, step, gains, covariances, spreads, states, innovations, adjo
         k = min(t, last)
         share = innovations[t] / spreads[k]
         for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += covariances[k, i, j] * adjoint[j]
-            states[t, i] -= total
+            states[t, i] -= _multiply_row(covariances[k], i, adjoint)
             share += gains[k, i] * adjoint[i]
         adjoint[0] -= share
-        for i in range(n - 1, -1, -1):
-            total = 0.0
-            for j in range(i + 1):
-                total += step[j, i] * adjoint[j]
-            adjoint[i] = total
+        _carry_back(adjoint, step)
 
 
 @lru_cache(maxsize=16)
 def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
-    """`_settle` for a first state of which nothing is known."""
+    """Gains (K, n), covariances (K, n, n) and variances (K,) of ``most`` samples until they settle.
+
+    They do not depend on the samples. Of the first state nothing is known.
+    """
     step, noise = transition(order)
     # A state settles at about the cut-off, in rad a sample, to the power of its order.
     wide = np.diag(_WIDE * ratio ** (np.arange(order) / order))
-    gains, covariances = np.empty((most, order)), np.empty((most, order, order))
-    spreads, work = np.empty(most), np.zeros((order + 1, order))
-    count = _settle(step, ratio * noise, wide, gains, covariances, spreads, work)
-    return gains[:count].copy(), covariances[:count].copy(), spreads[:count].copy()
+    passed, there = _allocate_pass(most, order), np.ones(most, dtype=bool)
+    work = np.empty((order, order))
+    _filter(np.zeros(most), there, step, ratio * noise, np.zeros(order), wide, passed, work)
+    # They swing as they settle: one that stands still for a moment says nothing.
+    change = np.abs(np.diff(passed.gains, axis=0))
+    settled = np.flatnonzero((change < _SETTLED * passed.gains[1:]).all(axis=1))
+    count = int(settled[0]) + 2 if settled.size else most
+    parts = passed.gains, passed.covariances, passed.spreads
+    gains, covariances, spreads = (part[:count].copy() for part in parts)
+    return gains, covariances, spreads
 
 
 def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]:
