@@ -144,13 +144,11 @@ def _allocate_pass(count: int, order: int) -> _Pass:
     )  # fmt: skip
 
 
-@njit(void(_V, _FLAGS, _M, _M, _V, _M, _PASS, _M), cache=True)
-def _filter(y, present, step, noise, x, p, passed, work):  # type: ignore[no-untyped-def]
-    """Run the filter from prior ``x``, ``p`` for the first sample and note what it passes.
-
-    ``work`` (n, n) is scratch.
-    """
+@njit(void(_V, _FLAGS, _M, _M, _V, _M, _PASS), cache=True)
+def _filter(y, present, step, noise, x, p, passed):  # type: ignore[no-untyped-def]
+    """Run the filter from prior ``x``, ``p`` for the first sample and note what it passes."""
     states, covariances, gains, innovations, spreads = passed
+    work = np.empty(step.shape)
     for t in range(y.shape[0]):
         if t > 0:
             _predict(x, p, step, noise, work)
@@ -162,15 +160,13 @@ def _filter(y, present, step, noise, x, p, passed, work):  # type: ignore[no-unt
                 covariances[t, i, j] = p[i, j]
 
 
-@njit(void(_FLAGS, _M, _PASS, _M, _M, _M, _M), cache=True)
-def _smooth(present, step, passed, variances, vectors, weight, left):  # type: ignore[no-untyped-def]
-    """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n).
-
-    ``vectors`` (2, n) and ``weight`` (n, n), zeros, and ``left`` (n, n) are scratch.
-    """
+@njit(void(_FLAGS, _M, _PASS, _M), cache=True)
+def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
+    """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n)."""
     states, covariances, gains, innovations, spreads = passed
     n = states.shape[1]
-    adjoint, pull = vectors[0], vectors[1]
+    adjoint, pull = np.zeros(n), np.zeros(n)
+    weight, left = np.zeros((n, n)), np.empty((n, n))
     for t in range(states.shape[0] - 1, -1, -1):
         p = covariances[t]
         for i in range(n):
@@ -211,14 +207,14 @@ def _smooth(present, step, passed, variances, vectors, weight, left):  # type: i
                 weight[j, i] = total
 
 
-@njit(types.Tuple((float64, float64, int64))(_V, _FLAGS, _M, _M, _V, _M, int64, _M, _V), cache=True)
-def _evidence(y, present, step, noise, x, p, skip, work, gain):  # type: ignore[no-untyped-def]
+@njit(types.Tuple((float64, float64, int64))(_V, _FLAGS, _M, _M, _V, _M, int64), cache=True)
+def _evidence(y, present, step, noise, x, p, skip):  # type: ignore[no-untyped-def]
     """Return sums of log S and v²/S over the innovations after ``skip``, and their count.
 
-    Once the covariance has settled it is kept until a sample is missing. ``work`` (n, n) and
-    ``gain`` (n,) are scratch.
+    Once the covariance has settled it is kept until a sample is missing.
     """
     n = x.shape[0]
+    work, gain = np.empty((n, n)), np.empty(n)
     logs, squares, count = 0.0, 0.0, 0
     settled, spread = False, 1.0
     for t in range(y.shape[0]):
@@ -267,7 +263,7 @@ def _informed_prior(y: Array, present: Flags, step: Array, noise: Array) -> tupl
     start, spread = _prior(reverse, order)
     passed = _allocate_pass(count, order)
     flags = np.ascontiguousarray(present[::-1])
-    _filter(reverse, flags, step, noise, start, spread, passed, np.empty((order, order)))
+    _filter(reverse, flags, step, noise, start, spread, passed)
     return passed.states[-1] * signs, 100.0 * passed.covariances[-1] * np.outer(signs, signs)
 
 
@@ -312,21 +308,21 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
     y = (position - position[0]) / model.noise_sd
     start, spread = _informed_prior(y, present, step, model.ratio * noise)
     passed, variances = _allocate_pass(count, order), np.empty((count, order))
-    work = np.empty((order, order))
-    _filter(y, present, step, model.ratio * noise, start, spread, passed, work)
-    _smooth(present, step, passed, variances, np.zeros((2, order)), np.zeros((order, order)), work)
+    _filter(y, present, step, model.ratio * noise, start, spread, passed)
+    _smooth(present, step, passed, variances)
     scale = model.noise_sd * model.rate_hz ** np.arange(3)
     x, sd = passed.states[:, :3] * scale, np.sqrt(variances[:, :3]) * scale
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
 
 
-@njit(void(_V, _M, _M, float64[:, :, ::1], _V, _M, _V, _V), cache=True)
-def _smooth_mean(y, step, gains, covariances, spreads, states, innovations, adjoint):  # type: ignore[no-untyped-def]
-    """Smoothed states (T, n) of samples that are all there; ``adjoint`` (n,) holds zeros.
+@njit(_M(_V, _M, _M, float64[:, :, ::1], _V), cache=True)
+def _smooth_mean(y, step, gains, covariances, spreads):  # type: ignore[no-untyped-def]
+    """Smoothed states (T, n) of samples that are all there.
 
     The same recursions as `_filter` and `_smooth`, without what is the same for all samples.
     """
     count, n, last = y.shape[0], step.shape[0], spreads.shape[0] - 1
+    states, innovations, adjoint = np.empty((count, n)), np.empty(count), np.zeros(n)
     for i in range(n):
         states[0, i] = y[0] if i == 0 else 0.0
     for t in range(count):
@@ -345,6 +341,7 @@ def _smooth_mean(y, step, gains, covariances, spreads, states, innovations, adjo
             share += gains[k, i] * adjoint[i]
         adjoint[0] -= share
         _carry_back(adjoint, step)
+    return states
 
 
 @lru_cache(maxsize=16)
@@ -357,8 +354,7 @@ def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
     # A state settles at about the cut-off, in rad a sample, to the power of its order.
     wide = np.diag(_WIDE * ratio ** (np.arange(order) / order))
     passed, there = _allocate_pass(most, order), np.ones(most, dtype=bool)
-    work = np.empty((order, order))
-    _filter(np.zeros(most), there, step, ratio * noise, np.zeros(order), wide, passed, work)
+    _filter(np.zeros(most), there, step, ratio * noise, np.zeros(order), wide, passed)
     # They swing as they settle: one that stands still for a moment says nothing.
     change = np.abs(np.diff(passed.gains, axis=0))
     settled = np.flatnonzero((change < _SETTLED * passed.gains[1:]).all(axis=1))
@@ -377,12 +373,9 @@ def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]
         signal: (T,) on the uniform grid of ``model.rate_hz``, all of it there.
         model: motion and noise.
     """
-    order, count = model.order, len(signal)
-    step, _ = transition(order)
-    settled = _settled(order, model.ratio, count)
-    states, innovations = np.empty((count, order)), np.empty(count)
+    step, _ = transition(model.order)
     y = np.ascontiguousarray(signal, dtype=np.float64)
-    _smooth_mean(y, step, *settled, states, innovations, np.zeros(order))
+    states = _smooth_mean(y, step, *_settled(model.order, model.ratio, len(signal)))
     return states[:, 0], states[:, 1] * model.rate_hz, states[:, 2] * model.rate_hz**2
 
 
@@ -442,9 +435,8 @@ def maximum_likelihood(
         count = 0
         for (y, present), (start, spread) in zip(scaled, priors, strict=True):
             part = _evidence(
-                y, present, step, np.exp(log_ratio) * noise, start.copy(), spread.copy(), 4 * order,
-                np.empty((order, order)), np.empty(order),
-            )  # fmt: skip
+                y, present, step, np.exp(log_ratio) * noise, start.copy(), spread.copy(), 4 * order
+            )
             logs, squares, count = logs + part[0], squares + part[1], count + part[2]
         best = squares / max(count, 1)
         variance = max(best, 1.0) if quantum > 0.0 else max(best, 1e-30)

@@ -33,7 +33,6 @@ from bampipe.estimate.square_root import (
     Levels,
     Output,
     Samples,
-    allocate,
     filter_square_root,
 )
 
@@ -333,8 +332,8 @@ def run_kernel(
     )  # fmt: skip
     samples = Samples(*map(_array, (trial.t, trial.u, trial.input_curvature, trial.y)))
     ended, sample = filter_square_root(
-        model.functions.derivative_rows, model.functions.measure_rows, estimated, levels, samples,
-        mean, root, out, allocate(n, model.n_states, trial.u.shape[1], ny, nw, p),
+        model.functions.derivative_rows, model.functions.measure_rows, estimated, p, levels,
+        samples, mean, root, out,
     )  # fmt: skip
     if ended != DONE:
         raise FilterFailure(0, sample, _REASONS[ended])
