@@ -73,24 +73,8 @@ class Levels(NamedTuple):
     stride: int
 
 
-class Output(NamedTuple):
-    """What the kernel fills in.
-
-    Attributes:
-        means: (ceil(T / stride), n); covariances: (ceil(T / stride), n, n).
-        innovation, innovation_sd: (T, ny); nis, log_likelihood: (T,); NaN where no reading is.
-    """
-
-    means: Array
-    covariances: Array
-    innovation: Array
-    innovation_sd: Array
-    nis: Array
-    log_likelihood: Array
-
-
 @njit(
-    types.UniTuple(int64, 2)(
+    types.Tuple((int64, int64, types.Tuple((_M, float64[:, :, ::1], _M, _M, _V, _V))))(
         DERIVATIVE_ROWS,
         MEASURE_ROWS,
         ESTIMATED,
@@ -99,13 +83,12 @@ class Output(NamedTuple):
         record_type(Samples, _V, _M, _M, _M),
         _V,
         _M,
-        record_type(Output, _M, float64[:, :, ::1], _M, _M, _V, _V),
     ),
     cache=True,
     fastmath={"contract"},
 )
 def filter_square_root(  # type: ignore[no-untyped-def]
-    derivative, measure, estimated, p, levels, samples, mean, factor, out
+    derivative, measure, estimated, p, levels, samples, mean, factor
 ):
     """Filter one trial, propagating the lower root of the covariance.
 
@@ -122,17 +105,17 @@ def filter_square_root(  # type: ignore[no-untyped-def]
         p: (np + 1,) all parameters, then the timing of the inputs.
         mean: (n,) state and parameters, in and out; factor: (n, n) lower root of their
             covariance, in and out.
-        out: filled in.
 
     Returns:
-        Why it stopped, `DONE` or another, and the sample where it did.
+        Why it stopped, `DONE` or another, and the sample where it did. What it found: means (R, n)
+        and covariances (R, n, n) of every ``levels.stride``-th sample; innovations (T, ny) and
+        their standard deviations, nis (T,) and log likelihood (T,), NaN where no reading is.
     """
     t, u, curvature, y = samples
     nx, observed = estimated.n_states, estimated.observed
     lower, upper = estimated.lower, estimated.upper
     process_sd, walk_sd, reading_sd = levels.process_sd, levels.walk_sd, levels.reading_sd
     other, stride = levels.other, levels.stride
-    means, covariances, innovations, innovation_sd, squares, likelihoods = out
     n = mean.shape[0]
     nw = process_sd.shape[0]
     ny = observed.shape[0]
@@ -151,6 +134,11 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     noise, cross = np.empty((ny, ny)), np.empty((ny, n))
     cosine, sine, single, whitened = np.empty((4, n + ny + 1))
     centre_image = 2 * nw * other
+    size = t.shape[0]
+    means, covariances = np.empty((-(-size // stride), n)), np.empty((-(-size // stride), n, n))
+    innovations, innovation_sd = np.full((size, ny), np.nan), np.full((size, ny), np.nan)
+    squares, likelihoods = np.full(size, np.nan), np.full(size, np.nan)
+    found = means, covariances, innovations, innovation_sd, squares, likelihoods
     log_normal = 0.5 * ny * np.log(2.0 * np.pi)
     for i in range(n):
         for j in range(n):
@@ -158,7 +146,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     for i in range(n):
         means[0, i] = mean[i]
     covariance_of(root, covariances[0])
-    for k in range(1, t.shape[0]):
+    for k in range(1, size):
         dt = t[k] - t[k - 1]
         substeps = max(1, int(np.ceil(dt / levels.longest_step - 1e-6)))
         propagate_points(
@@ -172,7 +160,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                 total += images[i, row] - middle
             mean[i] = middle + other * total
             if not np.isfinite(mean[i]):
-                return NOT_FINITE, k
+                return NOT_FINITE, k, found
             for pair in range(pairs):
                 columns[i, pair] = half * (
                     images[i, pair] + images[i, pairs + pair] - 2.0 * mean[i]
@@ -199,10 +187,6 @@ def filter_square_root(  # type: ignore[no-untyped-def]
         missing = False
         for i in range(ny):
             missing = missing or np.isnan(y[k, i])
-            innovations[k, i] = np.nan
-            innovation_sd[k, i] = np.nan
-        squares[k] = np.nan
-        likelihoods[k] = np.nan
         if not missing:
             transpose(root, factor)
             measure_points(measure, estimated, mean, factor, reach, u[k], readings, points)
@@ -238,7 +222,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                     total += noise[i, j] * noise[i, j]
                 innovation_sd[k, i] = total**0.5
                 if not noise[i, i] > 0.0:
-                    return INNOVATION_NOT_POSITIVE, k
+                    return INNOVATION_NOT_POSITIVE, k, found
             forward_substitute(noise, ny, whitened)
             for i in range(ny):
                 nis += whitened[i] ** 2
@@ -256,5 +240,5 @@ def filter_square_root(  # type: ignore[no-untyped-def]
             covariance_of(root, covariances[k // stride])
     for i in range(n):
         if not np.isfinite(mean[i]):
-            return NOT_FINITE, t.shape[0] - 1
-    return DONE, t.shape[0] - 1
+            return NOT_FINITE, size - 1, found
+    return DONE, size - 1, found
