@@ -341,19 +341,16 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
         rows = [cells(line.text, delimiter) for line in tried]
         width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
         alike = [row for row in rows if len(row) == width]
-        numbers = sum(_number_cells(row, delimiter) for row in alike)
-        share = numbers / (width * len(rows)) if width else 0.0
+        found_numbers = sum(_number_cells(row, delimiter) for row in alike)
+        share = found_numbers / (width * len(rows)) if width else 0.0
         ranked.append((share * width if width > 1 else 0.0, width, delimiter))
     found = []
     best = max(score for score, _, _ in ranked)
     for _, width, delimiter in (each for each in ranked if each[0] >= _ALIKE * best):
         split = [cells(line.text, delimiter) for line in lines]
+        numbers = [_number_cells(row, delimiter) if len(row) == width else 0 for row in split]
         samples = [
-            [
-                n
-                for n, row in enumerate(split)
-                if len(row) == width and _number_cells(row, delimiter) > 0.5 * of(row)
-            ]
+            [n for n, row in enumerate(split) if numbers[n] > 0.5 * of(row)]
             for of in (len, lambda row: sum(map(bool, row)))  # of cells, or of those with something
         ]
         first = next((found[0] for found in samples if found), len(lines))
