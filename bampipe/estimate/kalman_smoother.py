@@ -15,14 +15,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import factorial
-from typing import NamedTuple
 
 import numpy as np
 from numba import boolean, float64, int64, types, void
 from scipy.optimize import minimize_scalar
 
 from bampipe.arrays import Array, Flags
-from bampipe.compiled import njit, part, record_type
+from bampipe.compiled import njit, part
 from bampipe.estimate.differentiation import Derivatives
 
 ORDERS = (3, 4)
@@ -121,43 +120,27 @@ def _update(x, p, y, gain):  # type: ignore[no-untyped-def]
     return innovation, spread
 
 
-class _Pass(NamedTuple):
-    """What the filter leaves for the smoother, by sample: states (T, n) and their covariances.
-
-    Also gains (T, n), innovations (T,) and their variances (T,).
-    """
-
-    states: Array
-    covariances: Array
-    gains: Array
-    innovations: Array
-    spreads: Array
+_PASS = types.Tuple((_M, float64[:, :, ::1], _M, _V, _V))
+"""What the filter leaves for the smoother, by sample: states (T, n), their covariances, gains
+(T, n), innovations (T,) and their variances (T,)."""
 
 
-_PASS = record_type(_Pass, _M, float64[:, :, ::1], _M, _V, _V)
-
-
-def _allocate_pass(count: int, order: int) -> _Pass:
-    return _Pass(
-        np.empty((count, order)), np.empty((count, order, order)), np.zeros((count, order)),
-        np.zeros(count), np.ones(count),
-    )  # fmt: skip
-
-
-@njit(void(_V, _FLAGS, _M, _M, _V, _M, _PASS), cache=True)
-def _filter(y, present, step, noise, x, p, passed):  # type: ignore[no-untyped-def]
-    """Run the filter from prior ``x``, ``p`` for the first sample and note what it passes."""
-    states, covariances, gains, innovations, spreads = passed
-    work = np.empty(step.shape)
-    for t in range(y.shape[0]):
+@njit(_PASS(_V, _FLAGS, _M, _M, _V, _M), cache=True)
+def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
+    """Run the filter from prior ``x``, ``p`` for the first sample and return what it passes."""
+    count, n = y.shape[0], x.shape[0]
+    states, covariances, gains = np.empty((count, n)), np.empty((count, n, n)), np.zeros((count, n))
+    innovations, spreads, work = np.zeros(count), np.ones(count), np.empty((n, n))
+    for t in range(count):
         if t > 0:
             _predict(x, p, step, noise, work)
         if present[t]:
             innovations[t], spreads[t] = _update(x, p, y[t], gains[t])
-        for i in range(x.shape[0]):
+        for i in range(n):
             states[t, i] = x[i]
-            for j in range(x.shape[0]):
+            for j in range(n):
                 covariances[t, i, j] = p[i, j]
+    return states, covariances, gains, innovations, spreads
 
 
 @njit(void(_FLAGS, _M, _PASS, _M), cache=True)
@@ -257,14 +240,11 @@ def _informed_prior(y: Array, present: Flags, step: Array, noise: Array) -> tupl
     nothing, this costs one per cent of double use and keeps the smoothed variances from being
     small differences of large numbers.
     """
-    count, order = len(y), len(step)
+    order = len(step)
     signs = (-1.0) ** np.arange(order)
-    reverse = np.ascontiguousarray(y[::-1])
-    start, spread = _prior(reverse, order)
-    passed = _allocate_pass(count, order)
-    flags = np.ascontiguousarray(present[::-1])
-    _filter(reverse, flags, step, noise, start, spread, passed)
-    return passed.states[-1] * signs, 100.0 * passed.covariances[-1] * np.outer(signs, signs)
+    reverse, flags = np.ascontiguousarray(y[::-1]), np.ascontiguousarray(present[::-1])
+    states, covariances, *_ = _filter(reverse, flags, step, noise, *_prior(reverse, order))
+    return states[-1] * signs, 100.0 * covariances[-1] * np.outer(signs, signs)
 
 
 @dataclass(frozen=True)
@@ -307,11 +287,11 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
     step, noise = transition(order)
     y = (position - position[0]) / model.noise_sd
     start, spread = _informed_prior(y, present, step, model.ratio * noise)
-    passed, variances = _allocate_pass(count, order), np.empty((count, order))
-    _filter(y, present, step, model.ratio * noise, start, spread, passed)
+    passed = _filter(y, present, step, model.ratio * noise, start, spread)
+    variances = np.empty((count, order))
     _smooth(present, step, passed, variances)
     scale = model.noise_sd * model.rate_hz ** np.arange(3)
-    x, sd = passed.states[:, :3] * scale, np.sqrt(variances[:, :3]) * scale
+    x, sd = passed[0][:, :3] * scale, np.sqrt(variances[:, :3]) * scale
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
 
 
@@ -353,15 +333,14 @@ def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
     step, noise = transition(order)
     # A state settles at about the cut-off, in rad a sample, to the power of its order.
     wide = np.diag(_WIDE * ratio ** (np.arange(order) / order))
-    passed, there = _allocate_pass(most, order), np.ones(most, dtype=bool)
-    _filter(np.zeros(most), there, step, ratio * noise, np.zeros(order), wide, passed)
+    there = np.ones(most, dtype=bool)
+    passed = _filter(np.zeros(most), there, step, ratio * noise, np.zeros(order), wide)
+    _, covariances, gains, _, spreads = passed
     # They swing as they settle: one that stands still for a moment says nothing.
-    change = np.abs(np.diff(passed.gains, axis=0))
-    settled = np.flatnonzero((change < _SETTLED * passed.gains[1:]).all(axis=1))
+    change = np.abs(np.diff(gains, axis=0))
+    settled = np.flatnonzero((change < _SETTLED * gains[1:]).all(axis=1))
     count = int(settled[0]) + 2 if settled.size else most
-    parts = passed.gains, passed.covariances, passed.spreads
-    gains, covariances, spreads = (part[:count].copy() for part in parts)
-    return gains, covariances, spreads
+    return gains[:count].copy(), covariances[:count].copy(), spreads[:count].copy()
 
 
 def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]:
