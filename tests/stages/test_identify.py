@@ -310,6 +310,7 @@ def test_what_cannot_be_identified_is_said(squares: tuple[Path, dict]) -> None:
     assert abs(lever["moves_percent"]["viscous.pitch"]) > 0.3
 
 
+@pytest.mark.long
 def test_two_terms_of_one_shape_are_said_to_move_together(simulated: RunFolder) -> None:
     """Friction that grows with the rod's load and Coulomb friction: nearly the same here."""
     text = MODEL.replace("[]", '["gravity_compensator_mistuned", "base_tilt"]')
