@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import Dialect, check_columns
@@ -279,7 +280,8 @@ def _otherwise(text: str, width: int) -> list[list[str]]:
 def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> list[str]:
     """Names in a header, which may be written as a remark: ``# t x`` has two names or three."""
     plain, bare = (cells(t, delimiter) for t in (text, _REMARK.sub("", text, count=1)))
-    rows = [line.text for line in below if line.text.strip() and not _is_remark(line.text)]
+    written = (line.text for line in below if line.text.strip() and not _is_remark(line.text))
+    rows = list(islice(written, _SEARCHED))
     if len(plain) == len(bare):
         row = bare if _is_remark(text) and plain[0].strip("#%/") else plain
     else:
@@ -289,7 +291,7 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
     row = [name.strip("\"'") for name in row]
     if _is_key_of_names(row):
         row = ["Time" if name == row[0] else name for name in row]
-    row = _named_items(row, [cells(text, delimiter) for text in rows[:_SEARCHED]])
+    row = _named_items(row, rows, delimiter)
     return _told_apart(row, cells(above[-1].text, delimiter) if above else [])
 
 
@@ -311,14 +313,15 @@ def _told_apart(header: list[str], above: list[str]) -> list[str]:
     return [f"{x} ({n})" if count[x] > 1 else x for x, n in zip(header, seen, strict=True)]
 
 
-def _named_items(header: list[str], rows: list[list[str]]) -> list[str]:
+def _named_items(header: list[str], below: list[str], delimiter: str) -> list[str]:
     """The header with ``field.effort[elbow]`` for ``field.effort0`` beside a ``field.name0``.
 
     So are messages with lists written by `rostopic echo -p`; the name has to be that of all rows.
     """
     of: dict[tuple[str, str], str] = {}
-    for at, column in enumerate(header):
-        match = re.fullmatch(r"(.*)name(\d+)", column)
+    matches = [re.fullmatch(r"(.*)name(\d+)", column) for column in header]
+    rows = [cells(text, delimiter) for text in below] if any(matches) else []
+    for at, match in enumerate(matches):
         said = {row[at].strip('"') for row in rows if at < len(row)}
         if match and len(said) == 1 and not _POINT.match(name := said.pop()) and name:
             of[match[1], match[2]] = name
@@ -338,19 +341,16 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
         rows = [cells(line.text, delimiter) for line in tried]
         width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
         alike = [row for row in rows if len(row) == width]
-        numbers = sum(_number_cells(row, delimiter) for row in alike)
-        share = numbers / (width * len(rows)) if width else 0.0
+        found_numbers = sum(_number_cells(row, delimiter) for row in alike)
+        share = found_numbers / (width * len(rows)) if width else 0.0
         ranked.append((share * width if width > 1 else 0.0, width, delimiter))
     found = []
     best = max(score for score, _, _ in ranked)
     for _, width, delimiter in (each for each in ranked if each[0] >= _ALIKE * best):
         split = [cells(line.text, delimiter) for line in lines]
+        numbers = [_number_cells(row, delimiter) if len(row) == width else 0 for row in split]
         samples = [
-            [
-                n
-                for n, row in enumerate(split)
-                if len(row) == width and _number_cells(row, delimiter) > 0.5 * of(row)
-            ]
+            [n for n, row in enumerate(split) if numbers[n] > 0.5 * of(row)]
             for of in (len, lambda row: sum(map(bool, row)))  # of cells, or of those with something
         ]
         first = next((found[0] for found in samples if found), len(lines))
