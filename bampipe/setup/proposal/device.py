@@ -204,8 +204,8 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         raise InputError(
             "no column looks like a position",
             where=f"{folder}: {found.trials[0].file}",
-            remedy="name the device: bampipe init FOLDER --device NAME; columns are "
-            + ", ".join(c.name for c in found.columns[:12]),
+            remedy="say in order what they are: bampipe init FOLDER --names t,angle_deg,...;"
+            f" columns are {', '.join(c.name for c in found.columns[:12])}",
         )
     linear = slides(position, found)
     driver, role = match.driver(position)

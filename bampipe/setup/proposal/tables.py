@@ -96,8 +96,10 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
     known, rows = np.isfinite(stamps), np.arange(len(stamps))
     stamps = np.interp(rows, rows[known], spread_stamps(unroll(stamps[known])[0])[0])
     named = f"column = {quoted(column.name)}"
+    named_unit = next((u for u in ("us", "ms", "ns") if u in words(column.name)), "")
     counter = not _COUNTERS.isdisjoint(words(column.name)) or column.role != "time"
-    kind = "" if counter else guesses.time_unit(stamps + start, column.unit)
+    counter &= not named_unit
+    kind = "" if counter else guesses.time_unit(stamps + start, column.unit or named_unit)
     tick = re.search(r"(?<!\d)(\d+) ?_?(ns|us|ms)(?![A-Za-z])", column.name)
     if counter and tick:
         size = float(tick[1]) * SECONDS[tick[2]]
@@ -420,17 +422,20 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             "who wrote the logger; N.m or N of a sensor, V with calibration_n_per_v of counts",
         )
         return [f'unit = "{UNKNOWN}"{note}']
+    note = ""
+    if any(column.si == "kg" for column in columns):
+        common = next(unit for unit in ("kgf", "gf") if columns[0].unit.startswith(unit[:-1]))
+        note = notes.guess(f"{names} is the weight of a mass: a force in {common}")
     if device.force_unit == "N.m" and any(_is_force(column) for column in columns):
-        note = "" if common else notes.guess(f"{names} is a force in N")
-        if any(column.si == "kg" for column in columns):
-            common = next(unit for unit in ("kgf", "gf") if columns[0].unit.startswith(unit[:-1]))
-            note = notes.guess(f"{names} is the weight of a mass: a force in {common}")
+        note = note or ("" if common else notes.guess(f"{names} is a force in N"))
         ask = notes.ask(
             f"lever_m, how far from the axis {names} acts, m",
             "measure it on the machine, or take it from the drawing; if the column is a torque"
             ' already, put unit = "N.m" and take lever_m out',
         )
         return [f'unit = "{common or "N"}"{note}', f"lever_m = 0.0{ask}"]
+    if note:
+        return [f'unit = "{common}"{note}']
     note = notes.guess(f"{names} is a {_QUANTITY[device.force_unit]} in {device.force_unit}{why}")
     return [f'unit = "{device.force_unit}"{note}']
 
