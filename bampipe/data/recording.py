@@ -10,7 +10,7 @@ import numpy as np
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean
 from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
-from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, interpolated
+from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, check_columns, interpolated
 from bampipe.data.session import SECONDS, Clock, Part, Session, TrialEntry, inside
 from bampipe.errors import InputError
 from bampipe.files import digest_file
@@ -338,4 +338,10 @@ def read_sound_trial(
             columns={clock.column: np.arange(count, dtype=float), **raw.columns},
             remarks=(*raw.remarks, note),
         )
-    return clean(raw, session, entry, limits)
+    trial = clean(raw, session, entry, limits)
+    for name in entry.negated:
+        known = {column.removeprefix("q_"): column for column in trial.columns}
+        check_columns(list(known), [name], f"{entry.file}, negated")
+        trial.columns[known[name]] = -trial.columns[known[name]]
+        trial.repairs.append(f"{name} negated, as the session says")
+    return trial

@@ -86,7 +86,9 @@ _BY_UNIT = {
     "m/s": "velocity", "kg": "force", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
 }  # fmt: skip
 _SHORT_UNITS = frozenset(["mm", "Nm", "kN", "mA", "mV"])
-_PLAIN_WORDS = frozenset(["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano"])
+_PLAIN_WORDS = frozenset(
+    ["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano", "meter"]
+)
 """Units of two letters at the end of a name that are no words, and longer ones that are."""
 _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
 _PRESENT = frozenset(["current", "curr", "cur"])

@@ -15,7 +15,8 @@ from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, Setu
 from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility, distance_from_prior
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, drawn_robot, is_drawn
-from bampipe.setup.search import Finding, Search, shorten, spoilt_axes
+from bampipe.setup.search import Finding, Search, shorten, spoilt_axes, spread
+from bampipe.setup.turned_trials import TurnedTrial, find_turned_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
@@ -28,23 +29,41 @@ _MANY = 8
 
 
 def inspect_setup(
-    system: System, session: IngestResult, motions: Sequence[Motion], band: Band, folds: Folds
+    system: System,
+    session: IngestResult,
+    motions: Sequence[Motion],
+    band: Band,
+    folds: Folds,
+    names: Sequence[str] = (),
 ) -> SetupResult:
-    """Hold the set-up of a session against some of its trials, with every input of the device.
+    """Hold the set-up of a session against its trials ``names``, with every input of the device.
+
+    Some of them, spread over the session, tell of mistakes in all; each tells of its own.
 
     Raises:
         InputError: the device leaves the scale of its equation open.
     """
-    short = shorten(motions)
-    _require_scale(system, short)
     signals = Signals.of_session(system, session)
+    _require_scale(system, motions[:1])
+    odd = find_turned_trials(system, motions, band, folds, signals)
+    place = {one.place: one.corrections[0].change for one in odd}
+    motions = [
+        place[k].of_motion(motion, signals) if k in place else motion
+        for k, motion in enumerate(motions)
+    ]
+    of_kind = [[k for k, fits in enumerate(folds.fitted) if fits == kind] for kind in (True, False)]
+    chosen = [some[k] for some in of_kind for k in spread(len(some))]
+    short, folds = shorten([motions[k] for k in chosen]), folds.subset(chosen)
     placeholders = _find_placeholders(system, session)
     search = Search(system, short, band, folds, signals)
     held = search.judge(())
     if is_drawn(system):
         search = DrawnSearch(system, shorten(short, DRAWN_SAMPLES), band, folds, signals)
     findings = search.find_mistakes(tuple(n for names in placeholders.values() for n in names))
-    mistakes = tuple(_record(system, session, found, placeholders) for found in findings)
+    mistakes = (
+        *(_record_turned(system, session, one, names[one.place]) for one in odd),
+        *(_record(system, session, found, placeholders) for found in findings),
+    )
     axes = {
         axis: _axis(place, axis, held, mistakes) for place, axis in enumerate(system.coordinates)
     }
@@ -132,6 +151,21 @@ def _record(
             for rival in found.rivals
         ),
     )
+
+
+def _record_turned(
+    system: System, session: IngestResult, found: TurnedTrial, name: str
+) -> SetupMistake:
+    """One trial with a sign of its own."""
+    signals = [one.signals[0] for one in found.corrections]
+    either = " or ".join(signals)
+    sentence = (
+        f"{name}: {either} has another sign than in the other trials: put negated ="
+        f' ["{signals[0]}"] into its [[trials]] entry, or leave the trial out'
+    )
+    one = Finding(found.corrections[0], (), found.before, found.after, 0.0)
+    record = _record(system, session, one, {})
+    return record.model_copy(update={"sentence": sentence})
 
 
 def _require_scale(system: System, motions: Sequence[Motion]) -> None:

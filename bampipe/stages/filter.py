@@ -1,6 +1,7 @@
 """Stage filter: velocity and acceleration from encoders, on a uniform grid, with error bands."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -34,7 +35,7 @@ from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import SetupResult
 from bampipe.schema import STRICT, NotNegative
 from bampipe.setup.inspection import inspect_setup
-from bampipe.setup.search import HIGHEST_HZ, spread
+from bampipe.setup.search import HIGHEST_HZ, MOST_TRIALS, shorten
 from bampipe.trials.band import LEAST_HZ, find_band
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.disturbances import find_disturbances
@@ -60,8 +61,9 @@ _NO_NOISE, _UNFOLLOWED = 30.0, 0.1
 differences of a position show is motion that is too fast for the rate of the log."""
 _SHORTEST = 32
 """Samples of a trial, the least that can be differentiated."""
-_TUNING_PART = 2000
-"""Least length, samples, of the parts that the bandwidth is chosen from, where trials are many."""
+_INSPECTED, _TUNING_PART = 12_000, 2000
+"""Samples of all trials on which the set-up is judged; and least length of the parts that the
+bandwidth is chosen from, where trials are many."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -336,17 +338,16 @@ def _inspect(
     bands: Mapping[str, ResidualBand],
     disturbances: Mapping[str, Sequence[Disturbance]],
 ) -> SetupResult:
-    """Hold the set-up against some trials ``ids``, those in ``free`` fitted."""
-    fitted, others = ([k for k in ids if (k in free) == side] for side in (True, False))
-    chosen = [some[k] for some in (fitted, others) for k in spread(len(some))]
-    motions = [
-        read_motion(path, name, system, disturbances.get(name, ()), every_input=True)
-        for name in chosen
-    ]
+    """Hold the set-up against the trials ``ids``, those in ``free`` fitted."""
+    motions = []
+    for name in ids:
+        motion = read_motion(path, name, system, disturbances.get(name, ()), every_input=True)
+        motions += deepcopy(shorten([motion], _INSPECTED // min(len(ids), MOST_TRIALS)))
     # What brakes do is no part of the bare device: it is judged by braked trials, not fitted.
-    folds = Folds.of_trials(chosen, (), fitted)
+    folds = Folds.of_trials(ids, (), [name for name in ids if name in free])
     cutoffs = tuple(min(bands[axis].cutoff_hz, HIGHEST_HZ) for axis in system.coordinates)
-    return inspect_setup(system, session, motions, Band(session.sample_rate_hz, cutoffs), folds)
+    band = Band(session.sample_rate_hz, cutoffs)
+    return inspect_setup(system, session, motions, band, folds, ids)
 
 
 def _load(samples: Path, trial_id: str, rate: float) -> _Trial | str:

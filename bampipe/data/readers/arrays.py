@@ -15,7 +15,11 @@ from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns,
 from bampipe.errors import InputError
 
 LARGEST_WIDTH = 64
-_RUN = re.compile(r"(.*?)(?:\[([^\[\]:]+)\]|_?(\d+))[./]([^\[\]]+)")
+_RUN = re.compile(
+    r"(?i)(.+?(?=\[)|(?:.*[./_])?(?:trial|run|rep|test|take|rec|recording|exp|experiment|measurement"
+    r"|messung|versuch|essai|episode|demo|trajectory|traj|log)s?_?(?=\d))"
+    r"(?:\[([^\[\]:]+)\]|(\d+))[./]([^\[\]]+)"
+)
 _TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
 
 
@@ -75,6 +79,11 @@ def columns_of_arrays(arrays: Mapping[str, np.ndarray | None]) -> dict[str, str]
     return {column: "datetime" if column in moment else "" for column in found}
 
 
+def is_run(label: str) -> bool:
+    """Whether an array may be of one of several recordings in a file, by its name."""
+    return _RUN.fullmatch(label) is not None
+
+
 def split_index(column: str, names: Container[str]) -> tuple[str, int | None]:
     """``("X", 2)`` for ``X[2]``, where there is no variable of that whole name."""
     match = re.fullmatch(r"(.+)\[(\d{1,3})\]", column)
@@ -123,7 +132,7 @@ def _join_runs(
 ) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, ...]]]:
     """Vectors of one name in all structs of a list, end to end: ``runs[:].q`` of ``runs[0].q``.
 
-    And of groups whose names are a word and a number, as ``run1.q``. Of structs that each have a
+    And of groups that are called trials by a number, as ``run1.q``. Of structs that each have a
     time, or are as long as no other; others are rather joints. All arrays, and by the name of each
     that was joined the samples before which one begins.
     """

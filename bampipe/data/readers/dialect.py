@@ -299,6 +299,9 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
     if _is_key_of_names(row):
         row = ["Time" if name == row[0] else name for name in row]
     row = _named_items(row, [cells(text, delimiter) for text in rows[:_SEARCHED]])
+    first = [cells(text, delimiter)[0] for text in rows[:_SEARCHED]]
+    if len(row) > 1 and not row[0] and first and all("." in x or is_moment(x) for x in first):
+        row[0] = "index" if "time" in row else "time"  # of a frame of pandas; R numbers its rows
     return _told_apart(row, beside)
 
 
@@ -362,7 +365,10 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
             ]
             for of in (len, lambda row: sum(map(bool, row)))  # of cells, or of those with something
         ]
-        first = next((found[0] for found in samples if found), len(lines))
+        # What is written of the log above it may be numbers, but not for several lines.
+        most = next(filter(None, samples), [])
+        first = next((n for n, end in zip(most, most[3:], strict=False) if end - n < 6), -1)
+        first = first if first >= 0 else next(iter(most), len(lines))
         # What was logged before all sensors had answered are samples with empty cells.
         while 0 < first < len(lines) and _is_sparse(cells(lines[first - 1].text, delimiter), width):
             first -= 1

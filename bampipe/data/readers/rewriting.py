@@ -90,7 +90,7 @@ def find_form(head: str, name: str) -> Form | None:
         return _stamped(lines)
     if _are(_FORTRAN, lines):
         return Form("exponents of Fortran", lambda line: _FORTRAN.sub(r"\1E\2", line))
-    for find in (_named_numbers, _protocol_fields, _elements):
+    for find in (_protocol_fields, _elements, _named_numbers):
         if pairs := _pairs(lines, find):
             return pairs
     for delimiter in (*_DELIMITERS, " "):

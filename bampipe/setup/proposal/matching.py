@@ -14,6 +14,8 @@ from bampipe.setup.proposal.positions import travelled
 from bampipe.setup.proposal.robot import RobotColumns
 
 _MANY = 6
+_SUPPLIED = frozenset(["in", "input", "supply", "bus", "battery"])
+"""Words in the name of what a converter takes up rather than what its motor gets."""
 _NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
 _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
 Match = tuple[SurveyedColumn | None, str]
@@ -150,6 +152,7 @@ class Matcher:
         # A velocity of an unknown name fits itself. Of several joints without a drawing, a drive
         # has the number of its position.
         fitting = [name for name in fitting if roles[name] in DRIVERS] or fitting
+        fitting = [name for name in fitting if not _SUPPLIED & set(words(name))] or fitting
         number = _numbers(position.name)
         fitting = [name for name in fitting if number and _numbers(name) == number] or fitting
         if not fitting:

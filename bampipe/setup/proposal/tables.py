@@ -422,6 +422,13 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             "who wrote the logger; N.m or N of a sensor, V with calibration_n_per_v of counts",
         )
         return [f'unit = "{UNKNOWN}"{note}']
+    other = next((c for c in columns if c.si not in (None, "", "V", "kg", "N", "N.m")), None)
+    if other is not None:
+        note = notes.ask(
+            f"the force: {other.name} is in {bare(other.unit)} and follows the motion, but is none",
+            "a channel of a force sensor; of a cylinder, log pressure times area in its place",
+        )
+        return [f'unit = "{UNKNOWN}"{note}']
     note = ""
     if any(column.si == "kg" for column in columns):
         common = next(unit for unit in ("kgf", "gf") if columns[0].unit.startswith(unit[:-1]))
