@@ -303,7 +303,9 @@ def _sign(correction: Correction, session: IngestResult) -> str:
         return f"the encoder of {name} counts the other way: {fix}"
     entry = f"scale of channels.{name}" if name in session.channels else "its column"
     if name in session.force.columns:
-        entry = _force_entry(session) + " in its row" * (len(session.force.columns) > 1)
+        if len(session.force.columns) == 1:
+            return f"{name} has the wrong sign: put reaction = true into [force]"
+        entry = _force_entry(session) + " in its row"
     return f"{name} has the wrong sign: negate {entry}"
 
 

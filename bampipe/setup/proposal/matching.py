@@ -33,6 +33,7 @@ class Matcher:
         robot: columns of a robot of which the drawing tells, and how they are counted.
         turning: what the readings of a position are worth, by the weight on it, by name of column.
         given: columns that are known, by name of axis or input.
+        reacting: the column of a drive that has the sign of the reaction, "" where none has.
     """
 
     found: Survey
@@ -42,6 +43,7 @@ class Matcher:
     robot: RobotColumns = field(default_factory=RobotColumns)
     turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
     given: Mapping[str, SurveyedColumn] = field(default_factory=dict)
+    reacting: str = ""
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""

@@ -358,6 +358,8 @@ def input_tables(
     if sensed and len(forces) in (0, len(device.forces)):
         match.used |= {column.name for column in forces}
         lines += _force_table(device, forces, given[device.forces[0]][1], notes)
+        if match.reacting in {column.name for column in forces}:
+            lines.insert(-1, "reaction = true" + notes.guess(f"{match.reacting} is the reaction"))
         wanted = dict(device.channels)
     lines += _brakes_table(device, match, notes)
     return lines + _channels_table(wanted, given, match, notes)
@@ -500,7 +502,8 @@ def _channel(
     """Column and unit of one input; its register or its scale, where the unit does not do."""
     register = match.registers.get(column.name)
     fields = register.fields if register else ""
-    fields += ", scale = -1.0" if name in match.robot.turned else ""
+    turned = name in match.robot.turned or column.name == match.reacting
+    fields += ", scale = -1.0" if turned else ""
     slides = (column.si, si) == ("N", "N.m")  # the drive of a sliding joint
     if column.si == si or slides:
         table = entry(column.name, bare(column.unit), fields)
