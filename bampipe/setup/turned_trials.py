@@ -63,27 +63,32 @@ def _search(
     folds: Folds,
     signals: Signals,
 ) -> list[TurnedTrial]:
-    part, now = folds.subset(places), shorten([motions[k] for k in places])
-    stated = judge_setup(system, now, band, part, _STEPS)
+    """Of one group; where nothing is found as stated, under a sign that is wrong in all of it."""
+    part, short = folds.subset(places), shorten([motions[k] for k in places])
+    stated = judge_setup(system, short, band, part, _STEPS)
     if stated is None or stated.error.max() < SUSPICIOUS_ERROR:
         return []
     options = [turned(signals, [name]) for name in (*signals.axes, *signals.forces)]
-    found: dict[int, tuple[Correction, ...]] = {}
-    best = stated
-    for _ in range(len(places) // 2):
-        tried = []
-        for at in (at for at in range(len(places)) if at not in found):
-            for one in options:
-                changed = [*now[:at], one.change.of_motion(now[at], signals), *now[at + 1 :]]
-                after = judge_setup(system, changed, band, part, _STEPS)
-                if after is not None:
-                    tried.append((after.score(RANKED_ERROR), at, one, after))
-        least, at, one, after = min(tried, key=lambda each: each[0], default=(0.0, 0, None, best))
-        if one is None or gain_of(best, after, 0.0) <= ALIKE:
-            break
-        alike = [c for score, k, c, _ in tried if k == at and score < least + ALIKE]
-        found[at], best = (one, *(c for c in alike if c is not one)), after
-        now[at] = one.change.of_motion(now[at], signals)
-    if gain_of(stated, best, 0.0) < LEAST_GAIN:
-        return []
-    return [TurnedTrial(places[at], any_of, stated, best) for at, any_of in found.items()]
+    for start in (None, *options):
+        now = [start.change.of_motion(one, signals) for one in short] if start else list(short)
+        best = judge_setup(system, now, band, part, _STEPS)
+        found: dict[int, tuple[Correction, ...]] = {}
+        while best is not None and len(found) < len(places) // 2:
+            tried = []
+            for at in (at for at in range(len(places)) if at not in found):
+                for one in options:
+                    changed = [*now[:at], one.change.of_motion(now[at], signals), *now[at + 1 :]]
+                    after = judge_setup(system, changed, band, part, _STEPS)
+                    if after is not None:
+                        tried.append((after.score(RANKED_ERROR), at, one, after))
+            if not tried:
+                break
+            least, at, one, after = min(tried, key=lambda each: each[0])
+            if gain_of(best, after, 0.0) <= ALIKE:
+                break
+            alike = [c for score, k, c, _ in tried if k == at and score < least + ALIKE]
+            found[at], best = (one, *(c for c in alike if c is not one)), after
+            now[at] = one.change.of_motion(now[at], signals)
+        if best is not None and found and gain_of(stated, best, 0.0) > LEAST_GAIN:
+            return [TurnedTrial(places[at], any_of, stated, best) for at, any_of in found.items()]
+    return []

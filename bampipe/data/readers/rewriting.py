@@ -8,10 +8,12 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 from bampipe.data.readers.dialect import cells
+from bampipe.data.readers.moments import is_moment
 from bampipe.data.units import unit
 from bampipe.errors import InputError
 
@@ -99,9 +101,9 @@ def find_form(head: str, name: str) -> Form | None:
         rows = [row for row in table if len(row) == width > 1]
         found = None
         if len(rows) > _MOST * len(table):
-            found = _grouped(whole, delimiter) or (
-                _cells(rows[0], rows[1:], delimiter) if delimiter != " " else None
-            )
+            every = [row for row in (cells(x, delimiter) for x in whole) if len(row) == width]
+            found = _grouped(every, delimiter)
+            found = found or (_cells(rows[0], rows[1:], delimiter) if delimiter != " " else None)
         if found:
             return found
     for line in (*whole[:_FEWEST], lines[-1]):
@@ -111,24 +113,26 @@ def find_form(head: str, name: str) -> Form | None:
     return None
 
 
-def _grouped(lines: Sequence[str], delimiter: str) -> Form | None:
-    """The form of a table with digits in thousands, where no cell has their sign otherwise."""
-    table = [cells(line, delimiter) for line in lines]
+def _grouped(table: Sequence[list[str]], delimiter: str) -> Form | None:
+    """The form of a table with digits in thousands, where no number has their sign otherwise."""
+    numbers = [
+        cell for row in table for cell in row if re.match(r"[-+\d]", cell) and not is_moment(cell)
+    ]
     for sign, decimal in _GROUPS:
         if sign == delimiter == " ":
             continue
         group = re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:{re.escape(sign)}\d{{3}})+(?:{decimal}\d*)?")
         # A sign of decimals alone would be that.
         sure = re.compile(rf".*{decimal}\d*" if sign in ",." else ".*")
-        own = [cell for row in table for cell in row if sign in cell and re.match(r"[-+\d]", cell)]
+        own = [cell for cell in numbers if sign in cell]
         if own and all(map(group.fullmatch, own)) and any(map(sure.fullmatch, own)):
-            return Form(
-                f"digits in thousands, as in {own[-1]}",
-                _by_row(
-                    delimiter, lambda c, s=sign, g=group: c.replace(s, "") if g.fullmatch(c) else c
-                ),
-            )
+            said = f"digits in thousands, as in {own[-1]}"
+            return Form(said, _by_row(delimiter, partial(_without, sign, group)))
     return None
+
+
+def _without(sign: str, group: re.Pattern[str], cell: str) -> str:
+    return cell.replace(sign, "") if group.fullmatch(cell) else cell
 
 
 def _by_row(delimiter: str, act: Callable[[str], str]) -> Callable[[str], str]:
