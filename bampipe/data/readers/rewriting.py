@@ -20,8 +20,10 @@ from bampipe.errors import InputError
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _PAIR = re.compile(rf"""["']?([A-Za-z_][\w./]*)["']?\s*[=:]\s*({_NUMBER})(?![\w.:])""")
 _STAMPED = re.compile(
-    r"\s*\[?((?:\d{4}-\d\d-\d\d[ T])?\d{1,2}:\d\d:\d\d[.,]\d+)(?:\]|\s*->)\s*(.*)"
+    r"\s*\[?((?:\d{4}-\d\d-\d\d[ T])?\d{1,2}:\d\d:\d\d[.,]\d+)"
+    r"(?:\]|\s*->|\s+(?:DEBUG|INFO|WARN\w*|ERROR)\b)\s*(.*)"
 )
+_QUOTED = re.compile(r'\s*"[^"]*\d[,;\t][^"]*"\s*\Z')
 _LINE_PROTOCOL = re.compile(r"[^\s,=]+(?:,\S+)? (\w[^\s=]*=\S+) (\d{10,19})\s*")
 _ELEMENT = re.compile(r"<(\w+)((?:\s+\w+=\"[^\"]*\")+)\s*/?>|<(\w+)>([^<>]*)</")
 _WITH_UNIT = re.compile(rf"({_NUMBER})[ \u00a0]?([^\W\d_]\S*|[%°]\S*)")
@@ -88,6 +90,8 @@ def find_form(head: str, name: str) -> Form | None:
     ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
     if 2 * len(ended) > len(lines) and all(re.search(r"[,\t |]", line) for line in ended):
         return Form("", lambda line: line.removesuffix(";"))
+    if _are(_QUOTED, lines):
+        return Form("quotes around whole lines left out", lambda line: line.strip().strip('"'))
     if _are(_STAMPED, lines):
         return _stamped(lines)
     if _are(_FORTRAN, lines):

@@ -13,7 +13,7 @@ from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import travelled
 from bampipe.setup.proposal.robot import RobotColumns
 
-_MANY = 6
+_MANY, _NO_LESS = 6, 0.03
 _SUPPLIED = frozenset(["in", "input", "supply", "bus", "battery"])
 """Words in the name of what a converter takes up rather than what its motor gets."""
 _NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
@@ -72,6 +72,7 @@ class Matcher:
         # A test stand may log the velocity only, which is integrated then.
         found = found or [c for c in moving if c.role == "velocity"]
         found = found or [c for c in moving if c.name in ("v", "V")]
+        found = [c for c in found if "motor" not in words(c.name)] or found
         if len(found) < 2:
             return found[0] if found else None
         best = found[0]
@@ -159,7 +160,10 @@ class Matcher:
         fitting = [name for name in fitting if number and _numbers(name) == number] or fitting
         if not fitting:
             return None
-        best = max(fitting, key=lambda name: share[name])
+        at_axis = [name for name in fitting if "motor" not in words(name) or roles[name] != "force"]
+        fitting = at_axis if "motor" not in words(position.name) and at_axis else fitting
+        # A torque needs no constant where a current tells the same.
+        best = max(fitting, key=lambda name: share[name] + _NO_LESS * (roles[name] == "force"))
         return next(c for c in self.found.columns if c.name == best)
 
 
