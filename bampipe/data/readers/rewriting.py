@@ -23,7 +23,7 @@ _STAMPED = re.compile(
     r"\s*\[?((?:\d{4}-\d\d-\d\d[ T])?\d{1,2}:\d\d:\d\d[.,]\d+)"
     r"(?:\]|\s*->|\s+(?:DEBUG|INFO|WARN\w*|ERROR)\b)\s*(.*)"
 )
-_QUOTED = re.compile(r'\s*"[^"]*\d[,;\t][^"]*"\s*\Z')
+_QUOTED = re.compile(r'\A\s*"[^"]*\d[,;\t][^"]*"\s*\Z')
 _LINE_PROTOCOL = re.compile(r"[^\s,=]+(?:,\S+)? (\w[^\s=]*=\S+) (\d{10,19})\s*")
 _ELEMENT = re.compile(r"<(\w+)((?:\s+\w+=\"[^\"]*\")+)\s*/?>|<(\w+)>([^<>]*)</")
 _WITH_UNIT = re.compile(rf"({_NUMBER})[ \u00a0]?([^\W\d_]\S*|[%°]\S*)")
