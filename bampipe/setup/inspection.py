@@ -304,7 +304,7 @@ def _sign(correction: Correction, session: IngestResult) -> str:
     entry = f"scale of channels.{name}" if name in session.channels else "its column"
     if name in session.force.columns:
         if len(session.force.columns) == 1:
-            return f"{name} has the wrong sign: put reaction = true into [force]"
+            return f"{name} has the wrong sign: put reaction = true into [force], or take it out"
         entry = _force_entry(session) + " in its row"
     return f"{name} has the wrong sign: negate {entry}"
 

@@ -22,7 +22,9 @@ from bampipe.trials.signals import Signals
 
 _TOGETHER = 6
 """Trials that are held against each other at once, the most."""
-_STEPS = 6
+_STEPS, _SAMPLES = 4, 4000
+_ONE_AXIS = 2
+"""Signals of a machine so small that signs wrong throughout are tried beside those of a trial."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +66,12 @@ def _search(
     signals: Signals,
 ) -> list[TurnedTrial]:
     """Of one group; where nothing is found as stated, under a sign that is wrong in all of it."""
-    part, short = folds.subset(places), shorten([motions[k] for k in places])
+    part, short = folds.subset(places), shorten([motions[k] for k in places], _SAMPLES)
     stated = judge_setup(system, short, band, part, _STEPS)
     if stated is None or stated.error.max() < SUSPICIOUS_ERROR:
         return []
     options = [turned(signals, [name]) for name in (*signals.axes, *signals.forces)]
-    for start in (None, *options):
+    for start in (None, *options) if len(options) <= _ONE_AXIS else (None,):
         now = [start.change.of_motion(one, signals) for one in short] if start else list(short)
         best = judge_setup(system, now, band, part, _STEPS)
         found: dict[int, tuple[Correction, ...]] = {}
