@@ -17,7 +17,7 @@ from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Pool, Search, added, gone
 from bampipe.diagnosis.session import Fit
-from bampipe.diagnosis.unknown import Unknown, spline_columns, weigh_unknown
+from bampipe.diagnosis.unknown import Splines, Unknown, lay_splines, weigh_unknown
 
 _DRAWS = 1000
 _NEAR = 14.0
@@ -83,7 +83,7 @@ def weigh_sets(
     # What a set fell short by when it was fitted.
     short = {k: c - by_noise.cost(k) for c, k in pool.values()}
     pool = {n: (search.cost(k) + short[k], k) for n, (_, k) in pool.items()}
-    none, evidence = search.cost(()), search.dictionary.evidence
+    none = search.cost(())
     own = [e for e in search.p.absence if e not in given]
     near = sorted((c, k) for c, k in pool.values() if c < none + _NEAR and k)[:_MOST]
     absent = [((f"-{e}", ()),) for e in own]
@@ -98,12 +98,16 @@ def weigh_sets(
     sets = _share(search, named, given, seed)
     effects, drops = _by_effect(sets), _losses(sets)
     effects |= {e: 0.0 for e in own if by_noise.size_of_own(e) < criteria.size}
-    unknown, functions = np.zeros(len(search.p.y)), []
+    unknown = np.zeros(len(search.p.y))
+    functions: list[Unknown | None] = []
     for axis in range(len(unknown)):
-        columns = spline_columns(evidence, axis)
-        by_all, here = (weigh_unknown(s, axis, columns) for s in (by_noise, search))
+        splines = lay_splines(by_noise, axis)
+        if splines is None:
+            functions.append(None)
+            continue
+        by_all, here = (weigh_unknown(s, splines) for s in (by_noise, search))
         functions.append(by_all)
-        if by_all is None or here is None or by_all.size < criteria.size:
+        if by_all.size < criteria.size:
             continue
         more = by_noise.cost(()) - by_all.cost - (none - here.cost) + search.log_prior
         if none - here.cost + more < search.log_prior - _NEAR:
@@ -114,7 +118,7 @@ def weigh_sets(
                 keys, axis, none - found.cost + more,
                 _by_block(search, keys, found) + more_by_block,
             )
-            for keys, found in _beside_unknown(search, axis, columns, here, own)
+            for keys, found in _beside_unknown(search, splines, here, own)
         ]  # fmt: skip
         # What one axis lacks is independent of what another one does.
         with_unknown = _share(search, [*named, *beside], given, seed)
@@ -129,7 +133,7 @@ def weigh_sets(
             sets = with_unknown
     far = np.sqrt(_squares(search, ()) / np.maximum(search.p.count, 1)) > criteria.doubt
     unknown[far] = 1.0
-    doubtful = unknown >= criteria.probability
+    doubtful = (unknown >= criteria.probability) & fit.is_above_floor
     for effect in own if doubtful.any() else ():
         # In doubt is not absent: the model keeps it, and the report mentions it.
         most = max(_share_explained(search, effect, doubtful), 1.0 - criteria.probability)
@@ -143,7 +147,7 @@ def _squares(search: Search, keys: tuple[Key, ...]) -> Array:
 
 
 def _share_explained(search: Search, effect: str, far: Flags) -> float:
-    """Of the mean square without an effect, what it takes on axes that are ``far``; the largest.
+    """Of the error without an effect, what it takes on axes that are ``far``; the largest.
 
     What is missing there may resemble an effect that takes less than that leaves. 1 of an effect
     that the other axes show, or show more than these.
@@ -152,7 +156,7 @@ def _share_explained(search: Search, effect: str, far: Flags) -> float:
     gain = 0.5 * search.p.independent * np.log(without / now)
     if gain[~far].sum() >= min(gain[far].sum(), _NEAR):
         return 1.0
-    return float(np.max(1.0 - now[far] / without[far]))
+    return float(np.max(1.0 - np.sqrt(now[far] / without[far])))
 
 
 @dataclass(frozen=True)
@@ -206,33 +210,23 @@ def _by_effect(sets: Sequence[WeighedSet]) -> dict[str, float]:
 
 
 def _beside_unknown(
-    search: Search, axis: int, columns: Sequence[Array], here: Unknown, own: Sequence[str]
+    search: Search, splines: Splines, here: Unknown, own: Sequence[str]
 ) -> list[tuple[tuple[Key, ...], Unknown]]:
-    """Sets beside an unknown function, and less each of their effects.
+    """Sets beside an unknown function: the whole one, and less each effect whose place it takes.
 
-    Effects that explain less than the function does beyond them may be mere resemblances of what is
-    missing: those whose place it takes, but for less than a size that matters, are left out.
+    An effect of the model may be a mere resemblance of what is missing.
     """
-    p, size = search.p, search.criteria.size
-    root = p.likelihood.root[axis]
-    force = float(np.sqrt(np.mean(p.likelihood.applied[axis] ** 2)))
-
-    def without(effects: Sequence[str]) -> Unknown:
-        keys = tuple((f"-{e}", ()) for e in sorted(effects))
-        found = weigh_unknown(search, axis, columns, keys)
-        assert found is not None
-        return found
-
-    def replaces(effect: str) -> bool:
-        moved = (without([effect]).residual[axis] - here.residual[axis]) / root
-        return float(np.sqrt(np.mean(moved**2))) < size * force
-
-    beside = [e for e in own if axis in touched_axes(search, e)]
-    none, bare = search.cost(()), search.cost(tuple((f"-{e}", ()) for e in sorted(beside)))
-    resembles = none - here.cost > bare - none
-    gone_all = [e for e in beside if resembles and replaces(e)]
-    sets = [gone_all, *([*gone_all, e] for e in beside if e not in gone_all)]
-    return [(tuple((f"-{e}", ()) for e in sorted(one)), without(one)) for one in sets]
+    keys: tuple[Key, ...] = ()
+    found = [(keys, here)]
+    while True:
+        beside = [e for e in own if splines.axis in touched_axes(search, e) if e not in gone(keys)]
+        fewer = [tuple(sorted((*keys, (f"-{e}", ())))) for e in beside]
+        tried = [(less, weigh_unknown(search, splines, less)) for less in fewer]
+        best = min(tried, key=lambda one: one[1].cost, default=None)
+        found += tried
+        if best is None or best[1].cost > min(one.cost for _, one in found):
+            return found
+        keys = best[0]
 
 
 def touched_axes(search: Search, effect: str) -> tuple[int, ...]:

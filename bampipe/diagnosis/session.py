@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from bampipe.arrays import Array
+from bampipe.arrays import Array, Flags
 from bampipe.diagnosis.candidates import (
     Candidate,
     build_candidate_model,
@@ -22,6 +22,7 @@ from bampipe.estimate.simulation import Runaway
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
+from bampipe.results.floor import compare_with_floor
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.likelihood import (
@@ -357,6 +358,12 @@ class Fit:
             more = float(variance.mean()) if b.size else 0.0
             levels.append(np.sqrt(square + np.clip(off, 0.0, more)))
         return NoiseFloor.of_errors([*np.array(levels).T])
+
+    @property
+    def is_above_floor(self) -> Flags:
+        """Of each axis, whether its error is clearly above the noise floor, (n_q,)."""
+        errors = zip(self.held_out_rmse, self.noise_floor.level, self.noise_floor.sd, strict=True)
+        return np.array([compare_with_floor(*map(float, e)) == "above_floor" for e in errors])
 
     @property
     def creeping_floor(self) -> Array:

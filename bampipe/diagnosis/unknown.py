@@ -1,26 +1,31 @@
 """Something that no effect of the library is: a smooth function of what an axis does.
 
-Linear splines in position, speed, load and time since the last reversal, and in the position of the
-other axes, even and odd in the direction of motion, with a normal prior: a Gaussian process of few
-knots. Its evidence is integrated over the strengths and the best of a few sizes is taken.
+A sum of linear splines, each of one quantity (position, speed, load, time or distance since
+the last reversal, or the position of another axis), coarse or fine, alike in both directions of
+motion or opposite, with a normal prior: Gaussian processes of few knots. Splines are added while
+the evidence, integrated over their strengths, grows.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from bampipe.arrays import Array
+from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Search, gone
 from bampipe.diagnosis.shape import since_reversal
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import solve_scaled, take_samples
 
-_KNOTS, _KNOTS_OF_OTHERS = 9, 5
+_KNOTS, _KNOTS_OF_OTHERS = (9, 33), (5,)
+"""Of each spline of what the axis does itself, and of the position of the others."""
 _SIZES = (0.003, 0.01, 0.03, 0.1)
 """Standard deviations of the function at a knot, over the applied force of the axis."""
-_REWEIGHTS = 4
+_REWEIGHTS = 2
+"""From the weights of the function with one spline less."""
+_OWN = 5
+"""Of the quantities, those of the axis itself."""
 
 
 @dataclass(frozen=True)
@@ -43,29 +48,53 @@ class Unknown:
     size: float
 
 
-def spline_columns(evidence: Evidence, axis: int) -> list[Array]:
-    """Splines of what an axis does, low-passed as its residual is, by trial, each (K, m)."""
-    e, width = evidence, evidence.system.model.device.coordinates[axis].sign_width
-    parts: list[list[Array]] = []
-    quantities = [_quantities(e, trial, axis) for trial in range(len(e.motions))]
-    for place in range(len(quantities[0])):
-        values = np.concatenate([q[place] for q in quantities])
-        count = _KNOTS if place < 4 else _KNOTS_OF_OTHERS
-        knots = np.unique(np.quantile(values, np.linspace(0.0, 1.0, count)))
-        if len(knots) > 2:
-            parts.append([_hats(q[place], knots) for q in quantities])
-    columns = []
-    for trial, motion in enumerate(e.motions):
-        even = np.concatenate([part[trial] for part in parts], axis=1)
-        side = np.tanh(motion.qd[:, axis] / width)[:, None]
-        both = np.concatenate([even, even * side], axis=1)
-        columns.append(e.band.thin(both, [axis] * both.shape[1]))
-    return columns
+@dataclass(frozen=True)
+class Splines:
+    """Functions of what an axis does, one of which or a sum of some may be what is missing.
+
+    Attributes:
+        axis: whose equation they are part of.
+        columns: low-passed and weighted as the residual is, (n, m).
+        functions: places of the columns of each function.
+        products: of the columns with the model's own parameters, (nb, m), with each other, (m, m),
+            and with the residual, (m,).
+    """
+
+    axis: int
+    columns: Array
+    functions: tuple[Indices, ...]
+    products: tuple[Array, Array, Array]
+
+
+def lay_splines(search: Search, axis: int) -> Splines | None:
+    """The functions that are weighed on an axis; None where the axis does not move."""
+    p, e = search.p, search.dictionary.evidence
+    if len(p.y[axis]) <= search.bb.shape[1]:
+        return None
+    width = e.system.model.device.coordinates[axis].sign_width
+    quantities = zip(*(_quantities(e, k, axis) for k in range(len(e.motions))), strict=True)
+    sides = [np.tanh(m.qd[:, axis] / width)[:, None] for m in e.motions]
+    blocks = []
+    for place, values in enumerate(quantities):
+        for count in _KNOTS if place < _OWN else _KNOTS_OF_OTHERS:
+            knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0.0, 1.0, count)))
+            if len(knots) < 3:
+                continue
+            even = [_hats(v, knots) for v in values]
+            for hats in (even, [h * side for h, side in zip(even, sides, strict=True)]):
+                thin = [e.band.thin(h, [axis] * len(knots))[:, None, :] for h in hats]
+                blocks.append(take_samples(thin, p.likelihood.samples[axis], 0))
+    if not blocks:
+        return None
+    ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
+    x = np.concatenate(blocks, axis=1) * p.likelihood.root[axis][:, None]
+    functions = tuple(np.arange(*pair) for pair in pairwise(ends))
+    return Splines(axis, x, functions, (p.base[axis].T @ x, x.T @ x, x.T @ p.y[axis]))
 
 
 def _quantities(evidence: Evidence, trial: int, axis: int) -> list[Array]:
     motion, n_q = evidence.motions[trial], len(evidence.system.coordinates)
-    since, _ = since_reversal(motion, axis)
+    since, distance = since_reversal(motion, axis)
     fitted = evidence.fitted[trial]
     # The load by the model, not as measured: a function of that could take all of it away.
     load = (fitted.applied - fitted.residual)[:, axis]
@@ -74,6 +103,7 @@ def _quantities(evidence: Evidence, trial: int, axis: int) -> list[Array]:
         np.abs(motion.qd[:, axis]),
         load,
         np.log(since + 0.02),
+        np.log(distance + 0.02 * max(float(np.ptp(motion.q[:, axis])), 1e-300)),
         *(motion.q[:, other] for other in range(n_q) if other != axis),
     ]
 
@@ -84,56 +114,94 @@ def _hats(values: Array, knots: Array) -> Array:
     return np.column_stack([np.interp(inside, knots, row) for row in np.eye(len(knots))])
 
 
-def weigh_unknown(
-    search: Search, axis: int, columns: Sequence[Array], keys: tuple[Key, ...] = ()
-) -> Unknown | None:
-    """The evidence of an unknown function on an axis beside a set; None if the axis has no samples.
+def weigh_unknown(search: Search, splines: Splines, keys: tuple[Key, ...] = ()) -> Unknown:
+    """The evidence of an unknown function beside a set, of effects of the model taken away."""
+    model = _ModelWithout(search, splines, keys)
+    best = model.add_best({}, search.solve(keys).weight)
+    while len(best.sizes) < len(splines.functions):
+        found = model.add_best(best.sizes, best.weight)
+        if found.cost >= best.cost:
+            break
+        best = found
+    return model.describe(best)
 
-    ``columns`` are its `spline_columns`; ``keys`` the set, of effects of the model taken away.
-    """
-    p, nb = search.p, search.bb.shape[1]
-    if len(p.y[axis]) <= nb:
-        return None
-    wide = [c[:, None, :] for c in columns]
-    root = p.likelihood.root[axis]
-    x = take_samples(wide, p.likelihood.samples[axis], 0) * root[:, None]
-    absent = {k: v for name in gone(keys) for k, v in p.absence[name].items()}
-    fixed, free = p.hold(absent)
-    force = float(np.sqrt(np.mean(p.likelihood.applied[axis] ** 2)))
-    base = [b @ free for b in p.base]
-    y = [v + b @ fixed for v, b in zip(p.y, p.base, strict=True)]
-    bb = np.array([b.T @ b for b in base])
-    by = np.array([b.T @ v for b, v in zip(base, y, strict=True)])
-    precision = free.T @ p.precision @ free
-    moment = free.T @ (p.moment - p.precision @ fixed)
-    bx, xx, xy = base[axis].T @ x, x.T @ x, x.T @ y[axis]
-    best: Unknown | None = None
-    for size in _SIZES:
-        known = 1.0 / (size * force) ** 2
-        weight = search.solve(keys).weight
+
+@dataclass(frozen=True)
+class _Solution:
+    """Functions of given sizes, by number, and unknowns of the model and of these at their best."""
+
+    sizes: dict[int, float]
+    cost: float
+    base: Array
+    strengths: Array
+    weight: Array
+
+
+class _ModelWithout:
+    """The linear problem of a model without some of its effects, to which functions are added."""
+
+    def __init__(self, search: Search, splines: Splines, keys: tuple[Key, ...]) -> None:
+        p = self.p = search.p
+        self.splines, axis = splines, splines.axis
+        absent = {k: v for name in gone(keys) for k, v in p.absence[name].items()}
+        self.fixed, self.free = p.hold(absent)
+        self.base = [b @ self.free for b in p.base]
+        self.y = [v + b @ self.fixed for v, b in zip(p.y, p.base, strict=True)]
+        self.bb = np.array([b.T @ b for b in self.base])
+        self.by = np.array([b.T @ v for b, v in zip(self.base, self.y, strict=True)])
+        self.yy = np.array([float(v @ v) for v in self.y])
+        self.precision = self.free.T @ p.precision @ self.free
+        self.moment = self.free.T @ (p.moment - p.precision @ self.fixed)
+        bx, self.xx, xy = splines.products
+        self.bx, self.xy = self.free.T @ bx, xy + bx.T @ self.fixed
+        self.penalty, self.before = search.penalty_of(keys), search.residual_rows(keys)[axis]
+        self.force = float(np.sqrt(np.mean(p.likelihood.applied[axis] ** 2)))
+
+    def add_best(self, sizes: dict[int, float], weight: Array) -> _Solution:
+        """With the function and the size that take most off the cost beside those of ``sizes``."""
+        wider = [
+            {**sizes, function: size}
+            for function in range(len(self.splines.functions))
+            if function not in sizes
+            for size in _SIZES
+        ]
+        return min((self.solve(one, weight) for one in wider), key=lambda one: one.cost)
+
+    def solve(self, sizes: dict[int, float], weight: Array) -> _Solution:
+        """The best strengths of functions of given sizes, and the cost; from ``weight`` on."""
+        p, axis, functions = self.p, self.splines.axis, self.splines.functions
+        at = np.concatenate([functions[k] for k in sizes])
+        known = np.concatenate(
+            [np.full(len(functions[k]), (size * self.force) ** -2) for k, size in sizes.items()]
+        )
+        bx, xx, xy = self.bx[:, at], self.xx[np.ix_(at, at)], self.xy[at]
         for _ in range(_REWEIGHTS):
-            own, w = np.tensordot(weight, bb, 1) + precision, weight[axis]
-            taken = solve_scaled(own, w * bx)
-            inside = w * xx - w * bx.T @ taken
-            right = moment - weight @ by
-            c = solve_scaled(
-                inside + known * np.eye(len(xx)), -w * xy - w * bx.T @ solve_scaled(own, right)
-            )
-            b = solve_scaled(own, right - w * bx @ c)
-            left = [v + z @ b for v, z in zip(y, base, strict=True)]
-            left[axis] = left[axis] + x @ c
-            squares = np.maximum([float(v @ v) for v in left], 1e-300)
-            weight = p.independent / squares
-        cost = p.fixed_cost + float(p.independent @ (0.5 * np.log(squares / p.count)))
-        moved = fixed + free @ b
+            own, w = np.tensordot(weight, self.bb, 1) + self.precision, weight[axis]
+            right = np.column_stack([w * bx, self.moment - weight @ self.by])
+            taken = solve_scaled(own, right)
+            inside = w * xx - w * bx.T @ taken[:, :-1]
+            c = solve_scaled(inside + np.diag(known), -w * xy - w * bx.T @ taken[:, -1])
+            b = taken[:, -1] - taken[:, :-1] @ c
+            squares = self.yy + 2.0 * self.by @ b + (self.bb @ b) @ b
+            squares[axis] += 2.0 * (xy + bx.T @ b) @ c + c @ xx @ c
+            weight = p.independent / np.maximum(squares, 1e-9 * self.yy + 1e-300)
+        moved = self.fixed + self.free @ b
+        cost = p.fixed_cost + float(
+            p.independent @ (0.5 * np.log(p.independent / weight / p.count))
+        )
         cost += 0.5 * float(moved @ p.precision @ moved) - float(p.moment @ moved)
-        cost += 0.5 * known * float(c @ c)
-        cost += 0.5 * float(np.linalg.slogdet(np.eye(len(xx)) + inside / known)[1])
-        cost += np.log(len(_SIZES)) + search.penalty_of(keys)
-        if best is None or cost < best.cost:
-            before = search.residual_rows(keys)[axis] / root
-            after = left[axis] / root
-            share = 1.0 - float(after @ after) / max(float(before @ before), 1e-300)
-            size_now = float(np.sqrt(np.mean((before - after) ** 2))) / max(force, 1e-300)
-            best = Unknown(axis, cost, tuple(left), weight, share, size_now)
-    return best
+        cost += 0.5 * float(c @ (known * c))
+        cost += 0.5 * float(np.linalg.slogdet(np.eye(len(at)) + inside / known)[1])
+        cost += len(sizes) * np.log(len(_SIZES) * len(functions)) + self.penalty
+        return _Solution(sizes, cost, b, c, weight)
+
+    def describe(self, one: _Solution) -> Unknown:
+        """What functions leave and add."""
+        axis, root = self.splines.axis, self.p.likelihood.root[self.splines.axis]
+        at = np.concatenate([self.splines.functions[k] for k in one.sizes])
+        left = [v + z @ one.base for v, z in zip(self.y, self.base, strict=True)]
+        left[axis] = left[axis] + self.splines.columns[:, at] @ one.strengths
+        before, after = self.before / root, left[axis] / root
+        share = 1.0 - float(after @ after) / max(float(before @ before), 1e-300)
+        size = float(np.sqrt(np.mean((before - after) ** 2))) / max(self.force, 1e-300)
+        return Unknown(axis, one.cost, tuple(left), one.weight, share, size)
