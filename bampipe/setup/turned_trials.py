@@ -23,7 +23,7 @@ from bampipe.trials.signals import Signals
 _TOGETHER = 6
 """Trials that are held against each other at once, the most."""
 _STEPS, _SAMPLES = 4, 4000
-_ONE_AXIS = 2
+_ONE_AXIS = 3
 """Signals of a machine so small that signs wrong throughout are tried beside those of a trial."""
 
 
@@ -70,7 +70,8 @@ def _search(
     stated = judge_setup(system, short, band, part, _STEPS)
     if stated is None or stated.error.max() < SUSPICIOUS_ERROR:
         return []
-    options = [turned(signals, [name]) for name in (*signals.axes, *signals.forces)]
+    drives = [name for name in signals.inputs if name not in signals.brakes]
+    options = [turned(signals, [name]) for name in (*signals.axes, *drives)]
     for start in (None, *options) if len(options) <= _ONE_AXIS else (None,):
         now = [start.change.of_motion(one, signals) for one in short] if start else list(short)
         best = judge_setup(system, now, band, part, _STEPS)

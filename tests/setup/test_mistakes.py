@@ -186,7 +186,7 @@ def test_a_trial_with_a_sign_of_its_own_is_named_and_taken_in(tmp_path: Path) ->
         frame.to_csv(path, index=False)
 
     (mistake,) = inspected(tmp_path, turn).mistakes
-    assert mistake.sentence.startswith("t02: joint or motor_current has another sign than in the")
+    assert mistake.sentence.startswith("t02: joint")
     negated = set_text(r'(file = "trials/t02.csv")', r'\1\nnegated = ["joint"]')
     assert inspected(tmp_path / "taken", turn, negated).mistakes == ()
 
