@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import scipy.io
 
-from bampipe.data.quality.clock import spread_stamps
 from bampipe.data.quality.encoders import unwrapped
 from bampipe.data.readers import columns_of, read_trial
 from bampipe.data.recording import describe_spans, read_recording
@@ -251,13 +250,6 @@ def test_counters_wrap_at_any_width_and_go_on():
     assert not len(unwrapped(np.where(np.arange(500) < 250, 0.0, 3000.0), 0.0, True)[1])
 
 
-def test_stamps_of_whole_seconds_give_the_true_rate():
-    t = np.arange(2400) / 200.0 + 0.3
-    found, rounding = spread_stamps(np.floor(t))
-    assert rounding == 1.0
-    np.testing.assert_allclose(np.diff(found), 1.0 / 200.0, rtol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("header", "asked"),
     [
@@ -330,13 +322,6 @@ def test_digits_in_thousands(tmp_path: Path, cell: str):
         file.write("".join(f"{n}{sep}{other}\n" for n, other in enumerate(("12,5", "12.5") * 3)))
     with pytest.raises(InputError):
         read_trial(path, ("n", "x"))
-
-
-def test_a_workbook_is_read_where_openpyxl_is(tmp_path: Path):
-    path = tmp_path / "a.xlsx"
-    path.write_bytes(b"PK\x03\x04")
-    with pytest.raises(InputError, match=r"needs openpyxl|not a sound workbook of Excel"):
-        columns_of(path)
 
 
 def test_trials_in_one_file_are_told_apart(tmp_path: Path):
