@@ -258,7 +258,8 @@ class _Logs:
                 where=str(folder),
                 remedy=self.passed[0][1]
                 if self.passed
-                else f"supported file extensions are {', '.join(EXTENSIONS)}",
+                else f"supported file extensions are {', '.join(EXTENSIONS)}"
+                + "; of XML, name it *.txt" * any(name.endswith(".xml") for name in others),
             )
         if len(paths) > MOST_FILES:
             raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
