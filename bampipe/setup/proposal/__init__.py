@@ -35,12 +35,10 @@ from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robo
 from bampipe.setup.proposal.tables import clock_of, encoders_table, input_tables
 
 SESSION = "session.toml"
-_TRIALS = frozenset(
-    {"trial", "run", "rep", "cycle", "condition", "test", "block", "set", "versuch"}
-)
+_TRIALS = frozenset({"trial", "run", "condition", "test", "block", "versuch"})
 """Words in the name of a column that numbers trials."""
-_LEAP_S, _MOST_CUTS = 1.0, 200
-"""Length, s, of a trial or of what lies between two, the least; trials of a record, the most."""
+_LEAP_S, _SHORTEST_S, _MOST_CUTS = 1.0, 2.0, 200
+"""Length, s, of what lies between two trials and of a trial, the least; cuts, the most."""
 
 
 @dataclass(frozen=True)
@@ -269,7 +267,7 @@ def _cuts(match: Matcher) -> tuple[list[float], str]:
             ends[f"where {column.name} changes"] = np.flatnonzero(np.diff(column.values))
     for where, found in reversed(ends.items()):
         pieces = np.diff([0.0, *t[found], t[-1]])
-        if 0 < len(found) <= _MOST_CUTS and pieces.min() > _LEAP_S:
+        if 0 < len(found) <= _MOST_CUTS and pieces.min() > _SHORTEST_S:
             return [round(float(0.5 * (t[k] + t[k + 1])), 5) for k in found], where
     return [], ""
 
