@@ -1,5 +1,6 @@
 """Write `schemas/<name>.schema.json` from the declarations: `python .ci/write_schemas.py`."""
 
+import json
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -12,7 +13,7 @@ from bampipe.declarations.pipeline import Pipeline
 from bampipe.physics.device import Device
 from bampipe.physics.effect import Effect
 from bampipe.results.record import Result
-from bampipe.schema import Declaration, json_schema_text
+from bampipe.schema import Declaration, json_schema
 
 FOLDER = Path(__file__).parent.parent / "schemas"
 FILES: dict[str, type[Declaration]] = {
@@ -29,7 +30,11 @@ for module in iter_modules(results.__path__):
             FILES[kind.__name__.removesuffix("Result").lower()] = kind
 
 
+def schema_text(declared: type[Declaration]) -> str:
+    """Return the text of the JSON Schema of a file."""
+    return json.dumps(json_schema(declared), indent=1, ensure_ascii=False) + "\n"
+
+
 if __name__ == "__main__":
     for name, declared in FILES.items():
-        text = json_schema_text(declared)
-        (FOLDER / f"{name}.schema.json").write_text(text, encoding="utf-8")
+        (FOLDER / f"{name}.schema.json").write_text(schema_text(declared), encoding="utf-8")

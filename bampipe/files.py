@@ -28,9 +28,6 @@ LARGEST_JSON_BYTES = 100_000_000
 DEEPEST = 40
 """Tables nested more deeply than this are refused (code that walks them may recurse)."""
 
-MOST_DIGITS = 300
-"""Whole numbers of more digits are refused: no floating-point number is that large."""
-
 STORAGE_FAULTS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
@@ -72,7 +69,7 @@ def read_json_table(path: Path) -> dict[str, Any]:
 def parse_json(data: bytes, where: str) -> Any:
     """The value that the bytes ``data`` of the JSON file ``where`` stand for."""
     try:
-        value = json.loads(data, parse_int=_whole_number)
+        value = json.loads(data)
     except json.JSONDecodeError as error:
         raise InputError(f"not JSON: {error.msg}", where=f"{where}, line {error.lineno}") from error
     except UnicodeDecodeError as error:
@@ -132,29 +129,6 @@ def is_inside(folder: Path, name: object) -> bool:
         return (folder / str(name)).resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError):  # a link to itself, a name that is too long
         return False
-
-
-def refuse_links(folder: Path) -> None:
-    """Refuse a folder of results that holds anything but files and folders.
-
-    A link would lead what is read, written or removed to another place; a pipe or a device
-    would be waited for without end.
-
-    Raises:
-        InputError: names the first entry that is no file and no folder.
-    """
-    try:
-        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
-    except (FileNotFoundError, NotADirectoryError):
-        return
-    for entry in entries:
-        if entry.is_dir(follow_symlinks=False):
-            refuse_links(Path(entry.path))
-        elif not entry.is_file(follow_symlinks=False) and os.path.lexists(entry.path):
-            what = "a link" if entry.is_symlink() else "neither a file nor a folder"
-            raise InputError(
-                f"{what}, which has no place among results", where=entry.path, remedy="remove it"
-            )
 
 
 def require_regular(path: Path) -> os.stat_result:
@@ -316,12 +290,6 @@ def read_bytes(path: Path, limit: int) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise cannot("read", path, error) from error
-
-
-def _whole_number(text: str) -> int:
-    if len(text) > MOST_DIGITS:
-        raise ValueError(f"a whole number of {len(text)} digits")
-    return int(text)
 
 
 def _refuse_deep(value: object, where: str, depth: int = DEEPEST) -> None:

@@ -200,32 +200,6 @@ def json_schema(kind: type) -> dict[str, Any]:
     return head | content
 
 
-_SEVERAL = ("$defs", "properties")
-"""Keywords of a JSON Schema whose entries have names of the file: each begins a line."""
-
-
-def json_schema_text(kind: type[Declaration]) -> str:
-    """The JSON Schema of a file as it stands in ``schemas/``: short entries share a line."""
-
-    def lines(value: Any, indent: str, keyword: str = "") -> str:
-        short = json.dumps(value, ensure_ascii=False)
-        if not isinstance(value, dict | list) or len(indent) + len(short) < 140:
-            return short
-        inner = indent + " "
-        entries = value.items() if isinstance(value, dict) else (("", item) for item in value)
-        text = ""
-        for key, item in entries:
-            label = f"{json.dumps(key)}: " if isinstance(value, dict) else ""
-            part = label + lines(item, inner, "" if keyword in _SEVERAL else key)
-            line = text.rpartition("\n")[2]
-            full = len(line) + len(part.partition("\n")[0]) > 138
-            apart = keyword in _SEVERAL or "\n" in part or line.endswith((" }", " ]")) or full
-            text += (f",\n{inner}" if apart else ", ") * bool(text) + part
-        return f"{short[0]}\n{inner}{text}\n{indent}{short[-1]}"
-
-    return lines(json_schema(kind), "") + "\n"
-
-
 def dotted(path: Iterable[str | int]) -> str:
     """``encoders.yaw.unit`` or ``trials[2].kind``, for the keys and indices in ``path``."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)

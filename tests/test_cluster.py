@@ -1,7 +1,6 @@
 """The Dask engine on a real cluster of two worker processes on this machine."""
 
 import contextlib
-import gc
 import json
 import os
 import signal
@@ -170,25 +169,6 @@ def test_an_address_that_nobody_answers_at_is_one_line(
         run_on_cluster([toy.request()], address, unheard)
 
 
-def test_a_connection_that_failed_leaves_no_client(toy: Toy) -> None:
-    """One that is collected later can hold up the next connection for 10 s."""
-
-    def clients() -> int:
-        return sum(type(thing) is distributed.Client for thing in gc.get_objects())
-
-    server = Listener(ANSWERS["HTTP"])
-    gc.collect()
-    before = clients()
-    gc.disable()
-    try:
-        with pytest.raises(InputError, match="no Dask scheduler answers"):
-            run_on_cluster([toy.request()], server.address, unheard)
-        assert clients() == before
-    finally:
-        gc.enable()
-        server.socket.close()
-
-
 @contextlib.contextmanager
 def scheduler(tmp_path: Path, *workers: str) -> Iterator[tuple[str, list[Any]]]:
     """A scheduler, and workers, in processes of their own; gives its address and them."""
@@ -234,7 +214,7 @@ def test_a_scheduler_without_workers_is_one_line(toy: Toy, monkeypatch: pytest.M
 @pytest.mark.long
 def test_a_worker_in_place_of_a_scheduler_is_one_line(toy: Toy, cluster: Any) -> None:
     worker = next(iter(cluster.workers.values()))
-    with pytest.raises(InputError, match="no Dask scheduler answers: this is a worker"):
+    with pytest.raises(InputError, match="no Dask scheduler answers"):
         run_on_cluster([toy.request()], worker.worker_address, unheard)
 
 

@@ -1,7 +1,6 @@
 """Runs published on file systems that fsspec knows: whole or not at all, and fetched back."""
 
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -144,18 +143,10 @@ def test_what_a_hostile_store_says_stays_in_the_run_folder(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("name", ["..", "a/b", ".hidden", "s1\n"])
-def test_a_name_that_is_no_session_is_not_fetched(tmp_path: Path, url: str, name: str) -> None:
-    """A store may list what it likes: `..` with --force would have replaced the folder of runs."""
-    publish(make_run(tmp_path / "runs/s1"), url)
-    with pytest.raises(InputError, match="is no name of a session"):
-        fetch(url, name, tmp_path / "runs", force=True)
-    assert (tmp_path / "runs/s1/run.json").is_file()
-
-
 def test_a_listing_names_sessions_only(
     tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A store may list what it likes: `..` with --force would replace the folder of runs."""
     publish(make_run(tmp_path / "runs/s1"), url)
     system, base = fsspec.core.url_to_fs(url)
     listed = [f"{base}/s1", f"{base}/..", f"{base}/.", f"{base}/a\x1bb"]
@@ -209,26 +200,3 @@ def test_an_address_of_no_use_is_said_before_the_run(
     assert code == 2 and said.count("\n") == 1 and "no such file system" in said
     assert toy.ran() == []
     assert command("fetch", url, "--runs", toy.runs)[0] == 2
-
-
-@pytest.mark.parametrize("kind", ["fifo", "endless", "folder"])
-def test_what_is_no_file_is_not_fetched(tmp_path: Path, kind: str) -> None:
-    url = f"file://{tmp_path / 'published'}"
-    publish(make_run(tmp_path / "runs/s1"), url)
-    for path in [
-        *(tmp_path / "published/s1").glob("*/run.json"),
-        tmp_path / "published/s1" / CURRENT,
-    ]:
-        content = path.read_bytes()
-        path.unlink()
-        if kind == "fifo":
-            os.mkfifo(path)
-        elif kind == "folder":
-            path.mkdir()
-        else:
-            path.symlink_to("/dev/zero")
-        with pytest.raises(InputError, match=r"not a file|cannot be fetched"):
-            fetch(url, "s1", tmp_path / "elsewhere")
-        path.rmdir() if kind == "folder" else path.unlink()
-        path.write_bytes(content)
-    assert fetch(url, "s1", tmp_path / "elsewhere").is_dir()

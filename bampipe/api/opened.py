@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 import pandas as pd
 
 from bampipe.errors import InputError
-from bampipe.files import refuse_links
 from bampipe.report.run_results import Results
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
@@ -196,10 +195,9 @@ def open_run(path: str | Path) -> Run:
         path: such as ``runs/2026-10-03_s01`` or ``2026-10-03_s01``.
 
     Raises:
-        InputError: there is no such run, or it holds a link.
+        InputError: there is no such run.
     """
     for candidate in (Path(path), Path("runs") / path):
         if (candidate / record.FILE).is_file():
-            refuse_links(candidate)
             return Run(candidate)
     return Run(path)

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bampipe.errors import InputError, choose_from
-from bampipe.files import refuse_links
 from bampipe.run import record
 from bampipe.run.session_name import session_folder, session_id
 
@@ -33,7 +32,7 @@ def find_run(argument: str | None, runs: Path) -> Path:
         runs: the folder of runs.
 
     Raises:
-        InputError: there is no such run, or it holds a link.
+        InputError: there is no such run.
     """
     known = _known_runs(runs)
     if argument is None and not known:
@@ -54,7 +53,6 @@ def find_run(argument: str | None, runs: Path) -> Path:
                 "this session has not been run", where=str(folder), remedy=f"`bampipe run {folder}`"
             )
     assert root is not None
-    refuse_links(root)
     return root
 
 

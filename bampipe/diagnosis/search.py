@@ -296,7 +296,10 @@ class Search:
         for k, (key, strength) in enumerate(zip(keys, strengths, strict=True)):
             at = np.flatnonzero(place == k)
             here = np.ix_(at, at)
-            alone = float(b[at] @ np.linalg.pinv(spread[here], hermitian=True) @ b[at])
+            if len(at) == 1:
+                alone = float(b[at[0]]) ** 2 / max(float(spread[here][0, 0]), 1e-300)
+            else:
+                alone = float(b[at] @ np.linalg.pinv(spread[here], hermitian=True) @ b[at])
             share = alone / max(float(b[at] @ own[here] @ b[at]), 1e-300)
             sizes.append(self._size(key, strength) * float(np.sqrt(max(share, 0.0))))
         return tuple(sizes)

@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 from bampipe.data import lab_tables
 from bampipe.errors import InputError
-from bampipe.files import atomic_writer, refuse_links, write_text
+from bampipe.files import atomic_writer, write_text
 from bampipe.lab import rows
 from bampipe.lab.folders import LOCK, is_foreign, run_folders
 from bampipe.lab.trends import build_trends
@@ -119,5 +119,4 @@ def _lock(folder: Path) -> Iterator[None]:
             stack.enter_context(hold(folder / LOCK))
         except OSError as error:
             raise InputError(f"cannot be written: {error.strerror}", where=str(folder)) from error
-        refuse_links(folder)
         yield

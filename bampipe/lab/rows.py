@@ -9,7 +9,6 @@ from typing import Any
 from bampipe.data import lab_tables, store
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
-from bampipe.files import refuse_links
 from bampipe.phrases import diagnosis as phrases
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
@@ -47,7 +46,6 @@ def read_run(root: Path) -> SessionRows:
     Raises:
         InputError: ingest has not run, or a result is damaged or was changed since it was written.
     """
-    refuse_links(root)
     made = models.names(root)
     of_models = [f"models/{model}/{name}" for model in made for name in _OF_MODELS]
     record.require_untouched(root, [*_OF_SESSION, *of_models])

@@ -44,7 +44,6 @@ class Precision:
     Attributes:
         sd: (n,) published standard deviations of the estimated parameters, in order.
         formal_sd: (n,) those of the estimator alone, if its assumptions on noise held.
-        systematic_sd: (n,) the part of ``sd`` by which methods disagree.
         irreducible_sd: (n,) the part that no further trial reduces: calibration of the sensors and
             smoothing of friction.
         blocks: number of blocks of time in the trials at hand, whose scatter is in ``sd``.
@@ -58,7 +57,6 @@ class Precision:
     names: tuple[str, ...]
     sd: Array
     formal_sd: Array
-    systematic_sd: Array
     irreducible_sd: Array
     blocks: int
     information: Array
@@ -124,8 +122,7 @@ class Precision:
                 of_motion, total, formal = by_residual, other, by_scatter
         return cls(
             tuple(names), np.array([e.sd for e in entries]), formal,
-            np.array([e.systematic_sd or 0.0 for e in entries]), np.array(lasting),
-            sum(max(1, int((m.t[-1] - m.t[0]) / _BLOCK_S)) for m in motions),
+            np.array(lasting), sum(max(1, int((m.t[-1] - m.t[0]) / _BLOCK_S)) for m in motions),
             total, problem.precision, of_motion,
         )  # fmt: skip
 
@@ -134,9 +131,7 @@ class Precision:
 
         A published standard deviation is the formal one times the excess scatter of blocks of time.
         That factor is estimated from few blocks, so that it is uncertain: the value of a parameter
-        is shrunk towards the mean of all. Methods disagree where noise is as large as the motion: a
-        trial with a larger motion dilutes the disagreement at least by its share of information,
-        and mostly removes it, because the misled method is recognised. Priors do not scatter.
+        is shrunk towards the mean of all. Priors do not scatter.
 
         Args:
             added: (m, m) information of the trials; seconds: their total length.
@@ -145,8 +140,7 @@ class Precision:
             self._split_variance(matrix) for matrix in (self.information, self.information + added)
         )
         share, new = after / before, max(1, int(seconds / _BLOCK_S))
-        rest = self.systematic_sd**2 + self.irreducible_sd**2
-        statistical = np.maximum(self.sd**2 - rest, 1e-300) / self.formal_sd**2
+        statistical = np.maximum(self.sd**2 - self.irreducible_sd**2, 1e-300) / self.formal_sd**2
         scattered = np.maximum(statistical - (1.0 - by_data), 1e-12)
         scatter = 0.5 * np.log(scattered / np.maximum(by_data, 1e-12))
         scatter -= np.log(self._widen_for_few(self.blocks))
@@ -165,11 +159,11 @@ class Precision:
             return np.asarray(least * np.sqrt(by_data_then * data**2 + (1.0 - by_data_then)))
 
         low, median, high = (
-            np.hypot(np.hypot(size, disagreement), self.irreducible_sd)
-            for size, disagreement in (
-                (noise(np.exp(-wide)), 0.0),
-                (np.maximum(noise(1.0), least), share**2 * self.systematic_sd),
-                (np.maximum(noise(np.exp(wide)), least), share * self.systematic_sd),
+            np.hypot(size, self.irreducible_sd)
+            for size in (
+                noise(np.exp(-wide)),
+                np.maximum(noise(1.0), least),
+                np.maximum(noise(np.exp(wide)), least),
             )
         )
         return Expected(low, median, high)

@@ -13,7 +13,6 @@ from bampipe.results.validate import JudgedError
 METHODS: Mapping[Method, str] = {
     "ukf": "the unscented filter",
     "least-squares": "least squares",
-    "output-error": "output error",
 }
 FILTERS = {
     "kalman": "a Kalman smoother",

@@ -8,8 +8,10 @@ from typing import Any, TypeVar, cast
 
 import pandas as pd
 
+from bampipe.data.run_folder import RunFolder
+from bampipe.data.store import column_names, read_parquet, trial_ids
 from bampipe.declarations.model import read_model_file
-from bampipe.errors import InputError, MissingResultError
+from bampipe.errors import MissingResultError
 from bampipe.files import read_toml
 from bampipe.lists import join_names
 from bampipe.report.document import Paragraph, Section
@@ -36,30 +38,25 @@ class Results:
 
     def read(self, kind: type[R], model: str = "") -> R | None:
         """Return the result ``kind`` of ``model`` (default: the one in detail), or None."""
-        relative = kind.file(model or (self.model if "{model}" in kind.FILE else ""))
+        name = model or (self.model if "{model}" in kind.FILE else "")
+        relative = kind.file(name)
         if relative not in self._results:
-            path = self.root / relative
-            self._results[relative] = kind.read(path) if path.is_file() else None
+            self._results[relative] = RunFolder(self.root).find(kind, name)
         return cast("R | None", self._results[relative])
 
     def table(
         self, relative: str, columns: Sequence[str] | None = None, trial: str | None = None
     ) -> pd.DataFrame | None:
-        """Return a Parquet file, or the rows of one trial; None without such a file."""
+        """Return a Parquet file, or the rows of one trial; None without such a file or trial."""
         path = self.root / relative
-        if not path.is_file():
+        if not path.is_file() or (trial is not None and trial not in trial_ids(path)):
             return None
-        filters = [("trial_id", "==", trial)] if trial is not None else None
-        try:
-            return pd.read_parquet(path, columns=columns and list(columns), filters=filters)
-        except (OSError, ValueError) as error:
-            remedy = "make it again (--force)"
-            raise InputError("not a sound Parquet file", where=str(path), remedy=remedy) from error
+        return read_parquet(path, columns, trial)
 
     def columns(self, relative: str) -> tuple[str, ...]:
         """Return the names of the columns of a Parquet file; none where there is no file."""
-        frame = self.table(relative, trial="")
-        return () if frame is None else tuple(str(name) for name in frame.columns)
+        path = self.root / relative
+        return column_names(path) if path.is_file() else ()
 
     @cached_property
     def outdated(self) -> tuple[str, ...]:
@@ -88,18 +85,12 @@ class Results:
     @cached_property
     def session(self) -> IngestResult:
         """The result of ingest."""
-        return self._require(self.read(IngestResult), IngestResult.FILE)
+        return RunFolder(self.root).read(IngestResult)
 
     @cached_property
     def trials(self) -> pd.DataFrame:
         """One row per trial."""
-        return self._require(self.table("ingest/trials.parquet"), "ingest/trials.parquet")
-
-    def _require(self, found: T | None, relative: str) -> T:
-        if found is None:
-            remedy = f"run `bampipe ingest SESSION` for {self.root} first"
-            raise InputError(f"{relative} is missing", where=str(self.root), remedy=remedy)
-        return found
+        return read_parquet(RunFolder(self.root).require("ingest/trials.parquet", "ingest"))
 
     @cached_property
     def axes(self) -> tuple[str, ...]:

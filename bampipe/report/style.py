@@ -8,6 +8,7 @@ import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -52,49 +53,13 @@ WIDTH = 6.69
 TALLEST = 9.1
 """Height of a figure, inches, that leaves room for a caption on its page."""
 
-_SETTINGS: dict[str, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 7.5,
-    "axes.titlesize": 8.0,
-    "axes.titleweight": "bold",
-    "axes.labelsize": 7.5,
-    "legend.fontsize": 7.0,
-    "legend.frameon": False,
-    "legend.handlelength": 1.8,
-    "xtick.labelsize": 7.0,
-    "ytick.labelsize": 7.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.6,
-    "axes.edgecolor": INK,
-    "axes.labelcolor": INK,
-    "axes.titlecolor": INK,
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": FAINT,
-    "grid.alpha": 0.35,
-    "grid.linewidth": 0.5,
-    "lines.linewidth": 1.0,
-    "figure.facecolor": "none",
-    "axes.facecolor": "none",
-    "savefig.facecolor": "none",
-    "axes.unicode_minus": True,
-    "axes.formatter.useoffset": False,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "bampipe",
-    "path.simplify": True,
-    "path.simplify_threshold": 0.2,
-}
+_SETTINGS = Path(__file__).parent / "templates" / "figure.mplstyle"
 
 
 def use_style() -> AbstractContextManager[None]:
     """Return the context in which figures are drawn, independent of the user's own settings."""
-    settings: dict[Any, Any] = {**mpl.rcParamsDefault, **_SETTINGS, "backend": "svg"}
+    own = mpl.rc_params_from_file(_SETTINGS, use_default_template=False)
+    settings: dict[Any, Any] = {**mpl.rcParamsDefault, **own, "backend": "svg"}
     return mpl.rc_context(settings)
 
 

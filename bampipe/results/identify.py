@@ -7,8 +7,8 @@ from pydantic import Field
 from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
-Method = Literal["ukf", "least-squares", "output-error"]
-"""How parameters are estimated; by output error in runs of earlier versions only."""
+Method = Literal["ukf", "least-squares"]
+"""How parameters are estimated."""
 
 
 class ParameterEstimate(Record):
@@ -21,10 +21,6 @@ class ParameterEstimate(Record):
     filter_sd: Size | None = Field(
         default=None,
         description="Of the filter alone, valid for white noise only",
-    )
-    systematic_sd: Size | None = Field(
-        default=None,
-        description="Part of sd by which methods disagree, in runs of earlier versions",
     )
     smoothing_sd: Size | None = Field(
         default=None,
@@ -304,10 +300,6 @@ class IdentifyResult(Result):
     nis: Consistency | None = None
     innovations: dict[str, InnovationTests] | None = Field(default=None, description="By axis")
     noise: NoiseLevels | None = None
-    position_error: dict[str, Size] | None = Field(
-        default=None,
-        description="Of output error, by earlier versions: position error by axis, rad or m",
-    )
     residual_sd: dict[str, Size] | None = Field(
         default=None, description="Least squares: low-passed residual by axis, N.m or N"
     )

@@ -7,13 +7,12 @@ the finished run folders elsewhere (see :mod:`bampipe.run.publish`).
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
-import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent import futures
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -95,10 +94,7 @@ def _connect(scheduler: str) -> Client:
     from distributed import Client
 
     try:
-        # A client that fails is not asked: collected at some later time, it can hold up the next.
-        kind = _within(PATIENCE_S, lambda: asyncio.run(_ask_kind(scheduler)))
-        if kind == "Scheduler":
-            return _within(PATIENCE_S, lambda: Client(scheduler, timeout=f"{PATIENCE_S:g}s"))
+        return _within(PATIENCE_S, lambda: Client(scheduler, timeout=f"{PATIENCE_S:g}s"))
     except TimeoutError as error:
         raise InputError(
             f"no Dask scheduler answers within {PATIENCE_S:g} s", where=scheduler
@@ -107,16 +103,6 @@ def _connect(scheduler: str) -> Client:
     except Exception as error:
         what = str(error).partition("\n")[0] or type(error).__name__
         raise InputError(f"no Dask scheduler answers: {what}", where=scheduler) from error
-    raise InputError(f"no Dask scheduler answers: this is a {kind.lower()}", where=scheduler)
-
-
-async def _ask_kind(address: str) -> str:
-    """Return what is at this address: "Scheduler", "Worker" or "Nanny"."""
-    from distributed import rpc
-
-    async with rpc(address, timeout=PATIENCE_S) as remote:
-        found = await asyncio.wait_for(remote.identity(), PATIENCE_S)
-    return str(found["type"])
 
 
 def _within(seconds: float, call: Callable[[], Answer]) -> Answer:
@@ -125,22 +111,17 @@ def _within(seconds: float, call: Callable[[], Answer]) -> Answer:
     Raises:
         TimeoutError: it takes longer.
     """
-    answers: queue.SimpleQueue[tuple[Answer | None, Exception | None]] = queue.SimpleQueue()
+    answer: futures.Future[Answer] = futures.Future()
 
     def ask() -> None:
         try:
-            answers.put((call(), None))
+            answer.set_result(call())
         except Exception as error:
-            answers.put((None, error))
+            answer.set_exception(error)
 
+    # Not an executor's thread, for which the program would wait at its end.
     threading.Thread(target=ask, daemon=True).start()
-    try:
-        answer, error = answers.get(timeout=seconds)
-    except queue.Empty:
-        raise TimeoutError(f"no answer within {seconds:g} s") from None
-    if error is not None:
-        raise error
-    return answer  # type: ignore[return-value]
+    return answer.result(timeout=seconds)
 
 
 class _Watch:

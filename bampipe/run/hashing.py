@@ -90,7 +90,7 @@ def digest_session(folder: Path) -> dict[str, str]:
 @cache
 def _digest_tree(root: Path) -> str:
     found = sorted(root.rglob("*")) if root.is_dir() else [root]
-    sources = [path for path in found if path.suffix in {".py", ".toml", ".typ"}]
+    sources = [path for path in found if path.suffix in {".py", ".toml", ".typ", ".mplstyle"}]
     return digest_content([(str(path.relative_to(root)), digest_file(path)) for path in sources])
 
 

@@ -1,10 +1,8 @@
 """One process at a time in a folder; a lock whose holder was killed is free, and that is said."""
 
 import contextlib
-import errno
 import os
 import platform
-import stat
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -45,10 +43,10 @@ def hold(
         taking_over: called with the name of a holder that was killed.
 
     Raises:
-        InputError: it is no regular file, or another process holds it and ``wait`` is false.
+        InputError: another process holds it and ``wait`` is false.
         OSError: the file cannot be made.
     """
-    handle = _open(path)
+    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     _held.add(handle)
     try:
         if not lock_descriptor(handle, blocking=False):
@@ -72,27 +70,6 @@ def hold(
     finally:
         _held.discard(handle)
         os.close(handle)
-
-
-def _open(path: Path) -> int:
-    """Open the lock file without waiting for the other end of a pipe, nor following a link."""
-    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-    try:
-        handle = os.open(path, flags, 0o666)
-    except OSError as error:
-        if error.errno in (errno.ELOOP, errno.EISDIR, errno.ENXIO):
-            raise _not_a_lock(path) from error
-        raise
-    if not stat.S_ISREG(os.fstat(handle).st_mode):
-        os.close(handle)
-        raise _not_a_lock(path)
-    return handle
-
-
-def _not_a_lock(path: Path) -> InputError:
-    return InputError(
-        "no regular file, where a lock is expected", where=str(path), remedy="remove it"
-    )
 
 
 def _write_name(handle: int, name: str) -> None:

@@ -10,8 +10,7 @@ or shared folder and published whole:
 new one, never a mixture; an upload that was cut short is not seen at all, and the next one
 completes it. Versions that no longer count are left: somebody may be reading them.
 
-What fsspec, the driver of a file system or the place itself refuses is an `InputError`; and a run
-folder that holds a link.
+What fsspec, the driver of a file system or the place itself refuses is an `InputError`.
 """
 
 from __future__ import annotations
@@ -25,12 +24,10 @@ from typing import TYPE_CHECKING, Any
 
 from bampipe.errors import InputError
 from bampipe.files import (
-    LARGEST_JSON_BYTES,
     digest_content,
     digest_file,
     json_text,
     parse_json,
-    refuse_links,
 )
 from bampipe.run import record
 from bampipe.run.session_name import is_name
@@ -50,7 +47,6 @@ def publish(root: Path, url: str) -> str:
     Args:
         url: a folder as fsspec names it, such as ``s3://bucket/runs`` or ``file:///mnt/runs``.
     """
-    refuse_links(root)
     files = {
         path.relative_to(root).as_posix(): path
         for path in sorted(root.rglob("*"))
@@ -93,7 +89,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
     """Fetch the published run of ``session`` into ``runs``, every file held against its hash.
 
     Args:
-        url: as for :func:`publish`; runs: folder of run folders.
+        url: as for :func:`publish`; session: as `published` lists it; runs: folder of run folders.
         force: replace a run folder that says something else.
 
     Returns:
@@ -102,8 +98,6 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
     Raises:
         InputError: nothing published, a file does not match its hash, or there is another run.
     """
-    if not is_name(session):
-        raise InputError(f"{session!r} is no name of a session", where=url)
     system, base = _open(url)
     here, root = f"{base}/{session}", runs / session
     with _driver("cannot be fetched", url):
@@ -124,8 +118,6 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
         try:
             for name, known in current.files.items():
                 source, target = f"{here}/{current.version}/{name}", draft / name
-                if system.info(source)["type"] != "file":
-                    raise InputError(f"{name} is not a file", where=f"{url}/{session}")
                 target.parent.mkdir(parents=True, exist_ok=True)
                 system.get_file(source, str(target))
                 if digest_file(target) != known:
@@ -178,9 +170,6 @@ def _current(system: Any, here: str) -> Published | None:
     place = f"{here}/{CURRENT}"
     try:
         system.invalidate_cache(here)
-        about = system.info(place)
-        if about["type"] != "file" or int(about["size"]) > LARGEST_JSON_BYTES:
-            raise InputError("not a file of this size", where=place)
         return read(Published, parse_json(system.cat_file(place), place), place)
     except FileNotFoundError:
         return None

@@ -9,13 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from bampipe.errors import InputError
-from bampipe.files import (
-    STORAGE_FAULTS,
-    digest_file,
-    is_inside,
-    refuse_links,
-    write_json,
-)
+from bampipe.files import STORAGE_FAULTS, digest_file, write_json
 from bampipe.run.events import Event, Listener, unheard
 from bampipe.run.lock import hold
 
@@ -93,20 +87,17 @@ def lock(root: Path, wait: bool, listen: Listener = unheard) -> Iterator[None]:
         listen: called before waiting, and where the last holder was killed.
 
     Raises:
-        InputError: another process holds it and ``wait`` is false; it holds a link; or the disk
-            is full, read-only or the like.
+        InputError: another process holds it and ``wait`` is false; or the disk is full, read-only
+            or the like.
     """
 
     def tell(kind: str) -> Callable[[str], None]:
         return lambda holder: listen(Event(root.name, "", kind, message=holder))
 
     private = root / PRIVATE
-    if private.exists() and not is_inside(root, f"{PRIVATE}/lock"):
-        refuse_links(root)
     try:
         private.mkdir(parents=True, exist_ok=True)
         with hold(private / "lock", wait, tell("waiting"), tell("taken over")):
-            refuse_links(root)
             yield
     except FileNotFoundError as error:
         if private.exists():

@@ -112,7 +112,7 @@ def _sealed(root: Path, staging: Path) -> Commit | None:
     if folder_name(sealed.step) != staging.name:
         return None
     for name in (*outputs, *sealed.remove):
-        if not is_inside(root, name) or (root / name).is_dir():
+        if not (is_inside(root, name) and is_inside(staging, name)) or (root / name).is_dir():
             return None
     for name, digest in outputs.items():
         if (staging / name).is_file() and digest_file(staging / name) != digest:

@@ -45,21 +45,33 @@ def inspect_setup(
     """
     signals = Signals.of_session(system, session)
     _require_scale(system, motions[:1])
-    odd = find_turned_trials(system, motions, band, folds, signals)
-    place = {one.place: one.corrections[0].change for one in odd}
-    motions = [
-        place[k].of_motion(motion, signals) if k in place else motion
-        for k, motion in enumerate(motions)
-    ]
     of_kind = [[k for k, fits in enumerate(folds.fitted) if fits == kind] for kind in (True, False)]
     chosen = [some[k] for some in of_kind for k in spread(len(some))]
-    short, folds = shorten([motions[k] for k in chosen]), folds.subset(chosen)
+    part = folds.subset(chosen)
     placeholders = _find_placeholders(system, session)
-    search = Search(system, short, band, folds, signals)
-    held = search.judge(())
-    if is_drawn(system):
-        search = DrawnSearch(system, shorten(short, DRAWN_SAMPLES), band, folds, signals)
-    findings = search.find_mistakes(tuple(n for names in placeholders.values() for n in names))
+    ones = tuple(n for names in placeholders.values() for n in names)
+
+    def search_in(motions: Sequence[Motion]) -> tuple[Search, Plausibility | None]:
+        short = shorten([motions[k] for k in chosen])
+        search = Search(system, short, band, part, signals)
+        held = search.judge(())
+        if is_drawn(system):
+            search = DrawnSearch(system, shorten(short, DRAWN_SAMPLES), band, part, signals)
+        return search, held
+
+    search, held = search_in(motions)
+    findings, odd = search.find_mistakes(ones), list[TurnedTrial]()
+    if not findings and search.over_position is None:
+        # What is wrong in all trials is likelier than what is in some.
+        odd = find_turned_trials(system, motions, band, folds, signals)
+    if odd:
+        changes = {one.place: one.corrections[0].change for one in odd}
+        motions = [
+            changes[k].of_motion(motion, signals) if k in changes else motion
+            for k, motion in enumerate(motions)
+        ]
+        search, _ = search_in(motions)
+        findings = search.find_mistakes(ones)
     mistakes = (
         *(_record_turned(system, session, one, names[one.place]) for one in odd),
         *(_record(system, session, found, placeholders) for found in findings),

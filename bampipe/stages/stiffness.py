@@ -374,26 +374,23 @@ def _poses(system: System, recorded: Array) -> dict[str, Array]:
 
 def _loop_rows(axis: str, trial: _Loops) -> pd.DataFrame:
     """Return the samples of one trial, branch by branch; deflection from the recorded pose."""
-    parts = []
-    for number, branch in enumerate(trial.found.branches):
-        rows = np.arange(branch.start, branch.stop)
-        torque = trial.torque[rows]
-        parts.append(
-            pd.DataFrame(
-                {
-                    "trial_id": trial.trial_id,
-                    "axis": axis,
-                    "cycle": np.int64(number // 2),
-                    "branch": "rising" if branch.direction > 0 else "falling",
-                    "t": rows / trial.rate,
-                    "torque": torque,
-                    "deflection": trial.deflection[rows],
-                    "post_yield": branch.direction * (torque - trial.torque[branch.start])
-                    >= trial.found.transition,
-                }
-            )
-        )
-    return pd.concat(parts, ignore_index=True)
+    branches = trial.found.branches
+    rows = np.concatenate([np.arange(branch.start, branch.stop) for branch in branches])
+    number = np.repeat(np.arange(len(branches)), [one.stop - one.start for one in branches])
+    direction = np.array([branch.direction for branch in branches])[number]
+    since_reversal = trial.torque[rows] - trial.torque[[one.start for one in branches]][number]
+    return pd.DataFrame(
+        {
+            "trial_id": trial.trial_id,
+            "axis": axis,
+            "cycle": number // 2,
+            "branch": np.where(direction > 0, "rising", "falling"),
+            "t": rows / trial.rate,
+            "torque": trial.torque[rows],
+            "deflection": trial.deflection[rows],
+            "post_yield": direction * since_reversal >= trial.found.transition,
+        }
+    )
 
 
 def _describe_gears(gears: Mapping[str, GearStiffness]) -> list[str]:

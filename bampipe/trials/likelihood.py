@@ -603,7 +603,7 @@ def solve_bounded(
             normal = np.tensordot(weight, xx, 1) + precision
             right = moment - weight @ xy - normal @ fixed
             b = fixed + chosen @ solve_scaled(chosen.T @ normal @ chosen, chosen.T @ right)
-            left = np.maximum(yy + 2.0 * xy @ b + np.einsum("i,aij,j->a", b, xx, b), 1e-12 * yy)
+            left = np.maximum(yy + 2.0 * xy @ b + (xx @ b) @ b, 1e-12 * yy)
             left = left + 1e-300
             before, weight = weight, independent / left
             if np.all(np.abs(weight - before) <= _STEADY * before):

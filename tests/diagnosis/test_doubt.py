@@ -20,7 +20,7 @@ AXIS = MachineScale(
 @pytest.mark.parametrize(
     ("without", "probability"),
     [
-        ((30.0, 1.0), 1.0 - 20.0**2 / 30.0**2),  # only the axis that is far shows it
+        ((30.0, 1.0), 1.0 - 20.0 / 30.0),  # only the axis that is far shows it
         ((30.0, 1.5), 1.0),  # the other one does, by 40 nats
         ((20.2, 1.1), 1.0),  # the other one does, if by less than 14, by more than the far one
     ],

@@ -105,7 +105,7 @@ def test_text_from_files_cannot_break_the_page(run: Path, tmp_path: Path) -> Non
     shutil.copytree(run, root)
     frame = pd.read_parquet(root / "ingest/trials.parquet")
     frame["kind"] = "</script><script>alert(1)</script>"
-    frame.to_parquet(root / "ingest/trials.parquet")
+    write_parquet(root / "ingest/trials.parquet", frame)
     assert "<script>alert" not in explorer_page(Results(root), "")
 
 

@@ -125,7 +125,7 @@ def _place_trials(sessions: Sequence[_Session]) -> list[_Span]:
         for row in session.results.trials.to_dict("records"):
             name = str(row["trial_id"])
             times = session.results.table("ingest/samples.parquet", ["t"], trial=name)
-            if times is None or times.empty:
+            if times is None:
                 continue
             first, last = float(times["t"].iloc[0]), float(times["t"].iloc[-1])
             stop = start + last - first

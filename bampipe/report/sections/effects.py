@@ -205,7 +205,7 @@ def _draw_window(top: Axes, bottom: Axes, found: _Window, unit: str) -> list[flo
 def _read_stretch(results: Results, model: str, window: WorstWindow) -> pd.DataFrame | None:
     """Return the residuals of ``model`` in the window, with 1.5 times its length on either side."""
     frame = results.table(results.model_file("residuals.parquet", model), trial=window.trial_id)
-    if frame is None or frame.empty or f"residual_{window.axis}" not in frame:
+    if frame is None or f"residual_{window.axis}" not in frame:
         return None
     margin = 1.5 * (window.t_end - window.t_start)
     part = frame[frame["t"].between(window.t_start - margin, window.t_end + margin)]

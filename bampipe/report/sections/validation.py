@@ -186,7 +186,7 @@ def _read_velocity(results: Results, residuals: pd.DataFrame) -> dict[str, np.nd
     ]
     trial = str(residuals["trial_id"].iloc[0])
     frame = results.table(path, ["t", *(f"qd_{axis}" for axis in axes)], trial=trial)
-    if not axes or frame is None or frame.empty:
+    if not axes or frame is None:
         return {}
     t, known = residuals["t"].to_numpy(), frame["t"].to_numpy()
     return {axis: np.interp(t, known, frame[f"qd_{axis}"].to_numpy()) for axis in axes}
