@@ -183,6 +183,19 @@ def test_the_report_says_it_first(reversed_joint: bampipe.Run) -> None:
     assert "leaves something unexplained" not in page
 
 
+def test_a_trial_with_a_sign_of_its_own_is_named_and_taken_in(tmp_path: Path) -> None:
+    def turn(folder: Path) -> None:
+        path = sorted(folder.glob("trials/*.csv"))[1]
+        frame = pd.read_csv(path)
+        frame["q"] *= -1.0
+        frame.to_csv(path, index=False)
+
+    (mistake,) = inspected(tmp_path, turn).mistakes
+    assert mistake.sentence.startswith("t02: joint")
+    negated = set_text(r'(file = "trials/t02.csv")', r'\1\nnegated = ["joint"]')
+    assert inspected(tmp_path / "taken", turn, negated).mistakes == ()
+
+
 def test_gravity_that_the_device_lacks_is_no_exchanged_column(tmp_path: Path) -> None:
     """A pendulum whose device file has no weight: its current follows position, and is none."""
     weightless = set_text(r'potential = ".*"', 'potential = "0"', "joint.toml")
