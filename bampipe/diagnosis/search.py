@@ -16,7 +16,7 @@ _STEP = 0.02
 """Of a shape's range: the step of its slope."""
 _FARTHEST = 0.2
 
-_BESIDE, _PROMISING, _SWAPPED = 24, 8, 5
+_BESIDE, _PROMISING, _SWAPPED = 12, 8, 5
 """Candidates weighed exactly beside a set that grows, beside one that lost a member, and of those
 the ones whose shapes are refined."""
 _SWAPS, _POLISHED = 3, 4

@@ -89,7 +89,7 @@ def _judge(
     verdict: Verdict
     if against_floor == "floor_missing":
         verdict = "no_verdict"
-    elif remains and not sure:
+    elif remains and max(listed.values(), default=0.0) < 0.5:
         verdict = "unknown_effect"
     elif open_question or 1.0 - c.probability <= asked < c.probability:
         verdict = "undecided"

@@ -15,6 +15,7 @@ from bampipe.stages.diagnose import Config
 NUMERICAL = {
     "verdict": {
         "0.001": "less probable sets are not listed, whatever is said",
+        "0.5": "more probable than not",
         "2": "effects in which two sets differ by an exchange",
     },
     "probability": {
