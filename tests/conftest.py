@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, settings
 from jsonschema import Draft202012Validator
 from numba.core import dispatcher
 
-TOYS, ORACLES = (Path(__file__).parent / name for name in ("toys", "oracles"))
-sys.path[:0] = [str(TOYS), str(ORACLES)]
+TOYS = Path(__file__).parent / "toys"
+sys.path.insert(0, str(TOYS))
 # The simulators that share no code with bampipe serve tests and benchmarks alike.
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 SCHEMAS = Path(__file__).parent.parent / "schemas"

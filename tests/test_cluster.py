@@ -92,7 +92,7 @@ def test_a_worker_killed_in_mid_run_loses_nothing(toy: Toy, cluster: Any) -> Non
     check(toy, given, [outcome.state for outcome in outcomes])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_workers_publish_what_they_have_run(toy: Toy, cluster: Any) -> None:
     pytest.importorskip("fsspec", reason="the remote extra is not installed")
     from bampipe.run.publish import fetch, published

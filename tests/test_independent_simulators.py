@@ -27,7 +27,13 @@ def content(folder):
     return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-@pytest.mark.parametrize("machine", independent.MACHINES)
+@pytest.mark.parametrize(
+    "machine",
+    [
+        pytest.param(name, marks=[pytest.mark.long] * (name not in ("joint", "damper")))
+        for name in independent.MACHINES
+    ],
+)
 def test_every_effect_changes_what_is_recorded(tmp_path, machine):
     known = independent.MACHINES[machine]
     free = Conditions(trials=1, seconds=6.0)
@@ -99,6 +105,7 @@ def test_every_effect_of_the_arm_changes_its_log(tmp_path, effect):
     assert not np.allclose(bare["tau_2 [Nm]"], hidden["tau_2 [Nm]"])
 
 
+@pytest.mark.long
 def test_joints_of_soft_drives_stand_still_within_their_friction():
     specimen = arm.build("ZY", 8)
     t, q, _, drive = arm.measure(specimen, np.random.default_rng(1), 3.0, 250.0, 0.0, soft_hz=4.0)

@@ -39,7 +39,7 @@ empty range below the bit shows it."""
 _NICE = (1, 1.2, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 7.5, 8)
 _DERIVATIVE = 0.98
 """Correlation of a column with the integral of another, both without a line, to be that of it."""
-DRIVEN = 0.5
+DRIVEN, _CLEAR = 0.5, 0.95
 """Share of a column that the motion must explain for it to pass as what drives it."""
 _MOVED, _CLEARLY = 0.8, 0.5
 """Of two columns, the share of one that the motion of the other must explain, and how much less it
@@ -121,6 +121,11 @@ class Driven:
     viscous: float = 0.0
     coulomb: float = 0.0
     pose: AngleTorque | None = None
+
+    @property
+    def feeds(self) -> bool:
+        """Whether mass and friction come out negative, as by a drive whose sign is turned."""
+        return self.share > _CLEAR and max(self.inertia, self.viscous, self.coulomb) < 0.0
 
 
 def driven(t: np.ndarray, q: np.ndarray, column: np.ndarray, angle: bool = False) -> Driven:

@@ -10,7 +10,7 @@ import numpy as np
 from bampipe.data.quality import CleaningLimits, CleanTrial, clean
 from bampipe.data.readers import read_trial
 from bampipe.data.readers.moments import NANOSECONDS
-from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, interpolated
+from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, check_columns, interpolated
 from bampipe.data.session import SECONDS, Clock, Part, Session, TrialEntry, inside
 from bampipe.errors import InputError
 from bampipe.files import digest_file
@@ -85,7 +85,18 @@ def read_recording(
             ticks = SECONDS.get(clock.unit, 1.0), SECONDS.get(unit, 1.0)
             raw = _by_time(raw, other, entry.file, part, kept, (clock.column, time), ticks)
     raw = replace(raw, columns={column: raw.columns[column] for column in columns})
-    return _at_one_rate(_one_of(raw, entry, clock), clock)
+    return _at_one_rate(_filled(_one_of(raw, entry, clock), clock), clock)
+
+
+def _filled(raw: RawTrial, clock: Clock) -> RawTrial:
+    """The rows before those at the end that a logger made room for and never filled."""
+    t = raw.columns.get(clock.column, np.empty(0))
+    held = int(np.argmax(t[::-1] != t[-1])) if len(t) else 0
+    end = len(t) - held
+    if held < _LEAST or not t[-1] < t[end - 1]:
+        return raw
+    note = f"{held} rows from row {raw.rows[end]} on were never filled: left out"
+    return replace(raw.between(0, end), notes=(*raw.notes, note))
 
 
 def _at_one_rate(raw: RawTrial, clock: Clock) -> RawTrial:
@@ -327,4 +338,10 @@ def read_sound_trial(
             columns={clock.column: np.arange(count, dtype=float), **raw.columns},
             remarks=(*raw.remarks, note),
         )
-    return clean(raw, session, entry, limits)
+    trial = clean(raw, session, entry, limits)
+    for name in entry.negated:
+        known = {column.removeprefix("q_"): column for column in trial.columns}
+        check_columns(list(known), [name], f"{entry.file}, negated")
+        trial.columns[known[name]] = -trial.columns[known[name]]
+        trial.repairs.append(f"{name} negated, as the session says")
+    return trial

@@ -11,7 +11,7 @@ import numpy as np
 
 from bampipe.data.guesses import describe, find_roles, is_time
 from bampipe.data.parts import are_axes, join_parts
-from bampipe.data.readers import EXTENSIONS, TEXTS, columns_of, lerobot, objects, read_trial
+from bampipe.data.readers import EXTENSIONS, SHEETS, TEXTS, columns_of, lerobot, objects, read_trial
 from bampipe.data.readers.trial import Dialect, RawTrial
 from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
@@ -25,7 +25,7 @@ MOST_FILES = 500
 _MOST_COLUMNS = 500
 """Of a table of samples, unless it has many rows."""
 _OTHER_DATA = {
-    **dict.fromkeys((".xlsx", ".xls", ".ods"), "export the sheet as CSV"),
+    **dict.fromkeys((".xls", ".ods"), "save the sheet as .xlsx or CSV"),
     **dict.fromkeys((".pkl", ".pickle", ".joblib"), "it may run any program; save with np.savez"),
     **dict.fromkeys((".feather", ".arrow", ".orc", ".rds"), "save it as Parquet or CSV"),
     **dict.fromkeys((".zip", ".gz", ".7z", ".tar", ".bz2", ".xz", ".rar"), "unpack it"),
@@ -47,21 +47,22 @@ _GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
 """Words in the name of a column that say less of it than the name of its file."""
 _WORDS = {
     "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
-    " nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd",
+    " nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
+    " tid czas cas zaman aika ido",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
-    " wanted con ctrl action ziel consigne consigna referencia riferimento",
+    " wanted con ctrl action ziel consigne consigna referencia riferimento planned requested",
     "brake": "brake bremse",
     "acceleration": "acc accel acceleration qdd ddq beschleunigung aceleracion accelerazione",
     "velocity": "vel velocity speed qd dq qdot omega geschwindigkeit drehzahl rpm rate vitesse"
-    " velocidad velocidade velocita snelheid",
+    " velocidad velocidade velocita snelheid predkosc rychlost hiz hastighet",
     "force": "force forc f fx fy fz torque tau trq kraft moment drehmoment loadcell wrench effort"
-    " eff couple fuerza forza forca par coppia momento koppel",
+    " eff couple fuerza forza forca par coppia momento koppel vridmoment tork kuvvet sila",
     "current": "current curr cur i iq amp amps ampere strom coil courant corriente corrente stroom",
     "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung tension"
     " voltaje tensao tensione",
     "position": "pos position ang angle theta phi psi q enc encoder disp displacement dist x stroke"
     " winkel weg lage hub joint deflection yaw pitch extension carriage counts posicion posicao"
-    " posizione angulo angolo hoek",
+    " posizione angulo angolo hoek vinkel kat uhel aci konum poloha course",
 }
 _SIGNS = {
     "加速度": "acc", "速度": "velocity", "力矩": "torque", "扭矩": "torque", "转矩": "torque",
@@ -72,6 +73,7 @@ _SIGNS = {
     "время": "time", "угол": "angle", "скорость": "velocity", "момент": "torque", "ток": "current",
 }  # fmt: skip
 """Words of other scripts; of those inside others the longer comes first."""
+_PLAIN = str.maketrans({"ı": "i", "ł": "l", "Ł": "L", "ø": "o", "ß": "ss"})
 _ALL_WORDS = frozenset(word for text in _WORDS.values() for word in text.split())
 _ENDS = sorted((word for word in _ALL_WORDS if len(word) > 4 or word in ("time", "zeit")), key=len)
 _RUN_TOGETHER = re.compile(r"(q|dq|tau|trq|pos|vel)(des|ref|cmd|meas|msr|act)")
@@ -84,7 +86,9 @@ _BY_UNIT = {
     "m/s": "velocity", "kg": "force", "N": "force", "N.m": "force", "A": "current", "V": "voltage",
 }  # fmt: skip
 _SHORT_UNITS = frozenset(["mm", "Nm", "kN", "mA", "mV"])
-_PLAIN_WORDS = frozenset(["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano"])
+_PLAIN_WORDS = frozenset(
+    ["foot", "feet", "pound", "turn", "min", "milli", "micro", "nano", "meter"]
+)
 """Units of two letters at the end of a name that are no words, and longer ones that are."""
 _PLAIN_POSITIONS = frozenset(["pos", "position", "angle", "theta"])
 _PRESENT = frozenset(["current", "curr", "cur"])
@@ -97,9 +101,9 @@ _JOINED = {
 }
 _UNIT_WORDS = {
     "time": ("us", "ms", "ns", "s"),
-    "position": ("rad", "deg", "mm", "cm", "m"),
+    "position": ("rad", "deg", "mm", "cm", "um", "m"),
     "velocity": ("rad/s", "deg/s", "mm/s", "m/s", "rpm"),
-    "force": ("Nm", "kN", "N", "V"),
+    "force": ("Nm", "kN", "N", "V", "kg", "g"),
     "current": ("mA", "A"),
     "voltage": ("mV", "V", "percent", "pct", "%"),
 }
@@ -254,7 +258,8 @@ class _Logs:
                 where=str(folder),
                 remedy=self.passed[0][1]
                 if self.passed
-                else f"supported file extensions are {', '.join(EXTENSIONS)}",
+                else f"supported file extensions are {', '.join(EXTENSIONS)}"
+                + "; of XML, name it *.txt" * any(name.endswith(".xml") for name in others),
             )
         if len(paths) > MOST_FILES:
             raise InputError(f"{len(paths)} logs are more than {MOST_FILES}", where=str(folder))
@@ -269,7 +274,8 @@ class _Logs:
                 columns = columns_of(path, name=name, dialect=self.dialect)
                 if not columns:
                     raise InputError(f"no column of numbers in it{_like(path)}")
-                small = path.stat().st_size < _SMALL and path.suffix.lower() in TEXTS
+                text = path.suffix.lower() in (*TEXTS, *SHEETS)
+                small = path.stat().st_size < _SMALL and text
                 wide, first = len(columns) > _MOST_COLUMNS, next(iter(columns))
                 rows = len(self._read_one(name, columns, first)) if small or wide else 2
                 if wide and 0 < 10 * rows < len(columns):
@@ -400,6 +406,7 @@ class _Logs:
         if not (trial.parts or trial.recording or trial.file.lower().endswith(TEXTS)):
             self.remarks += raw.remarks
         # Times of one name, beside the readings that each is of.
+        times = [c for c in times if c in raw.columns]
         ends = [re.sub(r" \(\d+\)$", "", c).rpartition(".")[2] for c in times]
         for one, other in combinations(times if times and times[0][:1] != "/" else (), 2):
             here, there = (raw.columns[c][sound] for c in (one, other))
@@ -445,7 +452,9 @@ class _Logs:
         path = self.folder / trial.file
         self.scanned += path.stat().st_size
         columns = self.found[trial.file]
-        several = path.suffix.lower() in TEXTS or any("[:]." in column for column in columns)
+        several = path.suffix.lower() in (*TEXTS, *SHEETS) or any(
+            "[:]." in column for column in columns
+        )
         if trial.parts or not several or self.scanned > _MOST_SCANNED:
             return [trial]
         times = [c for c, u in columns.items() if _role(c, u) == "time"]
@@ -566,7 +575,7 @@ def words(name: str) -> list[str]:
     bare = re.sub(r"[\[(（].*?[\])）]", " ", name)
     for foreign, english in _SIGNS.items():
         bare = bare.lower().replace(foreign, f" {english} ") if foreign in bare.lower() else bare
-    bare = "".join(c for c in normalize("NFKD", bare) if not combining(c))
+    bare = "".join(c for c in normalize("NFKD", bare.translate(_PLAIN)) if not combining(c))
     parts = re.split(r"[^A-Za-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", bare))
     return [word for part in parts if part for word in _parts_of(part.lower())]
 
@@ -634,6 +643,9 @@ def _unit(name: str, stated: str, role: str) -> str:
         return f"{rate[1]}/s"
     parts = re.split(r"[_\W]+", bare)
     suffix = parts[-1] if len(parts) > 1 else ""
+    arm = unit(".".join(parts[-2:])) if role == "force" and len(parts) > 2 else None  # in_lbs, N_m
+    if arm is not None and arm.si == "N.m":
+        return ".".join(parts[-2:])
     matches = [u for u in _UNIT_WORDS.get(role, ()) if u.lower() == suffix.lower()]
     if matches or role == "time" or len(suffix) <= _LONGEST_WORD:
         return next(iter(matches), "")

@@ -33,7 +33,7 @@ _ORDER = ("kg", "N", "W", "Pa", "V", "A", "T", "K", "Hz", "rad", "m", "s")
 """In which SI units stand in a product."""
 _LOGGED = frozenset(["", *_ORDER, "N.m", "rad/s", "rad/s2", "m/s", "m/s2"])
 """SI units of what is logged."""
-_PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
+_PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 0.1, "da": 10.0, "k": 1e3, "M": 1e6}
 _PREFIXED = frozenset(["s", "m", "rad", "deg", "N", "A", "V", "W", "Hz", "Pa", "T", "g", "bar"])
 _WHOLE = {
     "1/min": "rev/min", "-": "", "1": "",
@@ -51,7 +51,7 @@ _SPELLINGS = {
     "millimeter": "mm", "millimetre": "mm", "centimeter": "cm", "inch": "in", "inche": "in",
     "foot": "ft", "feet": "ft", "lb": "lbf", "pound": "lbf", "oz": "ozf", "hz": "Hz",
     "percent": "%", "pct": "%", "Arms": "A", "Vdc": "V", "Vrms": "V", "U": "rev", "Umdr": "rev",
-    "tr": "rev", "grado": "deg", "grados": "deg", "degré": "deg",
+    "tr": "rev", "grado": "deg", "grados": "deg", "grader": "deg", "derece": "deg", "degré": "deg",
 }  # fmt: skip
 """Of single factors; those in the plural are found without their s."""
 _CELSIUS = frozenset(["degc", "°c", "c", "celsius"])
@@ -89,6 +89,7 @@ def unit(text: str) -> RecordedUnit | None:
     """
     plain = bare(text).replace("µ", "u").replace("μ", "u")
     plain = plain.replace("²", "2").replace("³", "3").replace("⁻", "-").replace("¹", "1")
+    plain = re.sub(r"(?:x ?)?\b10(?:\^|\*\*)(-?\d+)", r"1e\1", plain)
     plain = _WHOLE.get(plain.lower().replace("-", "").replace(".", "") or plain, plain)
     plain = re.sub(
         r"(?i)(?<![a-z])(rpm|r/min|rps|dps)(?![a-z])", lambda rate: _RATES[rate[0].lower()], plain
@@ -128,9 +129,10 @@ def _factor(word: str) -> list[tuple[str, float]] | None:
         known = _SPELLINGS.get(spelling, spelling)
         if known in _FACTORS:
             return [_FACTORS[known]]
-        if known[:1] in _PREFIXES and known[1:] in _PREFIXED:
-            si, scale = _FACTORS[known[1:]]
-            return [(si, scale * _PREFIXES[known[0]])]
+        prefix = "da" if known == "daN" else known[:1]
+        if prefix in _PREFIXES and known.removeprefix(prefix) in _PREFIXED:
+            si, scale = _FACTORS[known.removeprefix(prefix)]
+            return [(si, scale * _PREFIXES[prefix])]
     return None
 
 

@@ -15,8 +15,9 @@ from scipy.special import logit, softmax
 from bampipe.arrays import Array, Flags
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Key
-from bampipe.diagnosis.search import Pool, Search, added, gone
+from bampipe.diagnosis.search import Pool
 from bampipe.diagnosis.session import Fit
+from bampipe.diagnosis.set_cost import SetCosts, added, gone
 from bampipe.diagnosis.unknown import Splines, Unknown, lay_splines, weigh_unknown
 
 _DRAWS = 1000
@@ -66,7 +67,7 @@ class Weighed:
 
 
 def weigh_sets(
-    by_noise: Search, fit: Fit, pool: Pool, given: Sequence[str], criteria: Criteria, seed: int
+    by_noise: SetCosts, fit: Fit, pool: Pool, given: Sequence[str], criteria: Criteria, seed: int
 ) -> Weighed:
     """Weigh the sets of a pool, each member's absence, and unknown functions beside them.
 
@@ -74,86 +75,86 @@ def weigh_sets(
     samples that are independent in what remains.
 
     Args:
-        by_noise: the search over sets beside the most probable model; fit: that model.
+        by_noise: costs of sets beside the most probable model; fit: that model.
         pool: sets near it, with costs by the noise.
         given: effects of the model diagnosed, which are not in question.
         seed: of the bootstrap.
     """
-    search = by_noise.with_independent(fit.count_independent(criteria))
+    costs = by_noise.with_independent(fit.count_independent(criteria))
     # What a set fell short by when it was fitted.
     short = {k: c - by_noise.cost(k) for c, k in pool.values()}
-    pool = {n: (search.cost(k) + short[k], k) for n, (_, k) in pool.items()}
-    none = search.cost(())
-    own = [e for e in search.p.absence if e not in given]
+    pool = {n: (costs.cost(k) + short[k], k) for n, (_, k) in pool.items()}
+    none = costs.cost(())
+    own = [e for e in costs.p.absence if e not in given]
     near = sorted((c, k) for c, k in pool.values() if c < none + _NEAR and k)[:_MOST]
     absent = [((f"-{e}", ()),) for e in own]
     named = [
         _Listed(
-            keys, None, none - search.cost(keys) - short.get(keys, 0.0),
-            _by_block(search, keys, None, short.get(keys, 0.0)),
+            keys, None, none - costs.cost(keys) - short.get(keys, 0.0),
+            _by_block(costs, keys, None, short.get(keys, 0.0)),
         )
         for keys in dict.fromkeys([(), *(k for _, k in near), *absent])
-        if np.isfinite(search.cost(keys))
+        if np.isfinite(costs.cost(keys))
     ]  # fmt: skip
-    sets = _share(search, named, given, seed)
+    sets = _share(costs, named, given, seed)
     effects, drops = _by_effect(sets), _losses(sets)
     effects |= {e: 0.0 for e in own if by_noise.size_of_own(e) < criteria.size}
-    unknown = np.zeros(len(search.p.y))
+    unknown = np.zeros(len(costs.p.y))
     functions: list[Unknown | None] = []
     for axis in range(len(unknown)):
         splines = lay_splines(by_noise, axis)
         if splines is None:
             functions.append(None)
             continue
-        by_all, here = (weigh_unknown(s, splines) for s in (by_noise, search))
+        by_all, here = (weigh_unknown(s, splines) for s in (by_noise, costs))
         functions.append(by_all)
         if by_all.size < criteria.size:
             continue
-        more = by_noise.cost(()) - by_all.cost - (none - here.cost) + search.log_prior
-        if none - here.cost + more < search.log_prior - _NEAR:
+        more = by_noise.cost(()) - by_all.cost - (none - here.cost) + costs.log_prior
+        if none - here.cost + more < costs.log_prior - _NEAR:
             continue
-        more_by_block = _by_block(by_noise, (), by_all) - _by_block(search, (), here)
+        more_by_block = _by_block(by_noise, (), by_all) - _by_block(costs, (), here)
         beside = [
             _Listed(
                 keys, axis, none - found.cost + more,
-                _by_block(search, keys, found) + more_by_block,
+                _by_block(costs, keys, found) + more_by_block,
             )
-            for keys, found in _beside_unknown(search, splines, here, own)
+            for keys, found in _beside_unknown(costs, splines, here, own)
         ]  # fmt: skip
         # What one axis lacks is independent of what another one does.
-        with_unknown = _share(search, [*named, *beside], given, seed)
+        with_unknown = _share(costs, [*named, *beside], given, seed)
         here_too = _by_effect(with_unknown)
         unknown[axis] = sum(s.probability for s in with_unknown if s.unknown is not None)
         for effect in own:
-            if axis in touched_axes(search, effect):
+            if axis in touched_axes(costs, effect):
                 effects[effect] = min(effects[effect], here_too.get(effect, 0.0))
                 if unknown[axis] >= criteria.probability:
                     drops[effect] = _losses(with_unknown).get(effect, 0.0)
         if unknown[axis] == unknown.max():
             sets = with_unknown
-    far = np.sqrt(_squares(search, ()) / np.maximum(search.p.count, 1)) > criteria.doubt
+    far = np.sqrt(_squares(costs, ()) / np.maximum(costs.p.count, 1)) > criteria.doubt
     unknown[far] = 1.0
     doubtful = (unknown >= criteria.probability) & fit.is_above_floor
     for effect in own if doubtful.any() else ():
         # In doubt is not absent: the model keeps it, and the report mentions it.
-        most = max(_share_explained(search, effect, doubtful), 1.0 - criteria.probability)
+        most = max(_share_explained(costs, effect, doubtful), 1.0 - criteria.probability)
         effects[effect] = min(effects[effect], most)
     return Weighed(sets, effects, unknown, tuple(functions), drops)
 
 
-def _squares(search: Search, keys: tuple[Key, ...]) -> Array:
+def _squares(costs: SetCosts, keys: tuple[Key, ...]) -> Array:
     """Sum of squares that a set leaves, in units of the noise, (n_q,)."""
-    return np.array([max(float(rows @ rows), 1e-300) for rows in search.residual_rows(keys)])
+    return np.array([max(float(rows @ rows), 1e-300) for rows in costs.residual_rows(keys)])
 
 
-def _share_explained(search: Search, effect: str, far: Flags) -> float:
+def _share_explained(costs: SetCosts, effect: str, far: Flags) -> float:
     """Of the error without an effect, what it takes on axes that are ``far``; the largest.
 
     What is missing there may resemble an effect that takes less than that leaves. 1 of an effect
     that the other axes show, or show more than these.
     """
-    now, without = _squares(search, ()), _squares(search, ((f"-{effect}", ()),))
-    gain = 0.5 * search.p.independent * np.log(without / now)
+    now, without = _squares(costs, ()), _squares(costs, ((f"-{effect}", ()),))
+    gain = 0.5 * costs.p.independent * np.log(without / now)
     if gain[~far].sum() >= min(gain[far].sum(), _NEAR):
         return 1.0
     return float(np.max(1.0 - np.sqrt(now[far] / without[far])))
@@ -170,7 +171,7 @@ class _Listed:
 
 
 def _share(
-    search: Search, listed: Sequence[_Listed], given: Sequence[str], seed: int
+    costs: SetCosts, listed: Sequence[_Listed], given: Sequence[str], seed: int
 ) -> tuple[WeighedSet, ...]:
     """Probabilities of sets, the most probable first."""
     total, blocks = np.array([s.gain for s in listed]), np.array([s.by_block for s in listed])
@@ -179,7 +180,7 @@ def _share(
     drawn = rng.multinomial(count, np.full(count, 1.0 / count), _DRAWS)
     shares = softmax((drawn - 1.0) @ blocks.T + total, axis=1).mean(axis=0)
     sets = [
-        WeighedSet(s.keys, _effects(search, s.keys, given), s.unknown, s.gain, float(share))
+        WeighedSet(s.keys, _effects(costs, s.keys, given), s.unknown, s.gain, float(share))
         for s, share in zip(listed, shares, strict=True)
     ]
     return tuple(sorted(sets, key=lambda s: -s.probability))
@@ -210,7 +211,7 @@ def _by_effect(sets: Sequence[WeighedSet]) -> dict[str, float]:
 
 
 def _beside_unknown(
-    search: Search, splines: Splines, here: Unknown, own: Sequence[str]
+    costs: SetCosts, splines: Splines, here: Unknown, own: Sequence[str]
 ) -> list[tuple[tuple[Key, ...], Unknown]]:
     """Sets beside an unknown function: the whole one, and less each effect whose place it takes.
 
@@ -219,9 +220,9 @@ def _beside_unknown(
     keys: tuple[Key, ...] = ()
     found = [(keys, here)]
     while True:
-        beside = [e for e in own if splines.axis in touched_axes(search, e) if e not in gone(keys)]
+        beside = [e for e in own if splines.axis in touched_axes(costs, e) if e not in gone(keys)]
         fewer = [tuple(sorted((*keys, (f"-{e}", ())))) for e in beside]
-        tried = [(less, weigh_unknown(search, splines, less)) for less in fewer]
+        tried = [(less, weigh_unknown(costs, splines, less)) for less in fewer]
         best = min(tried, key=lambda one: one[1].cost, default=None)
         found += tried
         if best is None or best[1].cost > min(one.cost for _, one in found):
@@ -229,30 +230,30 @@ def _beside_unknown(
         keys = best[0]
 
 
-def touched_axes(search: Search, effect: str) -> tuple[int, ...]:
+def touched_axes(costs: SetCosts, effect: str) -> tuple[int, ...]:
     """Axes whose equation an effect of the model changes."""
-    system = search.dictionary.evidence.system
+    system = costs.dictionary.evidence.system
     item = next(i for i in system.model.effects if i.name == effect)
     axes = [system.coordinates.index(a) for a in item.axes]
     return tuple(axes) or tuple(range(len(system.coordinates)))
 
 
-def _effects(search: Search, keys: Sequence[Key], given: Sequence[str]) -> tuple[str, ...]:
+def _effects(costs: SetCosts, keys: Sequence[Key], given: Sequence[str]) -> tuple[str, ...]:
     away = gone(keys)
-    kept = [e for e in search.p.absence if e not in away and e not in given]
+    kept = [e for e in costs.p.absence if e not in away and e not in given]
     return (*kept, *(name for name, _ in added(keys)))
 
 
 def _by_block(
-    search: Search, keys: tuple[Key, ...], unknown: Unknown | None, short: float = 0.0
+    costs: SetCosts, keys: tuple[Key, ...], unknown: Unknown | None, short: float = 0.0
 ) -> Array:
     """Log likelihood of a set over that of none, less ``short``, nats, by block of time, (n,)."""
-    p = search.p
-    before = search.residual_rows(())
-    after = list(unknown.residual) if unknown else search.residual_rows(keys)
-    w_before = search.solve(()).weight
-    w_after = unknown.weight if unknown else search.solve(keys).weight
-    volume = search.volume_rows(keys)
+    p = costs.p
+    before = costs.residual_rows(())
+    after = list(unknown.residual) if unknown else costs.residual_rows(keys)
+    w_before = costs.solve(()).weight
+    w_after = unknown.weight if unknown else costs.solve(keys).weight
+    volume = costs.volume_rows(keys)
     count = 1 + max((int(s.block.max()) for s in p.likelihood.samples if len(s.block)), default=0)
     found = np.full(count, -short / count)
     for axis, here in enumerate(p.likelihood.samples):

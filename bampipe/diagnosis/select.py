@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
 from bampipe.diagnosis.probability import Weighed, weigh_sets
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.search import Pool, Search, added, gone, names
+from bampipe.diagnosis.search import Pool, Search
 from bampipe.diagnosis.session import (
     Fit,
     Session,
@@ -21,7 +21,7 @@ from bampipe.diagnosis.session import (
     without_members,
     workers,
 )
-from bampipe.diagnosis.unknown import lay_splines, weigh_unknown
+from bampipe.diagnosis.set_cost import added, gone, names
 from bampipe.physics.recipe import Recipe
 
 Progress = Callable[[float, str], None]
@@ -159,8 +159,6 @@ def select_effects(
             last |= number >= _MOST_ROUNDS - 1
             if not last:
                 better = [k for c, k in sorted(pool.values()) if c < none - _WORTH]
-                if number > 0:
-                    better = _beyond_smooth(search, better)
                 better += _without_weakest(search, recipe.effects)
                 tell = partial(progress, 0.15 + 0.1 * number)
                 moved, kept = _fit_better(session, search, current, better, fits, tell)
@@ -242,33 +240,6 @@ def _without_weakest(search: Search, given: Collection[str]) -> list[tuple[Key, 
     weakest = min(own, key=lambda e: search.cost(((f"-{e}", ()),)), default=None)
     shaped = any(search.p.shapes[e] for e in own if e != weakest)
     return [((f"-{weakest}", ()),)] if shaped else []
-
-
-def _beyond_smooth(search: Search, sets: Sequence[tuple[Key, ...]]) -> list[tuple[Key, ...]]:
-    """Sets that gain more than an unknown function does on the axis where they gain most.
-
-    The others imitate what no effect of the library is, the better the larger they are; one effect
-    in the place of another is no larger.
-    """
-    none = search.solve(())
-
-    @cache
-    def gain_of_smooth(axis: int) -> float:
-        splines = lay_splines(search, axis)
-        return 0.0 if splines is None else none.cost - weigh_unknown(search, splines).cost
-
-    def axis_of(keys: tuple[Key, ...]) -> int:
-        found = search.solve(keys)
-        ratio = np.maximum(found.scale, 1e-300) / np.maximum(none.scale, 1e-300)
-        gains = found.volume - none.volume - 0.5 * search.p.independent * np.log(ratio)
-        return int(np.argmax(gains))
-
-    return [
-        keys
-        for keys in sets
-        if len(added(keys)) <= len(gone(keys))
-        or none.cost - search.cost(keys) > gain_of_smooth(axis_of(keys))
-    ]
 
 
 def _leave_out(

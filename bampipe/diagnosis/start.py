@@ -11,9 +11,9 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.criteria import Criteria
-from bampipe.diagnosis.search import gone, names
 from bampipe.diagnosis.select import open_search, start_of
 from bampipe.diagnosis.session import Fit, Session, system_of
+from bampipe.diagnosis.set_cost import gone, names
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.measured import MeasuredTrials
 

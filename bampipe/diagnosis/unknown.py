@@ -13,7 +13,7 @@ import numpy as np
 
 from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.dictionary import Key
-from bampipe.diagnosis.search import Search, gone
+from bampipe.diagnosis.set_cost import SetCosts, gone
 from bampipe.diagnosis.shape import since_reversal
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import solve_scaled, take_samples
@@ -33,7 +33,7 @@ class Unknown:
     """The unknown function beside a set of effects.
 
     Attributes:
-        cost: negative log evidence of the set with it, as `Search.cost`.
+        cost: negative log evidence of the set with it, as `SetCosts.cost`.
         residual: weighted rows that are left, by axis, each (n,).
         weight: of the squares of each axis.
         share: of the mean square of the axis' residual, what it takes.
@@ -66,10 +66,10 @@ class Splines:
     products: tuple[Array, Array, Array]
 
 
-def lay_splines(search: Search, axis: int) -> Splines | None:
+def lay_splines(costs: SetCosts, axis: int) -> Splines | None:
     """The functions that are weighed on an axis; None where the axis does not move."""
-    p, e = search.p, search.dictionary.evidence
-    if len(p.y[axis]) <= search.bb.shape[1]:
+    p, e = costs.p, costs.dictionary.evidence
+    if len(p.y[axis]) <= costs.bb.shape[1]:
         return None
     width = e.system.model.device.coordinates[axis].sign_width
     quantities = zip(*(_quantities(e, k, axis) for k in range(len(e.motions))), strict=True)
@@ -114,10 +114,10 @@ def _hats(values: Array, knots: Array) -> Array:
     return np.column_stack([np.interp(inside, knots, row) for row in np.eye(len(knots))])
 
 
-def weigh_unknown(search: Search, splines: Splines, keys: tuple[Key, ...] = ()) -> Unknown:
+def weigh_unknown(costs: SetCosts, splines: Splines, keys: tuple[Key, ...] = ()) -> Unknown:
     """The evidence of an unknown function beside a set, of effects of the model taken away."""
-    model = _ModelWithout(search, splines, keys)
-    best = model.add_best({}, search.solve(keys).weight)
+    model = _ModelWithout(costs, splines, keys)
+    best = model.add_best({}, costs.solve(keys).weight)
     while len(best.sizes) < len(splines.functions):
         found = model.add_best(best.sizes, best.weight)
         if found.cost >= best.cost:
@@ -140,8 +140,8 @@ class _Solution:
 class _ModelWithout:
     """The linear problem of a model without some of its effects, to which functions are added."""
 
-    def __init__(self, search: Search, splines: Splines, keys: tuple[Key, ...]) -> None:
-        p = self.p = search.p
+    def __init__(self, costs: SetCosts, splines: Splines, keys: tuple[Key, ...]) -> None:
+        p = self.p = costs.p
         self.splines, axis = splines, splines.axis
         absent = {k: v for name in gone(keys) for k, v in p.absence[name].items()}
         self.fixed, self.free = p.hold(absent)
@@ -154,7 +154,7 @@ class _ModelWithout:
         self.moment = self.free.T @ (p.moment - p.precision @ self.fixed)
         bx, self.xx, xy = splines.products
         self.bx, self.xy = self.free.T @ bx, xy + bx.T @ self.fixed
-        self.penalty, self.before = search.penalty_of(keys), search.residual_rows(keys)[axis]
+        self.penalty, self.before = costs.penalty_of(keys), costs.residual_rows(keys)[axis]
         self.force = float(np.sqrt(np.mean(p.likelihood.applied[axis] ** 2)))
 
     def add_best(self, sizes: dict[int, float], weight: Array) -> _Solution:

@@ -89,12 +89,12 @@ def _judge(
     verdict: Verdict
     if against_floor == "floor_missing":
         verdict = "no_verdict"
+    elif remains and max(listed.values(), default=0.0) < 0.5:
+        verdict = "unknown_effect"
     elif open_question or 1.0 - c.probability <= asked < c.probability:
         verdict = "undecided"
-    elif sure:
-        verdict = "missing"
     else:
-        verdict = "unknown_effect" if remains else "nothing_missing"
+        verdict = "missing" if sure else "nothing_missing"
     force = rms(final.likelihood.applied[axis])
     excess = max(before**2 - level**2, 0.0)
     left = max(after**2 - level**2, 0.0)

@@ -1,12 +1,12 @@
 """Butterworth filter without phase, and central differences."""
 
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.signal import butter, periodogram, sosfiltfilt
 
 from bampipe.arrays import Array
-from bampipe.estimate.differentiation import Derivatives, extend, linear_noise_gains
+from bampipe.estimate.differentiation import Derivatives, differentiate_linearly, extend
 
 _REACH = 6
 """Samples on either side that a derivative of an input is made of."""
@@ -87,15 +87,10 @@ def _low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array,
 
 
 def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -> Derivatives:
-    """Return the motion behind ``position`` (T,) by :func:`zero_phase`, with error bands.
-
-    ``noise_sd`` is the standard deviation of the white noise on the samples; motion above the
-    cut-off is lost and is not in the bands.
-    """
-    results = zero_phase(position, rate_hz, cutoff_hz)
+    """`zero_phase` by `differentiate_linearly`."""
+    method = partial(zero_phase, rate_hz=rate_hz, cutoff_hz=cutoff_hz)
     edge = int(np.ceil(1.5 * rate_hz / cutoff_hz))
-    gains = linear_noise_gains(lambda x: zero_phase(x, rate_hz, cutoff_hz), len(position), edge)
-    return Derivatives(*results, *(noise_sd * gain for gain in gains))
+    return differentiate_linearly(method, position, edge, noise_sd)
 
 
 def floor_frequency(position: Array, rate_hz: float, noise_sd: float) -> float:

@@ -22,27 +22,24 @@ class _Controller(NamedTuple):
     Attributes:
         columns: of the inputs that it commands; ticks: how often it acts in a sample.
         states: (n_s,) what it integrates; limits: (n_s, 2) of these.
-        start, end: (nu,) inputs of a tick; given: (nr,) references then.
-        out: (nf + n_s,) its commands and the rates of its states.
     """
 
     columns: Indices
     ticks: int
     states: Array
     limits: Array
-    start: Array
-    end: Array
-    given: Array
-    out: Array
 
 
-_CONTROLLER = record_type(_Controller, int64[::1], int64, _V, _M, _V, _V, _V, _V)
+_CONTROLLER = record_type(_Controller, int64[::1], int64, _V, _M)
 
 
 @part()
-def _act(command, controller, y, r, dt):  # type: ignore[no-untyped-def]
-    """Command from readings and references, and advance the states of the controller by ``dt``."""
-    states, limits, out = controller.states, controller.limits, controller.out
+def _act(command, controller, y, r, dt, out):  # type: ignore[no-untyped-def]
+    """Write commands from readings and references, and advance the controller by ``dt``.
+
+    ``out`` (nf + n_s,) receives the commands, then the rates of its states.
+    """
+    states, limits = controller.states, controller.limits
     nf = controller.columns.shape[0]
     command(y, r, states, out)
     for i in range(states.shape[0]):
@@ -51,26 +48,26 @@ def _act(command, controller, y, r, dt):  # type: ignore[no-untyped-def]
 
 @njit(
     void(
-        DERIVATIVE, MEASURE, COMMAND, _M, _M, _M, _M, PLANT, _CONTROLLER, float64, _M
+        DERIVATIVE, MEASURE, COMMAND, _M, _M, _M, _M, PLANT, _CONTROLLER, float64
     ),
     cache=True,
 )  # fmt: skip
 def _close(  # type: ignore[no-untyped-def]
-    derivative, measure, command, x, u, r, readings, plant, controller, dt, work
+    derivative, measure, command, x, u, r, readings, plant, controller, dt
 ):
     """Fill the rows of ``x`` after the first, the commands in ``u``, and the readings."""
     p, w = plant.p, plant.w
-    columns, ticks, out = controller.columns, controller.ticks, controller.out
-    start, end, given = controller.start, controller.end, controller.given
+    columns, ticks = controller.columns, controller.ticks
     nu, nr, nf = u.shape[1], r.shape[1], columns.shape[0]
-    straight = work[8, :nu]
+    start, end, given, straight = np.empty(nu), np.empty(nu), np.empty(nr), np.zeros(nu)
+    out, work = np.empty(nf + controller.states.shape[0]), np.zeros((8, max(x.shape[1], nu)))
     tick_s = dt / ticks
     for k in range(x.shape[0]):
         if k > 0:
             for j in range(nf):  # the encoders may be moved by the load
                 u[k, columns[j]] = out[j]
         measure(x[k], u[k], p, readings[k])
-        _act(command, controller, readings[k], r[k], tick_s)
+        _act(command, controller, readings[k], r[k], tick_s, out)
         for j in range(nf):
             u[k, columns[j]] = out[j]
         if k + 1 == x.shape[0]:
@@ -87,7 +84,7 @@ def _close(  # type: ignore[no-untyped-def]
                 for j in range(nr):
                     given[j] = r[k, j] + (r[k + 1, j] - r[k, j]) * tick / ticks
                 measure(x[k + 1], start, p, readings[k + 1])
-                _act(command, controller, readings[k + 1], given, tick_s)
+                _act(command, controller, readings[k + 1], given, tick_s, out)
             for j in range(nf):
                 start[columns[j]] = out[j]
                 end[columns[j]] = out[j]
@@ -149,13 +146,9 @@ def simulate_controlled(
     controller = _Controller(
         columns=columns,
         ticks=max(1, round(dt * rate_hz) if rate_hz > 0.0 else int(np.ceil(dt / 1e-3 - 1e-9))),
-        states=states, limits=bounds, start=np.empty(total.shape[1]), end=np.empty(total.shape[1]),
-        given=np.empty(references.shape[1]), out=np.empty(columns.size + states.size),
+        states=states, limits=bounds,
     )  # fmt: skip
-    work = np.zeros((9, max(len(x0), total.shape[1])))
-    _close(
-        derivative, measure, command, x, total, references, readings, plant, controller, dt, work
-    )
+    _close(derivative, measure, command, x, total, references, readings, plant, controller, dt)
     require_finite(x, dt)
     return x, total, readings
 

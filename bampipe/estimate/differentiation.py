@@ -169,17 +169,20 @@ def _end_weights(fit: int, degree: int) -> Array:
 Linear = Callable[[Array], tuple[Array, Array, Array]]
 
 
-def linear_noise_gains(method: Linear, length: int, edge: int) -> tuple[Array, Array, Array]:
-    """Return how much white noise on the positions ``method`` leaves in what it returns.
+def differentiate_linearly(
+    method: Linear, position: Array, edge: int, noise_sd: float
+) -> Derivatives:
+    """Return the motion behind ``position`` (T,) by a linear method, with error bands.
+
+    Motion above the method's cut-off is lost and is not in the bands.
 
     Args:
         method: linear; takes (T,), returns position, velocity, acceleration, each (T,).
-        length: T.
-        edge: number of samples at either end where the gain differs from that in the middle.
-
-    Returns:
-        Standard deviations, each (T,), for noise of standard deviation 1.
+        position: samples on a uniform grid.
+        edge: number of samples at either end where noise passes otherwise than in the middle.
+        noise_sd: standard deviation of the white noise on the samples.
     """
+    length = len(position)
     edge = min(edge, (length + 1) // 2)
     window = min(length, 4 * edge + 1)
     squares = np.zeros((3, window))
@@ -192,4 +195,4 @@ def linear_noise_gains(method: Linear, length: int, edge: int) -> tuple[Array, A
     full[:] = gains[:, window // 2, None]
     full[:, :edge] = gains[:, :edge]
     full[:, length - edge :] = gains[:, window - edge :]
-    return full[0], full[1], full[2]
+    return Derivatives(*method(position), *(noise_sd * full))

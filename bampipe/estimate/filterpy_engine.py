@@ -6,6 +6,7 @@ filterpy draws the sigma points afresh after adding Q, as the compiled engine do
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -44,22 +45,17 @@ def filter_trials_by_filterpy(
         InputError: filterpy 2 is not installed.
     """
 
-    def filter_one(
-        index: int, trial: Trial, theta: Array, covariance: Array
-    ) -> tuple[FilteredTrial, Array, Array]:
-        return _filter(model, index, trial, theta, covariance, settings, advance)
-
-    return in_sequence(filter_one, trials, theta, covariance)
+    return in_sequence(partial(_filter, model, settings, advance), trials, theta, covariance)
 
 
 def _filter(
     model: FilterModel,
+    settings: FilterSettings,
+    advance: Callable[..., None],
     index: int,
     trial: Trial,
     theta: Array,
     covariance: Array,
-    settings: FilterSettings,
-    advance: Callable[..., None],
 ) -> tuple[FilteredTrial, Array, Array]:
     """Filter one trial; return it and the parameters with their covariance after it."""
     nx, n, ny = model.n_states, model.n_states + model.free.size, settings.observed.size

@@ -15,14 +15,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import factorial
-from typing import NamedTuple
 
 import numpy as np
 from numba import boolean, float64, int64, types, void
 from scipy.optimize import minimize_scalar
 
 from bampipe.arrays import Array, Flags
-from bampipe.compiled import njit, part, record_type
+from bampipe.compiled import njit, part
 from bampipe.estimate.differentiation import Derivatives
 
 ORDERS = (3, 4)
@@ -55,14 +54,39 @@ def ratio_for(bandwidth_hz: float, order: int, rate_hz: float) -> float:
 
 
 @part()
+def _advance(x, step):  # type: ignore[no-untyped-def]
+    """Advance state ``x`` (n,) by one sample, in place."""
+    for i in range(x.shape[0]):
+        total = 0.0
+        for j in range(i, x.shape[0]):
+            total += step[i, j] * x[j]
+        x[i] = total
+
+
+@part()
+def _carry_back(adjoint, step):  # type: ignore[no-untyped-def]
+    """Carry ``adjoint`` (n,) back by one sample, in place: F' adjoint."""
+    for i in range(adjoint.shape[0] - 1, -1, -1):
+        total = 0.0
+        for j in range(i + 1):
+            total += step[j, i] * adjoint[j]
+        adjoint[i] = total
+
+
+@part()
+def _multiply_row(matrix, i, vector):  # type: ignore[no-untyped-def]
+    """Row ``i`` of ``matrix`` (n, n) times ``vector`` (n,)."""
+    total = 0.0
+    for j in range(vector.shape[0]):
+        total += matrix[i, j] * vector[j]
+    return total
+
+
+@part()
 def _predict(x, p, step, noise, work):  # type: ignore[no-untyped-def]
     """Advance state ``x`` (n,) and covariance ``p`` (n, n) by one sample, in place."""
     n = x.shape[0]
-    for i in range(n):
-        total = 0.0
-        for j in range(i, n):
-            total += step[i, j] * x[j]
-        x[i] = total
+    _advance(x, step)
     for i in range(n):
         for j in range(n):
             total = 0.0
@@ -96,69 +120,43 @@ def _update(x, p, y, gain):  # type: ignore[no-untyped-def]
     return innovation, spread
 
 
-class _Pass(NamedTuple):
-    """What the filter leaves for the smoother, by sample: states (T, n) and their covariances.
-
-    Also gains (T, n), innovations (T,) and their variances (T,).
-    """
-
-    states: Array
-    covariances: Array
-    gains: Array
-    innovations: Array
-    spreads: Array
+_PASS = types.Tuple((_M, float64[:, :, ::1], _M, _V, _V))
+"""What the filter leaves for the smoother, by sample: states (T, n), their covariances, gains
+(T, n), innovations (T,) and their variances (T,)."""
 
 
-_PASS = record_type(_Pass, _M, float64[:, :, ::1], _M, _V, _V)
-
-
-def _allocate_pass(count: int, order: int) -> _Pass:
-    return _Pass(
-        np.empty((count, order)), np.empty((count, order, order)), np.zeros((count, order)),
-        np.zeros(count), np.ones(count),
-    )  # fmt: skip
-
-
-@njit(void(_V, _FLAGS, _M, _M, _V, _M, _PASS, _M), cache=True)
-def _filter(y, present, step, noise, x, p, passed, work):  # type: ignore[no-untyped-def]
-    """Run the filter from prior ``x``, ``p`` for the first sample and note what it passes.
-
-    ``work`` (n, n) is scratch.
-    """
-    states, covariances, gains, innovations, spreads = passed
-    for t in range(y.shape[0]):
+@njit(_PASS(_V, _FLAGS, _M, _M, _V, _M), cache=True)
+def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
+    """Run the filter from prior ``x``, ``p`` for the first sample and return what it passes."""
+    count, n = y.shape[0], x.shape[0]
+    states, covariances, gains = np.empty((count, n)), np.empty((count, n, n)), np.zeros((count, n))
+    innovations, spreads, work = np.zeros(count), np.ones(count), np.empty((n, n))
+    for t in range(count):
         if t > 0:
             _predict(x, p, step, noise, work)
         if present[t]:
             innovations[t], spreads[t] = _update(x, p, y[t], gains[t])
-        for i in range(x.shape[0]):
+        for i in range(n):
             states[t, i] = x[i]
-            for j in range(x.shape[0]):
+            for j in range(n):
                 covariances[t, i, j] = p[i, j]
+    return states, covariances, gains, innovations, spreads
 
 
-@njit(void(_FLAGS, _M, _PASS, _M, _M, _M, _M), cache=True)
-def _smooth(present, step, passed, variances, vectors, weight, left):  # type: ignore[no-untyped-def]
-    """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n).
-
-    ``vectors`` (2, n) and ``weight`` (n, n), zeros, and ``left`` (n, n) are scratch.
-    """
+@njit(void(_FLAGS, _M, _PASS, _M), cache=True)
+def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
+    """Turn the filtered states (T, n) into smoothed ones, in place; fill ``variances`` (T, n)."""
     states, covariances, gains, innovations, spreads = passed
     n = states.shape[1]
-    adjoint, pull = vectors[0], vectors[1]
+    adjoint, pull = np.zeros(n), np.zeros(n)
+    weight, left = np.zeros((n, n)), np.empty((n, n))
     for t in range(states.shape[0] - 1, -1, -1):
         p = covariances[t]
         for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += p[i, j] * adjoint[j]
-            states[t, i] -= total
+            states[t, i] -= _multiply_row(p, i, adjoint)
             variance = p[i, i]
             for j in range(n):
-                total = 0.0
-                for k in range(n):
-                    total += weight[j, k] * p[k, i]
-                variance -= p[i, j] * total
+                variance -= p[i, j] * _multiply_row(weight, j, p[i])
             variances[t, i] = max(variance, 0.0)
         if present[t]:
             # adjoint <- C' adjoint - H' v/S, weight <- C' weight C + H' H/S, with C = I - K H
@@ -167,10 +165,7 @@ def _smooth(present, step, passed, variances, vectors, weight, left):  # type: i
                 share += gains[t, j] * adjoint[j]
             adjoint[0] -= share + innovations[t] / spreads[t]
             for i in range(n):
-                total = 0.0
-                for j in range(n):
-                    total += weight[i, j] * gains[t, j]
-                pull[i] = total
+                pull[i] = _multiply_row(weight, i, gains[t])
             share = 0.0
             for i in range(n):
                 share += gains[t, i] * pull[i]
@@ -179,11 +174,7 @@ def _smooth(present, step, passed, variances, vectors, weight, left):  # type: i
                 weight[i, 0] -= pull[i]
                 weight[0, i] -= pull[i]
         # adjoint <- F' adjoint, weight <- F' weight F
-        for i in range(n - 1, -1, -1):
-            total = 0.0
-            for j in range(i + 1):
-                total += step[j, i] * adjoint[j]
-            adjoint[i] = total
+        _carry_back(adjoint, step)
         for i in range(n):
             for j in range(n):
                 total = 0.0
@@ -199,23 +190,19 @@ def _smooth(present, step, passed, variances, vectors, weight, left):  # type: i
                 weight[j, i] = total
 
 
-@njit(types.Tuple((float64, float64, int64))(_V, _FLAGS, _M, _M, _V, _M, int64, _M, _V), cache=True)
-def _evidence(y, present, step, noise, x, p, skip, work, gain):  # type: ignore[no-untyped-def]
+@njit(types.Tuple((float64, float64, int64))(_V, _FLAGS, _M, _M, _V, _M, int64), cache=True)
+def _evidence(y, present, step, noise, x, p, skip):  # type: ignore[no-untyped-def]
     """Return sums of log S and v²/S over the innovations after ``skip``, and their count.
 
-    Once the covariance has settled it is kept until a sample is missing. ``work`` (n, n) and
-    ``gain`` (n,) are scratch.
+    Once the covariance has settled it is kept until a sample is missing.
     """
     n = x.shape[0]
+    work, gain = np.empty((n, n)), np.empty(n)
     logs, squares, count = 0.0, 0.0, 0
     settled, spread = False, 1.0
     for t in range(y.shape[0]):
         if settled and present[t]:
-            for i in range(n):
-                total = 0.0
-                for j in range(i, n):
-                    total += step[i, j] * x[j]
-                x[i] = total
+            _advance(x, step)
             innovation = y[t] - x[0]
             for i in range(n):
                 x[i] += gain[i] * innovation
@@ -253,14 +240,11 @@ def _informed_prior(y: Array, present: Flags, step: Array, noise: Array) -> tupl
     nothing, this costs one per cent of double use and keeps the smoothed variances from being
     small differences of large numbers.
     """
-    count, order = len(y), len(step)
+    order = len(step)
     signs = (-1.0) ** np.arange(order)
-    reverse = np.ascontiguousarray(y[::-1])
-    start, spread = _prior(reverse, order)
-    passed = _allocate_pass(count, order)
-    flags = np.ascontiguousarray(present[::-1])
-    _filter(reverse, flags, step, noise, start, spread, passed, np.empty((order, order)))
-    return passed.states[-1] * signs, 100.0 * passed.covariances[-1] * np.outer(signs, signs)
+    reverse, flags = np.ascontiguousarray(y[::-1]), np.ascontiguousarray(present[::-1])
+    states, covariances, *_ = _filter(reverse, flags, step, noise, *_prior(reverse, order))
+    return states[-1] * signs, 100.0 * covariances[-1] * np.outer(signs, signs)
 
 
 @dataclass(frozen=True)
@@ -303,55 +287,29 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
     step, noise = transition(order)
     y = (position - position[0]) / model.noise_sd
     start, spread = _informed_prior(y, present, step, model.ratio * noise)
-    passed, variances = _allocate_pass(count, order), np.empty((count, order))
-    work = np.empty((order, order))
-    _filter(y, present, step, model.ratio * noise, start, spread, passed, work)
-    _smooth(present, step, passed, variances, np.zeros((2, order)), np.zeros((order, order)), work)
+    passed = _filter(y, present, step, model.ratio * noise, start, spread)
+    variances = np.empty((count, order))
+    _smooth(present, step, passed, variances)
     scale = model.noise_sd * model.rate_hz ** np.arange(3)
-    x, sd = passed.states[:, :3] * scale, np.sqrt(variances[:, :3]) * scale
+    x, sd = passed[0][:, :3] * scale, np.sqrt(variances[:, :3]) * scale
     return Derivatives(x[:, 0] + position[0], x[:, 1], x[:, 2], sd[:, 0], sd[:, 1], sd[:, 2])
 
 
-@njit(int64(_M, _M, _M, _M, float64[:, :, ::1], _V, _M), cache=True)
-def _settle(step, noise, p, gains, covariances, spreads, work):  # type: ignore[no-untyped-def]
-    """Write gains (K, n), covariances (K, n, n) and variances (K,) until they settle; count them.
-
-    They do not depend on the samples. ``p`` (n, n) is the covariance of the first state; it is
-    changed, as is ``work`` (n + 1, n).
-    """
-    n, x = step.shape[0], work[step.shape[0]]
-    for t in range(gains.shape[0]):
-        if t > 0:
-            _predict(x, p, step, noise, work)
-        _, spreads[t] = _update(x, p, 0.0, gains[t])
-        # They swing as they settle: one that stands still for a moment says nothing.
-        settled = t > 0
-        for i in range(n):
-            settled = settled and abs(gains[t, i] - gains[t - 1, i]) < _SETTLED * gains[t, i]
-            for j in range(n):
-                covariances[t, i, j] = p[i, j]
-        if settled:
-            return t + 1
-    return gains.shape[0]
-
-
-@njit(void(_V, _M, _M, float64[:, :, ::1], _V, _M, _V, _V), cache=True)
-def _smooth_mean(y, step, gains, covariances, spreads, states, innovations, adjoint):  # type: ignore[no-untyped-def]
-    """Smoothed states (T, n) of samples that are all there; ``adjoint`` (n,) holds zeros.
+@njit(_M(_V, _M, _M, float64[:, :, ::1], _V), cache=True)
+def _smooth_mean(y, step, gains, covariances, spreads):  # type: ignore[no-untyped-def]
+    """Smoothed states (T, n) of samples that are all there.
 
     The same recursions as `_filter` and `_smooth`, without what is the same for all samples.
     """
     count, n, last = y.shape[0], step.shape[0], spreads.shape[0] - 1
-    states[0, 0] = y[0]
-    for i in range(1, n):
-        states[0, i] = 0.0
+    states, innovations, adjoint = np.empty((count, n)), np.empty(count), np.zeros(n)
+    for i in range(n):
+        states[0, i] = y[0] if i == 0 else 0.0
     for t in range(count):
         if t > 0:
             for i in range(n):
-                total = 0.0
-                for j in range(i, n):
-                    total += step[i, j] * states[t - 1, j]
-                states[t, i] = total
+                states[t, i] = states[t - 1, i]
+            _advance(states[t], step)
         innovations[t] = y[t] - states[t, 0]
         for i in range(n):
             states[t, i] += gains[min(t, last), i] * innovations[t]
@@ -359,28 +317,29 @@ def _smooth_mean(y, step, gains, covariances, spreads, states, innovations, adjo
         k = min(t, last)
         share = innovations[t] / spreads[k]
         for i in range(n):
-            total = 0.0
-            for j in range(n):
-                total += covariances[k, i, j] * adjoint[j]
-            states[t, i] -= total
+            states[t, i] -= _multiply_row(covariances[k], i, adjoint)
             share += gains[k, i] * adjoint[i]
         adjoint[0] -= share
-        for i in range(n - 1, -1, -1):
-            total = 0.0
-            for j in range(i + 1):
-                total += step[j, i] * adjoint[j]
-            adjoint[i] = total
+        _carry_back(adjoint, step)
+    return states
 
 
 @lru_cache(maxsize=16)
 def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
-    """`_settle` for a first state of which nothing is known."""
+    """Gains (K, n), covariances (K, n, n) and variances (K,) of ``most`` samples until they settle.
+
+    They do not depend on the samples. Of the first state nothing is known.
+    """
     step, noise = transition(order)
     # A state settles at about the cut-off, in rad a sample, to the power of its order.
     wide = np.diag(_WIDE * ratio ** (np.arange(order) / order))
-    gains, covariances = np.empty((most, order)), np.empty((most, order, order))
-    spreads, work = np.empty(most), np.zeros((order + 1, order))
-    count = _settle(step, ratio * noise, wide, gains, covariances, spreads, work)
+    there = np.ones(most, dtype=bool)
+    passed = _filter(np.zeros(most), there, step, ratio * noise, np.zeros(order), wide)
+    _, covariances, gains, _, spreads = passed
+    # They swing as they settle: one that stands still for a moment says nothing.
+    change = np.abs(np.diff(gains, axis=0))
+    settled = np.flatnonzero((change < _SETTLED * gains[1:]).all(axis=1))
+    count = int(settled[0]) + 2 if settled.size else most
     return gains[:count].copy(), covariances[:count].copy(), spreads[:count].copy()
 
 
@@ -393,12 +352,9 @@ def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]
         signal: (T,) on the uniform grid of ``model.rate_hz``, all of it there.
         model: motion and noise.
     """
-    order, count = model.order, len(signal)
-    step, _ = transition(order)
-    settled = _settled(order, model.ratio, count)
-    states, innovations = np.empty((count, order)), np.empty(count)
+    step, _ = transition(model.order)
     y = np.ascontiguousarray(signal, dtype=np.float64)
-    _smooth_mean(y, step, *settled, states, innovations, np.zeros(order))
+    states = _smooth_mean(y, step, *_settled(model.order, model.ratio, len(signal)))
     return states[:, 0], states[:, 1] * model.rate_hz, states[:, 2] * model.rate_hz**2
 
 
@@ -458,9 +414,8 @@ def maximum_likelihood(
         count = 0
         for (y, present), (start, spread) in zip(scaled, priors, strict=True):
             part = _evidence(
-                y, present, step, np.exp(log_ratio) * noise, start.copy(), spread.copy(), 4 * order,
-                np.empty((order, order)), np.empty(order),
-            )  # fmt: skip
+                y, present, step, np.exp(log_ratio) * noise, start.copy(), spread.copy(), 4 * order
+            )
             logs, squares, count = logs + part[0], squares + part[1], count + part[2]
         best = squares / max(count, 1)
         variance = max(best, 1.0) if quantum > 0.0 else max(best, 1e-30)

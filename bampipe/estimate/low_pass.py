@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import float64, int64, void
+from numba import float64, int64
 from scipy.signal import butter, sosfilt_zi
 
 from bampipe.arrays import Array, Indices
@@ -20,11 +20,12 @@ _TOGETHER = 4
 side by side take hardly longer than one."""
 
 
-@njit(void(_M, _V, _V, int64[::1], _M, _M, _M), cache=True)
-def _run(values, section, start, kept, y, states, out):  # type: ignore[no-untyped-def]
+@njit(_M(_M, _V, _V, int64[::1]), cache=True)
+def _run(values, section, start, kept):  # type: ignore[no-untyped-def]
     count, columns = values.shape
+    y, out = np.zeros((count, _TOGETHER)), np.empty((len(kept), columns))
     b0, b1, b2, a1, a2 = section[0], section[1], section[2], section[4], section[5]
-    s0, s1 = states[0], states[1]
+    s0, s1 = np.empty(_TOGETHER), np.empty(_TOGETHER)
     for first in range(0, columns, _TOGETHER):
         width = min(_TOGETHER, columns - first)
         for i in range(count):
@@ -51,6 +52,7 @@ def _run(values, section, start, kept, y, states, out):  # type: ignore[no-untyp
         for i in range(len(kept)):
             for j in range(width):
                 out[i, first + j] = y[kept[i], j]
+    return out
 
 
 @lru_cache(maxsize=64)
@@ -79,11 +81,7 @@ def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: Indices) 
         ValueError: the cut-off is not between 0 and half the sampling rate.
     """
     section, start = _design(cutoff_hz, rate_hz)
-    values = np.ascontiguousarray(values)
-    out = np.empty((len(kept), values.shape[1]))
-    y, states = np.zeros((len(values), _TOGETHER)), np.empty((2, _TOGETHER))
-    _run(values, section, start, kept, y, states, out)
-    return out
+    return np.asarray(_run(np.ascontiguousarray(values), section, start, kept))
 
 
 @dataclass(frozen=True)

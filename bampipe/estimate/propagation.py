@@ -51,7 +51,8 @@ quantity i of point r is at [i*ROWS + r]. One matrix, because of separate arrays
 know how far apart they are, and checks it in every loop."""
 
 
-def allocate_points(nx: int, nu: int, p: Array, nw: int) -> Array:
+@part()
+def allocate_points(nx, nu, p, nw):  # type: ignore[no-untyped-def]
     """Return the workspace of `propagate_points` and `measure_points`, ``p`` in every row.
 
     Args:
@@ -62,7 +63,9 @@ def allocate_points(nx: int, nu: int, p: Array, nw: int) -> Array:
         (10, width).
     """
     points = np.zeros((10, ROWS * max(2 * nx, nu, len(p), nw)))
-    points[P, : ROWS * len(p)] = np.repeat(p, ROWS)
+    for i in range(len(p)):
+        for r in range(i * ROWS, (i + 1) * ROWS):
+            points[P, r] = p[i]
     return points
 
 

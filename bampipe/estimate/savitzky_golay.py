@@ -1,10 +1,12 @@
 """Savitzky-Golay: a polynomial fitted by least squares to a sliding window."""
 
+from functools import partial
+
 import numpy as np
 from scipy.signal import savgol_filter
 
 from bampipe.arrays import Array
-from bampipe.estimate.differentiation import Derivatives, linear_noise_gains
+from bampipe.estimate.differentiation import Derivatives, differentiate_linearly
 
 _DEGREE = 4
 
@@ -45,15 +47,10 @@ def smooth_mean(signal: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array,
 
 
 def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -> Derivatives:
-    """Return the motion behind ``position`` (T,) by :func:`polynomial`, with error bands.
-
-    ``noise_sd`` is the standard deviation of the white noise on the samples; motion above the
-    cut-off is lost and is not in the bands.
-    """
+    """`polynomial` by `differentiate_linearly`."""
     window = _window(position, rate_hz, cutoff_hz)
-    results = polynomial(position, rate_hz, window)
-    gains = linear_noise_gains(lambda x: polynomial(x, rate_hz, window), len(position), window // 2)
-    return Derivatives(*results, *(noise_sd * gain for gain in gains))
+    method = partial(polynomial, rate_hz=rate_hz, window=window)
+    return differentiate_linearly(method, position, window // 2, noise_sd)
 
 
 def _window(signal: Array, rate_hz: float, cutoff_hz: float) -> int:

@@ -98,28 +98,8 @@ class _Brakes(NamedTuple):
     gain: Array
 
 
-class _Workspace(NamedTuple):
-    """Memory: rows of a step (9, nx or nu), the last of zeros, and what solves for the arm's force.
-
-    Attributes:
-        response: (n, nf) acceleration by force; normal, factor: (nf, nf).
-        pull, pull_rate, goal: (nf,) force of the arm, its rate, what it is drawn to.
-        speed: (n,) as the brakes' controller sees it.
-    """
-
-    steps: Array
-    response: Array
-    normal: Array
-    factor: Array
-    pull: Array
-    pull_rate: Array
-    goal: Array
-    speed: Array
-
-
 PLANT = record_type(Plant, _V, _V, _V, float64)
 _ARM = record_type(_Arm, _I, _I, _I, _I, _I, float64, float64, float64)
-_WORKSPACE = record_type(_Workspace, _M, _M, _M, _M, _V, _V, _V, _V)
 
 
 @part()
@@ -162,24 +142,23 @@ def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-
     return min(int(np.ceil(dt * fastest)), _MOST_STEPS)
 
 
-@njit(int64(DERIVATIVE, _M, _M, PLANT, float64, _M), cache=True)
-def _count_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-def]
+@njit(int64(DERIVATIVE, _M, _M, PLANT, float64), cache=True)
+def _count_steps(derivative, x, u, plant, dt):  # type: ignore[no-untyped-def]
     """Sum of `stable_steps` over states (K, nx) and inputs (K, nu)."""
-    total = 0
+    total, work = 0, np.zeros((8, x.shape[1]))
     for k in range(x.shape[0]):
         total += stable_steps(derivative, x[k], u[k], plant, dt, work)
     return total
 
 
 @part()
-def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, work):  # type: ignore[no-untyped-def]
-    """Handle force that alone would give the acceleration which the arm demands: ``work.goal``."""
-    p, w, force, out = plant.p, plant.w, arm.force, work.goal
-    response, normal, factor = work.response, work.normal, work.factor
+def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, out):  # type: ignore[no-untyped-def]
+    """Write the handle force that alone would give the acceleration which the arm demands."""
+    p, w, force = plant.p, plant.w, arm.force
     frequency, damping = arm.natural_frequency, arm.damping_ratio
     nx, n, nf = x.shape[0], plant.width.shape[0], force.shape[0]
-    still = work.steps[6, :nx]
-    moved = work.steps[7, :nx]
+    still, moved, response = np.empty(nx), np.empty(nx), np.empty((n, nf))
+    normal, factor = np.empty((nf, nf)), np.zeros((nf, nf))
     derivative(x, u, p, w, still)
     for j in range(nf):
         u[force[j]] += 1.0
@@ -216,24 +195,26 @@ def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, work):  # type: ign
 
 @njit(
     void(
-        DERIVATIVE, _M, _M, PLANT, _ARM, record_type(_Brakes, _I, _M), _M, _M, float64, _WORKSPACE,
+        DERIVATIVE, _M, _M, PLANT, _ARM, record_type(_Brakes, _I, _M), _M, _M, float64,
     ),
     cache=True,
 )  # fmt: skip
-def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt, work):  # type: ignore[no-untyped-def]
+def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt):  # type: ignore[no-untyped-def]
     """Fill the rows of ``x`` after the first and add arm force and brake commands to ``u``.
 
     Without columns of force there is no arm, and ``q_ref``, ``qd_ref`` are not read.
     """
     force, rate, curvature, bandwidth = arm.force, arm.rate, arm.curvature, arm.bandwidth
-    pull, pull_rate, goal, speed = work.pull, work.pull_rate, work.goal, work.speed
-    brake, brake_gain, steps = brakes.columns, brakes.gain, work.steps
+    brake, brake_gain = brakes.columns, brakes.gain
     n, nf = plant.width.shape[0], force.shape[0]
+    # Force of the arm, its rate, what it is drawn to; speed as the brakes' controller sees it.
+    pull, pull_rate, goal, speed = np.zeros(nf), np.zeros(nf), np.zeros(nf), np.zeros(n)
+    steps = np.zeros((9, max(x.shape[1], u.shape[1])))
     fade = np.exp(-bandwidth * dt)
     follow = 1.0 - np.exp(-dt / _BRAKES_S)
     for k in range(x.shape[0] - 1):
         if nf > 0:
-            _solve_goal(derivative, x[k], u[k], plant, arm, q_ref[k], qd_ref[k], work)
+            _solve_goal(derivative, x[k], u[k], plant, arm, q_ref[k], qd_ref[k], goal)
         for j in range(nf):  # the low-pass, exact for a goal that is constant over dt
             gap = pull[j] - goal[j]
             slope = pull_rate[j] + bandwidth * gap
@@ -356,7 +337,7 @@ def simulate_tracking(
     x[0] = x0
     total = np.array(u, dtype=np.float64, order="C")
     gain = np.zeros((0, 0)) if brake_gain is None else np.ascontiguousarray(brake_gain)
-    n, nf, arm = len(width), len(force), impedance or Impedance()
+    n, arm = len(width), impedance or Impedance()
     if moved_first is None:
         moved_first = np.arange(2 * n).reshape(2, n).T
     _run(
@@ -370,11 +351,6 @@ def simulate_tracking(
         _Brakes(np.array(brake[: gain.shape[1]], dtype=np.int64), gain),
         np.array(q_ref, dtype=np.float64, order="C"),  # a copy: columns of a table are read-only
         np.array(qd_ref, dtype=np.float64, order="C"), dt,
-        _Workspace(
-            np.zeros((9, max(len(x0), total.shape[1]))),
-            np.empty((n, nf)), np.empty((nf, nf)), np.zeros((nf, nf)),
-            np.zeros(nf), np.zeros(nf), np.zeros(nf), np.zeros(n),
-        ),
     )  # fmt: skip
     require_finite(x, dt)
     return np.ascontiguousarray(x[::finer]), np.ascontiguousarray(total[::finer])
@@ -417,9 +393,9 @@ def count_steps(
     Args:
         x: (K, nx) states; u: (K, nu) inputs there; the others as in `simulate`.
     """
-    plant, work = make_plant(p, n_noise, width, max_step), np.zeros((9, x.shape[1]))
+    plant = make_plant(p, n_noise, width, max_step)
     rows = np.ascontiguousarray(x), np.ascontiguousarray(u)
-    return float(_count_steps(derivative, *rows, plant, dt, work) / len(x))
+    return float(_count_steps(derivative, *rows, plant, dt) / len(x))
 
 
 def require_finite(x: Array, dt: float) -> None:

@@ -2,8 +2,7 @@
 
 A filter may be stopped and continued: ``mean`` and the root of the covariance go in as the
 distribution at sample 0 and come out as that at the last sample, so that a filter fed sample by
-sample computes what the batch filter computes. Kernels get their memory from the caller: in each
-process, numba takes a second to compile what allocates arrays.
+sample computes what the batch filter computes.
 """
 
 from typing import NamedTuple
@@ -74,85 +73,22 @@ class Levels(NamedTuple):
     stride: int
 
 
-class Output(NamedTuple):
-    """What the kernel fills in.
-
-    Attributes:
-        means: (ceil(T / stride), n); covariances: (ceil(T / stride), n, n).
-        innovation, innovation_sd: (T, ny); nis, log_likelihood: (T,); NaN where no reading is.
-    """
-
-    means: Array
-    covariances: Array
-    innovation: Array
-    innovation_sd: Array
-    nis: Array
-    log_likelihood: Array
-
-
-class Workspace(NamedTuple):
-    """Memory of `filter_square_root`.
-
-    Attributes:
-        images: (nx, 1 + 2 (n + nw)) states of the sigma points after the interval.
-        readings: (ny, 1 + 2 n) measurements of the sigma points.
-        root: (n, padded) upper root R of the covariance, R^T R.
-        columns: (n, padded) deviations of the states; reading_columns: (ny, padded) of readings.
-        noise: (ny, ny) lower root of what the state leaves open of the readings.
-        cross: (ny, n) readings along the columns of R^T; gain: (ny, padded) transposed gain.
-        cosine, sine, single, whitened: (n + ny + 1,).
-        points: of `propagate_points`.
-    """
-
-    images: Array
-    readings: Array
-    root: Array
-    columns: Array
-    reading_columns: Array
-    noise: Array
-    cross: Array
-    gain: Array
-    cosine: Array
-    sine: Array
-    single: Array
-    whitened: Array
-    points: Array
-
-
-def allocate(n: int, nx: int, nu: int, ny: int, nw: int, p: Array) -> Workspace:
-    """Return the memory of `filter_square_root`.
-
-    Args:
-        n, nx, nu, ny, nw: lengths of mean, state, input, reading and process noise.
-        p: (np + 1,) all parameters, then the timing of the inputs.
-    """
-    pairs, wide, longest = n + nw, padded(n), n + ny + 1
-    return Workspace(
-        images=np.empty((nx, 1 + 2 * pairs)), readings=np.empty((ny, 1 + 2 * n)),
-        root=np.zeros((n, wide)), columns=np.zeros((n, padded(pairs + nw))),
-        reading_columns=np.zeros((ny, wide)), noise=np.empty((ny, ny)), cross=np.empty((ny, n)),
-        gain=np.empty((ny, wide)), cosine=np.empty(longest), sine=np.empty(longest),
-        single=np.empty(longest), whitened=np.empty(longest), points=allocate_points(nx, nu, p, nw),
-    )  # fmt: skip
-
-
 @njit(
-    types.UniTuple(int64, 2)(
+    types.Tuple((int64, int64, types.Tuple((_M, float64[:, :, ::1], _M, _M, _V, _V))))(
         DERIVATIVE_ROWS,
         MEASURE_ROWS,
         ESTIMATED,
+        _V,
         record_type(Levels, _V, _V, _V, float64, float64, float64, int64),
         record_type(Samples, _V, _M, _M, _M),
         _V,
         _M,
-        record_type(Output, _M, float64[:, :, ::1], _M, _M, _V, _V),
-        record_type(Workspace, *[_M] * 8, *[_V] * 4, _M),
     ),
     cache=True,
     fastmath={"contract"},
 )
 def filter_square_root(  # type: ignore[no-untyped-def]
-    derivative, measure, estimated, levels, samples, mean, factor, out, work
+    derivative, measure, estimated, p, levels, samples, mean, factor
 ):
     """Filter one trial, propagating the lower root of the covariance.
 
@@ -166,21 +102,20 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     Args:
         derivative: f(count, x, u, p, w, dx); measure: h(count, x, u, p, y).
         estimated, levels, samples: the model, its noise and the trial.
+        p: (np + 1,) all parameters, then the timing of the inputs.
         mean: (n,) state and parameters, in and out; factor: (n, n) lower root of their
             covariance, in and out.
-        out: filled in; work: from `allocate`.
 
     Returns:
-        Why it stopped, `DONE` or another, and the sample where it did.
+        Why it stopped, `DONE` or another, and the sample where it did. What it found: means (R, n)
+        and covariances (R, n, n) of every ``levels.stride``-th sample; innovations (T, ny) and
+        their standard deviations, nis (T,) and log likelihood (T,), NaN where no reading is.
     """
     t, u, curvature, y = samples
     nx, observed = estimated.n_states, estimated.observed
     lower, upper = estimated.lower, estimated.upper
     process_sd, walk_sd, reading_sd = levels.process_sd, levels.walk_sd, levels.reading_sd
     other, stride = levels.other, levels.stride
-    means, covariances, innovations, innovation_sd, squares, likelihoods = out
-    images, readings, root, columns, reading_columns, noise, cross, gain = work[:8]
-    cosine, sine, single, whitened, points = work[8:]
     n = mean.shape[0]
     nw = process_sd.shape[0]
     ny = observed.shape[0]
@@ -188,9 +123,22 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     reach = levels.spread**0.5
     half = (0.5 * other) ** 0.5
     pairs = n + nw
-    # root is R = L^T, so that what is rotated together is contiguous
-    wide = root.shape[1]
+    wide = padded(n)
+    # States of the sigma points after an interval, and measurements of points drawn afresh.
+    images, readings = np.empty((nx, 1 + 2 * pairs)), np.empty((ny, 1 + 2 * n))
+    points = allocate_points(nx, u.shape[1], p, nw)
+    # root is R = L^T, so that what is rotated together is contiguous; columns are deviations.
+    root, columns = np.zeros((n, wide)), np.zeros((n, padded(pairs + nw)))
+    reading_columns, gain = np.zeros((ny, wide)), np.empty((ny, wide))
+    # What the state leaves open of the readings (a lower root), and readings along R^T.
+    noise, cross = np.empty((ny, ny)), np.empty((ny, n))
+    cosine, sine, single, whitened = np.empty((4, n + ny + 1))
     centre_image = 2 * nw * other
+    size = t.shape[0]
+    means, covariances = np.empty((-(-size // stride), n)), np.empty((-(-size // stride), n, n))
+    innovations, innovation_sd = np.full((size, ny), np.nan), np.full((size, ny), np.nan)
+    squares, likelihoods = np.full(size, np.nan), np.full(size, np.nan)
+    found = means, covariances, innovations, innovation_sd, squares, likelihoods
     log_normal = 0.5 * ny * np.log(2.0 * np.pi)
     for i in range(n):
         for j in range(n):
@@ -198,7 +146,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     for i in range(n):
         means[0, i] = mean[i]
     covariance_of(root, covariances[0])
-    for k in range(1, t.shape[0]):
+    for k in range(1, size):
         dt = t[k] - t[k - 1]
         substeps = max(1, int(np.ceil(dt / levels.longest_step - 1e-6)))
         propagate_points(
@@ -212,7 +160,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                 total += images[i, row] - middle
             mean[i] = middle + other * total
             if not np.isfinite(mean[i]):
-                return NOT_FINITE, k
+                return NOT_FINITE, k, found
             for pair in range(pairs):
                 columns[i, pair] = half * (
                     images[i, pair] + images[i, pairs + pair] - 2.0 * mean[i]
@@ -239,10 +187,6 @@ def filter_square_root(  # type: ignore[no-untyped-def]
         missing = False
         for i in range(ny):
             missing = missing or np.isnan(y[k, i])
-            innovations[k, i] = np.nan
-            innovation_sd[k, i] = np.nan
-        squares[k] = np.nan
-        likelihoods[k] = np.nan
         if not missing:
             transpose(root, factor)
             measure_points(measure, estimated, mean, factor, reach, u[k], readings, points)
@@ -278,7 +222,7 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                     total += noise[i, j] * noise[i, j]
                 innovation_sd[k, i] = total**0.5
                 if not noise[i, i] > 0.0:
-                    return INNOVATION_NOT_POSITIVE, k
+                    return INNOVATION_NOT_POSITIVE, k, found
             forward_substitute(noise, ny, whitened)
             for i in range(ny):
                 nis += whitened[i] ** 2
@@ -296,5 +240,5 @@ def filter_square_root(  # type: ignore[no-untyped-def]
             covariance_of(root, covariances[k // stride])
     for i in range(n):
         if not np.isfinite(mean[i]):
-            return NOT_FINITE, t.shape[0] - 1
-    return DONE, t.shape[0] - 1
+            return NOT_FINITE, size - 1, found
+    return DONE, size - 1, found

@@ -12,7 +12,8 @@ _REASSOCIATE = {"reassoc", "nsz", "contract"}  # lets sums use vector registers;
 _LANES = 16
 
 
-def padded(n: int) -> int:
+@part()
+def padded(n):  # type: ignore[no-untyped-def]
     """Return the least length from ``n`` on that fills whole vector registers, unrolled.
 
     Loops over rows padded with zeros to this length are faster than shorter ones with a

@@ -31,9 +31,7 @@ from bampipe.estimate.square_root import (
     INNOVATION_NOT_POSITIVE,
     NOT_FINITE,
     Levels,
-    Output,
     Samples,
-    allocate,
     filter_square_root,
 )
 
@@ -314,31 +312,24 @@ def run_kernel(
         FilterFailure: of trial 0: the covariance lost positive definiteness or a number is not
             finite.
     """
-    n, size, ny, nw = mean.size, trial.t.size, settings.observed.size, settings.noise_sd.size
-    rows, p = -(-size // stride), _array(model.parameters)
-    out = Output(
-        means=np.empty((rows, n)), covariances=np.empty((rows, n, n)),
-        innovation=np.full((size, ny), np.nan), innovation_sd=np.full((size, ny), np.nan),
-        nis=np.full(size, np.nan), log_likelihood=np.full(size, np.nan),
-    )  # fmt: skip
+    p, spread = _array(model.parameters), ALPHA**2 * (mean.size + settings.noise_sd.size)
     estimated = Estimated(
         model.n_states, p.size - 1, _array(model.free, np.int64),
         _array(model.logarithmic, np.bool_), *model.range, _array(settings.observed, np.int64),
         model.reads_parameters,
     )  # fmt: skip
-    spread = ALPHA**2 * (n + nw)
     levels = Levels(
         _array(settings.noise_sd), _array(settings.walk_sd), _array(settings.reading_sd),
         spread, 0.5 / spread, float(settings.longest_step), int(stride),
     )  # fmt: skip
     samples = Samples(*map(_array, (trial.t, trial.u, trial.input_curvature, trial.y)))
-    ended, sample = filter_square_root(
-        model.functions.derivative_rows, model.functions.measure_rows, estimated, levels, samples,
-        mean, root, out, allocate(n, model.n_states, trial.u.shape[1], ny, nw, p),
+    ended, sample, found = filter_square_root(
+        model.functions.derivative_rows, model.functions.measure_rows, estimated, p, levels,
+        samples, mean, root,
     )  # fmt: skip
     if ended != DONE:
         raise FilterFailure(0, sample, _REASONS[ended])
-    return FilteredTrial(samples.t[::stride], *out)
+    return FilteredTrial(samples.t[::stride], *found)
 
 
 def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:

@@ -14,8 +14,8 @@ from bampipe.diagnosis.candidates import Candidate
 from bampipe.diagnosis.columns import added_residual
 from bampipe.diagnosis.probability import least_gain
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.search import log_prior, penalise
 from bampipe.diagnosis.session import Fit, Session, candidates_of
+from bampipe.diagnosis.set_cost import log_prior, penalise
 from bampipe.next_trial.discrimination import Alternative, Comparison, Sums
 from bampipe.physics.parameter import Parameter
 from bampipe.results.next import Detectable
@@ -106,7 +106,7 @@ def make_typical_alternative(item: Candidate, scale: MachineScale) -> Alternativ
 def find_limits(comparison: Comparison, sums: Sums, needed: float) -> list[DetectionLimit]:
     """Return the strength from which on each alternative of ``comparison`` is called missing.
 
-    Its log evidence, nats, less the penalties of `Search`, must reach ``needed`` with the
+    Its log evidence, nats, less the penalties of `SetCosts`, must reach ``needed`` with the
     probability that the criteria ask for, and its size must matter.
 
     The alternatives are effects at their typical strengths.

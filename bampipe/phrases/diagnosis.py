@@ -183,7 +183,9 @@ def _describe_verdict(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> 
     if entry.verdict == "nothing_missing":
         return f"nothing of a size that matters is missing, as far as these trials show; {errors}"
     if entry.verdict == "unknown_effect":
-        return f"something is missing that {_describe_unknown(entry, result)}; {errors}"
+        listed = list_effects(entry, entry.probabilities)
+        doubt = f"; in doubt beside it: {listed}" if listed else ""
+        return f"something is missing that {_describe_unknown(entry, result)}{doubt}; {errors}"
     if entry.verdict == "missing":
         verb = "is" if len(entry.effects) == 1 else "are"
         values = join_names(probability(entry.probabilities[name]) for name in entry.effects)

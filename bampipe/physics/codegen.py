@@ -365,6 +365,11 @@ def _encoder_readings(e: Equations) -> list[Any]:
     return readings
 
 
+def _encoder_groups(e: Equations) -> tuple[dict[str, list[Any]], dict[str, list[Any]]]:
+    """What the measurement takes, and what it fills."""
+    return {"x": [*e.q, *e.qd], **_select_groups(e, "u p")}, {"y": _encoder_readings(e)}
+
+
 def _print_motion(e: Equations, index: str = "{}", known: Sequence[Any] = ()) -> list[str]:
     """Body of the state derivative (eq 14): dx from x, u, p, w.
 
@@ -390,22 +395,35 @@ def _print_motion(e: Equations, index: str = "{}", known: Sequence[Any] = ()) ->
     return body + [f"dx[{index.format(i)}] = {v}" for i, v in enumerate(results)]
 
 
-def _print_reading(e: Equations, index: str = "{}") -> list[str]:
-    """Body of the measurement: y from x, u, p."""
-    readings = _encoder_readings(e)
-    block = print_block(readings)
-    body = unpack_groups({"x": [*e.q, *e.qd], **_select_groups(e, "u p")}, block.used, index)
-    return body + block.lines + [f"y[{index.format(i)}] = {v}" for i, v in enumerate(block.values)]
+def _print_filling(
+    groups: Mapping[str, Sequence[Any]], results: Mapping[str, Sequence[Any]], index: str = "{}"
+) -> list[str]:
+    """Body of a function of groups of columns that fills ``results``."""
+    block = print_block([x for part in results.values() for x in part])
+    places = [(part, index.format(i)) for part, parts in results.items() for i in range(len(parts))]
+    filled = [f"{part}[{i}] = {v}" for (part, i), v in zip(places, block.values, strict=True)]
+    return [*unpack_groups(groups, block.used, index), *block.lines, *filled]
+
+
+def filling_function(
+    name: str,
+    groups: Mapping[str, Sequence[Any]],
+    results: Mapping[str, Sequence[Any]],
+    options: str = _AS_ARGUMENT,
+) -> str:
+    """A compiled function of groups of columns that fills ``results``, its last arguments."""
+    arguments = ", ".join([*groups, *results])
+    return compiled_function(name, arguments, _print_filling(groups, results), options=options)
 
 
 def rows_sources(e: Equations, rows: int) -> dict[str, str]:
     """Sources of derivative and measurement over up to ``rows`` rows at once, by name."""
     index = "{}*" + f"{rows} + r"
     options = f"fastmath={{'contract'}}, {_AS_ARGUMENT}"
-    sources = {}
+    sources, reading = {}, _print_filling(*_encoder_groups(e), index)
     for name, arguments, body in (
         ("derivative_rows", "count, x, u, p, w, dx", _print_motion(e, index)),
-        ("measure_rows", "count, x, u, p, y", _print_reading(e, index)),
+        ("measure_rows", "count, x, u, p, y", reading),
     ):
         kinds = ", ".join(["types.int64", *["V"] * arguments.count(",")])
         body = _indent_loop("for r in range(count):", body)
@@ -426,7 +444,7 @@ def scalar_sources(e: Equations, bodies: Bodies, title: str = "") -> dict[str, s
     motion = _print_motion(e, known=bodies.names)
     return {
         "derivative": header + compiled_function("derivative", "x, u, p, w, dx", motion),
-        "measure": SCALAR_HEADER + compiled_function("measure", "x, u, p, y", _print_reading(e)),
+        "measure": SCALAR_HEADER + filling_function("measure", *_encoder_groups(e)),
     }
 
 
@@ -443,13 +461,3 @@ def residual_source(e: Equations, bodies: Sequence[Any]) -> str:
     block = print_block(residual, e.steps, bodies)
     groups = {**_select_groups(e, "q qd qdd"), "b": bodies, **_select_groups(e, "z u")}
     return _print_along_motion("residual", groups, e.p, block)
-
-
-def law_source(
-    motion: Sequence[Any], given: Sequence[Any], states: Sequence[Any], law: Sequence[Any]
-) -> str:
-    """Source of a compiled control law: ``command(y, r, s, out)``."""
-    block = print_block(law)
-    body = unpack_groups({"y": motion, "r": given, "s": states}, block.used)
-    body += block.lines + [f"out[{i}] = {v}" for i, v in enumerate(block.values)]
-    return SCALAR_HEADER + compiled_function("command", "y, r, s, out", body)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 
 from bampipe import generated_code
 from bampipe.errors import InputError
@@ -55,16 +56,16 @@ def _print_law(device: Device, inputs: tuple[str, ...]) -> str:
     """Source of the law, printed from its expressions."""
     import sympy as sp
 
-    from bampipe.physics.codegen import law_source
+    from bampipe.physics.codegen import SCALAR_HEADER, filling_function
 
     assert device.controller is not None
     axes, states = [c.name for c in device.coordinates], device.controller.states
-    groups = {"y": [*axes, *(f"qd_{a}" for a in axes)], "r": inputs, "s": [*states]}
-    motion, given, kept = (
-        {name: sp.Symbol(f"{letter}{i}", real=True) for i, name in enumerate(names)}
-        for letter, names in groups.items()
-    )
-    symbols = motion | given | kept
+    names = {"y": [*axes, *(f"qd_{a}" for a in axes)], "r": inputs, "s": [*states]}
+    groups = {
+        letter: [sp.Symbol(f"{letter}{i}", real=True) for i in range(len(group))]
+        for letter, group in names.items()
+    }
+    symbols = dict(zip(chain(*names.values()), chain(*groups.values()), strict=True))
     symbols |= {name: sp.Float(c.value) for name, c in device.constants.items()}
 
     def no_rate(_: object) -> object:
@@ -78,4 +79,4 @@ def _print_law(device: Device, inputs: tuple[str, ...]) -> str:
     parts += [(f"states.{name}.rate", state.rate) for name, state in states.items()]
     where, special = f"device {device.name!r}: controller", {"sgn": sp.sign, "ddt": no_rate}
     law = [expression.build(tree, symbols, f"{where}.{place}", special) for place, tree in parts]
-    return law_source([*motion.values()], [*given.values()], [*kept.values()], law)
+    return SCALAR_HEADER + filling_function("command", groups, {"out": law})

@@ -1,11 +1,11 @@
 """Source code of the internal states of effects along a motion, and the loops that follow them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import sympy as sp
 
-from bampipe.physics.codegen import SCALAR_HEADER, compiled_function, print_block, unpack_groups
+from bampipe.physics.codegen import SCALAR_HEADER, filling_function
 from bampipe.physics.equations import Equations
 from bampipe.physics.memory import ACCURATE, STABLE, STIFF_STEPS
 
@@ -205,33 +205,19 @@ def memory_source(e: Equations, places: Sequence[int]) -> tuple[str, dict[str, l
 
     if coupled or any(slope.free_symbols & set(z_all) for slope in slopes):
         groups_of = {**passed_symbols, "z": states}
-        rate = _memory_function("memory_rate", groups_of, {"dz": number_columns(rates)})
+        rate = filling_function("memory_rate", groups_of, {"dz": number_columns(rates)}, "")
         fastest = "np.inf" if coupled else repr(STIFF_STEPS * STABLE)
         head = f"import numpy as np\nFASTEST = {fastest}\nACCURATE = {ACCURATE}\n"
         head += f"COUPLED = {coupled}\n"
         source = SCALAR_HEADER + head + rate + BETWEEN + MEMORY_LOOP
         if not coupled:
-            slope = _memory_function("memory_slope", groups_of, {"slope": number_columns(slopes)})
+            results = {"slope": number_columns(slopes)}
+            slope = filling_function("memory_slope", groups_of, results, "")
             source += slope + STIFF_MEMORY_LOOP
         return source, uses
     rates_at_zero = [rate.subs(z, 0) for rate, z in zip(rates, z_all, strict=True)]
-    terms = _memory_function(
-        "memory_terms",
-        passed_symbols,
-        {"c": number_columns(rates_at_zero), "b": number_columns(slopes)},
-    )
+    columns = {"c": number_columns(rates_at_zero), "b": number_columns(slopes)}
+    terms = filling_function("memory_terms", passed_symbols, columns, "")
     steady = not any(slope.free_symbols & {*e.q, *e.qd, *e.u} for slope in slopes)
     head = f"import numpy as np\nRAMP = {steady}\nFEWEST = {_FEWEST}\n"
     return SCALAR_HEADER + head + terms + BETWEEN + LINEAR_MEMORY_LOOP, uses
-
-
-def _memory_function(
-    name: str, groups: Mapping[str, Sequence[Any]], results: Mapping[str, Sequence[Any]]
-) -> str:
-    """A compiled function of groups of columns that fills ``results``."""
-    block = print_block([x for part in results.values() for x in part])
-    body = unpack_groups(groups, block.used)
-    places = [f"{part}[{i}]" for part, parts in results.items() for i in range(len(parts))]
-    body += block.lines
-    body += [f"{place} = {v}" for place, v in zip(places, block.values, strict=True)]
-    return compiled_function(name, ", ".join([*groups, *results]), body, options="")

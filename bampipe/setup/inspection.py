@@ -15,7 +15,8 @@ from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, Setu
 from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility, distance_from_prior
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, drawn_robot, is_drawn
-from bampipe.setup.search import Finding, Search, shorten, spoilt_axes
+from bampipe.setup.search import Finding, Search, shorten, spoilt_axes, spread
+from bampipe.setup.turned_trials import TurnedTrial, find_turned_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
@@ -28,23 +29,53 @@ _MANY = 8
 
 
 def inspect_setup(
-    system: System, session: IngestResult, motions: Sequence[Motion], band: Band, folds: Folds
+    system: System,
+    session: IngestResult,
+    motions: Sequence[Motion],
+    band: Band,
+    folds: Folds,
+    names: Sequence[str] = (),
 ) -> SetupResult:
-    """Hold the set-up of a session against some of its trials, with every input of the device.
+    """Hold the set-up of a session against its trials ``names``, with every input of the device.
+
+    Some of them, spread over the session, tell of mistakes in all; each tells of its own.
 
     Raises:
         InputError: the device leaves the scale of its equation open.
     """
-    short = shorten(motions)
-    _require_scale(system, short)
     signals = Signals.of_session(system, session)
+    _require_scale(system, motions[:1])
+    of_kind = [[k for k, fits in enumerate(folds.fitted) if fits == kind] for kind in (True, False)]
+    chosen = [some[k] for some in of_kind for k in spread(len(some))]
+    part = folds.subset(chosen)
     placeholders = _find_placeholders(system, session)
-    search = Search(system, short, band, folds, signals)
-    held = search.judge(())
-    if is_drawn(system):
-        search = DrawnSearch(system, shorten(short, DRAWN_SAMPLES), band, folds, signals)
-    findings = search.find_mistakes(tuple(n for names in placeholders.values() for n in names))
-    mistakes = tuple(_record(system, session, found, placeholders) for found in findings)
+    ones = tuple(n for names in placeholders.values() for n in names)
+
+    def search_in(motions: Sequence[Motion]) -> tuple[Search, Plausibility | None]:
+        short = shorten([motions[k] for k in chosen])
+        search = Search(system, short, band, part, signals)
+        held = search.judge(())
+        if is_drawn(system):
+            search = DrawnSearch(system, shorten(short, DRAWN_SAMPLES), band, part, signals)
+        return search, held
+
+    search, held = search_in(motions)
+    findings, odd = search.find_mistakes(ones), list[TurnedTrial]()
+    if not findings and search.over_position is None:
+        # What is wrong in all trials is likelier than what is in some.
+        odd = find_turned_trials(system, motions, band, folds, signals)
+    if odd:
+        changes = {one.place: one.corrections[0].change for one in odd}
+        motions = [
+            changes[k].of_motion(motion, signals) if k in changes else motion
+            for k, motion in enumerate(motions)
+        ]
+        search, _ = search_in(motions)
+        findings = search.find_mistakes(ones)
+    mistakes = (
+        *(_record_turned(system, session, one, names[one.place]) for one in odd),
+        *(_record(system, session, found, placeholders) for found in findings),
+    )
     axes = {
         axis: _axis(place, axis, held, mistakes) for place, axis in enumerate(system.coordinates)
     }
@@ -132,6 +163,21 @@ def _record(
             for rival in found.rivals
         ),
     )
+
+
+def _record_turned(
+    system: System, session: IngestResult, found: TurnedTrial, name: str
+) -> SetupMistake:
+    """One trial with a sign of its own."""
+    signals = [one.signals[0] for one in found.corrections]
+    either = " or ".join(signals)
+    sentence = (
+        f"{name}: {either} has another sign than in the other trials: put negated ="
+        f' ["{signals[0]}"] into its [[trials]] entry, or leave the trial out'
+    )
+    one = Finding(found.corrections[0], (), found.before, found.after, 0.0)
+    record = _record(system, session, one, {})
+    return record.model_copy(update={"sentence": sentence})
 
 
 def _require_scale(system: System, motions: Sequence[Motion]) -> None:
@@ -269,7 +315,9 @@ def _sign(correction: Correction, session: IngestResult) -> str:
         return f"the encoder of {name} counts the other way: {fix}"
     entry = f"scale of channels.{name}" if name in session.channels else "its column"
     if name in session.force.columns:
-        entry = _force_entry(session) + " in its row" * (len(session.force.columns) > 1)
+        if len(session.force.columns) == 1:
+            return f"{name} has the wrong sign: put reaction = true into [force], or take it out"
+        entry = _force_entry(session) + " in its row"
     return f"{name} has the wrong sign: negate {entry}"
 
 

@@ -60,7 +60,7 @@ _SCREENING_STEPS = 3
 _SHORTLIST = 6
 DECADES = np.arange(-10, 11) / 2.0
 _STEPS = 16
-_MOST_TRIALS = 6
+MOST_TRIALS = 6
 _SAME_FACTOR = 0.05
 """Logarithm within which the factor that explains most is a usual one."""
 _HALVINGS = 11
@@ -396,7 +396,7 @@ def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:
 
 def spread(count: int) -> list[int]:
     """Numbers of some trials of ``count``, spread over the session."""
-    chosen = np.linspace(0, max(count - 1, 0), min(count, _MOST_TRIALS))
+    chosen = np.linspace(0, max(count - 1, 0), min(count, MOST_TRIALS))
     return [int(number) for number in np.unique(chosen.round())]
 
 

@@ -1,6 +1,7 @@
 """Stage filter: velocity and acceleration from encoders, on a uniform grid, with error bands."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -19,6 +20,7 @@ from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother
 from bampipe.estimate.differentiation import UniformGrid, uniform_grid
 from bampipe.estimate.low_pass import Band
+from bampipe.estimate.white_noise import white_noise_sd
 from bampipe.phrases.results import describe_dead_stretch, list_setup_faults
 from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
@@ -33,7 +35,7 @@ from bampipe.results.ingest import IngestResult
 from bampipe.results.setup import SetupResult
 from bampipe.schema import STRICT, NotNegative
 from bampipe.setup.inspection import inspect_setup
-from bampipe.setup.search import HIGHEST_HZ, spread
+from bampipe.setup.search import HIGHEST_HZ, MOST_TRIALS, shorten
 from bampipe.trials.band import LEAST_HZ, find_band
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.disturbances import find_disturbances
@@ -54,10 +56,14 @@ _CUTOFF_OVER_BAND = 4.0
 a band of 17 Hz ended, they were 17 %: a delay of 2 ms came out 5 % too long, at 8.6 floors."""
 _HIGHEST_CUTOFF = 0.4
 """Of the sampling rate: twice the highest frequency of a residual, where the filter takes 0.3 %."""
+_NO_NOISE, _UNFOLLOWED = 30.0, 0.1
+"""Times the noise of the quietest trial, and of the steps from sample to sample, beyond which what
+differences of a position show is motion that is too fast for the rate of the log."""
 _SHORTEST = 32
 """Samples of a trial, the least that can be differentiated."""
-_TUNING_PART = 2000
-"""Least length, samples, of the parts that the bandwidth is chosen from, where trials are many."""
+_INSPECTED, _TUNING_PART = 12_000, 2000
+"""Samples of all trials on which the set-up is judged; and least length of the parts that the
+bandwidth is chosen from, where trials are many."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -271,6 +277,15 @@ def _write_motions(
             if isinstance(trial, str):
                 written.skipped[trial_id] = trial
                 continue
+            for axis, one in kinematics.axes.items():
+                position = trial.frame[f"q_{axis}"].to_numpy(dtype=np.float64)
+                if _outruns(position, one.noise_sd):
+                    written.skipped[trial_id] = (
+                        f"{axis} moves faster than {kinematics.rate_hz:g} samples a second tell:"
+                        " log it faster"
+                    )
+            if trial_id in written.skipped:
+                continue
             for name, offset in offsets.get(trial_id, {}).items():
                 trial.frame[name] -= offset
             frame, errors = _differentiate(trial, kinematics)
@@ -323,17 +338,16 @@ def _inspect(
     bands: Mapping[str, ResidualBand],
     disturbances: Mapping[str, Sequence[Disturbance]],
 ) -> SetupResult:
-    """Hold the set-up against some trials ``ids``, those in ``free`` fitted."""
-    fitted, others = ([k for k in ids if (k in free) == side] for side in (True, False))
-    chosen = [some[k] for some in (fitted, others) for k in spread(len(some))]
-    motions = [
-        read_motion(path, name, system, disturbances.get(name, ()), every_input=True)
-        for name in chosen
-    ]
+    """Hold the set-up against the trials ``ids``, those in ``free`` fitted."""
+    motions = []
+    for name in ids:
+        motion = read_motion(path, name, system, disturbances.get(name, ()), every_input=True)
+        motions += deepcopy(shorten([motion], _INSPECTED // min(len(ids), MOST_TRIALS)))
     # What brakes do is no part of the bare device: it is judged by braked trials, not fitted.
-    folds = Folds.of_trials(chosen, (), fitted)
+    folds = Folds.of_trials(ids, (), [name for name in ids if name in free])
     cutoffs = tuple(min(bands[axis].cutoff_hz, HIGHEST_HZ) for axis in system.coordinates)
-    return inspect_setup(system, session, motions, Band(session.sample_rate_hz, cutoffs), folds)
+    band = Band(session.sample_rate_hz, cutoffs)
+    return inspect_setup(system, session, motions, band, folds, ids)
 
 
 def _load(samples: Path, trial_id: str, rate: float) -> _Trial | str:
@@ -377,6 +391,9 @@ def _choose(
     axis: str, records: list[tuple[Array, Flags]], rate: float, resolution: float, config: Config
 ) -> tuple[AxisFilter, dict[str, Any]]:
     """Return how to differentiate ``axis``, of which there are these ``records``, and why."""
+    shown = [white_noise_sd(x[seen]) for x, seen in records]
+    quietest = max(float(np.nanmin([*shown, np.inf])), resolution / float(np.sqrt(12.0)))
+    records = [(x, seen) for x, seen in records if not _outruns(x, quietest)] or records
     fits = {
         order: kalman_smoother.maximum_likelihood(
             records,
@@ -431,6 +448,16 @@ def _choose(
     if kalman:
         report["order"] = order
     return AxisFilter(cutoff, noise_sd, order if kalman else 0), report
+
+
+def _outruns(position: Array, noise_sd: float) -> bool:
+    """Whether an axis goes as far from one sample (T,) to the next one way as the other.
+
+    Such motion no filter follows at this rate; a likelihood would take it for noise.
+    """
+    shown = white_noise_sd(position)
+    steps = float(np.sqrt(np.mean(np.diff(position) ** 2)))
+    return shown > max(_NO_NOISE * noise_sd, _UNFOLLOWED * steps)
 
 
 def _differentiate(

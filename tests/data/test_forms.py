@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import scipy.io
 
-from bampipe.data.quality.clock import spread_stamps
 from bampipe.data.quality.encoders import unwrapped
 from bampipe.data.readers import columns_of, read_trial
 from bampipe.data.recording import describe_spans, read_recording
@@ -74,6 +73,17 @@ FORMS = {
         ("time s", "POS (ANAT)", "u"),
     ),
     "apostrophes": (lines("1'00{t:.3f};{q:.4f};{u:.4f}", "t;q;u\n"), ("t", "q", "u")),
+    "line protocol": (lines("arm,id=a t={t:.3f},q={q:.4f},u={u:.4f} 1790000000"), ("t", "q", "u")),
+    "lines of XML": (
+        lines('<R><T>{t:.3f}</T><P A1="{q:.4f}"/><M A1="{u:.4f}"/></R>'), ("T", "P.A1", "M.A1")
+    ),
+    "an index of pandas": (
+        lines("{t:.3f},{q:.4f},{u:.4f},1", ",a,b,b\n,x,x,y\nt,,,\n"), ("t", "a x", "b x")
+    ),
+    "an index without a name": (lines("{t:.3f},{q:.4f},{u:.4f}", ",q,u\n"), ("time", "q", "u")),
+    "remarks among samples": (
+        lines("{t:.3f} {q:.4f} {u:.4f}", "# t q u\n# trial 1\n") + "# trial 2\n", ("t", "q", "u")
+    ),
     "a first row with holes": (
         "t,q,u,note\n" + lines("{t:.3f},{q:.4f},{u:.4f},").replace("1.0000,", ",start", 1),
         ("t", "q", "u"),
@@ -157,7 +167,7 @@ def test_a_header_on_every_page_begins_no_recording(tmp_path: Path):
     "form",
     [
         "13.10.2026 14:00:0{:.3f}", "10/13/2026 2:00:0{:.3f} PM", "13-Oct-2026 14:00:0{:.3f}",
-        "2:00:0{:.3f} pm",
+        "2:00:0{:.3f} pm", "00:0{:.3f}", "0 days 00:00:0{:.3f}",
     ],
 )  # fmt: skip
 def test_dates_as_people_write_them(tmp_path: Path, form: str):
@@ -240,13 +250,6 @@ def test_counters_wrap_at_any_width_and_go_on():
     assert not len(unwrapped(np.where(np.arange(500) < 250, 0.0, 3000.0), 0.0, True)[1])
 
 
-def test_stamps_of_whole_seconds_give_the_true_rate():
-    t = np.arange(2400) / 200.0 + 0.3
-    found, rounding = spread_stamps(np.floor(t))
-    assert rounding == 1.0
-    np.testing.assert_allclose(np.diff(found), 1.0 / 200.0, rtol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("header", "asked"),
     [
@@ -275,14 +278,17 @@ def test_a_log_that_is_written_backwards_is_refused(tmp_path: Path):
 
 
 def test_units_that_labs_write():
-    for text, scale in (("U/min", 0.10472), ("Arms", 1.0), ("gon", 0.015708), ("grados", 0.017453)):
+    for text, scale in (
+        ("U/min", 0.10472), ("gon", 0.0157080), ("grados", 0.0174533), ("daN", 10.0),
+        ("10^-3 s", 1e-3),
+    ):  # fmt: skip
         found = unit(text)
         assert found is not None and found.scale == pytest.approx(scale, rel=1e-4)
 
 
 def test_data_of_other_kinds_are_named_with_what_to_do(tmp_path: Path):
-    (tmp_path / "a.xlsx").write_bytes(b"PK\x03\x04")
-    with pytest.raises(InputError, match=r"but a.xlsx; \*.xlsx is not read: export the sheet as"):
+    (tmp_path / "a.xls").write_bytes(b"")
+    with pytest.raises(InputError, match=r"but a.xls; \*.xls is not read: save the sheet as .xlsx"):
         survey(tmp_path)
     wide = "\n".join(",".join(f"{v:.3f}" for v in np.tile(row, 20)) for row in (T, Q, U))
     (tmp_path / "b.csv").write_text(wide + "\n")
@@ -290,12 +296,63 @@ def test_data_of_other_kinds_are_named_with_what_to_do(tmp_path: Path):
         InputError, match="3 rows of 1200 columns are no log; has it a channel a row"
     ):
         survey(tmp_path)
-    (tmp_path / "a.xlsx").unlink()
-    (tmp_path / "b.csv").write_text("(1.5) can0 141#A1250064\n" * 9)
-    with pytest.raises(
-        InputError, match=r"b.csv: no column of numbers in it; a line reads '\(1.5\) can0"
+    (tmp_path / "a.xls").unlink()
+    np.savez(tmp_path / "c.npz", trials=np.zeros((3, 60, 2)))
+    for text, said in (
+        ("(1.5) can0 141#A1250064\n" * 9, "frames of a CAN bus.*; decode them"),
+        ("t,variable,value\n" + "0.1,q,0.2\n" * 9, "one signal below the other; make it"),
+        ("# name: t\n# rows: 9\n" + "0.5\n" * 9, "as Octave writes them; save them with"),
     ):
+        (tmp_path / "b.csv").write_text(text)
+        with pytest.raises(InputError, match=f"b.csv: .*{said}"):
+            survey(tmp_path)
+    (tmp_path / "b.csv").unlink()
+    with pytest.raises(InputError, match=r"c.npz: 'trials' is a 3 by 60 by 2 array.*save each"):
         survey(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "cell", ['"1,234.5"', "1 234,5", "1\u202f234,5", "1'234.5", "1.234,5", "-1,234.5"]
+)
+def test_digits_in_thousands(tmp_path: Path, cell: str):
+    sep, path = "," if '"' in cell else ";", tmp_path / "a.csv"
+    path.write_text(f"n{sep}x\n" + "".join(f"{n}{sep}{cell}\n" for n in range(9)))
+    assert set(np.abs(read_trial(path, ("n", "x")).columns["x"])) == {1234.5}
+    with path.open("a") as file:  # nothing that could be read in two ways is
+        file.write("".join(f"{n}{sep}{other}\n" for n, other in enumerate(("12,5", "12.5") * 3)))
+    with pytest.raises(InputError):
+        read_trial(path, ("n", "x"))
+
+
+def test_trials_in_one_file_are_told_apart(tmp_path: Path):
+    """By groups that are called trials, by a column that numbers them, and without empty rows."""
+    t, u = np.arange(400) / 100.0, np.cos(np.arange(400) / 50.0)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for n in (1, 2, 3):
+            for name, values in (("t", t), ("q", np.sin(n * t)), ("u", u)):
+                file[f"trial_{n:02d}/{name}"] = values
+    assert [trial.recording for trial in survey(tmp_path).trials] == [1, 2, 3]
+    (tmp_path / "a.h5").unlink()
+    number = np.repeat([1, 2, 3], 400)
+    table = np.c_[np.arange(1200) / 100.0, np.tile(np.sin(3 * t), 3), np.tile(u, 3), number]
+    head = "time_s,angle_rad,torque_Nm,trial"
+    np.savetxt(tmp_path / "b.csv", table, delimiter=",", header=head, comments="")
+    session = propose(tmp_path).session
+    assert "end_s = 3.995" in session and "start_s = 7.995" in session
+    table = np.r_[table, np.zeros((50, 4))]
+    np.savetxt(tmp_path / "b.csv", table, delimiter=",", header=head, comments="")
+    clock, entry = Clock(column="time_s", unit="s"), TrialEntry(file="b.csv", kind="free")
+    raw = read_recording(tmp_path, entry, ("time_s", "angle_rad"), clock)
+    assert len(raw) == 1200 and "50 rows from row 1202 on were never filled" in raw.notes[0]
+
+
+def test_a_drive_with_the_sign_of_the_reaction_is_turned(tmp_path: Path):
+    t = np.arange(2000) / 200.0
+    q, v = np.sin(2 * t) + 0.3 * np.sin(5 * t), 2 * np.cos(2 * t) + 1.5 * np.cos(5 * t)
+    u = 0.3 * np.gradient(v, t) + 0.5 * np.tanh(v / 1e-2) + 0.4 * v
+    head = "time_s,angle_rad,torque_Nm"
+    np.savetxt(tmp_path / "a.csv", np.c_[t, q, -u], delimiter=",", header=head, comments="")
+    assert "reaction = true  # guess" in propose(tmp_path).session
 
 
 def test_a_trial_in_another_unit_is_said():

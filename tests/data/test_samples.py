@@ -65,7 +65,7 @@ def test_a_recording_that_starts_anew_is_no_counter():
     assert unroll(t)[1] == 0
 
 
-@pytest.mark.parametrize("rounding", [0.001, 0.01, 0.5])
+@pytest.mark.parametrize("rounding", [0.001, 0.01, 0.5, 1.0])
 def test_stamps_of_too_few_digits_are_spread_to_the_true_times(rounding: float):
     t = 17.3 + np.arange(4000) / 483.0
     found, of = spread_stamps(np.floor(t / rounding) * rounding)

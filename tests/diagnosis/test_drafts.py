@@ -136,6 +136,7 @@ def registered_device(run):
     return draft_stage.load_model(run, "base").device
 
 
+@pytest.mark.long
 def test_the_same_trials_give_the_same_draft_in_several_processes(detent):
     run, _ = detent
     files = ["models/base/draft.json", "models/base/drafts/*.toml"]

@@ -15,6 +15,7 @@ from bampipe.stages.diagnose import Config
 NUMERICAL = {
     "verdict": {
         "0.001": "less probable sets are not listed, whatever is said",
+        "0.5": "more probable than not",
         "2": "effects in which two sets differ by an exchange",
     },
     "probability": {
@@ -32,6 +33,12 @@ NUMERICAL = {
         "0.02": "nats up to which a descent of shapes is not worth a step",
         "0.3": "nats by which it goes on",
         "0.5": "the middle of a range, towards which slopes are taken",
+    },
+    "unknown": {
+        "3": "the fewest knots of a spline that bends",
+        "_OWN": "which quantities are of the axis itself",
+    },
+    "set_cost": {
         "_LEAST_SLOPE": "below it the equation has no scale, and its cost no meaning",
         "NOTHING": "what moves nothing over its whole range cannot be told from rounding",
     },

@@ -31,11 +31,11 @@ def moved(trials, change):
 @pytest.mark.parametrize(
     ("machine", "seed", "conditions"),
     [
-        ("joint", 7, {"creep": True}),
-        ("axis", 58, {"creep": True}),
+        pytest.param("joint", 7, {"creep": True}, marks=pytest.mark.long),
+        pytest.param("axis", 58, {"creep": True}, marks=pytest.mark.long),
         ("damper", 57, {}),
         ("wrist", 56, {}),
-        ("bam", 6, {}),
+        pytest.param("bam", 6, {}, marks=pytest.mark.long),
         ("bam", 6, {"coarse": 8.0}),  # play would make of counts what the model lacks
         ("axis", 58, {"creep": False}),  # it truly stops: no Stribeck friction, no compliance
         ("joint", 5, {}),
@@ -82,6 +82,7 @@ def test_a_lag_gains_nothing_by_averaging_noise(record, seed, known):
     assert not [n for n in named if n.partition(":")[0] in ("actuator_lag", "actuator_delay")]
 
 
+@pytest.mark.long
 def test_a_lag_of_two_samples_is_neither_a_delay_nor_a_flexible_load(record):
     """It leaves less of the noise of the drive as well, which alone speaks for nothing."""
     trials, recipe = record("joint", 6, "actuator_lag:current", creep=True, rate_hz=100.0)
@@ -156,25 +157,30 @@ def test_twins_are_undecided_and_their_probabilities_sum_to_one(record):
 
 
 @pytest.mark.parametrize(
-    ("machine", "seed", "effect", "axis"), [("bam", 12, "detent:yaw", 0)],
-)  # fmt: skip
-def test_what_no_effect_of_the_library_is_is_called_unknown(record, machine, seed, effect, axis):
-    _, found = diagnose_trials(*record(machine, seed, effect))
+    ("machine", "effect", "doubt"),
+    [
+        ("bam", "detent:yaw", set()),
+        ("axis", "rough_patch:carriage", {"position_dependent_friction:carriage"}),
+    ],
+)
+def test_what_no_effect_of_the_library_is_is_called_unknown(record, machine, effect, doubt):
+    axis, (_, found) = 0, diagnose_trials(*record(machine, 12, effect))
     here = found.axes[axis]
     assert here.verdict == "unknown_effect" and here.remains and here.unknown > 0.9
-    assert here.effects == found.selected == ()
+    assert {*here.effects, *found.selected} <= doubt
+    assert max(here.probabilities.values(), default=0.0) < 0.9
     assert {v for k, v in enumerate(verdicts(found)) if k != axis} <= {"nothing_missing"}
 
 
-@pytest.mark.parametrize("criteria", [{"size": 0.5}, {"probability": 0.99999}])
-def test_the_numbers_that_decide_are_those_that_are_given(record, criteria):
+def test_the_numbers_that_decide_are_those_that_are_given(record):
     """A dozen replays make nobody surer than one in ten thousand; half the force nothing is."""
     trials, recipe = record("joint", 41, "shear_thinning:joint")
     _, usual = diagnose_trials(trials, recipe)
     assert verdicts(usual) == ["missing"] and usual.selected == ("shear_thinning:joint",)
-    _, found = diagnose_trials(trials, recipe, **criteria)
-    assert verdicts(found) != ["missing"]
-    assert (found.selected == ()) == ("size" in criteria)
+    for criteria in ({"size": 0.5}, {"probability": 0.99999}):
+        _, found = diagnose_trials(trials, recipe, **criteria)
+        assert verdicts(found) != ["missing"]
+        assert (found.selected == ()) == ("size" in criteria)
 
 
 def test_the_pose_of_an_arm_is_no_reason_to_doubt_it(record):

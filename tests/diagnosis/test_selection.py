@@ -7,9 +7,10 @@ import pytest
 from sessions import TRUTH, bam, made
 
 from bampipe.diagnosis.criteria import Criteria
-from bampipe.diagnosis.search import Search, added, names
+from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.select import open_search, select_effects, start_of
 from bampipe.diagnosis.session import Session, system_of
+from bampipe.diagnosis.set_cost import added, names
 
 HIDDEN = {
     "stribeck.yaw.force": 1.1,

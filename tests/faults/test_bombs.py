@@ -31,20 +31,20 @@ def packed_zeros(pack: Any, size: int) -> bytes:
 
 
 def wide_text(path: Path) -> None:
-    """2 GB of text in a fixed width."""
+    """500 MB of text in a fixed width."""
     with h5py.File(path, "w") as file:
         file["x"] = np.zeros(ROWS)
         when = file.create_dataset(
-            "when", (ROWS,), dtype="S100000", chunks=(1000,), compression="gzip"
+            "when", (ROWS,), dtype="S25000", chunks=(1000,), compression="gzip"
         )
-        chunk = packed_zeros(zlib.compressobj(), 100_000_000)
+        chunk = packed_zeros(zlib.compressobj(), 25_000_000)
         for start in range(0, ROWS, 1000):
             when.id.write_direct_chunk((start,), chunk)
 
 
 def wide_chunk(path: Path) -> None:
-    """Samples with 1 GB of padding in one chunk."""
-    kind = np.dtype([("when", "S32"), ("x", "f8"), ("padding", "V50000")])
+    """Samples with 400 MB of padding in one chunk."""
+    kind = np.dtype([("when", "S32"), ("x", "f8"), ("padding", "V20000")])
     with h5py.File(path, "w") as file:
         file.create_dataset(
             "log", (ROWS,), dtype=kind, chunks=(ROWS,), compression="gzip", fillvalue=None
@@ -53,15 +53,15 @@ def wide_chunk(path: Path) -> None:
 
 
 def page(path: Path) -> None:
-    """One text of 300 MB in a page."""
-    table = pa.table({"when": [" " * 300_000_000], "x": [0.0]})
+    """One text of 150 MB in a page."""
+    table = pa.table({"when": [" " * 150_000_000], "x": [0.0]})
     pq.write_table(table, path, compression="zstd", use_dictionary=False, write_statistics=False)
 
 
 def mcap(path: Path) -> None:
-    """A chunk of 300 MB, compressed by zstd."""
+    """A chunk of 150 MB, compressed by zstd."""
     writer_module = pytest.importorskip("mcap.writer")
-    size = 300 << 20
+    size = 150 << 20
     with path.open("wb") as stream:
         writer = writer_module.Writer(stream, chunk_size=size // 2)
         writer.start()
@@ -73,14 +73,14 @@ def mcap(path: Path) -> None:
 
 
 def ros1(path: Path) -> None:
-    """A chunk of 300 MB."""
+    """A chunk of 150 MB."""
 
     def record(fields: dict[bytes, bytes], data: bytes) -> bytes:
         parts = [struct.pack("<I", len(k + v) + 1) + k + b"=" + v for k, v in fields.items()]
         header = b"".join(parts)
         return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
 
-    size = 300 << 20
+    size = 150 << 20
     data = packed_zeros(bz2.BZ2Compressor(), size)
     fields = {b"op": b"\x05", b"compression": b"bz2", b"size": struct.pack("<I", size)}
     start = {b"op": b"\x03", b"index_pos": struct.pack("<Q", 0)}
@@ -120,25 +120,25 @@ def messages(kind: str, *fields: str) -> Callable[[Path], None]:
 
 
 def brackets(path: Path) -> None:
-    """Empty objects: 150 MB of text are 4 GB of objects."""
+    """Empty objects: 45 MB of text are 1.2 GB of objects."""
     with path.open("wb") as stream:
         stream.write(b"[{}")
-        for _ in range(50):
+        for _ in range(15):
             stream.write(b",{}" * 1_000_000)
         stream.write(b"]")
 
 
 def deep_struct(path: Path) -> None:
-    """A compressed struct of 600 MB."""
-    content = {"when": np.zeros(20), "x": {"q": np.zeros(75_000_000)}}
+    """A compressed struct of 240 MB."""
+    content = {"when": np.zeros(20), "x": {"q": np.zeros(30_000_000)}}
     scipy.io.savemat(path, content, do_compression=True)
 
 
 def sound_hdf5(path: Path) -> None:
-    """A sound trial of 80 MB in a small file."""
+    """A sound trial of 32 MB in a small file."""
     with h5py.File(path, "w") as file:
         for name in ("when", "x"):
-            file.create_dataset(name, data=np.zeros(5_000_000), chunks=True, compression="gzip")
+            file.create_dataset(name, data=np.zeros(2_000_000), chunks=True, compression="gzip")
 
 
 SAMPLES = ("when", "x")
@@ -146,7 +146,7 @@ STATE = ("/state:@time", "/state:x")
 LACK = ("does not fit into memory", "not a sound")
 """What is said where the memory that a file may take does not suffice, by us or by a library."""
 BOMBS: dict[str, tuple[Callable[[Path], None], str, tuple[str, ...]]] = {
-    "wide_text.h5": (wide_text, "dates", ("a text of 100000 bytes, expected a date",)),
+    "wide_text.h5": (wide_text, "dates", ("a text of 25000 bytes, expected a date",)),
     "wide_chunk.h5": (wide_chunk, "log", LACK),
     "page.parquet": (page, "dates", LACK),
     "chunk.mcap": (mcap, "state", LACK),
@@ -155,7 +155,7 @@ BOMBS: dict[str, tuple[Callable[[Path], None], str, tuple[str, ...]]] = {
     "array.mcap": (messages("300000000", "float64 y"), "state", LACK),
     "brackets.json": (brackets, "", LACK),
     "struct.mat": (deep_struct, "", LACK),
-    "sound.h5": (sound_hdf5, "", ("5000000 samples",)),
+    "sound.h5": (sound_hdf5, "", ("2000000 samples",)),
 }
 MEASURE = """
 import json, re, sys
@@ -168,7 +168,7 @@ def memory(kind):
     text = Path("/proc/self/status").read_text()
     return int(re.search(kind + r":\\s*(\\d+) kB", text)[1]) * 1024
 
-readers._LEAST_ROOM, readers._MOST_UNPACKED = 250 << 20, 10
+readers._LEAST_ROOM, readers._MOST_UNPACKED = 100 << 20, 10
 for line in sys.stdin:
     path, columns, options = json.loads(line)
     Path("/proc/self/clear_refs").write_text("5")
@@ -185,7 +185,7 @@ for line in sys.stdin:
 
 @pytest.fixture(scope="module")
 def reader() -> Iterator[subprocess.Popen[str]]:
-    """A process that lets small files take 250 MB, reads files and says what came of it."""
+    """A process that lets small files take 100 MB, reads files and says what came of it."""
     with subprocess.Popen(
         [sys.executable, "-c", MEASURE],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -211,5 +211,5 @@ def test_a_bomb_does_not_go_off(name: str, tmp_path: Path, reader: subprocess.Po
     said, peak = json.loads(line)
     assert any(each in said for each in words) and "\n" not in said, said
     assert said.endswith("samples") or said.startswith(name)
-    room = max(250 << 20, 10 * path.stat().st_size)
+    room = max(100 << 20, 10 * path.stat().st_size)
     assert peak < room + (20 << 20), f"{peak >> 20} MB"

@@ -63,7 +63,7 @@ def test_a_device_that_takes_too_long_is_refused(
 ) -> None:
     declaration, words, definition = LONG[name]
     if "takes too long" in words:  # where size is what is refused, a slow machine must not be first
-        monkeypatch.setattr(derivation, "LONGEST_S", 1.0)
+        monkeypatch.setattr(derivation, "LONGEST_S", 0.3)
     start = time.process_time()
     equations, (fault,) = device_faults(declaration, "joint.toml")
     assert time.process_time() - start < 10.0
@@ -102,9 +102,9 @@ def spin(seconds: float) -> None:
 
 
 def test_the_time_limit_counts_one_thread_only() -> None:
-    other = threading.Thread(target=spin, args=(1.0,))
+    other = threading.Thread(target=spin, args=(0.6,))
     other.start()
-    with time_limit(0.5):
+    with time_limit(0.3):
         time.sleep(0.8)
     other.join()
 

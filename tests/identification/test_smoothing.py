@@ -58,6 +58,7 @@ def test_intervals_hold_friction_that_truly_stops_the_arm(tmp_path) -> None:
     assert any("`stribeck.yaw.force`" in note and "stands still" in note for note in result.notes)
 
 
+@pytest.mark.long
 def test_an_arm_that_creeps_as_the_model_does_has_nothing_added(tmp_path) -> None:
     result, _ = identified(tmp_path, creep=True)
     assert all(entry.smoothing_sd == 0.0 for entry in result.parameters.values())

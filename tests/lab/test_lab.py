@@ -174,7 +174,7 @@ def test_the_lines_in_the_documents_work(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_the_same_runs_give_the_same_bytes_and_a_lost_device_goes(tmp_path: Path) -> None:
-    runs = make_lab(tmp_path)
+    runs = make_lab(tmp_path, sessions=3)
     changed(10, {"mass": 1.0}, device="rail/2").write(runs)
     lab = tmp_path / "lab"
 
@@ -297,7 +297,7 @@ def test_after_several_sessions_the_page_that_links_them_comes_next(
 
 
 def test_the_page_links_the_pages_of_every_session(tmp_path: Path) -> None:
-    runs = make_lab(tmp_path, {})
+    runs = make_lab(tmp_path, sessions=5)
     for name in ("report.html", "explore.html"):
         target = runs / "s05" / "report" / name
         target.parent.mkdir(exist_ok=True)

@@ -33,6 +33,7 @@ def information_on(run: bampipe.Run, name: str) -> float:
     return found**-2
 
 
+@pytest.mark.long
 def test_the_uncertainty_forecast_is_the_one_that_comes(tmp_path):
     run, _ = record_run(tmp_path / "now", "joint", 922, **LONG)
     found, path = propose(run, purpose="coulomb.joint", seconds=12.0)

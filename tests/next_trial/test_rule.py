@@ -11,8 +11,9 @@ from bampipe.diagnosis.criteria import Criteria, most_probable
 from bampipe.diagnosis.dictionary import Dictionary, Key
 from bampipe.diagnosis.probability import chance_of, least_gain
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.search import Search, log_prior
+from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.session import Fit, Session, candidates_of, system_of
+from bampipe.diagnosis.set_cost import log_prior
 from bampipe.next_trial.sensitivity import find_detectability
 from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity, suggest_trial
 from bampipe.trials.folds import Folds

@@ -37,15 +37,32 @@ def once(met):
         seen.add(names)
 
 
+def kind_of(name):
+    """What decides where an effect acts, and on what."""
+    e = registry.effect(name.partition(":")[0])
+    by_load = bool(e.terms & {"applied", "load", "side"})
+    way = (e.kind, e.scope, e.acting_link, bool(e.states))
+    return (*way, "dry" in e.names, e.uses_weight, e.uses_pull, e.pulls, by_load)
+
+
+def one_a_kind(met):
+    """Pairs as parameters of a test: those of two kinds that have met before are `long`."""
+    seen = set()
+    for machine, first, second in met:
+        kinds = frozenset((kind_of(first), kind_of(second)))
+        yield pytest.param(machine, first, second, marks=[pytest.mark.long] * (kinds in seen))
+        seen.add(kinds)
+
+
 # Of the arm, what meets on one reading and one encoder; of the others, everything.
-PAIRS = list(once([
+PAIRS = list(one_a_kind(once([
     *pairs("magnetic_damper", [("piston", "current", "load_cell")]),
     *pairs("slider", [("carriage", "motor")]),
     *(p for p in pairs("bam", [("x", "xy")]) if "force" in p[1] and "force" in p[2]),
     ("bam", "base_tilt", "handle_payload"),
     ("bam", "encoder_scale:yaw", "transmission_compliance:yaw"),
     ("bam", "backlash:yaw", "encoder_scale:yaw"),
-]))  # fmt: skip
+])))  # fmt: skip
 
 
 def numbers(equations, model):

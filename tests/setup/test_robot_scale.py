@@ -183,7 +183,10 @@ def test_two_joints_of_a_makers_zero_posture_are_found_together() -> None:
     assert all(f.drawn and f.after.worst_error < 0.15 for f in found)
 
 
-@pytest.mark.parametrize("gravity", [(9.81, 0.0, 0.0), (0.0, 6.937, -6.937)])
+@pytest.mark.parametrize(
+    "gravity",
+    [pytest.param((9.81, 0.0, 0.0), marks=pytest.mark.long), (0.0, 6.937, -6.937)],
+)
 def test_a_base_that_does_not_stand_is_found_with_the_joint_that_is_reversed(
     gravity: tuple[float, float, float],
 ) -> None:
@@ -231,7 +234,12 @@ def test_a_reduction_follows_from_the_drives_and_is_none_of_a_list(
 
 @pytest.mark.parametrize(
     ("motor", "factor", "kind"),
-    [(2, -1.0, "sign"), (3, -1.0, "sign"), (3, 1000.0, "scale"), (2, 1.0 / 3.0, "scale")],
+    [
+        (2, -1.0, "sign"),
+        (3, 1000.0, "scale"),
+        pytest.param(3, -1.0, "sign", marks=pytest.mark.long),
+        pytest.param(2, 1.0 / 3.0, "scale", marks=pytest.mark.long),
+    ],
 )
 def test_one_mistaken_drive_of_motors_that_turn_several_joints_is_found(
     motor: int, factor: float, kind: str

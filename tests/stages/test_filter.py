@@ -184,6 +184,13 @@ def test_derivatives_of_the_force_reach_beyond_the_band(
     np.testing.assert_allclose(values[f"force_rate_{component}"], rate, rtol=1e-9, atol=1e-9)
 
 
+def test_motion_that_outruns_its_log_is_told_from_a_coarse_encoder() -> None:
+    rng, t = np.random.default_rng(1), np.arange(1000) / 100.0
+    assert stage._outruns(np.cumsum(rng.normal(0.0, 1e-3, t.size)), 1e-6)
+    assert not stage._outruns(1e-2 * np.sin(20.0 * t), 1e-7)
+    assert not stage._outruns(1e-4 * np.sin(t) + rng.normal(0.0, 1e-5, t.size), 1e-5)
+
+
 def test_no_trial_to_differentiate(tmp_path: Path) -> None:
     frames = {"a": free_trial(0)[0]}
     run = write_ingested(tmp_path / "run", frames, {"a": ("locked", "yaw")}, AXES)

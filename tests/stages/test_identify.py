@@ -134,6 +134,7 @@ def test_what_a_trial_told_the_filter_is_taken_off_without_running_it_again(tmp_
     assert np.max(np.abs(by_count[3].value - again.value) / again.sd) > 0.6
 
 
+@pytest.mark.long
 def test_velocity_may_be_measured_too(simulated: RunFolder) -> None:
     """Filtered velocities are neither white nor unbiased: why positions alone are the default."""
     content = identified(simulated, replace(FAST, measure="position_velocity"))
@@ -153,7 +154,7 @@ def test_tables_have_the_rows_that_are_asked_for(simulated: RunFolder, tmp_path:
 
 
 def test_filterpy_gives_the_same_numbers(tmp_path: Path) -> None:
-    run = simulated_run(tmp_path / "short", trials=1, seconds=1.2)
+    run = simulated_run(tmp_path / "short", trials=1, seconds=0.8)
     numbers = []
     for engine in ("compiled", "filterpy"):
         content = identified(run, replace(FAST, engine=engine, block_s=0.1))
@@ -224,13 +225,14 @@ def test_the_force_noise_moves_the_encoder_of_an_axis_that_winds_up(tmp_path: Pa
         pytest.param(
             "encoder_scale:yaw", {"encoder_scale.yaw.error": -0.05}, marks=pytest.mark.long
         ),
-        (
+        pytest.param(
             "position_dependent_friction:extension",
             {
                 "position_dependent_friction.extension.cosine": 2.0,
                 "position_dependent_friction.extension.sine": -1.5,
                 "position_dependent_friction.extension.wavenumber": 56.0,
             },
+            marks=pytest.mark.long,
         ),
     ],
 )
@@ -308,6 +310,7 @@ def test_what_cannot_be_identified_is_said(squares: tuple[Path, dict]) -> None:
     assert abs(lever["moves_percent"]["viscous.pitch"]) > 0.3
 
 
+@pytest.mark.long
 def test_two_terms_of_one_shape_are_said_to_move_together(simulated: RunFolder) -> None:
     """Friction that grows with the rod's load and Coulomb friction: nearly the same here."""
     text = MODEL.replace("[]", '["gravity_compensator_mistuned", "base_tilt"]')

@@ -94,7 +94,7 @@ def test_shared_sessions_stand_out_where_something_is_missing(
 def test_what_brakes_do_is_judged_in_the_trials_in_which_they_act(tmp_path: Path) -> None:
     """A lag of the brakes: free trials know nothing of it, and must not suffer from it."""
     hidden = simulation.Config(
-        effects=("brake_lag",), seed=5, trials=2, viscous_trials=2, duration=8
+        effects=("brake_lag",), seed=5, trials=2, viscous_trials=2, duration=5
     )
     truth = simulation.simulate_session(tmp_path / "session", hidden)
     run = recorded_run(tmp_path / "run", tmp_path / "session")

@@ -21,8 +21,10 @@ from bampipe.errors import InputError
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
 """File extensions of tables as text."""
+SHEETS = (".xlsx", ".xlsm")
+"""Of workbooks, whose first sheet with rows is read as a text."""
 _READERS: dict[str, ModuleType] = {
-    **dict.fromkeys(TEXTS, text),
+    **dict.fromkeys((*TEXTS, *SHEETS), text),
     ".parquet": parquet,
     ".mat": mat,
     **dict.fromkeys((".h5", ".hdf5", ".hdf"), hdf5),
@@ -43,6 +45,7 @@ _FOREIGN = {
     ".mat": ("MATLAB file", "save it again from MATLAB"),
     **dict.fromkeys((".h5", ".hdf5", ".hdf"), ("HDF5 file", _AGAIN)),
     ".tdms": ("TDMS file", _AGAIN),
+    **dict.fromkeys(SHEETS, ("workbook of Excel", "save it again, or export the sheet as CSV")),
     **dict.fromkeys((".npy", ".npz"), ("file of NumPy", "save it again with np.savez")),
     **dict.fromkeys((".bag", ".db3"), ("bag", f"{_AGAIN}, with the message definitions in it")),
     ".mcap": ("MCAP file", f"{_AGAIN}, with the message definitions in it"),
@@ -54,7 +57,7 @@ _KINDS = (
     (b"#ROSBAG", (".bag",), "a ROS bag"),
     (b"\x89MCAP0", (".mcap",), "an MCAP file"),
     (b"SQLite format 3", (".db3",), "an SQLite file"),
-    (b"PK\x03\x04", ("", ".npz"), "a zip archive or spreadsheet"),
+    (b"PK\x03\x04", ("", ".npz", *SHEETS), "a zip archive or spreadsheet"),
     (b"\x93NUMPY", (".npy",), "an array of NumPy"),
     (b"\x1f\x8b", ("",), "a gzip archive"),
     (hdf5.SIGNATURE, (".h5", ".hdf5", ".hdf", ".mat"), "an HDF5 file"),

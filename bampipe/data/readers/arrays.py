@@ -15,6 +15,11 @@ from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns,
 from bampipe.errors import InputError
 
 LARGEST_WIDTH = 64
+_RUN = re.compile(
+    r"(?i)(.+?(?=\[)|(?:.*[./_])?(?:trial|run|rep|test|take|rec|recording|exp|experiment|measurement"
+    r"|messung|versuch|essai|episode|demo|trajectory|traj|log)s?_?(?=\d))"
+    r"(?:\[([^\[\]:]+)\]|(\d+))[./]([^\[\]]+)"
+)
 _TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
 
 
@@ -74,6 +79,11 @@ def columns_of_arrays(arrays: Mapping[str, np.ndarray | None]) -> dict[str, str]
     return {column: "datetime" if column in moment else "" for column in found}
 
 
+def is_run(label: str) -> bool:
+    """Whether an array may be of one of several recordings in a file, by its name."""
+    return _RUN.fullmatch(label) is not None
+
+
 def split_index(column: str, names: Container[str]) -> tuple[str, int | None]:
     """``("X", 2)`` for ``X[2]``, where there is no variable of that whole name."""
     match = re.fullmatch(r"(.+)\[(\d{1,3})\]", column)
@@ -122,26 +132,41 @@ def _join_runs(
 ) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, ...]]]:
     """Vectors of one name in all structs of a list, end to end: ``runs[:].q`` of ``runs[0].q``.
 
-    Of structs that each have a time, or are as long as no other; others are rather joints. All
-    arrays, and by the name of each that was joined the samples before which one begins.
+    And of groups that are called trials by a number, as ``run1.q``. Of structs that each have a
+    time, or are as long as no other; others are rather joints. All arrays, and by the name of each
+    that was joined the samples before which one begins.
     """
     found = {label: array for label, array in arrays.items() if array is not None}
     begun: dict[str, tuple[int, ...]] = {}
-    runs: dict[str, dict[int, str]] = {}
+    runs: dict[str, dict[str, str]] = {}
     for label, array in found.items():
-        match = re.fullmatch(r"(.+?)\[(\d+)\]\.([^\[\]]+)", label)
+        match = _RUN.fullmatch(label)
         if match and len(labels("", array.shape)) == 1 < array.size:
-            runs.setdefault(f"{match[1]}[:].{match[3]}", {})[int(match[2])] = label
-    timed = {name.partition("[")[0] for name in runs if _TIMES.search(name)}
+            runs.setdefault(f"{match[1]}[:].{match[4]}", {})[match[2] or match[3]] = label
+    timed = {name.partition("[")[0]: list(own) for name, own in runs.items() if _TIMES.search(name)}
     for name, own in runs.items():
         parts = [found[label].ravel() for label in own.values()]
-        alike = len({part.size for part in parts}) == 1 and name.partition("[")[0] not in timed
-        if alike or len(own) < 2 or list(own) != list(range(len(own))):
+        times = timed.get(name.partition("[")[0])
+        alike = len({part.size for part in parts}) == 1 and times is None
+        if alike or len(own) < 2 or list(own) != (times or list(own)):
             continue
         found = {label: array for label, array in found.items() if label not in own.values()}
         found[name] = np.concatenate(parts)
         begun[name] = tuple(map(int, np.cumsum([part.size for part in parts[:-1]])))
     return found, begun
+
+
+def _refuse_blocks(arrays: Mapping[str, np.ndarray | None], name: str) -> None:
+    """Refuse a file whose arrays all have three dimensions or more."""
+    blocks = {label: a.shape for label, a in arrays.items() if a is not None and a.ndim > 2}
+    if blocks and len(blocks) == len(arrays):
+        label, shape = next(iter(blocks.items()))
+        raise InputError(
+            f"'{label}' is a {' by '.join(map(str, shape))} array, of which no side is said to be"
+            " the samples",
+            where=name,
+            remedy="save each trial as an array of its own, samples by channels",
+        )
 
 
 def recorded(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
@@ -169,7 +194,9 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
 
 def columns(path: Path, name: str) -> dict[str, str]:
     """Names of the vectors of numbers that were recorded together, or of columns; no units."""
-    return columns_of_arrays(_arrays(path, name))
+    arrays = _arrays(path, name)
+    _refuse_blocks(arrays, name)
+    return columns_of_arrays(arrays)
 
 
 def _arrays(path: Path, name: str) -> dict[str, np.ndarray | None]:

@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import Dialect, check_columns
@@ -82,7 +83,8 @@ class TableLayout:
         """Whether a line among the samples is text without a number in any cell."""
         row = [cell for cell in self.cells(text) if cell not in NULLS]
         plain = not any(_is_number(cell, self.decimal) or is_moment(cell) for cell in row)
-        return plain and text.isprintable() and (any(map(str.isalpha, text)) or _is_remark(text))
+        wordy = plain and text.isprintable() and any(map(str.isalpha, text))
+        return wordy or _is_remark(text)
 
 
 @dataclass(frozen=True)
@@ -279,7 +281,8 @@ def _otherwise(text: str, width: int) -> list[list[str]]:
 def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> list[str]:
     """Names in a header, which may be written as a remark: ``# t x`` has two names or three."""
     plain, bare = (cells(t, delimiter) for t in (text, _REMARK.sub("", text, count=1)))
-    rows = [line.text for line in below if line.text.strip() and not _is_remark(line.text)]
+    written = (line.text for line in below if line.text.strip() and not _is_remark(line.text))
+    rows = list(islice(written, _SEARCHED))
     if len(plain) == len(bare):
         row = bare if _is_remark(text) and plain[0].strip("#%/") else plain
     else:
@@ -287,10 +290,22 @@ def _names(text: str, delimiter: str, below: list[Line], above: list[Line]) -> l
     if delimiter == " ":
         row = [name.rstrip(",;") or name for name in row]
     row = [name.strip("\"'") for name in row]
+    beside = cells(above[-1].text, delimiter) if above else []
+    if len(beside) == len(row) and all(
+        bool(a) != bool(b) for a, b in zip(row, beside, strict=True)
+    ):
+        # The names of an index stand below those of the columns, as pandas writes them.
+        groups = cells(above[-2].text, delimiter) if len(above) > 1 else []
+        groups = groups if len(groups) == len(row) else [""] * len(row)
+        return [a or f"{g} {b}".strip() for a, b, g in zip(row, beside, groups, strict=True)]
     if _is_key_of_names(row):
         row = ["Time" if name == row[0] else name for name in row]
-    row = _named_items(row, [cells(text, delimiter) for text in rows[:_SEARCHED]])
-    return _told_apart(row, cells(above[-1].text, delimiter) if above else [])
+    row = _named_items(row, rows, delimiter)
+    unnamed = len(row) > 1 and not row[0]
+    first = [cells(text, delimiter)[0] for text in rows] if unnamed else []
+    if first and all("." in x or is_moment(x) for x in first):
+        row[0] = "index" if "time" in row else "time"  # of a frame of pandas; R numbers its rows
+    return _told_apart(row, beside)
 
 
 def _is_key_of_names(row: list[str]) -> bool:
@@ -311,14 +326,15 @@ def _told_apart(header: list[str], above: list[str]) -> list[str]:
     return [f"{x} ({n})" if count[x] > 1 else x for x, n in zip(header, seen, strict=True)]
 
 
-def _named_items(header: list[str], rows: list[list[str]]) -> list[str]:
+def _named_items(header: list[str], below: list[str], delimiter: str) -> list[str]:
     """The header with ``field.effort[elbow]`` for ``field.effort0`` beside a ``field.name0``.
 
     So are messages with lists written by `rostopic echo -p`; the name has to be that of all rows.
     """
     of: dict[tuple[str, str], str] = {}
-    for at, column in enumerate(header):
-        match = re.fullmatch(r"(.*)name(\d+)", column)
+    matches = [re.fullmatch(r"(.*)name(\d+)", column) for column in header]
+    rows = [cells(text, delimiter) for text in below] if any(matches) else []
+    for at, match in enumerate(matches):
         said = {row[at].strip('"') for row in rows if at < len(row)}
         if match and len(said) == 1 and not _POINT.match(name := said.pop()) and name:
             of[match[1], match[2]] = name
@@ -338,22 +354,22 @@ def _guess(lines: list[Line], delimiters: list[str]) -> list[tuple[int, str]]:
         rows = [cells(line.text, delimiter) for line in tried]
         width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
         alike = [row for row in rows if len(row) == width]
-        numbers = sum(_number_cells(row, delimiter) for row in alike)
-        share = numbers / (width * len(rows)) if width else 0.0
+        found_numbers = sum(_number_cells(row, delimiter) for row in alike)
+        share = found_numbers / (width * len(rows)) if width else 0.0
         ranked.append((share * width if width > 1 else 0.0, width, delimiter))
     found = []
     best = max(score for score, _, _ in ranked)
     for _, width, delimiter in (each for each in ranked if each[0] >= _ALIKE * best):
         split = [cells(line.text, delimiter) for line in lines]
+        numbers = [_number_cells(row, delimiter) if len(row) == width else 0 for row in split]
         samples = [
-            [
-                n
-                for n, row in enumerate(split)
-                if len(row) == width and _number_cells(row, delimiter) > 0.5 * of(row)
-            ]
+            [n for n, row in enumerate(split) if numbers[n] > 0.5 * of(row)]
             for of in (len, lambda row: sum(map(bool, row)))  # of cells, or of those with something
         ]
-        first = next((found[0] for found in samples if found), len(lines))
+        # What is written of the log above it may be numbers, but not for several lines.
+        most = next(filter(None, samples), [])
+        first = next((n for n, end in zip(most, most[3:], strict=False) if end - n < 6), -1)
+        first = first if first >= 0 else next(iter(most), len(lines))
         # What was logged before all sensors had answered are samples with empty cells.
         while 0 < first < len(lines) and _is_sparse(cells(lines[first - 1].text, delimiter), width):
             first -= 1
@@ -383,7 +399,11 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
     for n, row in rows.items():
         if not width - 1 <= len(row) <= width:
             rows[n] = next(iter(_otherwise(lines[n].text, width)), row)
-    fitting = [n for n, row in rows.items() if width - 1 <= len(row) <= width]
+    fitting = [
+        n
+        for n, row in rows.items()
+        if width - 1 <= len(row) <= width and not all(map(_POINT.match, row))
+    ]
     while len(fitting) > 1 and any(re.match(r"[A-Za-z ]+:\s+\S", c) for c in rows[fitting[-1]]):
         fitting.pop()  # Type: double
     for n in reversed(_filled(lines[:first])):
@@ -503,7 +523,9 @@ def _units_in(header: list[str]) -> dict[str, str]:
 
     Beside units of other columns, ``[1]`` is one, unless the name comes with other numbers too.
     """
-    matches = {name: match for name in header if (match := _NAME_WITH_UNIT.match(name))}
+    # A number behind the unit tells two of one name apart.
+    plain = {name: re.sub(r"(?<=[\])]) \(\d+\)\Z", "", name) for name in header}
+    matches = {n: match for n in header if (match := _NAME_WITH_UNIT.match(plain[n]))}
     numbered = Counter(m["name"] for m in matches.values() if m["unit"].isdigit())
     others = any(not match["unit"].isdigit() for match in matches.values())
     return {

@@ -12,14 +12,22 @@ from typing import Any
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import labels, pick, recorded, split_index
+from bampipe.data.readers.arrays import (
+    columns_of_arrays,
+    is_run,
+    labels,
+    pick,
+    read_arrays,
+    recorded,
+    split_index,
+)
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
 from bampipe.errors import InputError
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _MOST_DATASETS = 2000
 _BLOCK_ROWS = 1 << 14
-_COLUMNS = ("columns", "names", "column_names", "labels", "fields")
+_COLUMNS = ("columns", "channels", "names", "column_names", "labels", "fields")
 """Attributes with the names of the columns of a matrix."""
 
 
@@ -33,6 +41,8 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
 
     matlab = what == "variable"
     with h5py.File(path, "r") as file:
+        if any("[:]" in column for column in wanted.columns):
+            return read_arrays(_vectors(file), wanted, name, what)
         values: dict[str, np.ndarray] = {}
         units: dict[str, str] = {}
         for column in wanted.columns:
@@ -70,9 +80,23 @@ def columns(path: Path, name: str) -> dict[str, str]:
                     shapes[column] = data.shape
                     units |= dict.fromkeys(labels(column, data.shape), _unit(data))
                     named |= dict(zip(labels(column, data.shape), _names(data), strict=False))
+        if any(is_run(label) for label in shapes):
+            runs = columns_of_arrays(_vectors(file))
+            if any("[:]" in column for column in runs):
+                return runs
     return {
         f"{column.rpartition('[')[0]}/{named[column]}" if column in named else column: units[column]
         for column in recorded(shapes)
+    }
+
+
+def _vectors(file: Any) -> dict[str, np.ndarray | None]:
+    """The vectors of numbers of a file, by their path."""
+    found = dict(_datasets(file))
+    return {
+        label: data[()]
+        for label, data in found.items()
+        if data.dtype.kind in "iufb" and max(data.shape, default=0) == data.size
     }
 
 

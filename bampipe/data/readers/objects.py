@@ -117,6 +117,15 @@ _CALLED = ("name", "label", "signal", "channel")
 """Keys of what an object is called."""
 
 
+def _with_lists(content: object, depth: int = 2) -> object:
+    """What was parsed, with lists for objects whose keys are numbers of rows, as pandas writes."""
+    if not isinstance(content, dict) or depth == 0:
+        return content
+    if len(content) > 1 and all(key == str(n) for n, key in enumerate(content)):
+        return list(content.values())
+    return {key: _with_lists(item, depth - 1) for key, item in content.items()}
+
+
 def _are_names(values: list[object]) -> bool:
     texts = [value for value in values if isinstance(value, str) and value]
     return bool(texts) and len(set(texts)) == len(values)
@@ -144,7 +153,7 @@ def _samples(
                 raise
             notes = ("last line is cut off: 1 row dropped",)
     else:
-        content = _parsed(text, name)
+        content = _with_lists(_parsed(text, name))
     lists = _lists_of_samples(content)
     single = all(_is_sample(items[0]) for items in lists.values())
     if not (lists and single) and (arrays := dict(_arrays(content))):

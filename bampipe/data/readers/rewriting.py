@@ -8,18 +8,49 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 from bampipe.data.readers.dialect import cells
+from bampipe.data.readers.moments import is_moment
 from bampipe.data.units import unit
+from bampipe.errors import InputError
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _PAIR = re.compile(rf"""["']?([A-Za-z_][\w./]*)["']?\s*[=:]\s*({_NUMBER})(?![\w.:])""")
-_STAMPED = re.compile(r"\s*(\d{1,2}:\d\d:\d\d[.,]\d+)\s*->\s*(.*)")
+_STAMPED = re.compile(
+    r"\s*\[?((?:\d{4}-\d\d-\d\d[ T])?\d{1,2}:\d\d:\d\d[.,]\d+)"
+    r"(?:\]|\s*->|\s+(?:DEBUG|INFO|WARN\w*|ERROR)\b)\s*(.*)"
+)
+_QUOTED = re.compile(r'\A\s*"[^"]*\d[,;\t][^"]*"\s*\Z')
+_LINE_PROTOCOL = re.compile(r"[^\s,=]+(?:,\S+)? (\w[^\s=]*=\S+) (\d{10,19})\s*")
+_ELEMENT = re.compile(r"<(\w+)((?:\s+\w+=\"[^\"]*\")+)\s*/?>|<(\w+)>([^<>]*)</")
 _WITH_UNIT = re.compile(rf"({_NUMBER})[ \u00a0]?([^\W\d_]\S*|[%°]\S*)")
 _FORTRAN = re.compile(r"(\d\.?\d*)[Dd]([-+]\d)")
-_GROUPED = re.compile(r"(?<=\d)['’](?=\d{3}(?!\d))")
+_GROUPS = ((",", r"\."), (".", ","), (" ", "[.,]"), ("'", "[.,]"), ("’", "[.,]"))
+"""Signs between thousands, and what may stand before the decimals then."""
+_CAN = "frames of a CAN bus, whose bytes mean nothing without their data base (DBC)"
+_DECODE = "decode them, for example with `cantools`, `asammdf` or the logger, to a CSV of signals"
+_PIVOT = (
+    "make it a column a signal: frame.pivot(index=TIME, columns=SIGNAL, values=VALUE) in pandas,"
+    ' |> pivot(rowKey: ["_time"], columnKey: ["_field"], valueColumn: "_value") in Flux'
+)
+_FOREIGN = (
+    (re.compile(r"\s*\(\d+\.\d+\)\s+\w+\s+[0-9A-F]+#"), _CAN, _DECODE),
+    (re.compile(r"\s*\d+\.\d+\s+\d+\s+[0-9A-Fa-f]+x?\s+[RT]x\s+d "), _CAN, _DECODE),
+    (
+        re.compile(r"# name: \w+"),
+        "variables one below the other, as Octave writes them",
+        "save them with: save -v7 FILE.mat",
+    ),
+    (
+        re.compile(r"(?i)(?=.*\b_?(?:field|variable|signal|channel|parameter)\b)(?=.*\b_?value\b)"),
+        "a reading a row, one signal below the other",
+        _PIVOT,
+    ),
+)
+"""Lines of texts that are no table of samples, what they are, and what to do."""
 _TYPESET = {"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2009": " "}
 """Minus and blanks of typesetters."""
 _MOST = 0.8
@@ -40,15 +71,18 @@ class Form:
     names: tuple[str, ...] = ()
 
 
-def find_form(head: str) -> Form | None:
-    """The form of a text that begins with ``head`` (whole lines); None of a table as it is."""
+def find_form(head: str, name: str) -> Form | None:
+    """The form of a text that begins with ``head`` (whole lines); None of a table as it is.
+
+    InputError where it is known, and no table can be made of it.
+    """
     whole = [line for line in head.splitlines() if line.strip()]
     lines = whole[-_TRIED:]
     if len(lines) < _FEWEST:
         return None
     if any(sign in head for sign in _TYPESET):
         plain = str.maketrans(_TYPESET)
-        inner = find_form(head.translate(plain)) or Form("", str)
+        inner = find_form(head.translate(plain), name) or Form("", str)
         said = "; ".join(
             filter(None, ("typeset minus signs and blanks are plain ones", inner.said))
         )
@@ -56,21 +90,61 @@ def find_form(head: str) -> Form | None:
     ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
     if 2 * len(ended) > len(lines) and all(re.search(r"[,\t |]", line) for line in ended):
         return Form("", lambda line: line.removesuffix(";"))
-    if any(map(_GROUPED.search, lines)):
-        return Form("apostrophes in numbers left out", lambda line: _GROUPED.sub("", line))
+    if _are(_QUOTED, lines):
+        return Form("quotes around whole lines left out", lambda line: line.strip().strip('"'))
     if _are(_STAMPED, lines):
         return _stamped(lines)
     if _are(_FORTRAN, lines):
         return Form("exponents of Fortran", lambda line: _FORTRAN.sub(r"\1E\2", line))
-    if pairs := _pairs(lines):
-        return pairs
-    for delimiter in _DELIMITERS:
+    for find in (_protocol_fields, _elements, _named_numbers):
+        if pairs := _pairs(lines, find):
+            return pairs
+    for delimiter in (*_DELIMITERS, " "):
         table = [cells(line, delimiter) for line in (*whole[:_TRIED], *lines)]
         width = Counter(map(len, table)).most_common(1)[0][0]
         rows = [row for row in table if len(row) == width > 1]
-        if len(rows) > _MOST * len(table) and (found := _cells(rows[0], rows[1:], delimiter)):
+        found = None
+        if len(rows) > _MOST * len(table):
+            every = [row for row in (cells(x, delimiter) for x in whole) if len(row) == width]
+            found = _grouped(every, delimiter)
+            found = found or (_cells(rows[0], rows[1:], delimiter) if delimiter != " " else None)
+        if found:
             return found
+    for line in (*whole[:_FEWEST], lines[-1]):
+        for pattern, what, remedy in _FOREIGN:
+            if pattern.match(line):
+                raise InputError(what, where=name, remedy=remedy)
     return None
+
+
+def _grouped(table: Sequence[list[str]], delimiter: str) -> Form | None:
+    """The form of a table with digits in thousands, where no number has their sign otherwise."""
+    numbers = [
+        cell for row in table for cell in row if re.match(r"[-+\d]", cell) and not is_moment(cell)
+    ]
+    for sign, decimal in _GROUPS:
+        if sign == delimiter == " ":
+            continue
+        group = re.compile(rf"[-+]?[1-9]\d{{0,2}}(?:{re.escape(sign)}\d{{3}})+(?:{decimal}\d*)?")
+        # A sign of decimals alone would be that.
+        sure = re.compile(rf".*{decimal}\d*" if sign in ",." else ".*")
+        own = [cell for cell in numbers if sign in cell]
+        if own and all(map(group.fullmatch, own)) and any(map(sure.fullmatch, own)):
+            said = f"digits in thousands, as in {own[-1]}"
+            return Form(said, _by_row(delimiter, partial(_without, sign, group)))
+    return None
+
+
+def _without(sign: str, group: re.Pattern[str], cell: str) -> str:
+    return cell.replace(sign, "") if group.fullmatch(cell) else cell
+
+
+def _by_row(delimiter: str, act: Callable[[str], str]) -> Callable[[str], str]:
+    def rewrite(line: str) -> str:
+        row = map(act, cells(line, delimiter))
+        return delimiter.join(f'"{cell}"' if delimiter in cell else cell for cell in row)
+
+    return rewrite
 
 
 def _are(kind: re.Pattern[str], lines: Sequence[str]) -> bool:
@@ -79,7 +153,7 @@ def _are(kind: re.Pattern[str], lines: Sequence[str]) -> bool:
 
 def _stamped(lines: Sequence[str]) -> Form:
     inner = [match[2] for match in map(_STAMPED.match, lines) if match]
-    pairs = _pairs(inner)
+    pairs = _pairs(inner, _named_numbers)
     joint = (
         "," if pairs else next((d for d in _DELIMITERS if _are(re.compile(f"[{d}]"), inner)), " ")
     )
@@ -95,14 +169,35 @@ def _stamped(lines: Sequence[str]) -> Form:
     return Form("times stand before each line", rewrite, ("time", *pairs.names) if pairs else ())
 
 
-def _pairs(lines: Sequence[str]) -> Form | None:
-    found = Counter(tuple(name for name, _ in _PAIR.findall(line)) for line in lines)
+def _named_numbers(line: str) -> list[tuple[str, str]]:
+    return _PAIR.findall(line)
+
+
+def _protocol_fields(line: str) -> list[tuple[str, str]]:
+    """Fields and time of a line that a database of time series takes (InfluxDB, Telegraf)."""
+    match = _LINE_PROTOCOL.fullmatch(line)
+    pairs = [field.partition("=") for field in match[1].split(",")] if match else []
+    named = [(name, value.rstrip("iu")) for name, _, value in pairs]
+    return [*named, ("timestamp", match[2])] if match else []
+
+
+def _elements(line: str) -> list[tuple[str, str]]:
+    """Numbers in the elements of a line of XML, as robot controllers send it."""
+    found = []
+    for name, inner, single, content in _ELEMENT.findall(line):
+        parts = re.findall(r'(\w+)="([^"]*)"', inner) if inner else [("", content)]
+        found += [(f"{name}.{key}" if key else single, value) for key, value in parts]
+    return [(name, value) for name, value in found if re.fullmatch(_NUMBER, value)]
+
+
+def _pairs(lines: Sequence[str], find: Callable[[str], list[tuple[str, str]]]) -> Form | None:
+    found = Counter(tuple(name for name, _ in find(line)) for line in lines)
     names, count = found.most_common(1)[0] if found else ((), 0)
     if len(names) < 2 or len(set(names)) < len(names) or count <= _MOST * len(lines):
         return None
 
     def rewrite(line: str) -> str:
-        pairs = _PAIR.findall(line)
+        pairs = find(line)
         alike = tuple(name for name, _ in pairs) == names
         return ",".join(value for _, value in pairs) if alike else line
 

@@ -4,6 +4,7 @@ Rows are counted as an editor does: the first line of the file is row 1.
 """
 
 import codecs
+import csv
 import io
 import re
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ import pyarrow.csv as pa_csv
 from bampipe.data.readers import dialect as dialects
 from bampipe.data.readers import moments, rewriting
 from bampipe.data.readers.dialect import HEAD, NULLS, Line, TableLayout
-from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size
+from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, need
 from bampipe.errors import InputError
 
 BLOCK = 1 << 20
@@ -82,12 +83,13 @@ def _opened(
 
     InputError where it is not in the encoding that it claims.
     """
-    with path.open("rb") as stream:
+    with path.open("rb") as file:
+        stream = _sheet(file, name) if path.suffix.lower().startswith(".xls") else file
         head = stream.read(HEAD)
         stream.seek(0)
         encoding = dialect.encoding or _encoding(head)
         whole = head[: head.rfind(b"\n") + 1] or head
-        form = rewriting.find_form(whole.decode(encoding, "ignore"))
+        form = rewriting.find_form(whole.decode(encoding, "ignore").removeprefix("\ufeff"), name)
         if encoding == "utf-8" and form is None:
             yield stream, dialect, ()
             return
@@ -106,6 +108,17 @@ def _opened(
             if form.names and not dialect.names:
                 dialect = dialect.model_copy(update={"names": form.names})
         yield io.BytesIO(text.encode("utf-8", "replace")), dialect, said
+
+
+def _sheet(file: BinaryIO, name: str) -> BinaryIO:
+    """The first sheet of a workbook that holds rows, as CSV; InputError without openpyxl."""
+    book = need("openpyxl", "xlsx", name).load_workbook(file, read_only=True, data_only=True)
+    rows = next(
+        (r for s in book.worksheets if len(r := list(s.iter_rows(values_only=True))) > 1), []
+    )
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows(rows)
+    return io.BytesIO(text.getvalue().encode())
 
 
 def _encoding(head: bytes) -> str:
@@ -131,7 +144,8 @@ def _asian(head: bytes) -> str:
     if not runs or _sound(head, "utf-8"):
         return ""
     # Letters of Western Europe stand alone among others.
-    if all(len(run) % 2 == 0 for run in runs) and _sound(head, "gb2312"):
+    lone = re.search(rb"[A-Za-z][\x80-\xff]{2}(?![\x80-\xff])", head)
+    if not lone and all(len(run) % 2 == 0 for run in runs) and _sound(head, "gb2312"):
         return "gb18030"
     japanese = re.findall(rb"[\x82\x83\x88-\x9f][\x40-\xfc]", head)
     return "shift_jis" if len(japanese) > 2 and _sound(head, "shift_jis") else ""
@@ -396,6 +410,8 @@ def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> I
     remedy = ""
     if sign:
         remedy = f"export with one decimal sign; '{layout.decimal}' was taken from the first rows"
+    elif re.fullmatch(r"\s*[-+]?\d{1,3}([ .,'’]\d{3})+([.,]\d*)?\s*", value):
+        remedy = "export without thousands separators"
     elif moments.is_moment(value):
         remedy = 'is it the time? then say unit = "datetime" under [time]'
     elif re.fullmatch(r"[-+]?[\d.,]+(e[-+]?\d+)?\s+[^\d\s]\S*", value.strip(), re.IGNORECASE):

@@ -287,6 +287,11 @@ class Force(Declaration):
         alias="lever_m",
         description="Distance from the axis at which a force acts, m: makes a torque in N.m of it",
     )
+    reaction: bool = Field(
+        default=False,
+        description="The sensor shows what the machine exerts, as one at the foot of a motor or a"
+        " brake does: its sign is turned",
+    )
     frame: str = Field(default="", description="In which the components are given: free text")
     calibration_n_per_v: (
         Annotated[Several[Annotated[Several[Number], Field(min_length=1)]], Field(min_length=1)]
@@ -342,7 +347,7 @@ class Force(Declaration):
         matrix = _unit(self.raw_unit).scale * np.eye(len(self.columns))
         if self.calibration_n_per_v is not None:
             matrix = np.array(self.calibration_n_per_v)
-        lever = 1.0 if self.lever is None else self.lever
+        lever = (1.0 if self.lever is None else self.lever) * (-1.0 if self.reaction else 1.0)
         return tuple(tuple(float(v) for v in row) for row in lever * matrix)
 
     @property

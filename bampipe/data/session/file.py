@@ -30,6 +30,7 @@ from bampipe.files import is_inside, read_toml
 from bampipe.schema import (
     ByName,
     Declaration,
+    Distinct,
     NamedDeclaration,
     NotNegative,
     Positive,
@@ -172,6 +173,11 @@ class TrialEntry(NamedDeclaration):
     end_s: Positive = Field(
         default=math.inf,
         description="Where it ends, s after the first sample of the record; this moment excluded",
+    )
+    negated: Distinct[ChannelName] = Field(
+        default=(),
+        description="Axes, components of the force and channels that were logged with the other"
+        " sign in this trial",
     )
     hold_out: bool = Field(default=False, description="Never fitted, only for judging models")
     notes: str = Field(default="", description="Free text")

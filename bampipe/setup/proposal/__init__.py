@@ -35,6 +35,10 @@ from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robo
 from bampipe.setup.proposal.tables import clock_of, encoders_table, input_tables
 
 SESSION = "session.toml"
+_TRIALS = frozenset({"trial", "run", "condition", "test", "block", "versuch"})
+"""Words in the name of a column that numbers trials."""
+_LEAP_S, _SHORTEST_S, _MOST_CUTS = 1.0, 2.0, 200
+"""Length, s, of what lies between two trials and of a trial, the least; cuts, the most."""
 
 
 @dataclass(frozen=True)
@@ -226,12 +230,12 @@ def _trials_tables(
 ) -> list[str]:
     """Propose the trials and their kinds; a long single record is cut at rests of its axis."""
     trials = match.found.trials
-    cuts: list[float] = []
-    if len(trials) == 1 and axes:
-        cuts = guesses.stretches(match.t, next(iter(axes.values())).values)
+    cuts, where = _cuts(match) if len(trials) == 1 else ([], "")
+    if len(trials) == 1 and axes and not cuts:
+        cuts, where = guesses.stretches(match.t, next(iter(axes.values())).values), "at rests"
     lines = []
     if cuts:
-        note = notes.guess("one record, cut at rests, so that each part can be held out")
+        note = notes.guess(f"one record, cut {where}, so that each part can be held out")
         lines.append(note.strip())
     for trial in trials:
         for start_s, end_s in pairwise([None, *cuts, None]):
@@ -250,6 +254,22 @@ def _trials_tables(
                 lines += [f"{key} = {quoted(value)}" for key, value in told.items() if value]
             lines.append("")
     return lines
+
+
+def _cuts(match: Matcher) -> tuple[list[float], str]:
+    """Times, s, at which one record goes on with another trial, and how that shows."""
+    t = match.t - match.t[0]
+    steps = np.diff(t)
+    ends = {"where time leaps": np.flatnonzero(steps > max(_LEAP_S, 20.0 * np.median(steps)))}
+    for column in match.found.columns:
+        if column.is_integer and not column.role and _TRIALS & set(words(column.name)):
+            match.used.add(column.name)
+            ends[f"where {column.name} changes"] = np.flatnonzero(np.diff(column.values))
+    for where, found in reversed(ends.items()):
+        pieces = np.diff([0.0, *t[found], t[-1]])
+        if 0 < len(found) <= _MOST_CUTS and pieces.min() > _SHORTEST_S:
+            return [round(float(0.5 * (t[k] + t[k + 1])), 5) for k in found], where
+    return [], ""
 
 
 def _trial_kind(file: str, device: Device, notes: Notes) -> list[str]:

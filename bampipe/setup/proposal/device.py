@@ -204,8 +204,8 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         raise InputError(
             "no column looks like a position",
             where=f"{folder}: {found.trials[0].file}",
-            remedy="name the device: bampipe init FOLDER --device NAME; columns are "
-            + ", ".join(c.name for c in found.columns[:12]),
+            remedy="say in order what they are: bampipe init FOLDER --names t,angle_deg,...;"
+            f" columns are {', '.join(c.name for c in found.columns[:12])}",
         )
     linear = slides(position, found)
     driver, role = match.driver(position)
@@ -213,6 +213,15 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     coil = role == "force" and _has_coil(driver, match, notes)
     read, position = position, position if linear else _at_joint(position, driver, match)
     fit = _rough_fit(position, driver, role, linear, match.t)
+    if driver is not None and fit.feeds:
+        # A sensor at the foot of a motor shows what the axis does to that.
+        match.reacting = driver.name
+        turned = replace(driver, values=-driver.values)
+        fit = _rough_fit(position, turned, role, linear, match.t)
+        notes.check.append(
+            f"{driver.name} falls where the motion asks for more: it is taken for the reaction, its"
+            " sign turned"
+        )
     drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
     weight, on_gravity = weight_of(position, fit, linear, found)

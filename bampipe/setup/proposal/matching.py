@@ -13,7 +13,9 @@ from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import travelled
 from bampipe.setup.proposal.robot import RobotColumns
 
-_MANY = 6
+_MANY, _NO_LESS = 6, 0.03
+_SUPPLIED = frozenset(["in", "input", "supply", "bus", "battery"])
+"""Words in the name of what a converter takes up rather than what its motor gets."""
 _NEVER_DRIVES = ("time", "velocity", "acceleration", "reference", "position")
 _INPUT_ROLE = {"N": "force", "N.m": "force", "A": "current", "V": "voltage", "": "voltage"}
 Match = tuple[SurveyedColumn | None, str]
@@ -31,6 +33,7 @@ class Matcher:
         robot: columns of a robot of which the drawing tells, and how they are counted.
         turning: what the readings of a position are worth, by the weight on it, by name of column.
         given: columns that are known, by name of axis or input.
+        reacting: the column of a drive that has the sign of the reaction, "" where none has.
     """
 
     found: Survey
@@ -40,6 +43,7 @@ class Matcher:
     robot: RobotColumns = field(default_factory=RobotColumns)
     turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
     given: Mapping[str, SurveyedColumn] = field(default_factory=dict)
+    reacting: str = ""
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""
@@ -68,6 +72,7 @@ class Matcher:
         # A test stand may log the velocity only, which is integrated then.
         found = found or [c for c in moving if c.role == "velocity"]
         found = found or [c for c in moving if c.name in ("v", "V")]
+        found = [c for c in found if "motor" not in words(c.name)] or found
         if len(found) < 2:
             return found[0] if found else None
         best = found[0]
@@ -150,11 +155,15 @@ class Matcher:
         # A velocity of an unknown name fits itself. Of several joints without a drawing, a drive
         # has the number of its position.
         fitting = [name for name in fitting if roles[name] in DRIVERS] or fitting
+        fitting = [name for name in fitting if not _SUPPLIED & set(words(name))] or fitting
         number = _numbers(position.name)
         fitting = [name for name in fitting if number and _numbers(name) == number] or fitting
         if not fitting:
             return None
-        best = max(fitting, key=lambda name: share[name])
+        at_axis = [name for name in fitting if "motor" not in words(name) or roles[name] != "force"]
+        fitting = at_axis if "motor" not in words(position.name) and at_axis else fitting
+        # A torque needs no constant where a current tells the same.
+        best = max(fitting, key=lambda name: share[name] + _NO_LESS * (roles[name] == "force"))
         return next(c for c in self.found.columns if c.name == best)
 
 

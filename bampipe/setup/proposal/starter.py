@@ -17,7 +17,7 @@ _NAMELESS = (
     "enc encoder pos position angle counts ticks displacement disp stroke present actual act"
     " measured meas current state value deg degree degrees rad radian radians vel velocity speed"
     " header feedback column ang motion dist percent rec log data mot motor field run runs"
-    " observation ist akt mesure mesuree medido misurato gemessen"
+    " observation ist akt grad rev mesure mesuree medido misurato gemessen"
 )
 """Words in the name of a position that name no axis."""
 _FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "eff", "torque", "tau"}

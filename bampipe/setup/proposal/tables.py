@@ -96,8 +96,10 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
     known, rows = np.isfinite(stamps), np.arange(len(stamps))
     stamps = np.interp(rows, rows[known], spread_stamps(unroll(stamps[known])[0])[0])
     named = f"column = {quoted(column.name)}"
+    named_unit = next((u for u in ("us", "ms", "ns") if u in words(column.name)), "")
     counter = not _COUNTERS.isdisjoint(words(column.name)) or column.role != "time"
-    kind = "" if counter else guesses.time_unit(stamps + start, column.unit)
+    counter &= not named_unit
+    kind = "" if counter else guesses.time_unit(stamps + start, column.unit or named_unit)
     tick = re.search(r"(?<!\d)(\d+) ?_?(ns|us|ms)(?![A-Za-z])", column.name)
     if counter and tick:
         size = float(tick[1]) * SECONDS[tick[2]]
@@ -356,6 +358,8 @@ def input_tables(
     if sensed and len(forces) in (0, len(device.forces)):
         match.used |= {column.name for column in forces}
         lines += _force_table(device, forces, given[device.forces[0]][1], notes)
+        if match.reacting in {column.name for column in forces}:
+            lines.insert(-1, "reaction = true" + notes.guess(f"{match.reacting} is the reaction"))
         wanted = dict(device.channels)
     lines += _brakes_table(device, match, notes)
     return lines + _channels_table(wanted, given, match, notes)
@@ -420,17 +424,27 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             "who wrote the logger; N.m or N of a sensor, V with calibration_n_per_v of counts",
         )
         return [f'unit = "{UNKNOWN}"{note}']
+    other = next((c for c in columns if c.si not in (None, "", "V", "kg", "N", "N.m")), None)
+    if other is not None:
+        note = notes.ask(
+            f"the force: {other.name} is in {bare(other.unit)} and follows the motion, but is none",
+            "a channel of a force sensor; of a cylinder, log pressure times area in its place",
+        )
+        return [f'unit = "{UNKNOWN}"{note}']
+    note = ""
+    if any(column.si == "kg" for column in columns):
+        common = next(unit for unit in ("kgf", "gf") if columns[0].unit.startswith(unit[:-1]))
+        note = notes.guess(f"{names} is the weight of a mass: a force in {common}")
     if device.force_unit == "N.m" and any(_is_force(column) for column in columns):
-        note = "" if common else notes.guess(f"{names} is a force in N")
-        if any(column.si == "kg" for column in columns):
-            common = next(unit for unit in ("kgf", "gf") if columns[0].unit.startswith(unit[:-1]))
-            note = notes.guess(f"{names} is the weight of a mass: a force in {common}")
+        note = note or ("" if common else notes.guess(f"{names} is a force in N"))
         ask = notes.ask(
             f"lever_m, how far from the axis {names} acts, m",
             "measure it on the machine, or take it from the drawing; if the column is a torque"
             ' already, put unit = "N.m" and take lever_m out',
         )
         return [f'unit = "{common or "N"}"{note}', f"lever_m = 0.0{ask}"]
+    if note:
+        return [f'unit = "{common}"{note}']
     note = notes.guess(f"{names} is a {_QUANTITY[device.force_unit]} in {device.force_unit}{why}")
     return [f'unit = "{device.force_unit}"{note}']
 
@@ -488,7 +502,8 @@ def _channel(
     """Column and unit of one input; its register or its scale, where the unit does not do."""
     register = match.registers.get(column.name)
     fields = register.fields if register else ""
-    fields += ", scale = -1.0" if name in match.robot.turned else ""
+    turned = name in match.robot.turned or column.name == match.reacting
+    fields += ", scale = -1.0" if turned else ""
     slides = (column.si, si) == ("N", "N.m")  # the drive of a sliding joint
     if column.si == si or slides:
         table = entry(column.name, bare(column.unit), fields)
