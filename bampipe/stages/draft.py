@@ -214,9 +214,10 @@ def _axis(
 def _say(found: FoundDraft, effects: list[DraftedEffect], diagnosed: AxisVerdict) -> str:
     chance, unit = found.chance[0], diagnosed.unit
     before, after = found.options[0].held_out_rmse, found.chosen.held_out_rmse
+    most = max(0.0, *chance.gains)
     by_chance = (
         f"the best formula gains {chance.gain:.3g} nats of log evidence; on {len(chance.gains)} "
-        f"replays, where nothing is missing, the same search gains {max(0.0, *chance.gains):.2g} at most "
+        f"replays, where nothing is missing, the same search gains {most:.2g} at most "
         f"(p = {chance.p_value:.2g})"
     )
     if effects:
