@@ -14,6 +14,7 @@ from bampipe.results.intervals import NORMAL_95
 from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.noise_floor import draw_trials
+from bampipe.trials.residuals import ModelOnTrial
 
 _BINS = 24
 _FEWEST = 8
@@ -97,8 +98,9 @@ def _parts(system: System) -> Iterator[_Part]:
 
 def _residual(evidence: Evidence, p: Array) -> Array:
     """Return the residual over all trials, thinned, (K, n_q)."""
-    found = (evidence.unfiltered_residual(k, p) for k in range(len(evidence.motions)))
-    return np.concatenate([one[evidence.band.thinned_rows(len(one))] for one in found])
+    e = evidence
+    found = (ModelOnTrial(e.system, p, e.motions, k).residual for k in range(len(e.motions)))
+    return np.concatenate([one[e.band.thinned_rows(len(one))] for one in found])
 
 
 def _curves(

@@ -172,9 +172,12 @@ class Evidence:
 
         See `held_out_steps` for the parameters without each group of trials.
         """
-        if self.is_linear:
-            return self.folds.error(self.sums, self.held_out_steps)
         judged = [k for k, counts in enumerate(self.folds.judged) if counts]
+        if self.is_linear:
+            sums, steps, none = self.sums, self.held_out_steps, np.zeros(self.sums.yy.shape[1])
+            squares = sum((sums.subset([k]).squares(steps[k])[0] for k in judged), none)
+            count = sum((sums.count[k] for k in judged), none)
+            return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))
         return rms((self.held_out_residual(k) for k in judged), [self.used[k] for k in judged])
 
     @property
@@ -189,8 +192,9 @@ class Evidence:
             if self.is_linear or not step.any():
                 found = self.residual[trial] + self.jacobian[trial] @ step
             else:
-                unfiltered = self.unfiltered_residual(trial, self.held_out_parameters(trial))
-                found = self.band.thin(unfiltered) * self.used[trial]
+                p = self.held_out_parameters(trial)
+                on_trial = ModelOnTrial(self.system, p, self.motions, trial)
+                found = self.band.thin(on_trial.residual) * self.used[trial]
             self._held_out[trial] = found
         return self._held_out[trial]
 
@@ -203,10 +207,6 @@ class Evidence:
         p = self.p.copy()
         p[list(self.free)] += self.held_out_steps[trial]
         return p
-
-    def unfiltered_residual(self, trial: int, p: Array) -> Array:
-        """The residual of a trial with parameters ``p``, (n_p,), before the low-pass, (T, n_q)."""
-        return ModelOnTrial(self.system, p, self.motions, trial).residual
 
 
 def gather_evidence(

@@ -5,11 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from bampipe.arrays import Array
-from bampipe.estimate.normal_equations import NormalEquations
-
 HELD_OUT = -1
 """Group of the trials that the session holds out."""
 MOST_GROUPS = 10
@@ -66,12 +61,3 @@ class Folds:
     def nothing_held_out(self) -> bool:
         """Whether there is one group only, so that the error is that of the fit."""
         return len(set(self.groups)) == 1
-
-    def error(self, sums: NormalEquations, values: Sequence[Array]) -> Array:
-        """Root mean square by axis over the judged trials, (n_q,); ``values`` (P,) by trial."""
-        squares, count = np.zeros(sums.yy.shape[1]), np.zeros(sums.yy.shape[1])
-        for k, judged in enumerate(self.judged):
-            if judged:
-                squares += sums.subset([k]).squares(values[k])[0]
-                count += sums.count[k]
-        return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))

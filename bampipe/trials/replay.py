@@ -100,20 +100,20 @@ class StandIn:
     @cached_property
     def courses(self) -> TrialCache[Course]:
         """What it does in each trial: the same in all replays, which differ by noise alone."""
-
-        def follow(trial: int) -> Course:
-            return follow_motion(self.system, self.p, self.motions[trial], self.rate_hz)
-
-        return TrialCache(follow, len(self.motions), lambda course: len(course.q))
+        return TrialCache(
+            lambda trial: follow_motion(self.system, self.p, self.motions[trial], self.rate_hz),
+            len(self.motions),
+            lambda course: len(course.q),
+        )
 
     @cached_property
     def rests(self) -> TrialCache[Flags]:
         """Where the axes of each trial stand still, (T, n_q)."""
-
-        def find_rest(trial: int) -> Flags:
-            return standstill_of(self.motions[trial], self.system, self.rate_hz)
-
-        return TrialCache(find_rest, len(self.motions), len)
+        return TrialCache(
+            lambda trial: standstill_of(self.motions[trial], self.system, self.rate_hz),
+            len(self.motions),
+            len,
+        )
 
 
 def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> Course:
