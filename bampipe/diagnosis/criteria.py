@@ -43,7 +43,7 @@ class Criteria:
     tails: Positive = 4.0
     block_s: Positive = 2.0
     beam: Annotated[int, Field(ge=1)] = 10
-    doubt: Positive = 6.0
+    doubt: Positive = 3.0
 
     @property
     def largest_p_value(self) -> float:

@@ -53,7 +53,8 @@ class Weighed:
 
     Attributes:
         sets: the most probable first.
-        effects: probability of each effect of any of them.
+        effects: probability of each effect of any of them; by_name: the same where nothing is
+            unknown.
         unknown: probability that an axis lacks something unknown, (n_q,).
         functions: what that would be, by axis; None where an axis does not move.
         drops: log evidence lost without each effect, where nothing takes its place, nats.
@@ -61,6 +62,7 @@ class Weighed:
 
     sets: tuple[WeighedSet, ...]
     effects: Mapping[str, float]
+    by_name: Mapping[str, float]
     unknown: Array
     functions: tuple[Unknown | None, ...]
     drops: Mapping[str, float]
@@ -99,6 +101,7 @@ def weigh_sets(
     sets = _share(costs, named, given, seed)
     effects, drops = _by_effect(sets), _losses(sets)
     effects |= {e: 0.0 for e in own if by_noise.size_of_own(e) < criteria.size}
+    by_name = dict(effects)
     unknown = np.zeros(len(costs.p.y))
     functions: list[Unknown | None] = []
     for axis in range(len(unknown)):
@@ -139,7 +142,7 @@ def weigh_sets(
         # In doubt is not absent: the model keeps it, and the report mentions it.
         most = max(_share_explained(costs, effect, doubtful), 1.0 - criteria.probability)
         effects[effect] = min(effects[effect], most)
-    return Weighed(sets, effects, unknown, tuple(functions), drops)
+    return Weighed(sets, effects, by_name, unknown, tuple(functions), drops)
 
 
 def _squares(costs: SetCosts, keys: tuple[Key, ...]) -> Array:

@@ -247,14 +247,16 @@ def _leave_out(
 ) -> Fit | None:
     """The model without the effects that came out improbable; None where there are none.
 
-    With what the most probable set has in their place.
+    With what the most probable set has in their place. What an unknown function could replace
+    stays: it describes the machine until its effect has a name.
     """
     least = 1.0 - session.criteria.probability
     own = [e for e in fit.recipe.effects if e not in given]
-    out = {e for e in own if weighed.effects.get(e, 0.0) < least}
+    out = {e for e in own if weighed.by_name.get(e, 0.0) < least}
     if not out:
         return None
-    best = weighed.sets[0].keys if out & gone(weighed.sets[0].keys) else ()
+    best = next(one.keys for one in weighed.sets if one.unknown is None)
+    best = best if out & gone(best) else ()
     keys = tuple(sorted({*best, *((f"-{e}", ()) for e in out)}))
     less = change_set(fit.recipe, keys)
     if np.isfinite(search.cost(keys)):

@@ -1,13 +1,13 @@
 """Something that no effect of the library is: a smooth function of what an axis does.
 
-A sum of linear splines, each of one quantity (position, speed, load, time or distance since
-the last reversal, or the position of another axis), coarse or fine, alike in both directions of
-motion or opposite, with a normal prior: Gaussian processes of few knots. Splines are added while
-the evidence, integrated over their strengths, grows.
+A sum of linear splines, each of one quantity (position, speed, load, time since the last reversal,
+or the position of another axis), alike in both directions of motion or opposite, with a normal
+prior: Gaussian processes of few knots. Splines are added while the evidence, integrated over their
+strengths, grows.
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise, repeat
 
 import numpy as np
 
@@ -18,14 +18,14 @@ from bampipe.diagnosis.shape import since_reversal
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import solve_scaled, take_samples
 
-_KNOTS, _KNOTS_OF_OTHERS = (9, 33), (5,)
-"""Of each spline of what the axis does itself, and of the position of the others."""
+_KNOTS = (9, 33), (9,), (9,), (9,)
+"""Of splines of the position of the axis, of its speed, its load, and the time since a reversal."""
+_KNOTS_OF_OTHERS = (5,)
+"""Of splines of the position of another axis."""
 _SIZES = (0.003, 0.01, 0.03, 0.1)
 """Standard deviations of the function at a knot, over the applied force of the axis."""
 _REWEIGHTS = 2
 """From the weights of the function with one spline less."""
-_OWN = 5
-"""Of the quantities, those of the axis itself."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ def lay_splines(costs: SetCosts, axis: int) -> Splines | None:
     quantities = zip(*(_quantities(e, k, axis) for k in range(len(e.motions))), strict=True)
     sides = [np.tanh(m.qd[:, axis] / width)[:, None] for m in e.motions]
     blocks = []
-    for place, values in enumerate(quantities):
-        for count in _KNOTS if place < _OWN else _KNOTS_OF_OTHERS:
+    for values, counts in zip(quantities, chain(_KNOTS, repeat(_KNOTS_OF_OTHERS)), strict=False):
+        for count in counts:
             knots = np.unique(np.quantile(np.concatenate(values), np.linspace(0.0, 1.0, count)))
             if len(knots) < 3:
                 continue
@@ -94,7 +94,7 @@ def lay_splines(costs: SetCosts, axis: int) -> Splines | None:
 
 def _quantities(evidence: Evidence, trial: int, axis: int) -> list[Array]:
     motion, n_q = evidence.motions[trial], len(evidence.system.coordinates)
-    since, distance = since_reversal(motion, axis)
+    since, _ = since_reversal(motion, axis)
     fitted = evidence.fitted[trial]
     # The load by the model, not as measured: a function of that could take all of it away.
     load = (fitted.applied - fitted.residual)[:, axis]
@@ -103,7 +103,6 @@ def _quantities(evidence: Evidence, trial: int, axis: int) -> list[Array]:
         np.abs(motion.qd[:, axis]),
         load,
         np.log(since + 0.02),
-        np.log(distance + 0.02 * max(float(np.ptp(motion.q[:, axis])), 1e-300)),
         *(motion.q[:, other] for other in range(n_q) if other != axis),
     ]
 

@@ -36,7 +36,6 @@ NUMERICAL = {
     },
     "unknown": {
         "3": "the fewest knots of a spline that bends",
-        "_OWN": "which quantities are of the axis itself",
     },
     "set_cost": {
         "_LEAST_SLOPE": "below it the equation has no scale, and its cost no meaning",
