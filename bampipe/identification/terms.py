@@ -9,7 +9,6 @@ from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.shape import Variable, number_bins, variables
 from bampipe.errors import InputError
 from bampipe.physics import System
-from bampipe.physics.effect import Effect
 from bampipe.results.identify import Covariance
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
@@ -33,17 +32,6 @@ class _Part:
     text: EffectText
     parameters: tuple[int, ...]
     strengths: tuple[int, ...]
-
-
-def effect_text(effect: Effect) -> EffectText:
-    """Return what the file of ``effect`` says of it."""
-    return EffectText(
-        summary=effect.summary,
-        formulas=effect.formulas,
-        looks_like=effect.looks_like,
-        on_the_machine=effect.on_the_machine,
-        source=effect.source,
-    )
 
 
 def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: str) -> TermsResult:
@@ -105,7 +93,7 @@ def _parts(system: System) -> Iterator[_Part]:
     for bound in system.model.effects:
         own = [numbers[item.name] for item in bound.parameters]
         strengths = [numbers[item.name] for item in bound.parameters if item.strength]
-        yield _Part(bound.name, effect_text(bound.effect), tuple(own), tuple(strengths))
+        yield _Part(bound.name, EffectText.of(bound.effect), tuple(own), tuple(strengths))
 
 
 def _residual(evidence: Evidence, p: Array) -> Array:
@@ -144,10 +132,12 @@ def _curves(
         own = force[use, axis]
         if not own.size or np.sqrt(np.mean(own**2)) < _LEAST_SHARE * error[axis]:
             continue
-        binned = [number_bins(np.concatenate(v.values)[use], _BINS) for v in known[axis]]
+        own_states = ("", part.name.replace(":", "."))
+        causes = [v for v in known[axis] if v.name.partition(" of ")[2] in own_states]
+        binned = [number_bins(np.concatenate(v.values)[use], _BINS) for v in causes]
         shares = [_explained(own, which) for which in binned]
         best = int(np.argmax(shares))
-        share, variable, which = shares[best], known[axis][best], binned[best]
+        share, variable, which = shares[best], causes[best], binned[best]
         values = np.concatenate(variable.values)[use]
         filled = [b for b in range(which.max() + 1) if np.sum(which == b) >= _FEWEST]
         if len(filled) < 2:

@@ -22,7 +22,6 @@ from bampipe.diagnosis.shape import residual_map, variables, worst_windows
 from bampipe.diagnosis.verdict import conclude
 from bampipe.errors import InputError, NothingToDoError, did_you_mean
 from bampipe.estimate.simulation import Runaway
-from bampipe.identification.terms import effect_text
 from bampipe.next_trial.suggestion import suggest_trial
 from bampipe.phrases import diagnosis as phrases
 from bampipe.physics import compile_model, registry
@@ -32,6 +31,7 @@ from bampipe.progress import Progress
 from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, ResidualMap
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.setup import SetupResult
+from bampipe.results.terms import EffectText
 from bampipe.schema import STRICT, Count, Distinct
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.folds import HELD_OUT
@@ -185,7 +185,9 @@ def _result(
         trials=tuple(dict.fromkeys(trial_of_block(m.trial_id) for m in session.trials.weighed)),
         axes=dict(zip(names, found.axes, strict=True)),
         ranking=ranking,
-        descriptions={name: effect_text(own.get(name) or registry.effect(name)) for name in known},
+        descriptions={
+            name: EffectText.of(own.get(name) or registry.effect(name)) for name in known
+        },
         selected=found.selected,
         sets=found.sets,
         chance=found.chance,
