@@ -390,6 +390,17 @@ def test_verify_says_what_was_touched(toy: Toy) -> None:
     ]
 
 
+def test_a_stage_outside_the_pipeline_makes_no_later_one_stale(toy: Toy) -> None:
+    toy.run()
+    pipeline, settings = toy.request().pipeline, {"toy_double": {"factor": 3}}
+    without = tuple(stage for stage in pipeline.stages if stage != "toy_double")
+    for stages, last in ((pipeline.stages, "stale"), (without, "current")):
+        found = status(
+            toy.root, pipeline.model_copy(update={"stages": stages, "settings": settings})
+        )
+        assert [step.state for step in found[1::2]] == ["stale", last]
+
+
 def test_status_changes_nothing_and_names_what_is_stale(toy: Toy) -> None:
     toy.run()
     (toy.session / "numbers.txt").write_text("9")

@@ -60,12 +60,15 @@ def after_proposal(root: Path, model: str) -> str:
     from bampipe.results.next import NextResult
 
     run = RunFolder(root)
-    if run.read(NextResult, model).purpose != "decision":
+    proposed = run.read(NextResult, model)
+    if proposed.purpose != "decision":
         found = run.find(DiagnoseResult, model)
         if found is not None and found.selected:
             return _after_diagnosis(run, model, found.next)
         if found is None and _is_above_floor(run, model):
             return f"bampipe diagnose RUN{run.model_option(model)}"
+    if proposed.plan is not None and proposed.plan.is_enough and not proposed.plan.trials:
+        return "bampipe report RUN"
     return "record that trial, add it to session.toml, and run the session again"
 
 

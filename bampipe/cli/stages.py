@@ -154,7 +154,6 @@ def next_(
         print_forecasts(root, chosen)
     asked = {"purpose": purpose, "seconds": seconds, "plan": plan, "trajectory": suffix}
     run_stage("next", root, options, model=chosen, more={**asked, "sd": share})
-    advise(after_proposal(root, chosen), root, options)
     quiet = options.json or options.quiet
     if suffix:
         file = root / f"models/{chosen}/trajectory.{suffix}"
@@ -164,6 +163,7 @@ def next_(
             show.say(f"trajectory: {out or file}")
     if plan and not quiet:
         show.say(f"sheet: {root}/models/{chosen}/protocol.pdf")
+    advise(after_proposal(root, chosen), root, options)
 
 
 def _choose_trajectory(form: str, out: Path | None, plan: bool) -> str:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.arrays import Array, Indices
+from bampipe.physics.effect import state_units
 from bampipe.results.diagnose import WorstWindow
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.measured import trial_of_block
@@ -73,9 +74,10 @@ def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
             if k != axis:
                 put(f"{other.name} position", other.unit, motion.q[kept, k])
                 put(f"{other.name} velocity", f"{other.unit}/s", motion.qd[kept, k])
-        for k, name in enumerate(system.memory_names):
-            effect, _, state = name.rpartition(".")
-            put(f"{state} of {effect}", "", memory[kept, k])
+        for item in system.model.effects:
+            for state, in_unit in state_units(item, system.model.device).items():
+                k = system.memory_names.index(f"{item.prefix}.{state}")
+                put(f"{state} of {item.prefix}", in_unit, memory[kept, k])
         put("time", "s", motion.t[kept])
         put("trial", "", np.full(len(kept), float(index)))
     return tuple(Variable(name, u, tuple(v)) for name, (u, v) in columns.items())

@@ -133,10 +133,12 @@ def _curves(
         own = force[use, axis]
         if not own.size or np.sqrt(np.mean(own**2)) < _LEAST_SHARE * error[axis]:
             continue
-        binned = [number_bins(np.concatenate(v.values)[use], _BINS) for v in known[axis]]
+        own_states = ("", part.name.replace(":", "."))
+        causes = [v for v in known[axis] if v.name.partition(" of ")[2] in own_states]
+        binned = [number_bins(np.concatenate(v.values)[use], _BINS) for v in causes]
         shares = [_explained(own, which) for which in binned]
         best = int(np.argmax(shares))
-        share, variable, which = shares[best], known[axis][best], binned[best]
+        share, variable, which = shares[best], causes[best], binned[best]
         values = np.concatenate(variable.values)[use]
         filled = [b for b in range(which.max() + 1) if np.sum(which == b) >= _FEWEST]
         if len(filled) < 2:

@@ -14,6 +14,7 @@ _MOST_ALTERNATIVES = 3
 """Most sets of effects that a phrase names."""
 _NO_SHAPES: Mapping[str, str] = MappingProxyType({})
 _PROBABILITY = "probability "
+_SURE = 0.9  # as the diagnosis's own default
 
 
 def probability(value: float) -> str:
@@ -191,7 +192,10 @@ def _describe_verdict(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> 
         values = join_names(probability(entry.probabilities[name]) for name in entry.effects)
         return f"{join_names(entry.effects)} {verb} missing ({_PROBABILITY}{values}); {errors}"
     known, parts = split_alternatives(result, axis, first=_PROBABILITY)
-    sure = f"{known} {'are' if ' and ' in known else 'is'} missing, and " if known else ""
+    verb = "are" if " and " in known else "is"
+    if any(entry.probabilities[name] < _SURE for name in split_sets(result, axis)[0]):
+        verb = "may be"
+    sure = f"{known} {verb} missing, and " if known else ""
     return f"{sure}{open_question(parts)}; {errors}"
 
 

@@ -85,11 +85,6 @@ class State(NamedDeclaration):
     linear: Unit | None = Field(default=None, description="On a linear axis")
     description: str = Field(default="", description="What it is, in a few words")
 
-    def unit_on(self, kind: str) -> str:
-        """Unit of the state on a ``kind`` of axis; of an effect of no axis where empty."""
-        entry = {"rotary": self.rotary, "linear": self.linear}.get(kind)
-        return entry.unit if entry else self.unit
-
 
 class Effect(DeclaredFile):
     """An effect: one physical term that a model may have; `bind` places it on a device."""
@@ -449,6 +444,13 @@ def unit_of(unit: str, effect: Effect, target: str, device: Device) -> str:
         for inner, piece in _split_unit(units[part]) if part in units else [("*", part)]:
             (above if sign == inner or (sign, inner) == ("/", "/") else below).append(piece)
     return (".".join(above) or ("1" if below else "")) + "".join(f"/{p}" for p in below)
+
+
+def state_units(item: BoundEffect, device: Device) -> dict[str, str]:
+    """The unit of every state of a bound effect, by the name of the state."""
+    kind = device.coordinate(item.axes[0]).kind if item.axes else ""
+    units = {s.name: (getattr(s, kind, None) or s).unit for s in item.effect.states}
+    return {s: unit_of(unit, item.effect, item.target, device) for s, unit in units.items()}
 
 
 def _split_unit(unit: str) -> list[tuple[str, str]]:

@@ -18,7 +18,7 @@ from fractions import Fraction
 
 from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.device import INPUT_ORDERS, Device, derivative
-from bampipe.physics.effect import EACH, PAIR, BoundEffect, Effect, bind, unit_of
+from bampipe.physics.effect import EACH, PAIR, BoundEffect, Effect, bind, state_units
 
 BASE = ("kg", "m", "s", "A", "K")
 
@@ -329,10 +329,8 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
     check = _Findings()
     item = bind(effect, target, device)
     symbols = _effect_symbols(item, device, check)
-    kind = device.coordinate(item.axes[0]).kind if item.axes else ""
-    for state in effect.states:
-        unit = unit_of(state.unit_on(kind), effect, target, device)
-        symbols[state.name] = check.unit(unit, f"states.{state.name}.unit")
+    for name, unit in state_units(item, device).items():
+        symbols[name] = check.unit(unit, f"states.{name}.unit")
     force = symbols[device.forces[0]] if device.forces else None
     wanted: dict[str, Callable[[str], Found]] = {
         "torque": {axis: torque for axis, _, torque in _axes(device)}.get,

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from bampipe.lists import join_names
+from bampipe.lists import count_noun, join_names
 from bampipe.phrases import lab as phrases
 from bampipe.report import style
 from bampipe.report.build import Report
@@ -16,7 +16,6 @@ from bampipe.report.document import Block, Callout, Document, Paragraph, Section
 from bampipe.report.wording import (
     NONE,
     choose_scale,
-    count_noun,
     format_digits,
     format_p_value,
     format_unit,

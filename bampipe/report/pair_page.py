@@ -2,11 +2,12 @@
 
 import numpy as np
 
+from bampipe.lists import count_noun
 from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Callout, Document, Figure, Section, Table, Tone
 from bampipe.report.page import render_page
 from bampipe.report.sections.diagnosis import draw_map
-from bampipe.report.wording import count_noun, format_digits, format_p_value, format_unit
+from bampipe.report.wording import format_digits, format_p_value, format_unit
 from bampipe.results.pair import PairResult
 
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 
-from bampipe.lists import join_names
+from bampipe.lists import count_noun, join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.phrases.results import STANDINGS
 from bampipe.report.document import Callout
 from bampipe.report.run_results import Results
-from bampipe.report.wording import count_noun, format_digits
+from bampipe.report.wording import format_digits
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.validate import ValidateResult
 

@@ -131,11 +131,6 @@ def name_trial_state(status: str) -> str:
     return "sound" if status == "ok" else split_name(status)
 
 
-def count_noun(number: int, noun: str) -> str:
-    """Return ``1 trial``, ``2 trials``."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
 def name_parameter(name: str) -> str:
     """Return the name of a parameter in words: ``viscous.yaw`` is "Viscous damping, yaw"."""
     first, *others = name.split(".")

@@ -58,7 +58,8 @@ def status(root: Path, pipeline: Pipeline) -> list[StepStatus]:
                 if not reason and stale:
                     reason = "an earlier stage is stale"
                 state = "stale" if reason else "current"
-            stale = stale or state != "current"
+            # A stage outside the pipeline is not run with it: what follows stays as it is.
+            stale = stale or (state != "current" and stage in pipeline.stages)
             last_run = (timing.started_at, timing.seconds) if timing else ("", None)
             found.append(StepStatus(step.name, state, reason, *last_run))
     return found

@@ -14,6 +14,7 @@ import numpy as np
 from bampipe.data import store
 from bampipe.errors import InputError
 from bampipe.files import write_json, write_text
+from bampipe.lists import count_noun
 from bampipe.physics.device import Device
 from bampipe.progress import Progress, silent
 from bampipe.results.truth import TruthResult
@@ -33,7 +34,7 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
         progress: called after each trial.
 
     Returns:
-        ``session``, ``truth`` (paths), ``effects``, ``trials`` (file names).
+        ``headline``, ``session``, ``truth`` (paths), ``effects``, ``trials`` (file names).
 
     Raises:
         InputError: an effect, parameter or option makes no sense, or ``out`` is not empty.
@@ -77,6 +78,8 @@ def simulate_session(out: Path, config: Config, progress: Progress = silent) -> 
     )
     write_json(truth, found.model_dump(mode="json"))
     return {
+        "headline": f"{count_noun(len(trials), 'trial')}; the truth is beside {out.name}/, in"
+        f" {truth.name}",
         "session": str(out),
         "truth": str(truth),
         "effects": list(strengths),

@@ -21,6 +21,7 @@ from bampipe.estimate import butterworth, kalman_smoother
 from bampipe.estimate.differentiation import UniformGrid, uniform_grid
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.white_noise import white_noise_sd
+from bampipe.lists import count_noun
 from bampipe.phrases.results import describe_dead_stretch, list_setup_faults
 from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
@@ -213,9 +214,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         skipped=written.skipped,
         disturbances=disturbances,
         force_offsets=offsets,
-        headline=f"{kinematics.method}, {len(written.interpolated)} trials; bandwidth "
-        f"{_list_hz({axis: one.bandwidth_hz for axis, one in filters.items()})}; residuals compared"
-        f" below {_list_hz({axis: one.cutoff_hz for axis, one in bands.items()})}",
+        headline=f"{kinematics.method}, {count_noun(len(written.interpolated), 'trial')}; "
+        f"bandwidth {_list_hz({axis: one.bandwidth_hz for axis, one in filters.items()})};"
+        " residuals compared below "
+        + _list_hz({axis: one.cutoff_hz for axis, one in bands.items()}),
     )
     progress(0.97, "the set-up")
     setup = _inspect(system, path, session, names, of_kind - held_out, bands, disturbances)

@@ -24,6 +24,7 @@ from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.declarations.session_device import placeholders, session_device
 from bampipe.errors import InputError
 from bampipe.files import digest_content, toml_text
+from bampipe.lists import count_noun
 from bampipe.phrases import results as phrases
 from bampipe.physics.device import Device
 from bampipe.progress import Progress
@@ -260,21 +261,15 @@ def _description(
 def _summary(session: Session, rows: list[dict[str, Any]]) -> dict[str, object]:
     names = ("ok", "repaired", "set_aside")
     counts = {name: sum(row["status"] == name for row in rows) for name in names}
+    aside = [row for row in rows if row["status"] == "set_aside"]
+    mended = [row for row in rows if row["repairs"]]
     parts = [f"{counts['ok']} sound"]
     parts += [f"{counts['repaired']} repaired"] if counts["repaired"] else []
     parts += [f"{counts['set_aside']} set aside"] if counts["set_aside"] else []
     return {
         "session_id": session.session_id,
         "trials": counts,
-        "headline": f"{len(rows)} trials: {', '.join(parts)}",
-        "set_aside": [
-            {"trial_id": row["trial_id"], "reason": row["reason"]}
-            for row in rows
-            if row["status"] == "set_aside"
-        ],
-        "repaired": [
-            {"trial_id": row["trial_id"], "repairs": row["repairs"]}
-            for row in rows
-            if row["repairs"]
-        ],
+        "headline": f"{count_noun(len(rows), 'trial')}: {', '.join(parts)}",
+        "set_aside": [{key: row[key] for key in ("trial_id", "reason")} for row in aside],
+        "repaired": [{key: row[key] for key in ("trial_id", "repairs")} for row in mended],
     }

@@ -102,6 +102,12 @@ def test_a_verdict_names_what_is_probable(verdict: str, sets: Sets, start: str) 
     assert say(verdict, sets).startswith(start)
 
 
+def test_an_effect_that_may_be_chance_is_not_said_to_be_missing() -> None:
+    unsure = {A: 0.66, B: 0.6, C: 0.4}
+    said = say("undecided", {(A, B): 0.6, (A, C): 0.4}, probabilities=unsure)
+    assert "a:joint (probability 0.66) may be missing, and these trials do not decide" in said
+
+
 def test_what_is_left_beside_named_effects_is_said_with_its_shape() -> None:
     for verdict, sets in (("missing", {(A,): 1.0}), ("undecided", {(A,): 0.6, (B,): 0.4})):
         said = say(verdict, sets, remains=True, unknown=0.957)

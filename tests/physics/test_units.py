@@ -9,6 +9,8 @@ from small_arm import ARM
 
 from bampipe.errors import InputError
 from bampipe.physics import expression, registry
+from bampipe.physics.effect import state_units
+from bampipe.physics.model import Model
 from bampipe.physics.units import PURE, check_device, check_effect, dimension, parse_unit
 
 BAM = registry.device("bam")
@@ -192,6 +194,13 @@ def test_a_finding_may_depend_on_the_kind_of_axis():
     assert wrong_effect("stribeck", "extension", torque=torque) == [
         "torque: sin() takes a pure number, and 'q' is in m"
     ]
+
+
+def test_states_have_the_unit_of_their_axis():
+    names = ["flexible_load:carriage", "stribeck:carriage"]
+    flexible, stribeck = Model(registry.device("slider"), names).effects
+    assert state_units(flexible, registry.device("slider")) == {"stretch": "m", "rate": "m/s"}
+    assert state_units(stribeck, registry.device("slider")) == {}
 
 
 def test_exponents_stay_exact():

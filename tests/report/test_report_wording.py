@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bampipe.lists import join_names
+from bampipe.lists import count_noun, join_names
 from bampipe.report import wording
 from bampipe.report.document import split_spans
 
@@ -86,8 +86,8 @@ def test_names_in_words() -> None:
     assert wording.name_parameter("gravity_compensator_lag.time") == "Gravity compensator lag, time"
     assert join_names(["a", "b", "c"]) == "a, b and c"
     assert join_names(["a"]) == "a"
-    assert wording.count_noun(1, "trial") == "1 trial"
-    assert wording.count_noun(2, "trial") == "2 trials"
+    assert count_noun(1, "trial") == "1 trial"
+    assert count_noun(2, "trial") == "2 trials"
     assert wording.format_p_value(0.0002) == "< 0.001"
     assert wording.format_percent(0.812) == "81 %"
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bampipe.lists import join_names
+from bampipe.lists import count_noun, join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.report import style
 from bampipe.report.document import (
@@ -21,7 +21,6 @@ from bampipe.report.document import (
 from bampipe.report.run_results import Results
 from bampipe.report.sections import next_trial
 from bampipe.report.wording import (
-    count_noun,
     format_decimals,
     format_digits,
     format_p_value,

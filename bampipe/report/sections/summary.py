@@ -3,14 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
-from bampipe.lists import join_names
+from bampipe.lists import count_noun, join_names
 from bampipe.phrases.results import METHODS
 from bampipe.report import verdicts
 from bampipe.report.document import Block, Paragraph, Section, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
-    count_noun,
     format_decimals,
     format_digits,
     format_scaled,
