@@ -226,6 +226,26 @@ def test_tdms_refused(tdms):
     assert "this is a TDMS file, not *.csv" in refused(tdms.with_suffix(".csv"), ("t",))
 
 
+# Workbooks
+
+
+def test_the_first_sheet_with_rows_of_a_workbook_is_read(tmp_path):
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.append(["notes of the day"])
+    sheet = book.create_sheet("log")
+    sheet.append(["Time [s]", "Force [N]"])
+    for row in zip(T, F, strict=True):
+        sheet.append([float(x) for x in row])
+    path = tmp_path / "a.xlsx"
+    book.save(path)
+    trial = read_trial(path, ("Time [s]", "Force [N]"))
+    np.testing.assert_array_equal(trial.columns["Time [s]"], T)
+    np.testing.assert_array_equal(trial.columns["Force [N]"], F)
+    path.write_bytes(path.read_bytes()[:900])
+    assert "not a sound workbook of Excel" in refused(path, ("Time [s]",))
+
+
 # ROS and MCAP
 
 
@@ -458,12 +478,13 @@ def test_an_mcap_file_whose_summary_lies(tmp_path, lie, said):
         (".tdms", "nptdms", "tdms"),
         (".bag", "rosbags.highlevel", "ros"),
         (".mcap", "mcap.reader", "ros"),
+        (".xlsx", "openpyxl", "xlsx"),
     ],
 )
 def test_a_missing_extra_names_the_command(tmp_path, monkeypatch, ending, module, extra):
     monkeypatch.setitem(sys.modules, module, None)
     path = tmp_path / f"a{ending}"
     path.write_bytes(b"something")
-    line = refused(path, ("t",) if ending == ".tdms" else ("/a:b",))
+    line = refused(path, ("/a:b",) if extra == "ros" else ("t",))
     package = module.partition(".")[0]
     assert f"needs {package}, which is not installed; pip install 'bampipe[{extra}]'" in line

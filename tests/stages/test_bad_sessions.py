@@ -303,7 +303,7 @@ ASIDE: dict[str, tuple[Damage, str]] = {
             put("trials.0.file", "trials/t01.xlsx")(made)
             or file(b"PK\x03\x04" + bytes(99), "trials/t01.xlsx")(made)
         ),
-        "unsupported file extension '.xlsx'",
+        "not a sound workbook of Excel; save it again, or export the sheet as CSV",
     ),
     "file missing": (lambda made: lambda root: (root / T01).unlink(), "no such file 'trials/t01"),
     "a folder in its place": (
