@@ -23,6 +23,8 @@ _MOSTLY = 0.95
 """Share of rows in which a column that is of the same rows has a reading."""
 _LOST = 5.0
 """Of the usual step between readings: a longer one has lost some."""
+_FAR_OFF = 10.0
+"""Of the range of all other readings: how far off one that recurs is no reading."""
 _PAGE = 3.0
 """Steps that a clock goes on by where the header stands again on a new page."""
 _BACK = 0.02
@@ -45,8 +47,8 @@ def read_recording(
         InputError: as :func:`read_trial`; files that do not belong together, or a file that holds
             several recordings where ``entry`` does not say which.
     """
-    places = {column: _place(column, entry) for column in columns}
-    own_time = _place(clock.column, entry)[1]
+    places = {column: _place(entry.columns.get(column, column), entry) for column in columns}
+    own_time = _place(entry.columns.get(clock.column, clock.column), entry)[1]
 
     def read(name: str, file: str, time: str, unit: str) -> RawTrial:
         wanted = dict.fromkeys([time, *(bare for part, bare in places.values() if part == name)])
@@ -85,7 +87,24 @@ def read_recording(
             ticks = SECONDS.get(clock.unit, 1.0), SECONDS.get(unit, 1.0)
             raw = _by_time(raw, other, entry.file, part, kept, (clock.column, time), ticks)
     raw = replace(raw, columns={column: raw.columns[column] for column in columns})
-    return _at_one_rate(_filled(_one_of(raw, entry, clock), clock), clock)
+    return _at_one_rate(_without_codes(_filled(_one_of(raw, entry, clock), clock), clock), clock)
+
+
+def _without_codes(raw: RawTrial, clock: Clock) -> RawTrial:
+    """The readings without a number that stands for none, such as -9999: the same one, far off."""
+    columns, notes = dict(raw.columns), list(raw.notes)
+    for name in columns.keys() - {clock.column, clock.nanoseconds}:
+        for side in (-1.0, 1.0):
+            values = columns[name]
+            code = side * float(np.max(side * values, initial=-np.inf, where=np.isfinite(values)))
+            others = values[np.isfinite(values) & (values != code)]
+            count = int(np.sum(values == code))
+            if count < 2 or len(others) < max(_LEAST, count) or np.ptp(others) == 0.0:
+                continue
+            if np.min(np.abs(others - code)) > _FAR_OFF * np.ptp(others):
+                columns[name] = np.where(values == code, np.nan, values)
+                notes.append(f"column '{name}': {count} readings of {code:g} are taken for none")
+    return replace(raw, columns=columns, notes=tuple(notes))
 
 
 def _filled(raw: RawTrial, clock: Clock) -> RawTrial:

@@ -528,10 +528,11 @@ def _by_looks(
             where=str(folder),
             remedy=f"name them in order: bampipe init FOLDER --names time,position,...; {listed}",
         )
-    said = ", ".join(f"{name} a {role}" for name, role in roles.items())
-    guessed = f"by what columns without names look like, {said}".replace(
-        "a force", "what drives the motion"
-    ).replace("a acc", "an acc")
+    named: dict[str, list[str]] = {}
+    for name, role in roles.items():
+        named.setdefault("what drives the motion" if role == "force" else role, []).append(name)
+    said = "; ".join(f"{role}: {join_names(names, 4)}" for role, names in named.items())
+    guessed = f"columns without names by what they look like: {said}"
     return tuple(
         replace(c, role=roles[c.name], by_looks=True) if c.name in roles else c for c in columns
     ), [guessed]

@@ -42,6 +42,8 @@ def describe_hum(hum: MainsHum) -> str:
 
 def describe_dead_stretch(stretch: DeadStretch) -> str:
     """Return why the readings of a column are not used."""
+    if stretch.missing:
+        return f"'{stretch.column}' has no readings"
     if stretch.rail is not None:
         return f"'{stretch.column}' reads the end of its range"
     return f"'{stretch.column}' reads one and the same value while the machine moves"

@@ -73,12 +73,13 @@ class MainsHum(Record):
 
 
 class DeadStretch(Record):
-    """A stretch in which a sensor reads one value in motion, or the end of its range."""
+    """A stretch in which a sensor reads nothing, one value in motion, or the end of its range."""
 
     column: str
     start_s: Size = Field(description="Since the start of the trial")
     end_s: Size
     rail: float | None = Field(default=None, description="That value, at the end of the range")
+    missing: bool = Field(default=False, description="Whether it has no readings there")
 
 
 class IngestResult(Result):

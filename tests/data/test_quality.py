@@ -166,10 +166,24 @@ def test_an_unsigned_register_is_read_as_signed():
 def test_limits_are_heeded():
     table = columns()
     table["force_x"][100:107] = np.nan
-    with pytest.raises(InputError, match=r"a\.csv, row 102, column 'force_x': 7 samples in a row"):
-        cleaned(table)
+    with pytest.raises(InputError, match=r"b\.csv, row 102, column 'force_x': 7 samples in a row"):
+        cleaned(table, kind=1)  # a locked trial is used as a whole
+    assert cleaned(table).dead[0].missing
     lenient = cleaned(table, limits=CleaningLimits(nan_run=7))
     assert "7 missing samples interpolated" in lenient.repairs[0]
+
+
+def test_what_a_long_gap_spans_is_left_out_and_most_of_a_trial_is_not():
+    table = columns()
+    table["turn"][400:500] = np.nan
+    table["force_x"][500:520] = np.nan
+    trial = cleaned(table)
+    assert [(one.column, one.missing) for one in trial.dead] == [("turn", True), ("force_x", True)]
+    assert trial.dead[0].start_s < trial.t[400] - 0.05 and trial.dead[0].end_s > trial.t[499] + 0.05
+    assert np.isfinite(trial.columns["q_turn"]).all()
+    table["turn"][400:800] = np.nan
+    with pytest.raises(InputError, match="400 samples in a row are missing.*start_s and end_s"):
+        cleaned(table)
 
 
 def test_interpolation_follows_the_time_stamps():

@@ -350,7 +350,7 @@ def test_a_rate_that_nobody_knows_is_refused_until_it_is_given(tmp_path):
     write_stage_log(tmp_path / "a", "pos_mm", "load_cell_N")
     _, proposal = proposed(tmp_path / "a")
     (ask,) = proposal.fill_in
-    assert ask.startswith("sample_rate_hz, rows a second: ")
+    assert ask.startswith("sample_rate_hz, rows a second. To find it: ")
     with pytest.raises(InputError, match=r'sample_rate_hz: found "\?"'):
         read_session(tmp_path / "a")
 
@@ -368,7 +368,7 @@ def test_a_force_that_is_not_there_is_asked_for_where_it_is_read(tmp_path, comma
     table = {"time [s]": t, "position [rad]": np.sin(t), "current [A]": np.full_like(t, 1.25)}
     write_table(tmp_path / "a.csv", table, "%.6f")
     session, proposal = proposed(tmp_path)
-    assert proposal.fill_in == ["the column of force_drive in N.m: " + COLUMNS]
+    assert proposal.fill_in == ["the column of force_drive in N.m. To find it: " + COLUMNS]
     assert session["force"] == {"columns": ["?"], "components": ["drive"], "unit": "N.m"}
     code, _, err = command("ingest", tmp_path)
     assert code == 2 and "fill in the name of the column" in err
@@ -534,7 +534,7 @@ def test_a_torque_in_per_cent_asks_for_its_gain(tmp_path):
     session, proposal = proposed(tmp_path)
     assert session["force"]["unit"] == "V" and session["force"]["calibration_n_per_v"] == [[0.0]]
     (ask,) = proposal.fill_in
-    assert ask.startswith('calibration_n_per_v, N.m for one of "torque_percent": ')
+    assert ask.startswith('calibration_n_per_v, N.m for one of "torque_percent". To find')
 
 
 def test_names_can_be_given_to_a_log_without_a_header(tmp_path, command: Command):

@@ -299,7 +299,7 @@ def test_a_drive_that_was_not_logged_is_asked_for_and_the_other_stays_where_it_i
     table = pd.read_csv(tmp_path / "log.csv").drop(columns="tau1")
     table.rename(columns={"tau2": names[1]}).to_csv(tmp_path / "log.csv", index=False)
     proposal = proposed(tmp_path)
-    assert proposal.fill_in == ["the column of torque_shoulder in N.m: " + COLUMNS]
+    assert proposal.fill_in == ["the column of torque_shoulder in N.m. To find it: " + COLUMNS]
     assert f'torque_elbow = {{ column = "{names[1]}"' in proposal.session
     with pytest.raises(InputError, match="fill in the name of the column") as caught:
         read_session(tmp_path)

@@ -4,12 +4,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bampipe.data.quality.table import TrialTable, counted, longest_run
+from bampipe.data.quality.table import TrialTable, counted, find_runs, longest_run
 from bampipe.data.session import SECONDS, Channel, Encoder, Session
 from bampipe.data.session.channels import LARGEST_CONDITION
 from bampipe.data.units import unit
 from bampipe.errors import InputError
+from bampipe.results.ingest import DeadStretch
 
+_MOST_MISSING, _AROUND_S = 0.2, 0.1
+"""Share of the trial that long gaps may leave out, and s on either side that a filter smears."""
 LARGEST_VALUE = 1e6
 """No angle, force, torque or other input is as large as this in SI units."""
 
@@ -35,7 +38,7 @@ def refuse_other_units(table: TrialTable, stated: Mapping[str, str]) -> None:
 
 
 def fill_missing(table: TrialTable) -> None:
-    """Interpolate short runs of missing samples; drop them at the ends; refuse long ones."""
+    """Interpolate missing samples, drop them at the ends; what a long run spans is left out."""
     channels = [name for name in table.columns if name != table.clock]
     some = np.zeros(len(table), dtype=bool)
     for name in channels:
@@ -62,6 +65,17 @@ def fill_missing(table: TrialTable) -> None:
         if missing.any():
             known = ~missing
             values[missing] = np.interp(table.t[missing], table.t[known], values[known])
+            for start, stop in zip(*find_runs(missing), strict=True):
+                if stop - start > table.limits.nan_run:
+                    first, last = table.t[[start, stop - 1]] - table.t[0]
+                    table.dead.append(
+                        DeadStretch(
+                            column=name,
+                            start_s=max(0.0, float(first) - _AROUND_S),
+                            end_s=float(last) + _AROUND_S,
+                            missing=True,
+                        )
+                    )
             table.repairs.append(
                 f"column '{name}': {counted(int(missing.sum()), 'missing sample')} interpolated"
             )
@@ -79,18 +93,26 @@ def _refuse_missing(table: TrialTable, name: str, missing: np.ndarray) -> None:
     if count == 0:
         return
     start, length = longest_run(missing)
-    if length > table.limits.nan_run:
+    long = sum(
+        n for a, b in zip(*find_runs(missing), strict=True) if (n := b - a) > table.limits.nan_run
+    )
+    whole = table.entry.kind == "locked" or name in (
+        e.column for e in table.session.encoders if e.integrate
+    )
+    if length > table.limits.nan_run and (whole or long > _MOST_MISSING * len(missing)):
         raise table.fault(
             f"{length} samples in a row are missing, more than {table.limits.nan_run}",
             column=name,
             at=start,
+            remedy="take a stretch without by start_s and end_s of its [[trials]] entry",
         )
-    if count > max(table.limits.nan_share * len(missing), table.limits.nan_run):
+    if count - long > max(table.limits.nan_share * len(missing), table.limits.nan_run):
         raise table.fault(
             f"{count} of {len(missing)} samples are missing,"
             f" more than {table.limits.nan_share:.0%}",
             column=name,
             at=int(np.argmax(missing)),
+            remedy="find out why; to have them interpolated: --set ingest.nan_share=0.1",
         )
 
 

@@ -134,7 +134,8 @@ def interpolate_jumps(table: TrialTable, encoder: Encoder) -> None:
             f"({in_times(len(jumps))})",
             column=encoder.column,
             at=at + 1,
-            remedy="counts lost, or the counter was reset",
+            remedy="counts lost, or the counter was reset: take one side of it, by start_s or"
+            f" end_s = {table.t[at + 1]:.4g} in [[trials]]",
         )
     take_out(table, encoder.column, wild)
     fill_missing(table)

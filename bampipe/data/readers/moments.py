@@ -115,10 +115,11 @@ def seconds(moments: np.ndarray) -> np.ndarray:
     known = np.flatnonzero(~missing)
     if len(known) == 0:
         return np.full(len(moments), np.nan)
-    if moments[known].min() >= 0 and moments[known].max() < _DAY:  # times of day
-        days = np.zeros(len(moments), dtype=np.int64)
-        days[known[1:]] = np.cumsum(np.diff(moments[known]) < -0.9 * _DAY)
-        moments = moments + days * _DAY
+    if moments[known].min() >= 0 and moments[known].max() < _DAY:  # times of day, or of an hour
+        period = _DAY if moments[known].max() >= _DAY // 24 else _DAY // 24
+        passed = np.zeros(len(moments), dtype=np.int64)
+        passed[known[1:]] = np.cumsum(np.diff(moments[known]) < -0.9 * period)
+        moments = moments + passed * period
     # Whole numbers first: a double has no room for 1 us since 1970.
     since = (moments - moments[known[0]]) / NANOSECONDS
     return np.where(missing, np.nan, since)

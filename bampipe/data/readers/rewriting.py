@@ -28,6 +28,7 @@ _LINE_PROTOCOL = re.compile(r"[^\s,=]+(?:,\S+)? (\w[^\s=]*=\S+) (\d{10,19})\s*")
 _ELEMENT = re.compile(r"<(\w+)((?:\s+\w+=\"[^\"]*\")+)\s*/?>|<(\w+)>([^<>]*)</")
 _WITH_UNIT = re.compile(rf"({_NUMBER})[ \u00a0]?([^\W\d_]\S*|[%°]\S*)")
 _FORTRAN = re.compile(r"(\d\.?\d*)[Dd]([-+]\d)")
+_HEX = re.compile(r"(?i)(?<![\w.])0x[0-9a-f]{1,8}(?!\w)")
 _GROUPS = ((",", r"\."), (".", ","), (" ", "[.,]"), ("'", "[.,]"), ("’", "[.,]"))
 """Signs between thousands, and what may stand before the decimals then."""
 _CAN = "frames of a CAN bus, whose bytes mean nothing without their data base (DBC)"
@@ -94,6 +95,10 @@ def find_form(head: str, name: str) -> Form | None:
         return Form("quotes around whole lines left out", lambda line: line.strip().strip('"'))
     if _are(_STAMPED, lines):
         return _stamped(lines)
+    if _are(_HEX, lines):
+        return Form(
+            "hexadecimal numbers", lambda line: _HEX.sub(lambda n: str(int(n[0], 16)), line)
+        )
     if _are(_FORTRAN, lines):
         return Form("exponents of Fortran", lambda line: _FORTRAN.sub(r"\1E\2", line))
     for find in (_protocol_fields, _elements, _named_numbers):

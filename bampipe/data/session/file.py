@@ -156,6 +156,11 @@ class TrialEntry(NamedDeclaration):
         description="Which recording, where the file holds several: each begins with the header, or"
         " where time starts again",
     )
+    columns: dict[str, str] = Field(
+        default={},
+        description="Where several trials stand side by side in a file: its columns, by the names"
+        " that the tables give for the first of them",
+    )
     kind: Literal["free", "locked", "viscous"] = Field(
         description="free: moved at will; locked: a brake holds one axis; viscous: in a field"
     )
@@ -190,6 +195,7 @@ class TrialEntry(NamedDeclaration):
     def overlaps(self, other: TrialEntry) -> bool:
         """Whether the stretches of two trials of one file have samples in common."""
         apart = self.recording != other.recording and None not in (self.recording, other.recording)
+        apart |= self.columns != other.columns
         return not apart and self.start_s < other.end_s and other.start_s < self.end_s
 
     def cross_faults(self) -> Iterator[InputError]:

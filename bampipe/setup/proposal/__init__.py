@@ -32,6 +32,7 @@ from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import Notes, quoted
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
 from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
+from bampipe.setup.proposal.side_by_side import find_trials
 from bampipe.setup.proposal.tables import clock_of, encoders_table, input_tables
 
 SESSION = "session.toml"
@@ -90,11 +91,6 @@ def propose(
     match = Matcher(found, clock.t, set(clock.columns), registers)
     if chosen is None:
         chosen = new_device(folder, match, notes)
-        positions = len([c for c in found.of("position") if not c.is_constant])
-        if positions > 1:
-            notes.check.append(
-                f"{positions} columns are positions: of a robot? put its URDF beside the logs"
-            )
     elif chosen.device.robot is not None:
         columns = find_robot_columns(
             folder, chosen.device, chosen.device.robot, found, clock.t, notes
@@ -106,7 +102,9 @@ def propose(
         _check_robot(chosen, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
-    left = [column.name for column in found.columns if column.name not in match.used]
+    beside = _beside(chosen.device, axes, match, notes)
+    aside = {name for trial in beside for name in trial.values()} | match.used
+    left = [column.name for column in found.columns if column.name not in aside]
     lines = [
         *_head(folder, chosen.name, clock.rate),
         *(["[csv]", f"names = [{', '.join(map(quoted, names))}]", ""] if names else []),
@@ -114,7 +112,7 @@ def propose(
         *encoders,
         *inputs,
         *([f"# not used: {', '.join(left)}", ""] if left else []),
-        *_trials_tables(chosen.device, axes, match, notes),
+        *_trials_tables(chosen.device, axes, match, notes, beside),
     ]
     return ProposedSession(
         session="\n".join(lines) + "\n",
@@ -225,22 +223,54 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
         )
 
 
-def _trials_tables(
+def _beside(
     device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes
+) -> list[dict[str, str]]:
+    """Further trials in the same file, their columns by those of the first; and that in words."""
+    rivals = match.rivals
+    if len(device.coordinates) > 1 or not axes or len(rivals) < 2:
+        return []
+    axis, column = next(iter(axes.items()))
+    trials = find_trials(match, column, device.coordinate(axis).unit)
+    if trials:
+        names = join_names([column.name, *(trial[column.name] for trial in trials)], 4)
+        notes.check.append(
+            f"{names} are of one axis in {len(trials) + 1} trials, side by side in a"
+            " file: the same mass and friction explain all of them"
+        )
+        return trials
+    notes.check.append(f"of {join_names(rivals, 6)}, {column.name} is the measured position")
+    notes.check.append(
+        f"{len(rivals)} columns are positions: of a robot? put its URDF beside the"
+        " logs; of other trials? say so by columns in [[trials]]"
+    )
+    return []
+
+
+def _trials_tables(
+    device: Device,
+    axes: Mapping[str, SurveyedColumn],
+    match: Matcher,
+    notes: Notes,
+    beside: Sequence[Mapping[str, str]],
 ) -> list[str]:
     """Propose the trials and their kinds; a long single record is cut at rests of its axis."""
     trials = match.found.trials
-    cuts, where = _cuts(match) if len(trials) == 1 else ([], "")
-    if len(trials) == 1 and axes and not cuts:
+    alone = len(trials) == 1 and not beside
+    cuts, where = _cuts(match) if alone else ([], "")
+    if alone and axes and not cuts:
         cuts, where = guesses.stretches(match.t, next(iter(axes.values())).values), "at rests"
     lines = []
     if cuts:
         note = notes.guess(f"one record, cut {where}, so that each part can be held out")
         lines.append(note.strip())
     for trial in trials:
-        for start_s, end_s in pairwise([None, *cuts, None]):
+        spans = [(*span, dict[str, str]()) for span in pairwise([None, *cuts, None])]
+        for start_s, end_s, named in [*spans, *((None, None, names) for names in beside)]:
             lines += ["[[trials]]", f"file = {quoted(trial.file)}"]
             lines += _trial_kind(trial.file, device, notes)
+            pairs = ", ".join(f"{quoted(a)} = {quoted(b)}" for a, b in sorted(named.items()))
+            lines += [f"columns = {{ {pairs} }}"] if named else []
             lines += [f"recording = {trial.recording}"] if trial.recording else []
             lines += [f"start_s = {start_s}"] if start_s is not None else []
             lines += [f"end_s = {end_s}"] if end_s is not None else []

@@ -22,7 +22,15 @@ from bampipe.setup.hypotheses import MOST_TRAVEL
 from bampipe.setup.proposal.joints import chain_logged
 from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import Notes
-from bampipe.setup.proposal.positions import SLIDING, in_counts, position_in_si, scale_to, slides
+from bampipe.setup.proposal.positions import (
+    SLIDING,
+    in_counts,
+    is_force,
+    needs_gain,
+    position_in_si,
+    scale_to,
+    slides,
+)
 from bampipe.setup.proposal.starter import Drive, starter_device, weight_of
 
 DEVICE = "device.toml"
@@ -222,7 +230,14 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
             f"{driver.name} falls where the motion asks for more: it is taken for the reaction, its"
             " sign turned"
         )
-    drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
+    raw = driver is not None and (
+        role != "force"
+        or driver.si == "V"
+        or needs_gain(driver)
+        or (not linear and is_force(driver))
+    )
+    named = driver.name if driver is not None else ""
+    drive = Drive(role, named, supply is not None, coil, scaled=not raw)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
     weight, on_gravity = weight_of(position, fit, linear, found)
     starter = starter_device(position.name, linear, drive, fit, weight, width)

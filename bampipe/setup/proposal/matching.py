@@ -8,7 +8,6 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
-from bampipe.lists import join_names
 from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import travelled
 from bampipe.setup.proposal.robot import RobotColumns
@@ -34,6 +33,7 @@ class Matcher:
         turning: what the readings of a position are worth, by the weight on it, by name of column.
         given: columns that are known, by name of axis or input.
         reacting: the column of a drive that has the sign of the reaction, "" where none has.
+        rivals: names of columns that may be the position, where there are several.
     """
 
     found: Survey
@@ -44,6 +44,7 @@ class Matcher:
     turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
     given: Mapping[str, SurveyedColumn] = field(default_factory=dict)
     reacting: str = ""
+    rivals: list[str] = field(default_factory=list)
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""
@@ -79,8 +80,7 @@ class Matcher:
         for other in found[1:]:
             alike = abs(float(np.corrcoef(best.values, other.values)[0, 1])) > 0.9
             best = other if alike and guesses.follows(best.values, other.values) else best
-        listed = join_names((c.name for c in found), _MANY)
-        notes.guess(f"of {listed}, {best.name} is the measured position")
+        self.rivals = [c.name for c in found]
         return best
 
     def inputs(

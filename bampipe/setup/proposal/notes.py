@@ -6,8 +6,13 @@ from bampipe.lists import join_names
 
 UNKNOWN = "?"
 """Stands for a column that could not be found."""
-COLUMNS = "see the headers of the logs, or who wrote the logger"
+COLUMNS = "see the headers of the logs, or ask who wrote the logger"
 """Where the name of a column is looked up."""
+
+_SPELLED = {
+    "in": "inches", "m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees",
+    "rev": "turns", "s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds",
+}  # fmt: skip
 
 
 @dataclass
@@ -28,7 +33,8 @@ class Notes:
     def questions(self) -> list[str]:
         """What a person must fill in, each with where to look it up."""
         return self.fill_in + [
-            f"{_column_of(names, *kind)}: {COLUMNS}" for kind, names in self.columns.items()
+            f"{_column_of(names, *kind)}. To find it: {COLUMNS}"
+            for kind, names in self.columns.items()
         ]
 
     def guess(self, text: str) -> str:
@@ -44,7 +50,7 @@ class Notes:
 
     def ask(self, text: str, where: str) -> str:
         """The comment that marks what a person must fill in, and where to look it up."""
-        self.fill_in.append(f"{text}: {where}")
+        self.fill_in.append(f"{text}. To find it: {where}")
         return f"  # fill in: {text}"
 
 
@@ -52,6 +58,11 @@ def _column_of(names: list[str], what: str, unit: str) -> str:
     s = "s" if len(names) > 1 else ""
     whose = join_names(names, len(names))
     return f"the column{s} of {what and f'the {what}{s} of '}{whose}{unit and f' in {unit}'}"
+
+
+def say_unit(name: str) -> str:
+    """The name of a unit in a sentence."""
+    return _SPELLED.get(name, name)
 
 
 def quoted(text: str) -> str:

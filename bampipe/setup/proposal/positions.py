@@ -13,7 +13,10 @@ from bampipe.data.units import unit
 from bampipe.setup.proposal.notes import Notes
 
 SLIDING = frozenset(["stroke", "displacement", "disp", "dist", "weg", "hub", "carriage", "piston"])
-FEWEST_COUNTS = 100
+_FEWEST_COUNTS = 100
+_SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])
+_FORCES = frozenset(["force", "forc", "kraft", "loadcell", "fx", "fy", "fz"])
+_TORQUES = frozenset(["torque", "tau", "trq", "moment", "effort", "drehmoment"])
 _MOST_WILD = 0.01
 """Share of the readings that are wild or missing, the most."""
 
@@ -25,7 +28,22 @@ def is_velocity(column: SurveyedColumn) -> bool:
 
 def in_counts(column: SurveyedColumn) -> bool:
     """Whether a position is in whole counts of no known unit."""
-    return column.si is None and column.is_integer and bool(np.ptp(column.values) > FEWEST_COUNTS)
+    return column.si is None and column.is_integer and bool(np.ptp(column.values) > _FEWEST_COUNTS)
+
+
+def is_force(column: SurveyedColumn) -> bool:
+    """Whether the column of a drive is a force rather than a torque, by its unit or its name."""
+    said = set(words(column.name))
+    if column.si is not None:
+        return column.si in ("N", "kg")
+    return bool(said & _FORCES) and not said & _TORQUES
+
+
+def needs_gain(column: SurveyedColumn) -> bool:
+    """Whether the column of a force is a share or a count, by its name or by whole numbers."""
+    counts = column.is_integer and float(np.ptp(column.values)) > _FEWEST_COUNTS
+    shares = not _SHARES.isdisjoint(words(column.name))
+    return column.si == "" or (not column.unit and (counts or shares))
 
 
 def slides(column: SurveyedColumn, found: Survey) -> bool:

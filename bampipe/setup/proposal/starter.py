@@ -72,12 +72,14 @@ class Drive:
         column: that was recorded of it, "" where none was.
         supply: whether the supply voltage that a duty cycle is a share of is recorded too.
         coil: whether, beside a force, the current of a coil that changes the friction is.
+        scaled: whether what is recorded is a force or torque at the axis, no gain or lever missing.
     """
 
     role: str
     column: str
     supply: bool = False
     coil: bool = False
+    scaled: bool = True
 
 
 @dataclass(frozen=True)
@@ -189,19 +191,24 @@ force_unit = "{unit}"
     if constants:
         listed = " and ".join(constants)
         text += f"# Guessed with {listed} as above: scale what follows with what you put in.\n"
-    viscous, coulomb = (", ".join(_prior(size)) for size in (found.viscous, found.coulomb))
+    wide = 5.0 if drive.scaled else 100.0  # nobody knows yet what one of it is worth
+    viscous, coulomb = (", ".join(_prior(size, wide)) for size in (found.viscous, found.coulomb))
     text += f'''[friction.{axis}]
 viscous = {{ unit = "{rate}", {viscous}, lower = 0.0 }}  # guess
 coulomb = {{ unit = "{torque}", {coulomb}, lower = 0.0 }}  # guess
 '''
-    inertia = (*_prior(found.inertia), f"lower = {_least_inertia(linear, drive.coil, found):g}")
-    offset = ("prior = 0.0", f"sd = {_rounded(3.0 * abs(found.coulomb) or 20.0):g}")
+    inertia = (
+        *_prior(found.inertia, wide),
+        f"lower = {_least_inertia(linear, drive.coil, found):g}",
+    )
+    spread = 0.6 * wide * abs(found.coulomb) or 20.0
+    offset = ("prior = 0.0", f"sd = {_rounded(spread):g}")
     text += _parameter("inertia", mass, inertia, "all that moves, reduced to this axis")
     text += _parameter("offset", torque, offset, "needed to hold the axis where nothing else acts")
     if weight is not None:
         meaning = "mass times gravity times distance of the centre of gravity"
         for name, size in zip(("moment", "moment_across"), weight.moments, strict=True):
-            guessed = (f"prior = {_rounded(size):g}", f"sd = {_rounded(weight.sd):g}")
+            guessed = (f"prior = {_rounded(size):g}", f"sd = {_rounded(0.2 * wide * weight.sd):g}")
             text += _parameter(name, "N.m", guessed, meaning)
     if drive.coil:
         for name, si, size in (
@@ -209,7 +216,7 @@ coulomb = {{ unit = "{torque}", {coulomb}, lower = 0.0 }}  # guess
             ("viscous_per_ampere", rate, found.viscous),
         ):
             meaning = "what the coil adds, in proportion to its current"
-            text += _parameter(name, f"{si}/A", _prior(size), meaning, "lower = 0.0\n")
+            text += _parameter(name, f"{si}/A", _prior(size, wide), meaning, "lower = 0.0\n")
     return Starter(text, axis, source, tuple(constants))
 
 
@@ -271,11 +278,11 @@ def _parameter(
     return f'\n[parameters.{name}]\nunit = "{unit}"\n{marked}description = "{meaning}"\n{known}'
 
 
-def _prior(size: float) -> tuple[str, str]:
-    """A prior of the size found and its spread, five times that; wide where nothing was found."""
+def _prior(size: float, wide: float) -> tuple[str, str]:
+    """A prior of the size found and its spread, ``wide`` times that; 100 of 1 of nothing found."""
     if size <= 0.0:
         return "prior = 1.0", "sd = 100.0"
-    return f"prior = {_rounded(size):g}", f"sd = {_rounded(5.0 * size):g}"
+    return f"prior = {_rounded(size):g}", f"sd = {_rounded(wide * size):g}"
 
 
 def _rounded(value: float) -> float:

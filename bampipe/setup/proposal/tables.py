@@ -16,8 +16,8 @@ from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.setup.proposal.device import ChosenDevice
 from bampipe.setup.proposal.matching import Match, Matcher
-from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted
-from bampipe.setup.proposal.positions import FEWEST_COUNTS, in_counts, is_velocity
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted, say_unit
+from bampipe.setup.proposal.positions import in_counts, is_force, is_velocity, needs_gain
 
 _RECORDED = ":@time"
 """End of the name under which the reader of ROS bags has the time of recording."""
@@ -40,10 +40,7 @@ _SURE, _NEAR = 2.0, 0.025
 counts."""
 _SPEED_UNITS = ("rad/s", "deg/s", "rev/s", "rev/min", "m/s", "cm/s", "mm/s", "in/s")
 _FORCE_UNITS = ("N", "N.m", "mN", "kN", "mN.m", "N.cm", "N.mm", "kN.m", "kgf", "lbf", "kip", "V")
-_SHARES = frozenset(["percent", "pct", "raw", "counts", "adc", "permille"])
-_FORCES = frozenset(["force", "forc", "kraft", "loadcell", "fx", "fy", "fz"])
-_TORQUES = frozenset(["torque", "tau", "trq", "moment", "effort", "drehmoment"])
-_LOGGER = "who wrote the logger, or its manual"
+_LOGGER = "its manual, or ask who wrote the logger"
 _QUANTITY = {"N": "force", "N.m": "torque", "A": "current", "V": "voltage"}
 _MOST_VOLTS = 60.0
 """Of a supply: servos count theirs in tenths."""
@@ -125,7 +122,7 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
         return ProposedClock(samples, (column.name,), table, rate)
     t = stamps * SECONDS.get(kind, 1.0)
     said = kind == "datetime" or spelled(column.unit, tuple(SECONDS)) == kind
-    note = "" if said else notes.guess(f"time in {kind}, by the rate that it gives")
+    note = "" if said else notes.guess(f"time is in {say_unit(kind)}, by the rate that it gives")
     rate = _stamped_rate(guesses.sample_rate(t), notes)
     return ProposedClock(t, (column.name,), _table(named, f'unit = "{kind}"{note}'), rate)
 
@@ -252,7 +249,7 @@ def _encoder(
         note = notes.ask(
             f"the unit of {column.name}, "
             + (stated or f"which looks like the position of {axis.name}"),
-            "who wrote the logger, or by how far the machine moves; rad, deg, m and mm are usual",
+            "ask who wrote the logger, or see how far it moves; rad, deg, m and mm are usual",
         )
         return entry(column.name, UNKNOWN, _velocity_beside(axis, alone, match, notes)) + note
     by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
@@ -263,7 +260,7 @@ def _encoder(
     if geared:
         guess = f"is the position of the motor of {axis.name}, in {said}"
     elif right:
-        guess = "" if column.stated or how else f"in {column.unit}"
+        guess = "" if column.stated or how else f"is in {say_unit(column.unit)}"
     guess += ("; it " if guess and how else "") + how
     return entry(column.name, said, fields) + (
         notes.guess(f"{column.name} {guess}") if guess else ""
@@ -295,7 +292,7 @@ def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
     if column.is_foreign:
         note = notes.ask(
             f"the unit of {column.name}, stated as '{column.stated}', which is integrated",
-            "who wrote the logger; rad/s, rev/min and mm/s are usual",
+            "ask who wrote the logger; rad/s, rev/min and mm/s are usual",
         )
         return entry(column.name, UNKNOWN) + note
     said = spelled(column.unit, _SPEED_UNITS) if column.si == si else ""
@@ -400,16 +397,16 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
             "export them in one, as a force has one unit; it goes here",
         )
         return [f'unit = "{UNKNOWN}"{note}']
-    needs_gain = any(_needs_gain(column) for column in columns)
-    if common == "V" or needs_gain:
+    counted = any(needs_gain(column) for column in columns)
+    if common == "V" or counted:
         row = f"[{', '.join(['0.0'] * len(columns))}]"
         rows = f"[{', '.join([row] * len(columns))}]"
         ask = notes.ask(
             f"calibration_n_per_v, {device.force_unit} for one "
-            + (f"of {names}" if needs_gain else "volt"),
+            + (f"of {names}" if counted else "volt"),
             "the sensor's certificate or the driver's manual, or hang a known weight on it",
         )
-        if needs_gain:
+        if counted:
             volts = notes.guess(f"{names} counts or is a share: like volts it gets a calibration")
             zero = notes.guess(f"{names} is 0 without force")
         else:
@@ -421,7 +418,8 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
         looks = "which looks like what drives the motion"
         note = notes.ask(
             f"the unit of {names}, " + (f"stated as '{odd.stated}'" if odd is not None else looks),
-            "who wrote the logger; N.m or N of a sensor, V with calibration_n_per_v of counts",
+            'ask who wrote the logger; "N.m" and "N" are usual, and volts or counts are "V" with'
+            " a calibration_n_per_v",
         )
         return [f'unit = "{UNKNOWN}"{note}']
     other = next((c for c in columns if c.si not in (None, "", "V", "kg", "N", "N.m")), None)
@@ -435,7 +433,7 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
     if any(column.si == "kg" for column in columns):
         common = next(unit for unit in ("kgf", "gf") if columns[0].unit.startswith(unit[:-1]))
         note = notes.guess(f"{names} is the weight of a mass: a force in {common}")
-    if device.force_unit == "N.m" and any(_is_force(column) for column in columns):
+    if device.force_unit == "N.m" and any(is_force(column) for column in columns):
         note = note or ("" if common else notes.guess(f"{names} is a force in N"))
         ask = notes.ask(
             f"lever_m, how far from the axis {names} acts, m",
@@ -447,21 +445,6 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
         return [f'unit = "{common}"{note}']
     note = notes.guess(f"{names} is a {_QUANTITY[device.force_unit]} in {device.force_unit}{why}")
     return [f'unit = "{device.force_unit}"{note}']
-
-
-def _is_force(column: SurveyedColumn) -> bool:
-    """Whether the column of a drive is a force rather than a torque, by its unit or its name."""
-    said = set(words(column.name))
-    if column.si is not None:
-        return column.si in ("N", "kg")
-    return bool(said & _FORCES) and not said & _TORQUES
-
-
-def _needs_gain(column: SurveyedColumn) -> bool:
-    """Whether the column of a force is a share or a count, by its name or by whole numbers."""
-    counts = column.is_integer and float(np.ptp(column.values)) > FEWEST_COUNTS
-    shares = not _SHARES.isdisjoint(words(column.name))
-    return column.si == "" or (not column.unit and (counts or shares))
 
 
 def _brakes_table(device: Device, match: Matcher, notes: Notes) -> list[str]:

@@ -1,0 +1,90 @@
+"""Trials of one axis that stand side by side in a file, in columns named alike."""
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+
+import numpy as np
+
+from bampipe.arrays import Array
+from bampipe.data.angle_torque import SmoothedMotion, least_squares
+from bampipe.data.survey import DRIVERS, SurveyedColumn
+from bampipe.setup.proposal.matching import Matcher
+from bampipe.setup.proposal.positions import in_counts, position_in_si
+
+_TOKENS = re.compile(r"\d+|[A-Za-z]+|[^A-Za-z\d]+")
+_EXPLAINED, _AS_WELL = 0.8, 1.3
+"""Share of each drive that its own motion must explain, and how much more error one set of
+parameters may leave of both than one for each: joints differ in mass and friction."""
+_SAME = 0.99
+"""Correlation of two positions that are one motion, filtered for example."""
+
+
+def find_trials(match: Matcher, position: SurveyedColumn, si: str) -> list[dict[str, str]]:
+    """Columns of the further trials by those of the first, which has ``position`` in ``si``.
+
+    Further joints look the same, but no one machine explains them all.
+    """
+    columns = {c.name: c for c in match.found.columns}
+    drive = next((c for c in match.found.of(*DRIVERS) if c.name in match.used), None)
+    trials: dict[str, dict[str, str]] = {}
+    for move in _moves(position.name, columns) if drive is not None else ():
+        moved = {
+            name: columns[other]
+            for name in match.used
+            if (other := move(name)) in columns and columns[other].role == columns[name].role
+        }
+        if drive is not None and {position.name, drive.name} <= set(moved):
+            q, u = moved[position.name], moved[drive.name]
+            alike = abs(np.corrcoef(np.nan_to_num([position.values, q.values]))[0, 1]) > _SAME
+            if not alike and _is_one_machine([(position, drive), (q, u)], match.t, si):
+                trials.setdefault(q.name, {n: c.name for n, c in moved.items() if c.name != n})
+    return list(trials.values())
+
+
+def _moves(name: str, others: Iterable[str]) -> Iterator[Callable[[str], str]]:
+    """How names become those of another trial: by a step of a number, or another word."""
+    own = _TOKENS.findall(name)
+    for other in others:
+        theirs = _TOKENS.findall(other)
+        apart = [k for k, pair in enumerate(zip(own, theirs, strict=False)) if len(set(pair)) > 1]
+        if len(own) == len(theirs) and len(apart) == 1:
+            here, there = own[apart[0]], theirs[apart[0]]
+            if here.isdigit() and there.isdigit():
+                place = sum(map(str.isdigit, own[: apart[0]]))
+                yield partial(_renumbered, place=place, step=int(there) - int(here))
+            elif here.isalpha() and there.isalpha():
+                yield partial(_renamed, here=here, there=there)
+
+
+def _renumbered(name: str, place: int, step: int) -> str:
+    parts = re.split(r"(\d+)", name)
+    if len(own := parts[1::2]) > place:
+        parts[2 * place + 1] = f"{int(own[place]) + step:0{len(own[place])}d}"
+    return "".join(parts)
+
+
+def _renamed(name: str, here: str, there: str) -> str:
+    return "".join(there if token == here else token for token in _TOKENS.findall(name))
+
+
+def _is_one_machine(
+    pairs: Iterable[tuple[SurveyedColumn, SurveyedColumn]], t: Array, si: str
+) -> bool:
+    """Whether motions and drives have the same inertia, friction, weight and stiffness."""
+    designs, targets, left = [], [], 0.0
+    for position, drive in pairs:
+        motion = SmoothedMotion.of(t, position_in_si(position, t, si))
+        if motion is None:
+            return False
+        q, u = motion.position, motion.smooth(np.nan_to_num(drive.values))[motion.inner]
+        turns = (np.sin(q), np.cos(q)) if si == "rad" and not in_counts(position) else ()
+        designs.append(np.column_stack([motion.moving, q, *turns])[motion.inner])
+        targets.append(u - u.mean())  # each may be zeroed anew
+        designs[-1] -= designs[-1].mean(axis=0)
+        rest = least_squares(designs[-1], targets[-1])[1]
+        if not rest @ rest < (1.0 - _EXPLAINED) * (targets[-1] @ targets[-1]):
+            return False
+        left += float(rest @ rest)
+    rest = least_squares(np.concatenate(designs), np.concatenate(targets))[1]
+    return float(rest @ rest) < _AS_WELL**2 * left
