@@ -100,7 +100,7 @@ _JOINED = {
     "start": "by their times, as if started together",
 }
 _UNIT_WORDS = {
-    "time": ("us", "ms", "ns", "s"),
+    "time": ("us", "ms", "ns", "s", "min"),
     "position": ("rad", "deg", "mm", "cm", "um", "m"),
     "velocity": ("rad/s", "deg/s", "mm/s", "m/s", "rpm"),
     "force": ("Nm", "kN", "N", "V", "kg", "g"),

@@ -1,6 +1,7 @@
 """The set-up of a session held against its trials: mistakes in words, for stages and readers."""
 
 import ast
+import json
 import math
 from collections.abc import Mapping, Sequence
 
@@ -15,7 +16,7 @@ from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, Setu
 from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility, distance_from_prior
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, drawn_robot, is_drawn
-from bampipe.setup.search import Finding, Search, shorten, spoilt_axes, spread
+from bampipe.setup.search import MOST_AXES, Finding, Search, shorten, spoilt_axes, spread
 from bampipe.setup.turned_trials import TurnedTrial, find_turned_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -60,8 +61,11 @@ def inspect_setup(
         return search, held
 
     search, held = search_in(motions)
-    findings, odd = search.find_mistakes(ones), list[TurnedTrial]()
-    if not findings and search.over_position is None:
+    odd, many = list[TurnedTrial](), len(system.coordinates) > MOST_AXES
+    if many:
+        odd = find_turned_trials(system, motions, band, folds, signals)
+    findings = () if odd else search.find_mistakes(ones)
+    if not (many or findings) and search.over_position is None:
         # What is wrong in all trials is likelier than what is in some.
         odd = find_turned_trials(system, motions, band, folds, signals)
     if odd:
@@ -139,8 +143,14 @@ def _record(
     correction, axes = found.correction, spoilt_axes(found)
     sentence = describe_correction(correction, session)
     left = [s for s, names in placeholders.items() if set(correction.signals) <= set(names)]
+    rivals = found.rivals
     if correction.kind == "scale" and left:
-        sentence = f"{left[0]}, a placeholder: {describe_size(correction)}"
+        off = correction.factor
+        size = (
+            f"{number(off)} times too small" if off > 1.0 else f"{number(1 / off)} times too large"
+        )
+        sentence = f"{left[0]}, a placeholder: what drives the device is about {size} with it"
+        rivals = tuple(r for r in rivals if not set(r.signals) <= set(placeholders[left[0]]))
 
     def errors(of: Plausibility) -> dict[str, float]:
         return dict(zip(system.coordinates, 100.0 * of.error, strict=True))
@@ -160,7 +170,7 @@ def _record(
             PossibleMistake(
                 kind=rival.kind, signals=rival.signals, sentence=describe_correction(rival, session)
             )
-            for rival in found.rivals
+            for rival in rivals
         ),
     )
 
@@ -169,11 +179,12 @@ def _record_turned(
     system: System, session: IngestResult, found: TurnedTrial, name: str
 ) -> SetupMistake:
     """One trial with a sign of its own."""
-    signals = [one.signals[0] for one in found.corrections]
-    either = " or ".join(signals)
+    either = " or ".join(join_names(one.signals) for one in found.corrections)
+    names = found.corrections[0].signals
     sentence = (
-        f"{name}: {either} has another sign than in the other trials: put negated ="
-        f' ["{signals[0]}"] into its [[trials]] entry, or leave the trial out'
+        f"{name}: {either} {'have' if len(names) > 1 else 'has'} another sign than in the other"
+        f" trials: put negated = {json.dumps(names)} into its [[trials]] entry, or leave the trial"
+        " out"
     )
     one = Finding(found.corrections[0], (), found.before, found.after, 0.0)
     record = _record(system, session, one, {})
@@ -226,10 +237,11 @@ def _find_placeholders(system: System, session: IngestResult) -> dict[str, tuple
     device = system.model.device
     nodes = (node for tree in device.applied.values() for node in ast.walk(tree))
     used = {node.id for node in nodes if isinstance(node, ast.Name)}
+    inputs = tuple(name for name in (*device.forces, *device.channels) if name in used)
     for name, constant in device.constants.items():
         if name in used and constant.value == 1.0 and constant.unit:
             source = f", source {constant.source!r}" if constant.source else ""
-            found[f"{name} of the device file is 1 {constant.unit}{source}"] = device.forces
+            found[f"{name} of the device file is 1 {constant.unit}{source}"] = inputs
     return found
 
 

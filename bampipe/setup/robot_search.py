@@ -131,6 +131,11 @@ class DrawnSearch(Search):
             has_offset=False,
         )
 
+    def drives_against_bodies(self) -> list[str]:
+        """Drives of one joint each that as stated have the other sign than what they move."""
+        drives = self._as_drawn.hold(self._as_drawn.drawn)
+        return [name for name, k in self._alone.items() if drives[k].is_turned]
+
     @cached_property
     def _alone(self) -> dict[str, int]:
         """Joints by the force that alone acts on them, and on nothing else."""

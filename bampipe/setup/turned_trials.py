@@ -1,5 +1,6 @@
 """Trials in which a sensor counts the other way than in the others: no set-up suits all of them."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -7,6 +8,7 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.setup.hypotheses import Correction, turned
 from bampipe.setup.plausibility import Plausibility, judge_setup
+from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, is_drawn
 from bampipe.setup.search import (
     ALIKE,
     LEAST_GAIN,
@@ -32,7 +34,7 @@ class TurnedTrial:
     """A trial in which the readings of a signal have another sign than in those around it.
 
     Attributes:
-        place: of the trial; corrections: of one signal each, any of which sets it right.
+        place: of the trial; corrections: any sets it right; of one signal, or a robot's drives.
         before, after: what its group shows as stated, and with all that was found in it.
     """
 
@@ -45,16 +47,46 @@ class TurnedTrial:
 def find_turned_trials(
     system: System, motions: Sequence[Motion], band: Band, folds: Folds, signals: Signals
 ) -> list[TurnedTrial]:
-    """Find them among the trials that are fitted; of a robot with many joints none is looked for.
+    """Find them among the trials that are fitted; of many joints, drawn bodies must tell the signs.
 
     Where as many count one way as the other, those found are as right as the rest.
     """
     fitted = folds.fitted_trials
-    if len(system.coordinates) > MOST_AXES or len(fitted) < 2:
+    if len(fitted) < 2:
         return []
+    if len(system.coordinates) > MOST_AXES:
+        drawn = is_drawn(system)
+        return _by_drawn_bodies(system, motions, fitted, band, folds, signals) if drawn else []
     groups = -(-len(fitted) // _TOGETHER)
     parts = (fitted[start::groups] for start in range(groups))
     return [one for part in parts for one in _search(system, motions, part, band, folds, signals)]
+
+
+def _by_drawn_bodies(
+    system: System,
+    motions: Sequence[Motion],
+    fitted: Sequence[int],
+    band: Band,
+    folds: Folds,
+    signals: Signals,
+) -> list[TurnedTrial]:
+    """Those in which a drive goes against its drawn bodies and friction, which it does in few."""
+    alone = {
+        k: DrawnSearch(
+            system, shorten([motions[k]], DRAWN_SAMPLES), band, folds.subset([k]), signals
+        )
+        for k in fitted
+    }
+    against = {k: search.drives_against_bodies() for k, search in alone.items()}
+    often = Counter(name for names in against.values() for name in names)
+    found = []
+    for k, search in alone.items():
+        if names := [name for name in against[k] if 2 * often[name] < len(fitted)]:
+            one = turned(signals, names)
+            before, after = search.judge(()), search.judge((one,))
+            if before and after and gain_of(before, after, 0.0) > LEAST_GAIN:
+                found.append(TurnedTrial(k, (one,), before, after))
+    return found
 
 
 def _search(

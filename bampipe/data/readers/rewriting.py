@@ -29,6 +29,11 @@ _ELEMENT = re.compile(r"<(\w+)((?:\s+\w+=\"[^\"]*\")+)\s*/?>|<(\w+)>([^<>]*)</")
 _WITH_UNIT = re.compile(rf"({_NUMBER})[ \u00a0]?([^\W\d_]\S*|[%°]\S*)")
 _FORTRAN = re.compile(r"(\d\.?\d*)[Dd]([-+]\d)")
 _HEX = re.compile(r"(?i)(?<![\w.])0x[0-9a-f]{1,8}(?!\w)")
+_NAMES = re.compile(r"(?i)(?:channel|signal|marker)_names?[\t;,]")
+_LABVIEW = re.compile(
+    r"(?:LabVIEW|[A-Z]\w*_[A-Z]\w*|Separator|X_Columns|Operator|Project|Description|Date|Time|Channels"
+    r"|Samples|X0|\*\*\*End_of_Header)"
+)
 _GROUPS = ((",", r"\."), (".", ","), (" ", "[.,]"), ("'", "[.,]"), ("’", "[.,]"))
 """Signs between thousands, and what may stand before the decimals then."""
 _CAN = "frames of a CAN bus, whose bytes mean nothing without their data base (DBC)"
@@ -88,6 +93,8 @@ def find_form(head: str, name: str) -> Form | None:
             filter(None, ("typeset minus signs and blanks are plain ones", inner.said))
         )
         return Form(said, lambda line: inner.rewrite(line.translate(plain)), inner.names)
+    if found := _of_program(head, whole):
+        return found
     ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
     if 2 * len(ended) > len(lines) and all(re.search(r"[,\t |]", line) for line in ended):
         return Form("", lambda line: line.removesuffix(";"))
@@ -119,6 +126,31 @@ def find_form(head: str, name: str) -> Form | None:
         for pattern, what, remedy in _FOREIGN:
             if pattern.match(line):
                 raise InputError(what, where=name, remedy=remedy)
+    return None
+
+
+def _of_program(head: str, whole: Sequence[str]) -> Form | None:
+    """The form of a text of LabVIEW, AcqKnowledge or Qualisys; None of others."""
+    if head.startswith("LabVIEW Measurement"):
+        stated = next((re.split(r"[\t,]", x)[1:] for x in whole if x.startswith("Y_Unit")), [])
+
+        def rewrite(line: str) -> str:
+            if not line.startswith("X_Value"):
+                return "" if _LABVIEW.match(line) else line
+            time, *names = re.split(r"[\t,]", re.sub(r"[\t,](Comment)?$", "", line))
+            units = (f" [{u}]" if unit(u) else "" for u in (*stated, *names))
+            return "\t".join([time, *(n + u for n, u in zip(names, units, strict=False))])
+
+        return Form("heads of LabVIEW left out", rewrite)
+    if match := re.match(r"[^\n]*\n[\d.]+ \w+/sample\s+(\d+) channels\s", head):
+        end = 3 + 2 * int(match[1])
+        channels = [f"{a} [{b}]" for a, b in zip(whole[3:end:2], whole[4:end:2], strict=False)]
+        times = [f"time [{x}]" for x in whole[end].split(",") if x and not x.startswith("CH")]
+        return Form("names of channels above the table", str, (*times, *channels))
+    for line in whole[:_TRIED]:
+        names = re.split(r"[\t;,]", line)[1:] if _NAMES.match(line) else []
+        if names and len(names) == len(re.split(r"[\t;,]", whole[-1].strip())):
+            return Form("", str, tuple(names))
     return None
 
 

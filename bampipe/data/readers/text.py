@@ -249,6 +249,12 @@ def _read_samples(
             if line is None or not (again or layout.is_chatter(line.text)):
                 if line is not None and samples.passes_over(str(error), line, layout):
                     continue
+                if line is not None and samples.resumed and line.number - layout.first_line < 5:
+                    raise InputError(
+                        "another table begins",
+                        where=f"{name}, row {line.number}",
+                        remedy="save each table as a file of its own",
+                    ) from error
                 raise _fault(str(error), layout, line, name) from error
             _read_samples(stream, layout, line.start, samples, name)
             if again:

@@ -29,7 +29,7 @@ from bampipe.setup.proposal.device import (
     with_motors,
 )
 from bampipe.setup.proposal.matching import Matcher
-from bampipe.setup.proposal.notes import Notes, quoted
+from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
 from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
 from bampipe.setup.proposal.side_by_side import find_trials
@@ -112,7 +112,7 @@ def propose(
         *encoders,
         *inputs,
         *([f"# not used: {', '.join(left)}", ""] if left else []),
-        *_trials_tables(chosen.device, axes, match, notes, beside),
+        *_trials_tables(chosen.device, axes, match, notes, beside, UNKNOWN not in clock.rate),
     ]
     return ProposedSession(
         session="\n".join(lines) + "\n",
@@ -253,10 +253,14 @@ def _trials_tables(
     match: Matcher,
     notes: Notes,
     beside: Sequence[Mapping[str, str]],
+    timed: bool,
 ) -> list[str]:
-    """Propose the trials and their kinds; a long single record is cut at rests of its axis."""
+    """Propose the trials and their kinds; a long single record is cut at rests of its axis.
+
+    Not where its rate is not known: then nobody can say after how many seconds.
+    """
     trials = match.found.trials
-    alone = len(trials) == 1 and not beside
+    alone = len(trials) == 1 and not beside and timed
     cuts, where = _cuts(match) if alone else ([], "")
     if alone and axes and not cuts:
         cuts, where = guesses.stretches(match.t, next(iter(axes.values())).values), "at rests"

@@ -243,6 +243,10 @@ def find_robot_columns(
     other = explain(other_unit, drives) if other_unit is not None else None
     if other_unit is not None and other is not None and mean_left(other.drives) < _BETTER:
         positions, best = other_unit, other
+        notes.check.append(
+            "positions state no unit and go beyond the joints' ranges: degrees are taken; if they"
+            f" are radians of motors, {PUT_IN}"
+        )
     left = mean_left(best.drives) if best is not None else np.inf
     sound = best is not None and fits(best.drives)
     beyond = _beyond_range(logged, positions, of_joint=sound)

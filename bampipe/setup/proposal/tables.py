@@ -93,7 +93,7 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
     known, rows = np.isfinite(stamps), np.arange(len(stamps))
     stamps = np.interp(rows, rows[known], spread_stamps(unroll(stamps[known])[0])[0])
     named = f"column = {quoted(column.name)}"
-    named_unit = next((u for u in ("us", "ms", "ns") if u in words(column.name)), "")
+    named_unit = next((u for u in ("us", "ms", "ns", "min") if u in words(column.name)), "")
     counter = not _COUNTERS.isdisjoint(words(column.name)) or column.role != "time"
     counter &= not named_unit
     kind = "" if counter else guesses.time_unit(stamps + start, column.unit or named_unit)
@@ -155,6 +155,17 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
         note = notes.guess(f"samples are counted, and {name} sets the rate")
         rate = f"sample_rate_hz = {1.0 / step_s:g}"
         return ProposedClock(step_s * samples, (name,), _table(f'unit = "samples"{note}'), rate)
+    numbers = next((c for c in found.columns if not c.role and _numbers_rows(c)), None)
+    if numbers is not None:
+        note = notes.ask(
+            f"ticks_per_s and sample_rate_hz, both the rows a second: {numbers.name} numbers the"
+            " rows, and some are lost",
+            _OF_ROWS,
+        )
+        lines = f"column = {quoted(numbers.name)}", 'unit = "ticks"', f"ticks_per_s = 0.0{note}"
+        t = (numbers.values - numbers.values[0]) / _LIKELY_RATE_HZ
+        rate = f'sample_rate_hz = "{UNKNOWN}"'
+        return ProposedClock(t, (numbers.name,), _table(*lines), rate)
     stamps = next((column for column in found.of("time") if not column.is_constant), None)
     if stamps is not None and _FALLING < np.mean(np.diff(stamps.values) < 0.0):
         raise InputError(
@@ -181,6 +192,12 @@ def _counts_on(column: SurveyedColumn) -> bool:
     steps = np.diff(column.values)
     rises = len(steps) > 3 and bool(np.all(steps > 0.0))
     return rises and bool(np.ptp(steps) < np.median(steps)) and float(np.median(steps)) != 1.0
+
+
+def _numbers_rows(column: SurveyedColumn) -> bool:
+    """Whether a column counts rows, some of which are lost."""
+    steps = np.diff(column.values) if column.is_integer else np.zeros(1)
+    return bool(np.min(steps, initial=1.0) >= 1.0 and np.median(steps) == 1.0 < np.max(steps))
 
 
 def _table(*lines: str) -> tuple[str, ...]:
