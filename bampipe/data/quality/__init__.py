@@ -50,6 +50,7 @@ def clean(raw: RawTrial, session: Session, entry: TrialEntry, limits: CleaningLi
             channels.refuse_frozen(table, column)
     faulty_readings.note_dead_stretches(table)
     faulty_readings.leave_out_rails(table)
+    faulty_readings.refuse_new_zero(table)
     columns = channels.to_si(table)
     encoders.refuse_wrong_motion(table, columns)
     encoders.refuse_wrong_brakes(table, columns)

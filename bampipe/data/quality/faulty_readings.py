@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bampipe.arrays import Flags
+from bampipe.arrays import Array, Flags
 from bampipe.data.angle_torque import SmoothedMotion, least_squares
 from bampipe.data.quality.channels import fill_missing, take_out
 from bampipe.data.quality.table import TrialTable, find_runs, longest_run
@@ -40,6 +40,8 @@ _BESIDE = 10
 """Levels next to a rail that it is held against."""
 _EXPLAINED = 0.5
 """Share of the variance between the rails that the motion must explain to tell what is beyond."""
+_ONE_STEP, _MATTERS = 0.85, 0.01
+"""Share of what the motion leaves of an input that one step is; of its variance, what is left."""
 _BEYOND = 2.0
 """Times what it leaves there, by which the motion must ask for more than the rail, in the mean."""
 
@@ -203,17 +205,49 @@ def _motions(table: TrialTable) -> list[SmoothedMotion]:
     return found
 
 
+def _sides(motions: list[SmoothedMotion]) -> Array:
+    """What a drive is regressed on, (T, P)."""
+    sides = [np.ones(len(motions[0].position))]
+    for motion in motions:
+        angle = motion.position
+        sides += [*motion.moving.T, angle, np.sin(angle), np.cos(angle)]
+    return np.column_stack(sides)
+
+
+def refuse_new_zero(table: TrialTable) -> None:
+    """Refuse a trial in which a force is zeroed anew: one step is most of what motion leaves.
+
+    Where nothing else acts that may be switched on, such as a brake.
+    """
+    force, motions = table.session.force, _motions(table)
+    if force is None or not motions or table.session.brakes or table.session.channels:
+        return
+    inner = motions[0].inner
+    basis = np.linalg.qr(_sides(motions)[inner])[0]
+    for column in force.columns:
+        values = motions[0].smooth(table.columns[column])[inner]
+        rest = values - basis @ (basis.T @ values)
+        # A step after each sample, less what the motion takes of it.
+        along, own = np.cumsum(rest[::-1])[::-1], np.cumsum(basis[::-1], axis=0)[::-1]
+        gain = along**2 / np.maximum(np.arange(len(rest), 0, -1) - np.sum(own**2, axis=1), 1.0)
+        at, left = int(np.argmax(gain)), float(rest @ rest)
+        if gain[at] > _ONE_STEP * left and left > _MATTERS * float(np.var(values)) * len(values):
+            at += inner.start
+            raise table.fault(
+                "jumps and stays there, whatever the motion: zeroed anew, or another load",
+                column=column,
+                at=at,
+                remedy=f"cut it there, by end_s and start_s = {table.t[at]:.4g} in [[trials]]",
+            )
+
+
 def _beyond(
     values: np.ndarray, rails: dict[float, Flags], motions: list[SmoothedMotion]
 ) -> float | None:
     """How far the motion takes an input beyond its rails; 0 where it does not, None: not told."""
     if not motions:
         return None
-    sides = [np.ones(len(values))]
-    for motion in motions:
-        angle = motion.position
-        sides += [*motion.moving.T, angle, np.sin(angle), np.cos(angle)]
-    design, target = np.column_stack(sides), motions[0].smooth(values)
+    design, target = _sides(motions), motions[0].smooth(values)
     at_rail = np.any(list(rails.values()), axis=0)
     reached = np.convolve(at_rail, np.ones(2 * len(motions[0].window) + 1), "same") > 0.5
     between, inside = np.zeros(len(values), bool), np.zeros(len(values), bool)
