@@ -66,13 +66,13 @@ def test_following_judges_the_model_that_it_starts_from(
     [
         (
             {("actuator_delay",): 0.56, ("actuator_lag:joint",): 0.44},
-            "between actuator_delay (0.56) and actuator_lag:joint (0.44): the choice is arbitrary,"
-            " actuator_delay is added. A lag weakens",
+            "between actuator_delay (0.56) and actuator_lag:joint (0.44): actuator_delay added"
+            " provisionally. A lag weakens",
         ),
         (
             {("a:joint", "b:joint"): 0.7, ("a:joint", "c:joint"): 0.296, (): 0.004},
-            "between b:joint (0.70) and c:joint (0.30) beside a:joint (> 0.99): the choice is"
-            " arbitrary, b:joint is added. No trial was found",
+            "between b:joint (0.70) and c:joint (0.30) beside a:joint (> 0.99): b:joint added"
+            " provisionally. No trial was found",
         ),
         (
             {(): 0.6, ("a:joint",): 0.4},
@@ -80,7 +80,7 @@ def test_following_judges_the_model_that_it_starts_from(
         ),
     ],
 )
-def test_an_effect_that_is_added_undecided_is_called_arbitrary(
+def test_an_effect_that_is_added_undecided_is_called_provisional(
     sets: dict[tuple[str, ...], float], said: str
 ) -> None:
     lines = {}
