@@ -359,3 +359,60 @@ def test_a_trial_in_another_unit_is_said():
     spans = {"a": {"q": 1.2}, "b": {"q": 71.0}, "c": {"q": 1.0}, "d": {"q": 1.4}}
     (said,) = describe_spans(spans)
     assert said.startswith("b: q goes 59.2 times as far as in the others")
+
+
+HEAD = "LabVIEW Measurement\nSeparator\tTab\n***End_of_Header***\n\n"
+SEGMENT = "Channels\t2\nSamples\t60\t60\nY_Unit_Label\tDegrees\tNm\nDelta_X\t0.01\t0.01\n" + (
+    "***End_of_Header***\nX_Value\tAngle\tTorque\tComment\n"
+)
+KNOWN = {
+    "LabVIEW": (HEAD + lines("{t:.3f}\t{q:.4f}\t{u:.4f}", SEGMENT), "Angle [Degrees]"),
+    "AcqKnowledge": (
+        "knee.acq\n10 msec/sample\n2 channels\nElbow\ndegrees\nCell\nN-m\nsec,CH1,CH2,\n,60,60,\n"
+        + lines("{t:.3f},{q:.4f},{u:.4f},"),
+        "Elbow [degrees]",
+    ),
+    "Qualisys": (
+        "FREQUENCY\t100\nCHANNEL_NAMES\tElbow\tTorque\n" + lines("{q:.4f}\t{u:.4f}"), "Elbow",
+    ),
+    "hexadecimal": (lines("{t:.3f},0x{n:04X},{u:.4f}", "t,n,u\n"), "n"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("program", KNOWN)
+def test_exports_of_programs(tmp_path, program):
+    text, column = KNOWN[program]
+    (tmp_path / "a.txt").write_text(text)
+    values = read_trial(tmp_path / "a.txt", [column], name="a.txt").columns[column]
+    expected = np.arange(1.0, 61.0) if column == "n" else Q
+    np.testing.assert_allclose(values[-60:], expected)
+
+
+def test_a_second_table_in_a_file_and_a_segment_of_labview(tmp_path):
+    table = lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n")
+    (tmp_path / "a.csv").write_text(table + "\nModel Outputs\n200\nFrame,X\n1,2\n")
+    with pytest.raises(InputError, match="row 64: another table begins; save each table"):
+        read_trial(tmp_path / "a.csv", ["t", "q"], name="a.csv")
+    text = HEAD + 2 * lines("{t:.3f}\t{q:.4f}\t{u:.4f}", SEGMENT)
+    (tmp_path / "a.lvm").write_text(text)
+    raw = read_trial(tmp_path / "a.lvm", ["Angle [Degrees]"], name="a.lvm")
+    assert len(raw) == 120 and raw.begun == (60,)
+
+
+def test_codes_for_no_reading_are_taken_for_none_and_hours_pass(tmp_path):
+    rows = [
+        (n, q, -9999.0 if n in (7, 30, 31) else u)
+        for n, (q, u) in enumerate(zip(Q, U, strict=True))
+    ]
+    text = ""
+    for n, q, u in rows:
+        second = 3599.7 + 0.01 * n
+        text += f"{int(second // 60) % 60:02d}:{second % 60:06.3f},{q},{u}\n"
+    (tmp_path / "a.csv").write_text("Time,q,u\n" + text)
+    raw = read_recording(
+        tmp_path, TrialEntry(file="a.csv", kind="free"), ["Time", "q", "u"],
+        Clock(column="Time", unit="datetime"),
+    )  # fmt: skip
+    assert np.flatnonzero(np.isnan(raw.columns["u"])).tolist() == [7, 30, 31]
+    assert "column 'u': 3 readings of -9999 are taken for none" in raw.notes
+    np.testing.assert_allclose(np.diff(raw.columns["Time"]), 0.01, atol=2e-3)

@@ -182,7 +182,19 @@ def test_what_a_long_gap_spans_is_left_out_and_most_of_a_trial_is_not():
     assert trial.dead[0].start_s < trial.t[400] - 0.05 and trial.dead[0].end_s > trial.t[499] + 0.05
     assert np.isfinite(trial.columns["q_turn"]).all()
     table["turn"][400:800] = np.nan
-    with pytest.raises(InputError, match="400 samples in a row are missing.*start_s and end_s"):
+    with pytest.raises(InputError, match=r"400 samples in a row are missing.*start_s and end_s"):
+        cleaned(table)
+
+
+def test_a_force_that_is_zeroed_anew_sets_the_trial_aside():
+    t = np.arange(N) / 500.0
+    q = 0.8 * np.sin(4.0 * t) + 0.3 * np.sin(9.0 * t)
+    noise = 0.01 * np.random.default_rng(1).standard_normal(N)
+    force = 0.2 * np.gradient(np.gradient(q, t), t) + 2.0 * np.sin(q) + noise
+    table = columns() | {"turn": q, "force_x": force}
+    assert cleaned(table).repairs == []
+    table["force_x"] = force + 0.7 * (t >= 1.2)
+    with pytest.raises(InputError, match=r"jumps and stays there.*end_s and start_s = 1\.2 in"):
         cleaned(table)
 
 

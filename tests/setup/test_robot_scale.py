@@ -14,6 +14,7 @@ from bampipe.setup.hypotheses import scaled
 from bampipe.setup.plausibility import Plausibility
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch
 from bampipe.setup.search import Finding, conclude, shorten
+from bampipe.setup.turned_trials import find_turned_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
@@ -138,6 +139,19 @@ def test_what_spoils_a_joint_that_was_right_is_no_mistake(third: float, named: b
     )
     twice = scaled(search.signals, FORCES, 2.0, 0.0)
     assert bool(conclude(lambda chosen: after if chosen else before, (twice,), ())) == named
+
+
+def test_a_drive_that_one_trial_has_turned_is_named_with_it() -> None:
+    given = [*motions(1.0, 2.0), *motions(1.0, 2.0)]
+    names = [f"t{k}" for k in range(4)]
+    signs = np.array([1.0, -1.0, 1.0, 1.0])
+    given[2] = replace(
+        given[2], channels={n: s * given[2].channels[n] for n, s in zip(FORCES, signs, strict=True)}
+    )
+    search, folds = search_in(given[:2]), Folds.of_trials(names, [], names)
+    found = find_turned_trials(search.system, given, search.band, folds, search.signals)
+    assert [(one.place, one.corrections[0].signals) for one in found] == [(2, (FORCES[1],))]
+    assert found[0].after.error[1] < 0.2 * found[0].before.error[1]
 
 
 def turned(factor: float, zero: float, joint: int, drive: float) -> list[Motion]:

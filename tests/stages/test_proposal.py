@@ -684,3 +684,71 @@ def test_ticks_of_a_counter_and_slow_logs_are_asked_about(tmp_path):
     (tmp_path / "b").mkdir()
     write_table(tmp_path / "b/a.csv", {n: v[::10] for n, v in labelled("t,q,w,u").items()})
     assert any("too slow for inertia" in line for line in propose(tmp_path / "b").check)
+
+
+def machine(seed: int, size: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, angle and torque of a pendulum with friction, its motion given; all times ``size``."""
+    rng, t = np.random.default_rng(seed), np.arange(1600) / 200.0
+    rate, phase = 2.0 * np.pi * rng.uniform(0.1, 0.9, 4), rng.uniform(0.0, 6.0, 4)
+    waves = rate * t[:, None] + phase
+    q, v, a = (0.5 * np.sum(x, axis=1) for x in (
+        np.sin(waves) / rate, np.cos(waves), -rate * np.sin(waves)
+    ))  # fmt: skip
+    torque = 0.3 * a + 4.0 * np.sin(q) + 0.9 * np.tanh(v / 1e-3) + 0.8 * v
+    return t, q, size * torque + 0.02 * rng.standard_normal(t.size)
+
+
+@pytest.mark.parametrize("layout", ["numbers", "words", "no names"])
+def test_trials_side_by_side_are_told_from_joints(tmp_path, layout):
+    (t, *one), (_, *two), (_, *three) = (machine(seed) for seed in (1, 2, 3))
+    if layout == "no names":
+        columns = [t, *one, t, *two, t, *three]
+        np.savetxt(tmp_path / "a.txt", np.column_stack(columns), "%.6f")
+        moved = [{f"column_{k}": f"column_{k + step}" for k in (1, 2, 3)} for step in (3, 6)]
+    else:
+        tags = ("1", "2", "3") if layout == "numbers" else ("train", "valid", "test")
+        names = [f"{what}_{tag}" for tag in tags for what in ("angle", "torque")]
+        write_table(tmp_path / "a.csv", dict(zip(["time_s", *names], [t, *one, *two, *three],
+            strict=True)))  # fmt: skip
+        moved = [{f"{w}_{tags[0]}": f"{w}_{tag}" for w in ("angle", "torque")} for tag in tags[1:]]
+    session, proposal = proposed(tmp_path)
+    assert [trial.get("columns") for trial in session["trials"]] == [None, *moved]
+    assert any("are of one axis in 3 trials" in line for line in proposal.check)
+    if layout == "numbers":
+        read = samples(tmp_path, tmp_path / "out", "a_3")
+        np.testing.assert_allclose(read["q_joint"], three[0], atol=1e-6)
+        np.testing.assert_allclose(read["force_drive"], three[1], atol=1e-5)
+
+
+def test_two_joints_are_no_trials_of_one(tmp_path):
+    (t, *one), (_, *two) = machine(1), machine(2, size=1.7)
+    names = ("time_s", "angle_1", "torque_1", "angle_2", "torque_2")
+    write_table(tmp_path / "a.csv", dict(zip(names, [t, *one, *two], strict=True)))
+    session, proposal = proposed(tmp_path)
+    assert not any("columns" in trial for trial in session["trials"])
+    assert any("2 columns are positions: of a robot?" in line for line in proposal.check)
+
+
+def test_a_record_of_unknown_rate_is_not_cut_and_lost_rows_are_counted(tmp_path):
+    _, q, u = machine(4)
+    write_table(tmp_path / "a.csv", {"angle_rad": q, "torque_Nm": u})
+    session, _ = proposed(tmp_path)
+    assert len(session["trials"]) == 1 and session["sample_rate_hz"] == "?"
+    kept = np.r_[0:500, 520:1600]
+    table = {"sample": np.arange(1600.0)[kept], "angle_rad": q[kept], "torque_Nm": u[kept]}
+    (tmp_path / "b").mkdir()
+    write_table(tmp_path / "b/b.csv", table)
+    session, proposal = proposed(tmp_path / "b")
+    assert session["time"] == {"column": "sample", "unit": "ticks", "ticks_per_s": 0.0}
+    assert "sample numbers the rows, and some are lost" in proposal.fill_in[0]
+
+
+def test_what_needs_a_gain_gets_wide_priors(tmp_path):
+    t, q, u = machine(5)
+    for name, scale in (("torque_Nm", 1.0), ("torque_percent", 12.5)):
+        (tmp_path / name).mkdir()
+        write_table(tmp_path / name / "a.csv", {"time_s": t, "angle_rad": q, name: scale * u})
+        proposed(tmp_path / name)
+        device = tomllib.loads((tmp_path / name / "device.toml").read_text())
+        inertia = device["parameters"]["inertia"]
+        assert inertia["sd"] == pytest.approx((5, 100)[scale > 1] * inertia["prior"], rel=0.05)

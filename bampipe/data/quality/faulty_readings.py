@@ -40,7 +40,7 @@ _BESIDE = 10
 """Levels next to a rail that it is held against."""
 _EXPLAINED = 0.5
 """Share of the variance between the rails that the motion must explain to tell what is beyond."""
-_ONE_STEP, _MATTERS = 0.85, 0.01
+_ONE_STEP, _MATTERS = 0.85, 1e-3
 """Share of what the motion leaves of an input that one step is; of its variance, what is left."""
 _BEYOND = 2.0
 """Times what it leaves there, by which the motion must ask for more than the rail, in the mean."""
@@ -227,9 +227,10 @@ def refuse_new_zero(table: TrialTable) -> None:
     for column in force.columns:
         values = motions[0].smooth(table.columns[column])[inner]
         rest = values - basis @ (basis.T @ values)
-        # A step after each sample, less what the motion takes of it.
-        along, own = np.cumsum(rest[::-1])[::-1], np.cumsum(basis[::-1], axis=0)[::-1]
-        gain = along**2 / np.maximum(np.arange(len(rest), 0, -1) - np.sum(own**2, axis=1), 1.0)
+        # A step after each sample, as smooth as the rest, less what the motion takes of it.
+        both = np.column_stack([rest, basis]).T
+        along, *own = (np.cumsum(motions[0].smooth(x)[::-1])[::-1] for x in both)
+        gain = along**2 / np.maximum(np.arange(len(rest), 0, -1) - np.square(own).sum(axis=0), 1.0)
         at, left = int(np.argmax(gain)), float(rest @ rest)
         if gain[at] > _ONE_STEP * left and left > _MATTERS * float(np.var(values)) * len(values):
             at += inner.start
