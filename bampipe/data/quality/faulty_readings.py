@@ -214,6 +214,7 @@ def _sides(motions: list[SmoothedMotion]) -> Array:
     return np.column_stack(sides)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def refuse_new_zero(table: TrialTable) -> None:
     """Refuse a trial in which a force is zeroed anew: one step is most of what motion leaves.
 

@@ -131,7 +131,7 @@ def find_form(head: str, name: str) -> Form | None:
 
 def _of_program(head: str, whole: Sequence[str]) -> Form | None:
     """The form of a text of LabVIEW, AcqKnowledge or Qualisys; None of others."""
-    if head.startswith("LabVIEW Measurement"):
+    if head.startswith("LabVIEW Measurement") and "\nX_Value" in head:
         stated = next((re.split(r"[\t,]", x)[1:] for x in whole if x.startswith("Y_Unit")), [])
 
         def rewrite(line: str) -> str:
