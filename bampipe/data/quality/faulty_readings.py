@@ -42,6 +42,8 @@ _EXPLAINED = 0.5
 """Share of the variance between the rails that the motion must explain to tell what is beyond."""
 _ONE_STEP, _MATTERS = 0.85, 1e-3
 """Share of what the motion leaves of an input that one step is; of its variance, what is left."""
+_MOST_ROWS = 20_000
+"""Of which that is found."""
 _BEYOND = 2.0
 """Times what it leaves there, by which the motion must ask for more than the rail, in the mean."""
 
@@ -196,11 +198,11 @@ def leave_out_rails(table: TrialTable) -> None:
                 table.dead.append(DeadStretch(column=column, start_s=first, end_s=last, rail=rail))
 
 
-def _motions(table: TrialTable) -> list[SmoothedMotion]:
+def _motions(table: TrialTable, every: int = 1) -> list[SmoothedMotion]:
     found = []
     for encoder in table.session.encoders:
-        q = (table.columns[encoder.column] - encoder.zero) * encoder.scale
-        motion = SmoothedMotion.of(table.t, q)
+        q = (table.columns[encoder.column][::every] - encoder.zero) * encoder.scale
+        motion = SmoothedMotion.of(table.t[::every], q)
         found += [motion] if motion is not None else []
     return found
 
@@ -220,13 +222,14 @@ def refuse_new_zero(table: TrialTable) -> None:
 
     Where nothing else acts that may be switched on, such as a brake.
     """
-    force, motions = table.session.force, _motions(table)
+    every = max(1, len(table) // _MOST_ROWS)
+    force, motions = table.session.force, _motions(table, every)
     if force is None or not motions or table.session.brakes or table.session.channels:
         return
     inner = motions[0].inner
     basis = np.linalg.qr(_sides(motions)[inner])[0]
     for column in force.columns:
-        values = motions[0].smooth(table.columns[column])[inner]
+        values = motions[0].smooth(table.columns[column][::every])[inner]
         rest = values - basis @ (basis.T @ values)
         # A step after each sample, as smooth as the rest, less what the motion takes of it.
         both = np.column_stack([rest, basis]).T
@@ -234,7 +237,7 @@ def refuse_new_zero(table: TrialTable) -> None:
         gain = along**2 / np.maximum(np.arange(len(rest), 0, -1) - np.square(own).sum(axis=0), 1.0)
         at, left = int(np.argmax(gain)), float(rest @ rest)
         if gain[at] > _ONE_STEP * left and left > _MATTERS * float(np.var(values)) * len(values):
-            at += inner.start
+            at = every * (at + inner.start)
             raise table.fault(
                 "jumps and stays there, whatever the motion: zeroed anew, or another load",
                 column=column,
