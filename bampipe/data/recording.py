@@ -99,9 +99,10 @@ def _without_codes(raw: RawTrial, clock: Clock) -> RawTrial:
             code = side * float(np.max(side * values, initial=-np.inf, where=np.isfinite(values)))
             others = values[np.isfinite(values) & (values != code)]
             count = int(np.sum(values == code))
-            if count < 2 or len(others) < max(_LEAST, count) or np.ptp(others) == 0.0:
+            if not 2 <= count < len(others) or np.ptp(others) == 0.0:
                 continue
-            if np.min(np.abs(others - code)) > _FAR_OFF * np.ptp(others):
+            far = np.min(np.abs(others - code)) > _FAR_OFF * np.ptp(others)
+            if far and len(np.unique(others)) >= _LEAST:  # not -1 of a register at rest
                 columns[name] = np.where(values == code, np.nan, values)
                 notes.append(f"column '{name}': {count} readings of {code:g} are taken for none")
     return replace(raw, columns=columns, notes=tuple(notes))

@@ -67,15 +67,9 @@ def fill_missing(table: TrialTable) -> None:
             values[missing] = np.interp(table.t[missing], table.t[known], values[known])
             for start, stop in zip(*find_runs(missing), strict=True):
                 if stop - start > table.limits.nan_run:
-                    first, last = table.t[[start, stop - 1]] - table.t[0]
-                    table.dead.append(
-                        DeadStretch(
-                            column=name,
-                            start_s=max(0.0, float(first) - _AROUND_S),
-                            end_s=float(last) + _AROUND_S,
-                            missing=True,
-                        )
-                    )
+                    first, last = table.t[[start, stop - 1]] - table.t[0] + (-_AROUND_S, _AROUND_S)
+                    ends = {"start_s": max(0.0, float(first)), "end_s": float(last)}
+                    table.dead.append(DeadStretch(column=name, missing=True, **ends))
             table.repairs.append(
                 f"column '{name}': {counted(int(missing.sum()), 'missing sample')} interpolated"
             )
@@ -93,12 +87,10 @@ def _refuse_missing(table: TrialTable, name: str, missing: np.ndarray) -> None:
     if count == 0:
         return
     start, length = longest_run(missing)
-    long = sum(
-        n for a, b in zip(*find_runs(missing), strict=True) if (n := b - a) > table.limits.nan_run
-    )
-    whole = table.entry.kind == "locked" or name in (
-        e.column for e in table.session.encoders if e.integrate
-    )
+    lengths = np.subtract(*find_runs(missing)[::-1])
+    long = int(lengths[lengths > table.limits.nan_run].sum())
+    whole = table.entry.kind == "locked"
+    whole |= name in (e.column for e in table.session.encoders if e.integrate)
     if length > table.limits.nan_run and (whole or long > _MOST_MISSING * len(missing)):
         raise table.fault(
             f"{length} samples in a row are missing, more than {table.limits.nan_run}",

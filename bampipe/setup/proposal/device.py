@@ -230,14 +230,10 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
             f"{driver.name} falls where the motion asks for more: it is taken for the reaction, its"
             " sign turned"
         )
-    raw = driver is not None and (
-        role != "force"
-        or driver.si == "V"
-        or needs_gain(driver)
-        or (not linear and is_force(driver))
-    )
-    named = driver.name if driver is not None else ""
-    drive = Drive(role, named, supply is not None, coil, scaled=not raw)
+    drive = Drive(role, driver.name if driver is not None else "", supply is not None, coil)
+    if driver is not None:
+        levered = driver.si == "V" or needs_gain(driver) or (not linear and is_force(driver))
+        drive = replace(drive, scaled=role == "force" and not levered)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
     weight, on_gravity = weight_of(position, fit, linear, found)
     starter = starter_device(position.name, linear, drive, fit, weight, width)

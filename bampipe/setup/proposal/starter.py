@@ -197,12 +197,9 @@ force_unit = "{unit}"
 viscous = {{ unit = "{rate}", {viscous}, lower = 0.0 }}  # guess
 coulomb = {{ unit = "{torque}", {coulomb}, lower = 0.0 }}  # guess
 '''
-    inertia = (
-        *_prior(found.inertia, wide),
-        f"lower = {_least_inertia(linear, drive.coil, found):g}",
-    )
-    spread = 0.6 * wide * abs(found.coulomb) or 20.0
-    offset = ("prior = 0.0", f"sd = {_rounded(spread):g}")
+    least, spread = _least_inertia(linear, drive.coil, found), 0.6 * wide * abs(found.coulomb)
+    inertia = (*_prior(found.inertia, wide), f"lower = {least:g}")
+    offset = ("prior = 0.0", f"sd = {_rounded(spread or 20.0):g}")
     text += _parameter("inertia", mass, inertia, "all that moves, reduced to this axis")
     text += _parameter("offset", torque, offset, "needed to hold the axis where nothing else acts")
     if weight is not None:
