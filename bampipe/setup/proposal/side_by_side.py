@@ -56,23 +56,18 @@ def _moves(name: str, others: Iterable[str]) -> Iterator[tuple[int, Callable[[st
         apart = [k for k, pair in enumerate(zip(own, theirs, strict=False)) if len(set(pair)) > 1]
         if len(own) == len(theirs) and len(apart) == 1:
             here, there = own[apart[0]], theirs[apart[0]]
-            if here.isdigit() and there.isdigit():
+            if here.isdigit() == there.isdigit():
                 place = sum(map(str.isdigit, own[: apart[0]]))
-                step = int(there) - int(here)
-                yield apart[0], partial(_renumbered, place=place, step=step)
-            elif here.isalpha() and there.isalpha():
-                yield apart[0], partial(_renamed, here=here, there=there)
+                yield apart[0], partial(_moved, place=place, here=here, there=there)
 
 
-def _renumbered(name: str, place: int, step: int) -> str:
-    parts = re.split(r"(\d+)", name)
-    if len(own := parts[1::2]) > place:
-        parts[2 * place + 1] = f"{int(own[place]) + step:0{len(own[place])}d}"
-    return "".join(parts)
-
-
-def _renamed(name: str, here: str, there: str) -> str:
-    return "".join(there if token == here else token for token in _TOKENS.findall(name))
+def _moved(name: str, place: int, here: str, there: str) -> str:
+    tokens = _TOKENS.findall(name)
+    if not here.isdigit():
+        return "".join(there if token == here else token for token in tokens)
+    for k in [k for k, token in enumerate(tokens) if token.isdigit()][place : place + 1]:
+        tokens[k] = f"{int(tokens[k]) + int(there) - int(here):0{len(tokens[k])}d}"
+    return "".join(tokens)
 
 
 def _is_one_machine(
