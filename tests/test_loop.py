@@ -109,6 +109,30 @@ def test_a_child_that_was_never_identified_is_removed(
     assert models.names(tmp_path) == ("base",)
 
 
+@pytest.mark.parametrize(
+    ("effects", "start"),
+    [
+        (("stribeck:carriage",), {"stribeck.carriage.speed": 0.02}),
+        (("stribeck:carriage", "backlash:carriage"), {}),
+    ],
+    ids=["as fitted", "one not fitted"],
+)
+def test_identification_starts_where_the_diagnosis_ended(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    effects: tuple[str, ...],
+    start: dict[str, float],
+) -> None:
+    fitted = {"stribeck.carriage.speed": 0.02, "force_delay.delay": 0.004}
+    content = diagnosis({"carriage": {"verdict": "missing"}}, {("stribeck:carriage",): 1.0})
+    write_result(tmp_path, IngestResult, device="slider", axes={"carriage": {}})
+    write_result(tmp_path, DiagnoseResult, model="base", **content, fitted=fitted)
+    monkeypatch.setattr(loop.LoopOptions, "run", lambda *_: None)
+    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
+    child = loop.extend(options, "base", effects)
+    assert models.read(tmp_path, child).start == start
+
+
 def test_what_came_to_nothing_is_not_weighed_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

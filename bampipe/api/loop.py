@@ -184,6 +184,7 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
     """
     from bampipe.declarations.model import ModelFile
     from bampipe.declarations.model_file import load_model
+    from bampipe.results.diagnose import DiagnoseResult
 
     before = models.read(root, parent)
     for effect in named:
@@ -200,7 +201,9 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
         text = source.read_text(encoding="utf-8")
         write_text(root / "models" / child / "effects" / name, text)
     effects = (*before.effects, *named)
-    model = ModelFile(name=child, parent=parent, device=before.device, effects=effects)
+    diagnosis = RunFolder(root).find(DiagnoseResult, parent)
+    start = diagnosis.fitted_of(effects) if diagnosis is not None else {}
+    model = ModelFile(name=child, parent=parent, device=before.device, effects=effects, start=start)
     models.write(root, model)
     load_model(RunFolder(root), child, as_declared=True)
 
