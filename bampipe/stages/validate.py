@@ -103,7 +103,9 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         trials = replace(trials, folds=folds_by_channel(run, trials, config.hold_out_by, where))
     require_sound_motions(system, trials.motions)
     progress(0.1, "held-out fits")
-    evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds)
+    # Least squares would choose these so that less of the force is left to be explained.
+    held = [system.parameters[i].name for i in system.parameters_by_force]
+    evidence = gather_evidence(system, trials.motions, trials.band, p, trials.folds, held=held)
     # Parameters found with the inputs late are those of inputs that late.
     late_s = estimates.input_timing.estimate - trials.late_s
     compared = [compare_trial(evidence, k, p, late_s) for k in range(len(trials.motions))]

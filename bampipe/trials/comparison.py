@@ -126,7 +126,9 @@ def expected_published_ratio(
         replays = replay_motions(
             published, trials.sensors, trials.kinematics, (seed, _EXPECTED_SEED)
         )
-        again = gather_evidence(evidence.system, replays, evidence.band, evidence.p, evidence.folds)
+        again = gather_evidence(
+            evidence.system, replays, evidence.band, evidence.p, evidence.folds, held=evidence.held
+        )
     except InputError:
         return nothing
     if np.any(again.held_out_rmse > UNLIKE * evidence.held_out_rmse):

@@ -148,7 +148,11 @@ class Evidence:
         refits from there where it is not: a Gauss-Newton step alone leads shapes astray.
         """
         folds, free, steps = self.folds, list(self.free), dict[int, Array]()
-        problem = None if self.is_linear else problem_of(self.system, self.motions, self.band)
+        problem = (
+            None
+            if self.is_linear
+            else problem_of(self.system, self.motions, self.band, held=self.held)
+        )
         for group in sorted(set(folds.groups)):
             others = [k for k in folds.fitted_trials if folds.groups[k] != group]
             steps[group] = np.zeros(len(free))
@@ -179,6 +183,11 @@ class Evidence:
             count = sum((sums.count[k] for k in judged), none)
             return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))
         return rms((self.held_out_residual(k) for k in judged), [self.used[k] for k in judged])
+
+    @property
+    def held(self) -> list[str]:
+        """Parameters that are not estimated."""
+        return [q.name for i, q in enumerate(self.system.parameters) if i not in self.free]
 
     @property
     def is_linear(self) -> bool:
@@ -219,6 +228,7 @@ def gather_evidence(
     most_iterations: int = 12,
     like: Evidence | None = None,
     timing: tuple[float, float] = (0.0, 0.0),
+    held: Sequence[str] = (),
 ) -> Evidence:
     """Fit a model to the fitted trials by least squares and linearise it there on all.
 
@@ -227,11 +237,12 @@ def gather_evidence(
         like: a model with some more effects or some less, where that has been fitted: slopes that
             are the same for both are taken from it.
         timing: least and largest change of the inputs' timing, s, that may be weighed beside it.
+        held: parameters that stay as given.
 
     Raises:
         ValueError: fewer samples than parameters, where steps are to be taken.
     """
-    problem = problem_of(system, motions, band)
+    problem = problem_of(system, motions, band, held=held)
     fitted = folds.fitted_trials
     known = None
     if like is not None and like.motions is motions and like.band == band:
