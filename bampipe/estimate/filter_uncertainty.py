@@ -7,6 +7,7 @@ holds whatever the noise is, as long as stretches are independent of each other.
 """
 
 from collections.abc import Callable, Sequence
+from functools import cache
 
 import numpy as np
 
@@ -143,7 +144,8 @@ def climb(
     Returns:
         (k,) best logarithms, and the likelihood there.
     """
-    best, value = start.copy(), log_likelihood(start)
+    likely = cache(lambda *levels: log_likelihood(np.array(levels)))  # a pass meets some again
+    best, value = start.copy(), likely(*start)
     for _ in range(_ROUNDS):
         before = value
         for k in range(start.size):
@@ -154,7 +156,7 @@ def climb(
                     tried[k] = max(tried[k] + sign * step[k], lower[k])
                     if tried[k] == best[k]:
                         break
-                    candidate = log_likelihood(tried)
+                    candidate = likely(*tried)
                     if not candidate > value:
                         break
                     best, value, moved_any = tried, candidate, True
