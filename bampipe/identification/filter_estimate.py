@@ -395,7 +395,9 @@ class _Widths:
             model = self.model
             if width != self.width:
                 model = replace(model, functions=self.narrowed(width))
-            settings = replace(self.found.settings, longest_step=self.step / parts)
+            settings = replace(
+                self.found.settings, longest_step=self.step / parts, stride=_MOVED_SAMPLES
+            )
             with suppress(FilterFailure):
                 outcome = filter_trials(model, self.some[0], theta, self.some[1], settings)
                 likely = sum(float(np.nansum(one.log_likelihood)) for one in outcome.trials)
