@@ -54,7 +54,7 @@ LAWS = {
     ),
     "simulator": law(
         "numpy scipy pandas pyarrow numba pydantic",
-        "errors files schema results progress physics estimate data",
+        "errors files lists schema results progress physics estimate data",
     ),
     "monitor": law(
         "numpy scipy pandas pyarrow numba",
@@ -62,8 +62,8 @@ LAWS = {
     ),
     "stages": law(
         "numpy scipy pandas pyarrow numba pydantic",
-        "errors files schema results phrases progress physics estimate data declarations trials "
-        "identification setup diagnosis next_trial report",
+        "errors files lists schema results phrases progress physics estimate data declarations "
+        "trials identification setup diagnosis next_trial report",
     ),
     "report": law(
         "numpy matplotlib typst pandas pyarrow bampipe",

@@ -66,13 +66,13 @@ def test_following_judges_the_model_that_it_starts_from(
     [
         (
             {("actuator_delay",): 0.56, ("actuator_lag:joint",): 0.44},
-            "between actuator_delay (0.56) and actuator_lag:joint (0.44): the choice is arbitrary,"
-            " actuator_delay is added. A lag weakens",
+            "between actuator_delay (0.56) and actuator_lag:joint (0.44): actuator_delay added"
+            " provisionally. A lag weakens",
         ),
         (
             {("a:joint", "b:joint"): 0.7, ("a:joint", "c:joint"): 0.296, (): 0.004},
-            "between b:joint (0.70) and c:joint (0.30) beside a:joint (> 0.99): the choice is"
-            " arbitrary, b:joint is added. No trial was found",
+            "between b:joint (0.70) and c:joint (0.30) beside a:joint (> 0.99): b:joint added"
+            " provisionally. No trial was found",
         ),
         (
             {(): 0.6, ("a:joint",): 0.4},
@@ -80,7 +80,7 @@ def test_following_judges_the_model_that_it_starts_from(
         ),
     ],
 )
-def test_an_effect_that_is_added_undecided_is_called_arbitrary(
+def test_an_effect_that_is_added_undecided_is_called_provisional(
     sets: dict[tuple[str, ...], float], said: str
 ) -> None:
     lines = {}
@@ -107,6 +107,30 @@ def test_a_child_that_was_never_identified_is_removed(
     with pytest.raises(fault):
         loop.extend(options, "base", ["stribeck:carriage"])
     assert models.names(tmp_path) == ("base",)
+
+
+@pytest.mark.parametrize(
+    ("effects", "start"),
+    [
+        (("stribeck:carriage",), {"stribeck.carriage.speed": 0.02}),
+        (("stribeck:carriage", "backlash:carriage"), {}),
+    ],
+    ids=["as fitted", "one not fitted"],
+)
+def test_identification_starts_where_the_diagnosis_ended(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    effects: tuple[str, ...],
+    start: dict[str, float],
+) -> None:
+    fitted = {"stribeck.carriage.speed": 0.02, "force_delay.delay": 0.004}
+    content = diagnosis({"carriage": {"verdict": "missing"}}, {("stribeck:carriage",): 1.0})
+    write_result(tmp_path, IngestResult, device="slider", axes={"carriage": {}})
+    write_result(tmp_path, DiagnoseResult, model="base", **content, fitted=fitted)
+    monkeypatch.setattr(loop.LoopOptions, "run", lambda *_: None)
+    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
+    child = loop.extend(options, "base", effects)
+    assert models.read(tmp_path, child).start == start
 
 
 def test_what_came_to_nothing_is_not_weighed_again(

@@ -184,6 +184,7 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
     """
     from bampipe.declarations.model import ModelFile
     from bampipe.declarations.model_file import load_model
+    from bampipe.results.diagnose import DiagnoseResult
 
     before = models.read(root, parent)
     for effect in named:
@@ -200,7 +201,9 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
         text = source.read_text(encoding="utf-8")
         write_text(root / "models" / child / "effects" / name, text)
     effects = (*before.effects, *named)
-    model = ModelFile(name=child, parent=parent, device=before.device, effects=effects)
+    diagnosis = RunFolder(root).find(DiagnoseResult, parent)
+    start = diagnosis.fitted_of(effects) if diagnosis is not None else {}
+    model = ModelFile(name=child, parent=parent, device=before.device, effects=effects, start=start)
     models.write(root, model)
     load_model(RunFolder(root), child, as_declared=True)
 
@@ -267,7 +270,7 @@ def _list_open_questions(diagnosis: DiagnoseResult) -> Iterator[str]:
             continue
         known, parts = phrases.split_alternatives(diagnosis, axis)
         taken = join_names(name for name in entry.effects if name in open_effects)
-        added = f"the choice is arbitrary, {taken} is added" if taken else "none is added"
+        added = f"{taken} added provisionally" if taken else "none is added"
         beside = f" beside {known}" if known else ""
         asked = trial is not None and {*trial.between} & {*entry.probabilities}
         advice = trial.sentence if trial is not None and asked else phrases.advise_trial(entry)
@@ -279,10 +282,12 @@ def _add(
 ) -> str:
     """Extend ``model`` by the effects with a strength; return "" if that is no better."""
     from bampipe.results.compare import CompareResult
+    from bampipe.results.identify import IdentifyResult
 
     tell(f"adding {', '.join(effects)}")
     child = extend(options, model, effects)
-    if weak := _find_weak(options.root, child, effects):
+    found = RunFolder(options.root).read(IdentifyResult, child).effects
+    if weak := [name for name in effects if not found[name].has_strength]:
         tell(f"{', '.join(weak)}: no strength beside the other parameters, removed")
         effects = tuple(effect for effect in effects if effect not in weak)
         _remove(options, child)
@@ -297,18 +302,3 @@ def _add(
         why = "there is no noise floor, or the error is far below it and cannot be judged"
     tell(f"{', '.join(effects)}: {why}, stopped at {model}")
     return ""
-
-
-def _find_weak(root: Path, model: str, effects: Sequence[str]) -> list[str]:
-    """Return those of ``effects`` whose every strength in ``model`` is zero within two sd."""
-    from bampipe.declarations.model_file import load_model
-    from bampipe.results.identify import IdentifyResult
-
-    run = RunFolder(root)
-    found = run.read(IdentifyResult, model).parameters
-    weak = []
-    for effect in load_model(run, model).effects:
-        strengths = [found[p.name] for p in effect.parameters if p.strength and p.name in found]
-        if effect.name in effects and strengths:
-            weak += [effect.name] * all(abs(p.estimate) < 2.0 * p.sd for p in strengths)
-    return weak

@@ -1,13 +1,12 @@
 """The file ``models/<name>/model.toml``: a device, its effects, and the model it came from."""
 
-import json
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
 from bampipe.errors import InputError
-from bampipe.files import read_toml
+from bampipe.files import read_toml, toml_text
 from bampipe.schema import Declaration, Several, Text, read
 
 
@@ -21,12 +20,16 @@ class ModelFile(Declaration):
     parent: str = Field(default="", description="Name of the parent; empty for the base model")
     device: Text = Field(description="Name of the device")
     effects: Several[Text] = Field(default=(), description="Effects, name[:target]")
+    start: dict[str, float] = Field(
+        default={},
+        description="Where identification starts, by parameter of an effect; searched for where "
+        "one is absent",
+    )
 
     def text(self) -> str:
         """Return the model as TOML."""
-        table = self.model_dump(by_alias=True, exclude={} if self.parent else {"parent"})
-        lines = (f"{key} = {json.dumps(value)}" for key, value in table.items())
-        return "\n".join(lines) + "\n"
+        empty = {key for key in ("parent", "start") if not getattr(self, key)}
+        return toml_text(self.model_dump(by_alias=True, exclude=empty))
 
 
 def read_model_file(path: Path) -> ModelFile:

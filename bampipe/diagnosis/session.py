@@ -322,6 +322,14 @@ class Fit:
     log_likelihood: float = float("nan")
     given: bool = False
 
+    @property
+    def effect_parameters(self) -> dict[str, float]:
+        """Values of the parameters of its effects, by name."""
+        system = self.evidence.system
+        count = len(system.model.device.parameters)
+        pairs = zip(system.parameters[count:], self.evidence.p[count:], strict=True)
+        return {item.name: float(value) for item, value in pairs}
+
     @cached_property
     def solved(self) -> Solved:
         """The solution of its linear problem, next to zero but for the nuisance parameters."""

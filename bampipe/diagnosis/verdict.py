@@ -1,7 +1,7 @@
 """The rule: what is said of each axis, from the probabilities, the sizes and the noise floor."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -125,16 +125,12 @@ def _judge(
 
 def effect_axes(initial: Fit, final: Fit, effect: str) -> tuple[int, ...]:
     """Axes on which an effect changes the equation."""
-    if effect in final.recipe.effects:
-        system = final.evidence.system
-        item = next(i for i in system.model.effects if i.name == effect)
-    else:
-        candidate = candidates_of(initial.recipe, (effect,))[0]
-        system, item = candidate.system, candidate.system.model.effects[-1]
-    axes = tuple(system.coordinates.index(a) for a in item.axes)
-    if axes:
-        return axes
-    alone = candidates_of(initial.recipe, (effect,))[0].system
+    rest = tuple(e for e in initial.recipe.effects if e != effect)
+    alone = candidates_of(replace(initial.recipe, effects=rest), (effect,))[0].system
+    system = final.evidence.system if effect in final.recipe.effects else alone
+    item = next(i for i in system.model.effects if i.name == effect)
+    if item.axes:
+        return tuple(system.coordinates.index(a) for a in item.axes)
     return tuple(range(len(system.coordinates))) if alone.moves_sensors else tuple(alone.touched)
 
 

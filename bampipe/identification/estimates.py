@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from bampipe.arrays import Array, Flags, Indices
 from bampipe.estimate.influence import RemovedStretch
@@ -132,7 +133,10 @@ def collect_result(
         )
         for i, (name, place) in enumerate(zip(names, free, strict=True))
     }
-    effects = {each.name: _judge_effect(each, parameters) for each in system.model.effects}
+    effects = {
+        each.name: _judge_effect(each, parameters, estimate.covariance)
+        for each in system.model.effects
+    }
     unknown = [name for name, found in effects.items() if not found.identified]
     warning = f"not identified: {', '.join(unknown)}; " if unknown else ""
     timing = estimate.report["input_timing"]
@@ -211,12 +215,13 @@ def _assess_influence(
 
 
 def _judge_effect(
-    effect: BoundEffect, parameters: Mapping[str, ParameterEstimate]
+    effect: BoundEffect, parameters: Mapping[str, ParameterEstimate], covariance: Array
 ) -> EffectEstimate:
     """Say whether an effect is determined: a strength that is not nothing, and all of its shape.
 
-    Of several strengths, such as those of sine and cosine, one is enough. A shape that cannot be
-    negative needs an interval smaller than itself.
+    Several strengths, such as those of sine and cosine, are taken together: their errors may be
+    correlated so that none is determined alone. A shape that cannot be negative needs an interval
+    smaller than itself. ``covariance`` is (n, n), of all ``parameters`` in their order.
     """
     free = [(item, parameters[item.name]) for item in effect.parameters if item.name in parameters]
     faults = {item.name: _fault(item.name, entry) for item, entry in free}
@@ -227,9 +232,23 @@ def _judge_effect(
         if item.shape and (item.lower >= 0.0 or entry.at_bound)
     ]
     reasons = [fault for fault in shapes if fault]
-    if strengths and all(strengths):
-        reasons = [*strengths, *reasons]
-    return EffectEstimate(identified=not reasons, reasons=tuple(reasons))
+    places = [list(parameters).index(item.name) for item, _ in free if item.strength]
+    value = np.array([entry.estimate for item, entry in free if item.strength])
+    has_strength = not places or _differs_from_zero(value, covariance[np.ix_(places, places)])
+    if not has_strength:
+        reasons = [*filter(None, strengths), *reasons]
+    return EffectEstimate(has_strength=has_strength, identified=not reasons, reasons=tuple(reasons))
+
+
+def _differs_from_zero(value: Array, covariance: Array) -> bool:
+    """Return whether zero lies outside the 95 % region of estimates (k,), covariance (k, k)."""
+    sd = np.sqrt(np.diag(covariance))
+    if np.any((sd == 0.0) & (value != 0.0)):
+        return True
+    z = value / np.where(sd > 0.0, sd, 1.0)
+    correlation = covariance / np.outer(*[np.where(sd > 0.0, sd, 1.0)] * 2)
+    distance = z @ np.linalg.pinv(correlation, hermitian=True) @ z
+    return bool(distance > stats.chi2.ppf(0.95, len(value)))
 
 
 def _fault(name: str, entry: ParameterEstimate) -> str:

@@ -48,6 +48,8 @@ _MOVES = 0.01
 """Share of its range in the trial by which an axis must move within a window to count there."""
 _RUNS_AWAY = 0.1
 """Share of windows that may run away."""
+_RUN_AWAY_PERCENT = 1000.0
+"""Error of a whole trial in relation to its motion from which a free run says nothing."""
 _STEPS_S = (1e-3, 1e-4)
 """Longest steps of integration, the next where a motion runs away with one: friction that builds up
 within micrometres is stiffer than an axis, and runs away by the step alone."""
@@ -102,11 +104,14 @@ def free_runs(
             else:
                 return FreeRun(
                     reason=f"{reason}, and driven by its recorded inputs alone the mechanism does "
-                    "not forget where it started"
+                    "not forget where it started."
                 )
     except InputError as error:
-        return FreeRun(reason=f"{mode.replace('_', ' ')}: {error}")
+        return FreeRun(reason=f"{mode.replace('_', ' ')}: {error}.")
     counted = [r for r, j in zip(runs, judged, strict=True) if j] or runs
+    axes = _axes(system, counted)
+    if any(axis.relative_error_percent > _RUN_AWAY_PERCENT for axis in axes.values()):
+        return FreeRun(reason="The simulated motion runs away.")
     given = np.concatenate([r.force for r in counted])
     off = np.concatenate([r.command for r in counted]) - given
     names = system.model.device.forces if mode == CLOSED else ()
@@ -117,7 +122,7 @@ def free_runs(
     return FreeRun(
         reason="" if mode == CLOSED else reason,
         mode=mode,
-        axes=_axes(system, counted),
+        axes=axes,
         trials={r.trial_id: _axes(system, [r]) for r in runs},
         forces=forces,
     )

@@ -143,6 +143,9 @@ class DiagnoseResult(Result):
         default={}, description="Text of the effect file, by name of an effect in the ranking"
     )
     selected: Names
+    fitted: dict[str, float] = Field(
+        default={}, description="Parameters of the effects of the final model, in SI units"
+    )
     sets: tuple[WeighedSet, ...] = Field(description="The most probable first")
     chance: NullDistribution | None = Field(
         default=None, description="null where replicates do not resemble the measurement"
@@ -167,6 +170,17 @@ class DiagnoseResult(Result):
             here = tuple(name for name in known if name in one.effects)
             found[here] = found.get(here, 0.0) + one.probability
         return sorted(found.items(), key=lambda pair: -pair[1])
+
+    def fitted_of(self, effects: Names) -> dict[str, float]:
+        """Return the fitted parameters of ``effects``; none where it has not fitted them all."""
+        ahead = {effect: f"{effect.replace(':', '.')}." for effect in effects}
+        found = {
+            effect: {k: v for k, v in self.fitted.items() if k.startswith(start)}
+            for effect, start in ahead.items()
+        }
+        if not all(found.values()):
+            return {}
+        return {name: value for one in found.values() for name, value in one.items()}
 
     @property
     def alternatives(self) -> dict[str, Names]:

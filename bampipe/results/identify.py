@@ -98,6 +98,9 @@ class Influence(Record):
 class EffectEstimate(Record):
     """Whether the trials determine an effect of the model."""
 
+    has_strength: bool = Field(
+        default=True, description="Whether its strengths, taken together, differ from zero at 95 %"
+    )
     identified: bool
     reasons: Names = Field(default=(), description="Why it does not count as identified")
 

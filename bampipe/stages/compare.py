@@ -83,7 +83,7 @@ def _rung(
         confirmed=not parent,
         unit={axis: entry.unit for axis, entry in axes.items()},
         free_run_mode=free.mode if free else None,
-        free_run_reason=free.reason if free else "`free_run` is off",
+        free_run_reason=free.reason if free else "`free_run` is off.",
         free_run=free.axes if free else {},
         drift=free.drift if free else {},
     )

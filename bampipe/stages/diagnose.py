@@ -189,6 +189,7 @@ def _result(
             name: EffectText.of(own.get(name) or registry.effect(name)) for name in known
         },
         selected=found.selected,
+        fitted=selection.final.effect_parameters,
         sets=found.sets,
         chance=found.chance,
         cut_short=selection.cut_short,

@@ -11,6 +11,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender, write_parquet
+from bampipe.declarations.model import read_model_file
 from bampipe.declarations.model_file import MODEL_INPUTS, load_model, read_recipe
 from bampipe.diagnosis.start import SignWidth, choose_sign_width, search_start
 from bampipe.errors import InputError
@@ -301,13 +302,16 @@ def _describe_squares(task: _Task, squares: SquaresFit) -> list[str]:
 
 
 def _start(task: _Task) -> Array:
-    """Priors of the device; of effects, what a search over their range finds."""
+    """Priors of the device; of effects, what a diagnosis or a search over their range found."""
     system, start = task.system, task.system.prior
-    if system.model.effects:
+    count = len(system.model.device.parameters)
+    path = task.run.path(f"models/{task.config.model}/model.toml")
+    given, own = read_model_file(path).start, system.parameters[count:]
+    if all(item.name in given for item in own):
+        start[count:] = [np.clip(given[item.name], item.lower, item.upper) for item in own]
+    else:
         trials = read_measured_trials(task.run, system, every_input=True)
-        found = search_start(trials, task.recipe)
-        count = len(system.model.device.parameters)
-        start[count:] = found[count:]
+        start[count:] = search_start(trials, task.recipe)[count:]
     free = [k for k, item in enumerate(system.parameters) if not item.fixed]
     start[free] *= task.config.start_factor
     return start

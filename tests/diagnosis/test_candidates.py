@@ -1,6 +1,7 @@
 """Candidates: on what effects of the model leave, and among rivals on data of other simulators."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.select import open_search, start_of
 from bampipe.diagnosis.session import Session, candidates_of, system_of
 from bampipe.diagnosis.start import search_start
+from bampipe.diagnosis.verdict import effect_axes
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.residuals import ModelOnTrial
@@ -32,6 +34,15 @@ def test_gears_and_cables_are_weighed_wherever_a_motor_drives(effect):
 
     assert weighed("slider") and weighed("servo_pendulum")
     assert not weighed("bam") and not weighed("magnetic_damper")
+
+
+def test_an_effect_that_the_most_probable_set_takes_away_has_its_axes():
+    def fit(*effects: str) -> SimpleNamespace:
+        recipe = Recipe(registry.device("bam").declaration, effects, ())
+        return SimpleNamespace(recipe=recipe, evidence=SimpleNamespace(system=system_of(recipe)))
+
+    assert effect_axes(fit("stribeck:pitch"), fit(), "stribeck:pitch") == (1,)
+    assert effect_axes(fit("force_delay"), fit(), "force_delay") == (0, 1, 2)
 
 
 def test_beside_a_gear_that_loses_of_its_load_a_spring_is_scored_as_part_of_that_load():

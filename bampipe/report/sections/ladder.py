@@ -86,7 +86,7 @@ def _tabulate_free_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
         rows.append((_name_version(rungs, rung), split_name(rung.free_run_mode or NONE), *cells))
     heads = (f">{axis} ({unit}) | >relative (%)" for axis, (_, unit) in scales.items())
     reasons = (
-        f"{_name_version(rungs, rung).capitalize()}, –: {rung.free_run_reason}."
+        f"{_name_version(rungs, rung).capitalize()}, –: {rung.free_run_reason}"
         for rung in rungs
         if not rung.free_run and rung.free_run_reason
     )
