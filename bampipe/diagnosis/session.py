@@ -278,9 +278,7 @@ class Session:
         return evidence, problem
 
     def judge(self, recipe: Recipe, p: Array, count: int = 0) -> Fit:
-        """A model with given parameters, held against replays of it, on all trials that are judged.
-
-        ``count`` is that of `weight_samples`.
+        """A given model, held against ``count`` replays of it, on all trials that are judged.
 
         Raises:
             Runaway: the simulated motion grows without bounds.
@@ -459,10 +457,10 @@ def _narrower_friction(evidence: Evidence) -> list[Array]:
     """What Coulomb friction leaves whose sign is narrower than the model's, by trial, (K, n_q)."""
     e = evidence
     width = e.system.sign_widths
-    rows = [
+    rows = (
         dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width))
         for dry, m in zip(dry_friction(e), e.motions, strict=True)
-    ]
+    )
     thin = e.band.thin_trials(rows, range(len(width)))
     return [values * used for values, used in zip(thin, e.used, strict=True)]
 
@@ -470,7 +468,7 @@ def _narrower_friction(evidence: Evidence) -> list[Array]:
 def residuals_of(evidence: Evidence, replays: Sequence[Motion]) -> list[Array]:
     """The residual of a model on replays of its trials, by trial, each (K, n_q)."""
     e = evidence
-    rows = [ModelOnTrial(e.system, e.p, replays, k).residual for k in range(len(replays))]
+    rows = (ModelOnTrial(e.system, e.p, replays, k).residual for k in range(len(replays)))
     thin = e.band.thin_trials(rows, range(len(e.system.coordinates)))
     return [values * used for values, used in zip(thin, e.used, strict=True)]
 

@@ -71,9 +71,7 @@ def _low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array,
         ValueError: the cut-off is not between 0 and half the sampling rate.
     """
     if not 0.0 < cutoff_hz < 0.5 * rate_hz:
-        raise ValueError(
-            f"the cut-off {cutoff_hz:g} Hz is not between 0 and half of {rate_hz:g} Hz"
-        )
+        raise ValueError(f"cut-off {cutoff_hz:g} Hz is not between 0 and half of {rate_hz:g} Hz")
     reach = int(np.ceil(4.0 * rate_hz / cutoff_hz)) + 2
     longer = extend(values, reach, max(4, int(np.ceil(1.5 * rate_hz / cutoff_hz))))
     added = (len(longer) - len(values)) // 2

@@ -23,10 +23,7 @@ _SILENT = 1e-20
 
 
 def sandwich_covariance(
-    trials: Sequence[Stored],
-    n_states: int,
-    theta: Array,
-    covariance: Array,
+    trials: Sequence[Stored], n_states: int, theta: Array, covariance: Array
 ) -> tuple[Array, int]:
     """Covariance of the filter's final parameters from the scatter of blocks of time.
 
@@ -72,11 +69,7 @@ def sandwich_covariance(
 
 
 def leave_out(
-    trials: Sequence[Stored],
-    groups: Sequence[int],
-    n_states: int,
-    theta: Array,
-    covariance: Array,
+    trials: Sequence[Stored], groups: Sequence[int], n_states: int, theta: Array, covariance: Array
 ) -> dict[int, Array]:
     """Return the filter's final parameters (nt,) without each group of trials, by group.
 
@@ -127,10 +120,7 @@ def at_block_ends(trial: Stored, block_s: float) -> Stored:
 
 
 def climb(
-    log_likelihood: Callable[[Array], float],
-    start: Array,
-    step: Array,
-    lower: Array,
+    log_likelihood: Callable[[Array], float], start: Array, step: Array, lower: Array
 ) -> tuple[Array, float]:
     """Maximise a likelihood over a few noise levels, one at a time, by doubling steps.
 

@@ -326,9 +326,9 @@ def simulate_tracking(
     Raises:
         Runaway: the motion grows without bounds.
     """
-    finer = _finer(dt, smooth)
+    u, fine_dt = read_finely(u, dt, smooth)
+    finer, dt = round(dt / fine_dt), fine_dt
     if finer > 1:
-        u, dt = read_finely(u, dt, smooth)
         everything = range(q_ref.shape[1])
         q_ref, qd_ref = (_read_between(ref, finer, everything) for ref in (q_ref, qd_ref))
         brake_gain = None if brake_gain is None else _read_between(brake_gain, finer)
@@ -355,13 +355,9 @@ def simulate_tracking(
     return np.ascontiguousarray(x[::finer]), np.ascontiguousarray(total[::finer])
 
 
-def _finer(dt: float, smooth: Sequence[int]) -> int:
-    return int(np.ceil(dt / _WIDEST_GRID_S - 1e-6)) if len(smooth) else 1
-
-
 def read_finely(u: Array, dt: float, smooth: Sequence[int]) -> tuple[Array, float]:
     """Inputs (T, n_u, ...) as finely as smooth ones want them, and the interval of that grid, s."""
-    finer = _finer(dt, smooth)
+    finer = int(np.ceil(dt / _WIDEST_GRID_S - 1e-6)) if len(smooth) else 1
     return (u, dt) if finer == 1 else (_read_between(u, finer, smooth), dt / finer)
 
 

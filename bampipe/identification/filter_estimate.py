@@ -213,7 +213,8 @@ class _Filtering:
         value, slope = self.model.to_physical(found.theta)
         around = _AROUND * slope * np.sqrt(np.diag(found.covariance))
         with suppress(MotionLost):  # a narrow sign may throw it off at one reversal of many
-            again = self.run([(value, around, 1.0)], width.settings)
+            settings = replace(found.settings, longest_step=widths.step / width.parts)
+            again = self.run([(value, around, 1.0)], settings)
             if again.log_likelihood > found.log_likelihood + _LIKELIER:
                 first = found.first or found.passes
                 again = replace(again, restarts=found.restarts, repeats=1, first=first)
@@ -297,9 +298,7 @@ def _find_smoothing(width: _Width | None, widths: _Widths) -> tuple[Array, Array
     factor, parts = (1.0, 1) if width is None else (width.factor, width.parts)
     likely, value = widths.filter(factor, 2 * parts)
     likelier, moved = widths.filter(_NARROWER[0] * factor, 2 * parts)
-    off = np.zeros(value.size)
-    if likelier > likely > -np.inf:
-        off = (moved - value) / (1.0 - _NARROWER[0])
+    off = (moved - value) / (1.0 - _NARROWER[0]) if likelier > likely > -np.inf else 0.0 * value
     return off, np.zeros(off.size) if width is None else width.spread
 
 
@@ -359,13 +358,11 @@ class _Width:
 
     Attributes:
         factor: times the device's; parts: by which the Runge-Kutta step that suits is divided.
-        settings: of the filter, with that step.
         spread: (n,) how far parameters move between the widths and steps that are nearly as likely.
     """
 
     factor: float
     parts: int
-    settings: FilterSettings
     spread: Array
 
 
@@ -421,15 +418,9 @@ class _Widths:
         if max(best[:2]) < declared + _LIKELIER:
             return None
         most = max(best)
-        chosen = min(
-            (key for key, (likely, _) in self.filtered.items() if likely > most - _LIKELIER),
-            key=lambda key: key[1],
-        )
-        near = [
-            value
-            for likely, value in self.filtered.values()
-            if likely - declared > 0.5 * (most - declared)
-        ]
+        alike = [key for key, (likely, _) in self.filtered.items() if likely > most - _LIKELIER]
+        chosen = min(alike, key=lambda key: key[1])
+        far = 0.5 * (most + declared)
+        near = [value for likely, value in self.filtered.values() if likely > far]
         spread = np.max(np.abs(np.array(near) - self.filtered[chosen][1]), axis=0)
-        settings = replace(self.found.settings, longest_step=self.step / chosen[1])
-        return _Width(*chosen, settings, spread)
+        return _Width(*chosen, spread)

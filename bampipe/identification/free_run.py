@@ -163,7 +163,7 @@ def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -
     start, u = _start(system, motion, p), motion.inputs(system.inputs)
     if push is not None:
         start[: len(push)] += push
-    x = _simulate(system, start, u, p, float(motion.t[1] - motion.t[0]), system.forced)
+    x = _simulate(system, start, u, p, float(motion.t[1] - motion.t[0]), system.forced, MAX_STEP_S)
     readings = system.encoder_readings(x, u, p)
     none = np.zeros((len(x), 0))
     return _Run(motion.trial_id, np.hstack([motion.q, motion.qd]), readings, none, none)
@@ -232,7 +232,7 @@ def find_drift(
     spacing = sum(usable) / starts
     runs = [
         _let_go(
-            system, motions[k], parameters[k], length, length if len(chosen) == starts else spacing
+            system, motions, k, parameters[k], length, length if len(chosen) == starts else spacing
         )
         for k, length in zip(chosen, usable, strict=True)
     ]
@@ -243,9 +243,8 @@ def find_drift(
         reached = [reach for run in runs for reach in next(run, [])]
         for i, (axis, _) in enumerate(axes):
             if not found[axis].reason:
-                found[axis] = found[axis].model_copy(
-                    update=_drift(reached, i, horizon, found[axis])
-                )
+                update = _drift(reached, i, horizon, found[axis])
+                found[axis] = found[axis].model_copy(update=update)
     return found
 
 
@@ -263,38 +262,35 @@ def why_not_free(system: System, motions: Sequence[Motion], parameters: Sequence
 
 
 def _let_go(
-    system: System, motion: Motion, parameters: Array, length: float, spacing: float
+    system: System, motions: Sequence[Motion], trial: int, p: Array, length: float, spacing: float
 ) -> Iterator[list[_Reach]]:
-    """Runs from many samples of a trial: at each horizon those that end within the trial.
-
-    Args:
-        length, spacing: of the starts, s.
-    """
-    p = np.ascontiguousarray(parameters[: len(system.parameters)])
-    u = motion.inputs(system.inputs)
-    dt = float(motion.t[1] - motion.t[0])
+    """Runs from many samples of a trial, by horizon; ``length``, ``spacing`` of the starts, s."""
+    motion, p = motions[trial], np.ascontiguousarray(p[: len(system.parameters)])
+    u, dt = motion.inputs(system.inputs), float(motion.t[1] - motion.t[0])
     true = motion.of_mechanism(system, u, p)
     states = np.hstack([true.q, true.qd, system.memory(*true.kinematics, u, p, true.t)])
     last = len(motion.t) - 1 - round(_MARGIN_S / dt)
     count = int(length / spacing) if spacing > 0.0 else 0
     starts = [round((_MARGIN_S + (number + 0.5) * spacing) / dt) for number in range(count)]
-    running: list[Array | None] = [states[k] for k in starts]
-    travel, done = np.ptp(motion.q, axis=0), 0
+    running: list[Array | None] = [states[k].copy() for k in starts]
+    travel, done, longest = np.ptp(motion.q, axis=0), 0, round(HORIZONS_S[-1] / dt) + 1
+    seen = [(u[k : k + longest].copy(), motion.q[k : k + longest].copy()) for k in starts]
+    del motion, true, u, states  # of a hundred trials, these windows alone are kept
     for horizon in HORIZONS_S:
         steps = round(horizon / dt)
-        inside = [k for k in starts if k + steps <= last]  # the first of them
+        inside = [both for k, both in zip(starts, seen, strict=True) if k + steps <= last]
         if not inside:
             return
-        windows = np.stack([u[k + done : k + steps + 1] for k in inside], axis=-1)
+        windows = np.stack([given[done : steps + 1] for given, _ in inside], axis=-1)
         fine, fine_dt = read_finely(windows, dt, system.forced)
         reached, done = list[_Reach](), steps
-        for place, k in enumerate(inside):
-            measured, state = motion.q[k : k + steps + 1], running[place]
+        for place, (given, path) in enumerate(inside):
+            measured, state = path[: steps + 1], running[place]
             if state is not None:
                 state = _simulate_from(system, state, fine[..., place], p, fine_dt)
             running[place], error = state, np.full(len(travel), np.inf)
             if state is not None:
-                reading = system.encoder_readings(state[None], u[[k + steps]], p)[0]
+                reading = system.encoder_readings(state[None], given[[steps]], p)[0]
                 error = np.abs(reading[: error.size] - measured[-1])
             moves = np.ptp(measured, axis=0) > _MOVES * travel
             reached.append((error, np.abs(measured[-1] - measured[0]), moves))
@@ -310,13 +306,7 @@ def _simulate_from(system: System, state: Array, u: Array, p: Array, dt: float) 
 
 
 def _simulate(
-    system: System,
-    state: Array,
-    u: Array,
-    p: Array,
-    dt: float,
-    smooth: Sequence[int],
-    step: float = MAX_STEP_S,
+    system: System, state: Array, u: Array, p: Array, dt: float, smooth: Sequence[int], step: float
 ) -> Array:
     """States (T, nx) under the inputs (T, n_u) alone, from ``state`` on."""
     return simulate(

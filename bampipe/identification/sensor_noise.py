@@ -77,11 +77,7 @@ class Noise:
 
 
 def sensor_noise(
-    sensors: Sensors,
-    system: System,
-    motions: Sequence[Motion],
-    p: Array,
-    choice: FilterChoice,
+    sensors: Sensors, system: System, motions: Sequence[Motion], p: Array, choice: FilterChoice
 ) -> Noise:
     """Noise of the session's sensors as the filter wants it.
 

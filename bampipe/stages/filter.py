@@ -299,10 +299,7 @@ def _write_motions(
 
 
 def _motions(
-    path: Path,
-    names: Sequence[str],
-    system: System,
-    left_out: Mapping[str, Sequence[Disturbance]],
+    path: Path, names: Sequence[str], system: System, left_out: Mapping[str, Sequence[Disturbance]]
 ) -> TrialCache[Motion]:
     """The trials just written."""
 

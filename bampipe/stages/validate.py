@@ -151,17 +151,13 @@ def _noise_floor(
     progress(0.4, "noise floor")
     count = config.repeats or floor_replays(trials.motions)
     if count == 1:
-        raise InputError(
-            "one replicate has no scatter", where="validate.repeats", remedy="set 2 or more, or 0"
-        )
+        raise InputError("one replicate has no scatter", where="validate.repeats", remedy="set 2")
     # Where the session holds trials out, these are few, and all are needed to judge by.
     chosen: Sequence[int] = range(len(evidence.motions))
     if all(evidence.folds.judged):
         chosen = draw_trials(evidence.sizes)
     drawn = replace(
-        trials,
-        motions=[trials.motions[k] for k in chosen],
-        folds=trials.folds.subset(chosen),
+        trials, motions=[trials.motions[k] for k in chosen], folds=trials.folds.subset(chosen)
     )
     session = Session(drawn, Criteria(), seed=config.seed)
     try:

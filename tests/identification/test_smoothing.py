@@ -52,7 +52,6 @@ def test_the_likeliest_width_is_chosen_with_the_longest_step_that_serves() -> No
     likely = {(width, parts): best[width] for width in best for parts in (1, 2, 4)}
     chosen = widths(likely | {(0.25, 1): 120.0}).choose()
     assert chosen is not None and (chosen.factor, chosen.parts) == (0.25, 2)
-    assert chosen.settings.longest_step == 0.5e-3
     assert chosen.spread == pytest.approx(0.1875)  # to 0.0625, likelier than half way to the best
     assert widths(likely | {(1.0, 4): 171.0}).choose() is None
 
