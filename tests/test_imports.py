@@ -50,7 +50,8 @@ LAWS = {
         "errors lists results phrases physics estimate trials identification diagnosis",
     ),
     "declarations": law(
-        "numpy scipy pandas pydantic", "errors files lists schema stages.base results physics data"
+        "numpy scipy pandas pydantic matplotlib",
+        "errors files lists schema stages.base results physics data",
     ),
     "simulator": law(
         "numpy scipy pandas pyarrow numba pydantic",

@@ -5,12 +5,11 @@ They have fixed options and no metadata that varies. A file that cannot be read 
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
-from typing import BinaryIO, Self, TypeAlias
+from typing import BinaryIO, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -23,7 +22,7 @@ from bampipe.files import atomic_writer
 Frame: TypeAlias = pd.DataFrame | Mapping[str, np.ndarray | pa.Array]
 
 
-class ParquetAppender:
+class ParquetAppender(ExitStack):
     """Parquet file written frame by frame; appears whole when closed.
 
     Use as a context manager; :meth:`append` frames with the same columns. A ``trial_id`` column
@@ -33,14 +32,11 @@ class ParquetAppender:
     """
 
     def __init__(self, path: Path) -> None:
+        super().__init__()
         self._path = Path(path)
-        self._file = atomic_writer(self._path)
-        self._stream: BinaryIO | None = None
         self._writer: pq.ParquetWriter | None = None
-
-    def __enter__(self) -> Self:
-        self._stream = self._file.__enter__()
-        return self
+        self._stream = self.enter_context(atomic_writer(self._path))
+        self.push(self._finish)
 
     def append(self, frame: Frame) -> None:
         """Write the rows of a frame.
@@ -49,10 +45,8 @@ class ParquetAppender:
             frame: a DataFrame (its index is dropped) or named columns of equal length.
 
         Raises:
-            ValueError: columns differ from those of the first frame, or used outside ``with``.
+            ValueError: columns differ from those of the first frame.
         """
-        if self._stream is None:
-            raise ValueError("append() outside the with block")
         table = _table(frame)
         if self._writer is None:
             self._writer = _writer(self._stream, table.schema)
@@ -62,24 +56,11 @@ class ParquetAppender:
             part = table.slice(start, stop - start)
             self._writer.write_table(part, row_group_size=max(part.num_rows, 1))
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._stream = None
-        if self._writer is None and error is None:
-            error = ValueError(f"{self._path}: no frame was written")
-            self._file.__exit__(ValueError, error, None)
-            raise error
+    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._writer is not None:
-            try:
-                self._writer.close()
-            except OSError as closing:
-                if error is None:
-                    kind, error, trace = type(closing), closing, closing.__traceback__
-        self._file.__exit__(kind, error, trace)
+            self._writer.close()
+        elif kind is None:
+            raise ValueError(f"{self._path}: no frame was written")
 
 
 def write_parquet(path: Path, frame: Frame) -> None:

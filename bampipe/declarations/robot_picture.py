@@ -1,20 +1,29 @@
 """A robot as it is declared, drawn at position zero: from the side and from above, as SVG."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from html import escape
+from typing import Any
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 
 from bampipe.arrays import Array
 from bampipe.physics.robot import Joint, Robot, rotation_matrix
 
-_SIDE, _MARGIN, _TOP = 420.0, 60.0, 34.0
 _INK, _FAINT, _BODY, _WRONG = "#1c2024", "#b4b8bd", "#56b4e9", "#d55e00"
+_VIEWS = {"from the side": (0, 2, 1), "from above": (0, 1, 2)}
+"""By title, the base's axes to the right, upwards and to the eye."""
 _ALONG = 0.8
 """Of an axis' length along the view: it is drawn as one that points at the eye."""
-_LARGEST_PX, _HALF_AXIS_PX, _LINE_PX = 16.0, 14.0, 13.0
-_BARS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+_AXIS = 0.04
+"""Of the robot's length: what is drawn of an axis on either side of its joint."""
+_HEAVIEST = 800.0
+"""Area of the heaviest body, square points."""
+_NEAR, _LINE = 0.03, 11.0
+"""Of the robot's length, joints so close have their names one below the other, so many points."""
+_SETTINGS: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "bampipe", "font.size": 9.0}
 
 
 @dataclass(frozen=True)
@@ -28,29 +37,6 @@ class _Placed:
     center: Array
 
 
-@dataclass(frozen=True)
-class _View:
-    """One projection.
-
-    Attributes:
-        title: of it.
-        right, up, towards: the base's axes to the right, upwards and to the eye.
-        at: its middle, px; middle: the point there, m; scale: px a metre.
-    """
-
-    title: str
-    right: int
-    up: int
-    towards: int
-    at: tuple[float, float]
-    middle: Array
-    scale: float
-
-    def pixel(self, point: Array) -> tuple[float, float]:
-        off = (point - self.middle) * self.scale
-        return self.at[0] + float(off[self.right]), self.at[1] - float(off[self.up])
-
-
 def draw_robot(robot: Robot) -> str:
     """The chain at position zero: joints with their axes, and bodies as large as their mass.
 
@@ -62,25 +48,17 @@ def draw_robot(robot: Robot) -> str:
     """
     placed = _place(robot)
     points = np.array([np.zeros(3), *(p.place for p in placed), *(p.center for p in placed)])
-    span = max(float(np.ptp(points, axis=0).max()), 1e-3)
-    middle, scale = 0.5 * (points.max(axis=0) + points.min(axis=0)), (_SIDE - 2 * _MARGIN) / span
-    axes = (("from the side", 0, 2, 1), ("from above", 0, 1, 2))
-    views = [
-        _View(*view, (_SIDE * (k + 0.5), _TOP + 0.5 * _SIDE), middle, scale)
-        for k, view in enumerate(axes)
-    ]
-    width, height = _SIDE * len(views), _SIDE + _TOP
-    bar = max(b for b in _BARS if b <= max(0.4 * span, _BARS[0]))
-    lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}"'
-        f' width="{width:g}" height="{height:g}" font-family="sans-serif" font-size="11">',
-        f'<rect width="{width:g}" height="{height:g}" fill="white"/>',
-        *(line for view in views for line in _draw(placed, view)),
-        f'<path d="M14 {height - 14:g}h{bar * scale:.1f}" stroke="{_INK}" stroke-width="2"/>',
-        _text(14.0, height - 20.0, f"{bar:g} m"),
-        "</svg>",
-    ]
-    return "\n".join(lines) + "\n"
+    low, high = points.min(axis=0), points.max(axis=0)
+    span, middle, text = max(float((high - low).max()), 1e-3), 0.5 * (low + high), io.StringIO()
+    with mpl.rc_context({**mpl.rcParamsDefault, **_SETTINGS, "backend": "svg"}):
+        figure = Figure(figsize=(11.0, 5.5), layout="constrained")
+        for axes, (title, view) in zip(figure.subplots(1, 2), _VIEWS.items(), strict=True):
+            _draw(axes, placed, view, span)
+            axes.set(title=f"{title}, at position zero", xlabel="m", aspect="equal")
+            axes.set_xlim(middle[view[0]] + span * np.array([-0.65, 0.65]))
+            axes.set_ylim(middle[view[1]] + span * np.array([-0.65, 0.65]))
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    return text.getvalue()
 
 
 def _place(robot: Robot) -> list[_Placed]:
@@ -96,59 +74,31 @@ def _place(robot: Robot) -> list[_Placed]:
     return found
 
 
-def _draw(placed: Sequence[_Placed], view: _View) -> list[str]:
-    x, y = view.pixel(np.zeros(3))
-    lines = [
-        _text(view.at[0] - 0.5 * _SIDE + 14.0, 20.0, f"{view.title}, at position zero"),
-        f'<path d="M{x - 12:.1f} {y + 5:.1f}h24" stroke="{_INK}" stroke-width="3"/>',
-    ]
+def _draw(axes: Any, placed: Sequence[_Placed], view: tuple[int, int, int], span: float) -> None:
+    right, up, towards = view
+    seen = [right, up]
     heaviest = max((abs(p.joint.mass) for p in placed), default=0.0) or 1.0
+    axes.plot(0.0, 0.0, marker="_", markersize=24, markeredgewidth=3, color=_INK)
     for p in placed:
-        (x0, y0), (x, y), (xc, yc) = map(view.pixel, (p.before, p.place, p.center))
-        lines.append(
-            f'<path d="M{x0:.1f} {y0:.1f}L{x:.1f} {y:.1f}" stroke="{_INK}" stroke-width="2.5"/>'
-        )
+        axes.plot(*np.array([p.before, p.place])[:, seen].T, color=_INK, linewidth=2.5)
         if p.joint.mass != 0.0:
-            radius = _LARGEST_PX * (abs(p.joint.mass) / heaviest) ** 0.5
+            axes.plot(*np.array([p.place, p.center])[:, seen].T, color=_FAINT, linewidth=1)
             colour = _WRONG if p.joint.impossible else _BODY
-            lines += [
-                f'<path d="M{x:.1f} {y:.1f}L{xc:.1f} {yc:.1f}" stroke="{_FAINT}"/>',
-                f'<circle cx="{xc:.1f}" cy="{yc:.1f}" r="{radius:.1f}" fill="{colour}"'
-                f' opacity="0.45"><title>{escape(p.joint.name)}: {p.joint.mass:.4g} kg</title>'
-                "</circle>",
-            ]
-    return lines + [line for p in placed for line in _joint(p, view)] + _names(placed, view)
-
-
-def _joint(p: _Placed, view: _View) -> list[str]:
-    x, y = view.pixel(p.place)
-    outline = f'fill="white" stroke="{_INK}" stroke-width="1.5"'
-    shape = f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" {outline}/>'
-    if p.joint.kind == "prismatic":
-        shape = f'<rect x="{x - 5:.1f}" y="{y - 5:.1f}" width="10" height="10" {outline}/>'
-    if abs(p.axis[view.towards]) > _ALONG:
-        return [shape, f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.5" fill="{_INK}"/>']
-    dx, dy = (float(v) * _HALF_AXIS_PX for v in (p.axis[view.right], -p.axis[view.up]))
-    axis = f'<path d="M{x - dx:.1f} {y - dy:.1f}L{x + dx:.1f} {y + dy:.1f}" stroke="{_INK}"'
-    return [f'{axis} stroke-dasharray="4 2"/>', shape]
-
-
-def _names(placed: Sequence[_Placed], view: _View) -> list[str]:
-    """Names beside the joints; of those that lie on one another, one below the other."""
-    lines: list[str] = []
-    taken: list[tuple[float, float]] = []
+            size = _HEAVIEST * abs(p.joint.mass) / heaviest
+            axes.scatter(*p.center[seen], size, colour, alpha=0.45, linewidths=0, zorder=3)
+    named: list[Array] = []
     for p in placed:
-        x, y = view.pixel(p.place)
-        x, y = x + 10.0, y - 6.0
-        while any(abs(y - other) < _LINE_PX and abs(x - left) < 90.0 for left, other in taken):
-            y += _LINE_PX
-        taken.append((x, y))
-        lines.append(_text(x, y, p.joint.name))
-    return lines
-
-
-def _text(x: float, y: float, words: str) -> str:
-    return (
-        f'<text x="{x:.1f}" y="{y:.1f}" fill="{_INK}" stroke="white" stroke-width="3"'
-        f' paint-order="stroke">{escape(words)}</text>'
-    )
+        at, shape = p.place[seen], "s" if p.joint.kind == "prismatic" else "o"
+        axes.plot(*at, shape, markersize=9, color="white", markeredgecolor=_INK, zorder=4)
+        if abs(p.axis[towards]) > _ALONG:
+            axes.plot(*at, ".", markersize=4, color=_INK, zorder=5)
+        else:
+            ends = at + _AXIS * span * np.outer([-1.0, 1.0], p.axis[seen])
+            axes.plot(*ends.T, "--", color=_INK, linewidth=1, zorder=3)
+        below = sum(np.linalg.norm(at - other) < _NEAR * span for other in named)
+        named.append(at)
+        label = f"{p.joint.name}, {p.joint.mass:.3g} kg" if p.joint.mass else p.joint.name
+        axes.annotate(
+            label, at, (9.0, 5.0 - _LINE * below), textcoords="offset points", zorder=6,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5},
+        )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 from bampipe.arrays import Array
 from bampipe.next_trial.design_sentence import describe_design
 from bampipe.next_trial.discrimination import Comparison
-from bampipe.next_trial.precision import Precision
+from bampipe.next_trial.precision import Expected, Precision
 from bampipe.next_trial.primitives import Primitive, find_beyond
 from bampipe.next_trial.ranking import RankedDesign
 from bampipe.next_trial.rehearsal import Rehearsal
@@ -77,29 +77,25 @@ class Forecast:
 
     def _sd(self, added: Sequence[Array], seconds: float) -> dict[str, ExpectedSd]:
         every = [self.precision.expect(one, seconds) for one in added]
-        columns = zip(
-            self.precision.names,
-            self.precision.sd,
-            np.min([one.low for one in every], axis=0),
-            np.median([one.median for one in every], axis=0),
-            np.max([one.high for one in every], axis=0),
-            strict=True,
+        return self.tabulate_sd(
+            Expected(
+                np.min([one.low for one in every], axis=0),
+                np.median([one.median for one in every], axis=0),
+                np.max([one.high for one in every], axis=0),
+            )
         )
+
+    def tabulate_sd(self, found: Expected) -> dict[str, ExpectedSd]:
+        """Return the record of expected standard deviations, by parameter."""
         units = {q.name: q.unit for q in self.rehearsal.system.parameters}
+        columns = (self.precision.names, self.precision.sd, found.low, found.median, found.high)
         return {
             name: ExpectedSd(before=now, after=median, low=low, high=high, unit=units[name])
-            for name, now, low, median, high in columns
+            for name, now, low, median, high in zip(*columns, strict=True)
         }
 
 
 def describe_moves(design: Primitive, rehearsal: Rehearsal) -> dict[str, Move]:
     """Return the record of the strokes of a design."""
     axes = rehearsal.system.model.device.coordinates
-    strokes = {i: (s.low, s.high, s.slow, s.fast, s.rest_s) for i, s in design.strokes.items()}
-    if design.series is not None:
-        extent = enumerate(zip(*design.series.extent[:3], strict=True))
-        strokes = {i: (low, high, fast, fast, 0.0) for i, (low, high, fast) in extent}
-    return {
-        axes[i].name: Move(low=low, high=high, slow=slow, fast=fast, rest_s=rest, unit=axes[i].unit)
-        for i, (low, high, slow, fast, rest) in strokes.items()
-    }
+    return {axes[i].name: Move.of(one, unit=axes[i].unit) for i, one in design.moves.items()}

@@ -164,8 +164,7 @@ def _find_distance(outcome: _Outcome, goal: Goal) -> float:
 
 def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
     """Return the record of a plan."""
-    system, precision, seen = forecast.rehearsal.system, forecast.precision, forecast.rehearsal.seen
-    units = {q.name: q.unit for q in system.parameters}
+    system, seen = forecast.rehearsal.system, forecast.rehearsal.seen
     seconds = sum(design.seconds for design in found.designs)
     confusion: tuple[PlannedConfusion, ...] = ()
     sd: dict[str, PlannedSd] = {}
@@ -176,16 +175,8 @@ def record_plan(forecast: Forecast, goal: Goal, found: TrialPlan) -> Plan:
             for (i, j), after in found.confusion.items()
         )
     else:
-        columns = zip(
-            precision.names, precision.sd, found.sd.median, found.sd.low, found.sd.high, goal.sd,
-            strict=True,
-        )  # fmt: skip
-        sd = {
-            name: PlannedSd(
-                before=before, after=after, low=low, high=high, asked=asked, unit=units[name]
-            )
-            for name, before, after, low, high, asked in columns
-        }
+        pairs = zip(forecast.tabulate_sd(found.sd).items(), goal.sd, strict=True)
+        sd = {name: PlannedSd.of(entry, asked=asked) for (name, entry), asked in pairs}
     counted: dict[int, tuple[Primitive, int]] = {}
     for design in found.designs:
         counted[id(design)] = design, counted.get(id(design), (design, 0))[1] + 1

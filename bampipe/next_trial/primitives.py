@@ -295,6 +295,14 @@ class Primitive:
     series: Series | None = None
 
     @property
+    def moves(self) -> Mapping[int, Stroke]:
+        """Its strokes by number of the axis; of a series, the range and highest speed of each."""
+        if self.series is None:
+            return self.strokes
+        extent = enumerate(zip(*self.series.extent[:3], strict=True))
+        return {i: Stroke(low, high, fast, fast) for i, (low, high, fast) in extent}
+
+    @property
     def part_s(self) -> float:
         """Length of each of its trials, s."""
         return self.seconds / self.parts
@@ -354,13 +362,11 @@ def find_beyond(
 ) -> tuple[list[int], list[int]]:
     """Return the axes that go farther than in the trials, and those faster than a share of that."""
     slack = _TOLERATED_EXCESS * (seen.high - seen.low)
-    moves = {i: (stroke.low, stroke.high, stroke.fast) for i, stroke in design.strokes.items()}
-    if design.series is not None:
-        moves = dict(enumerate(zip(*design.series.extent[:3], strict=True)))
+    moves = design.moves
     lowest, highest = seen.low - slack, seen.high + slack
     most = (share + _TOLERATED_EXCESS) * seen.speed
-    farther = [i for i, (low, high, _) in moves.items() if low < lowest[i] or high > highest[i]]
-    return farther, [i for i, (_, _, fast) in moves.items() if fast > most[i]]
+    farther = [i for i, one in moves.items() if one.low < lowest[i] or one.high > highest[i]]
+    return farther, [i for i, one in moves.items() if one.fast > most[i]]
 
 
 def _list_within(

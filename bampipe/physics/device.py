@@ -162,13 +162,13 @@ class DeclaredFile(Declaration):
         return self._declaration
 
     @classmethod
-    def from_declaration(cls, declaration: Mapping[str, Any], where: str) -> Self:
-        """Check a declaration, named ``where`` in messages, and make one of it.
+    def from_declaration(cls, declaration: Mapping[str, Any], where: str = "") -> Self:
+        """Check a parsed file, named ``where`` in messages, and make one of it.
 
         Raises:
             InputError: something is missing, unknown or of the wrong type; names the field.
         """
-        found = read(cls, declaration, where)
+        found = read(cls, declaration, where or f"{cls.__name__.lower()} file")
         found._declaration = declaration
         return found
 
@@ -413,6 +413,4 @@ def derivative(force: str, order: int) -> str:
     return f"{force}_{kind}"
 
 
-def device_from(declaration: Mapping[str, Any], where: str = "device file") -> Device:
-    """The device of a parsed file; see `DeclaredFile.from_declaration`."""
-    return Device.from_declaration(declaration, where)
+device_from = Device.from_declaration

@@ -5,7 +5,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, StringConstraints, Tag
 
@@ -371,9 +371,7 @@ class BoundEffect:
         return next(p for p in self.parameters if p.name == f"{self.prefix}.{short}")
 
 
-def effect_from(declaration: Mapping[str, Any], where: str = "effect file") -> Effect:
-    """The effect of a parsed file; see `DeclaredFile.from_declaration`."""
-    return Effect.from_declaration(declaration, where)
+effect_from = Effect.from_declaration
 
 
 def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = ()) -> BoundEffect:

@@ -174,6 +174,14 @@ class Row(NamedDeclaration):
     )
 
 
+class Payload(Declaration):
+    """A body held by the last link."""
+
+    mass: Positive = Field(description="kg")
+    center: Triple = Field(default=(0.0, 0.0, 0.0), description="In the frame of the tip, m")
+    inertia: Sextuple = Field(default=(0.0,) * 6, description="As of a joint's body")
+
+
 class Robot(Declaration):
     """Rigid bodies on joints; what stands in [energy] beside it is added."""
 
@@ -363,17 +371,6 @@ class Robot(Declaration):
     def undrawn(self) -> list[str]:
         """The joints behind which neither mass nor inertia is drawn."""
         return [j.name for j in self.joints if j.mass == 0.0 and not any(j.inertia)]
-
-
-class Payload(Declaration):
-    """A body held by the last link."""
-
-    mass: Positive = Field(description="kg")
-    center: Triple = Field(default=(0.0, 0.0, 0.0), description="In the frame of the tip, m")
-    inertia: Sextuple = Field(default=(0.0,) * 6, description="As of a joint's body")
-
-
-Robot.model_rebuild()
 
 
 def rotation_matrix(angles: tuple[float, ...]) -> Array:

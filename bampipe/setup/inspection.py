@@ -145,11 +145,8 @@ def _record(
     def errors(of: Plausibility) -> dict[str, float]:
         return dict(zip(system.coordinates, 100.0 * of.error, strict=True))
 
-    return SetupMistake(
-        kind=correction.kind,
-        signals=correction.signals,
-        factor=correction.factor,
-        offset=correction.offset,
+    return SetupMistake.of(
+        correction,
         gravity=correction.change.gravity,
         axes=tuple(system.coordinates[i] for i in axes),
         sentence=sentence,
@@ -157,9 +154,7 @@ def _record(
         error_before=errors(found.before),
         error_after=errors(found.after),
         alternatives=tuple(
-            PossibleMistake(
-                kind=rival.kind, signals=rival.signals, sentence=describe_correction(rival, session)
-            )
+            PossibleMistake.of(rival, sentence=describe_correction(rival, session))
             for rival in found.rivals
         ),
     )

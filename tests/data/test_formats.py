@@ -72,7 +72,7 @@ def test_hdf5(hdf5):
         ("log/pose", "a 50 by 3 array, expected a vector; name one of its columns, as in X[0]"),
         ("log/pose[3]", "has 3 columns, [3] is not among them"),
         ("log/text", "not numbers"),
-        ("samples.w", "no field 'w'; it has q, count"),
+        ("samples.w", "no column 'samples.w', did you mean"),
         ("soft", "a link, expected numbers in this file"),
         ("far", "a link, expected numbers in this file"),
         ("short", "49 values, where 'log/t' has 50"),

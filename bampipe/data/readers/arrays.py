@@ -15,6 +15,8 @@ from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns,
 from bampipe.errors import InputError
 
 LARGEST_WIDTH = 64
+_STAMPED = "MO"
+"""Kinds of arrays of dates and times: NumPy's own, and of texts."""
 _RUN = re.compile(
     r"(?i)(.+?(?=\[)|(?:.*[./_])?(?:trial|run|rep|test|take|rec|recording|exp|experiment|measurement"
     r"|messung|versuch|essai|episode|demo|trajectory|traj|log)s?_?(?=\d))"
@@ -29,7 +31,7 @@ def read_arrays(
     """The wanted columns of the arrays of a file, runs of one recording end to end.
 
     Args:
-        arrays: by name, of numbers or of texts that are moments; None for what is neither.
+        arrays: by name, of numbers, moments, or texts that are moments; None for what is neither.
         wanted: columns; name, what: of the file and of its arrays, in messages.
 
     Raises:
@@ -44,10 +46,17 @@ def read_arrays(
         if array is None:
             _refuse_kind(variable, known, where)
         elif column in wanted.datetimes:
-            stamps = moments.nanoseconds(array.tolist(), wanted.datetimes[column], where)
+            if array.dtype.kind not in _STAMPED:
+                raise InputError("not text, expected dates and times", where=where)
+            stamps = array if array.dtype.kind == "M" else array.tolist()
+            stamps = moments.nanoseconds(stamps, wanted.datetimes[column], where)
             values[column] = moments.seconds(stamps)
-        elif array.dtype == object:
-            raise InputError("found text, expected numbers", where=where)
+        elif array.dtype.kind in _STAMPED:
+            raise InputError(
+                "found dates and times, or text; expected numbers",
+                where=where,
+                remedy='is it the time? then say unit = "datetime" under [time]',
+            )
         else:
             check_size(array.size, wanted, name)
             # A copy: what stands in a file cannot be written to.
@@ -74,7 +83,7 @@ def _refuse_kind(variable: str, known: Mapping[str, object], where: str) -> None
 def columns_of_arrays(arrays: Mapping[str, np.ndarray | None]) -> dict[str, str]:
     """Names of the columns that were recorded together; the unit of moments is "datetime"."""
     joined = _join_runs(arrays)[0]
-    moment = {label for label, array in joined.items() if array.dtype == object}
+    moment = {label for label, array in joined.items() if array.dtype.kind in _STAMPED}
     found = recorded({label: array.shape for label, array in joined.items()})
     return {column: "datetime" if column in moment else "" for column in found}
 
@@ -214,7 +223,5 @@ def _arrays(path: Path, name: str) -> dict[str, np.ndarray | None]:
         fields = array.dtype.names
         parts = {f"{key}.{part}": array[part] for part in fields} if fields else {key: array}
         for label, part in parts.items():
-            stamped = part.dtype.kind == "M"
-            part = part.astype(str).astype(object) if stamped else np.atleast_1d(part)
-            found[label] = part if stamped or part.dtype.kind in "iufb" else None
+            found[label] = np.atleast_1d(part) if part.dtype.kind in "iufbM" else None
     return found

@@ -5,7 +5,8 @@ or a column of a matrix (``log/pose[2]``). What lies outside the file is not fol
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -43,16 +44,20 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
     with h5py.File(path, "r") as file:
         if any("[:]" in column for column in wanted.columns):
             return read_arrays(_vectors(file), wanted, name, what)
+        known = _list_columns(file)
         values: dict[str, np.ndarray] = {}
         units: dict[str, str] = {}
         for column in wanted.columns:
             where = f"{name}, {what} '{column}'"
-            data, field, index = _found(file, column, wanted.columns, name, where)
-            kind = data.dtype if field is None else data.dtype[field]
+            own, index = split_index(column, known)
+            # A field of a struct of MATLAB is a path here.
+            own = next((n for n in (own, own.replace(".", "/")) if n in known), own)
+            _require_column(file, own, [*known], name, where)
+            data, field, place = known[own]
+            index = index if place is None else place
             moment = column in wanted.datetimes
-            _check(data, kind, moment, where)
-            count = math.prod(data.shape)
-            check_size(count, wanted, name)
+            _check(data, _kind(data, field), moment, where)
+            check_size(math.prod(data.shape), wanted, name)
             if moment:
                 stamps = _stamps(data, field, index, wanted.datetimes[column], where)
                 values[column] = moments.seconds(stamps)
@@ -72,22 +77,35 @@ def columns(path: Path, name: str) -> dict[str, str]:
     units: dict[str, str] = {}
     named: dict[str, str] = {}
     with h5py.File(path, "r") as file:
-        for label, data in _datasets(file):
-            for field in data.dtype.names or (None,):
-                kind = data.dtype if field is None else data.dtype[field]
-                if kind.kind in "iufb" and data.attrs.get("MATLAB_class") != b"char":
-                    column = label if field is None else f"{label}.{field}"
-                    shapes[column] = data.shape
-                    units |= dict.fromkeys(labels(column, data.shape), _unit(data))
-                    named |= dict(zip(labels(column, data.shape), _names(data), strict=False))
+        for column, (data, field, place) in _list_columns(file).items():
+            numeric = _kind(data, field).kind in "iufb"
+            if place is None and numeric and data.attrs.get("MATLAB_class") != b"char":
+                shapes[column] = data.shape
+                units |= dict.fromkeys(labels(column, data.shape), _unit(data))
+            elif place is not None:
+                named[f"{column.rpartition('/')[0]}[{place}]"] = column
         if any(is_run(label) for label in shapes):
             runs = columns_of_arrays(_vectors(file))
             if any("[:]" in column for column in runs):
                 return runs
-    return {
-        f"{column.rpartition('[')[0]}/{named[column]}" if column in named else column: units[column]
-        for column in recorded(shapes)
-    }
+    return {named.get(column, column): units[column] for column in recorded(shapes)}
+
+
+def _list_columns(file: Any) -> dict[str, tuple[Any, str | None, int | None]]:
+    """Every column of a file by its name: its dataset, which field and which column of it.
+
+    A matrix is one, each of its columns that has a name another.
+    """
+    found: dict[str, tuple[Any, str | None, int | None]] = {}
+    for label, data in _datasets(file):
+        for field in data.dtype.names or (None,):
+            found[label if field is None else f"{label}.{field}"] = data, field, None
+        found |= {f"{label}/{text}": (data, None, k) for k, text in enumerate(_names(data))}
+    return found
+
+
+def _kind(data: Any, field: str | None) -> Any:
+    return data.dtype if field is None else data.dtype[field]
 
 
 def _vectors(file: Any) -> dict[str, np.ndarray | None]:
@@ -118,47 +136,23 @@ def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[st
             yield from _datasets(item, f"{label}/", depth + 1)
 
 
-def _found(
-    file: Any, column: str, wanted: tuple[str, ...], name: str, where: str
-) -> tuple[Any, str | None, int | None]:
-    """The dataset of a column, and which field and which column of it."""
+def _require_column(file: Any, column: str, known: Sequence[str], name: str, where: str) -> None:
+    """Refuse a column that is not among those ``known``."""
     import h5py
 
-    path, index = split_index(column, file)
-    field = None
-    own, _, item = column.rpartition("/")
-    if own and isinstance(file.get(own), h5py.Dataset) and item in _names(file[own]):
-        path, index = own, _names(file[own]).index(item)
-    if path not in file and path.replace(".", "/") in file:  # as a field of a struct is written
-        path = path.replace(".", "/")
-    if path not in file and "." in path and path.rpartition(".")[0] in file:
-        path, _, field = path.rpartition(".")
-    if path not in file:
-        known = [
-            f"{label}.{part}" if part else label
-            for label, data in _datasets(file)
-            for part in data.dtype.names or ("",)
-        ]
-        check_columns(known, [column], name)
-    parts = path.split("/")
-    for end in range(1, len(parts) + 1):
-        if not isinstance(file.get("/".join(parts[:end]), getlink=True), h5py.HardLink):
+    if column in known:
+        return
+    for path in accumulate(column.split("/"), "{}/{}".format):
+        if isinstance(file.get(path, getlink=True), h5py.SoftLink | h5py.ExternalLink):
             raise InputError("a link, expected numbers in this file", where=where)
-    data = file[path]
-    if not isinstance(data, h5py.Dataset):
-        inside = [f"{path}/{key}" for key in data][:6]
+    inside = [other for other in known if other.startswith((f"{column}/", f"{column}."))]
+    if inside:
         raise InputError(
             "a structure, expected a vector of numbers",
             where=where,
-            remedy=f"name what is in it: {', '.join(inside)}" if inside else "",
+            remedy=f"name what is in it: {', '.join(inside[:6])}",
         )
-    if field is not None and field not in (data.dtype.names or ()):
-        raise InputError(
-            f"no field '{field}'",
-            where=where,
-            remedy=f"it has {', '.join(data.dtype.names or ['none'])}",
-        )
-    return data, field, index
+    check_columns(known, [column], name)
 
 
 def _names(data: Any) -> list[str]:
@@ -174,8 +168,6 @@ def _names(data: Any) -> list[str]:
 
 
 def _check(data: Any, kind: Any, moment: bool, where: str) -> None:
-    if data.external or data.is_virtual:
-        raise InputError("stored outside this file", where=where)
     text = kind.kind in "OS" or data.attrs.get("MATLAB_class") == b"char"
     if moment != text or (not moment and kind.kind not in "iufb"):
         raise InputError(
@@ -188,7 +180,7 @@ def _check(data: Any, kind: Any, moment: bool, where: str) -> None:
 
 def _stamps(data: Any, field: str | None, index: int | None, form: str, where: str) -> np.ndarray:
     """Dates and times as ns, (T,) int64, read in blocks of bounded size."""
-    kind = data.dtype if field is None else data.dtype[field]
+    kind = _kind(data, field)
     if kind.kind == "S" and kind.itemsize > moments.LONGEST:
         raise InputError(f"a text of {kind.itemsize} bytes, expected a date and time", where=where)
     stamps = np.empty(len(pick(np.empty(data.shape, dtype="V0"), index, where)), dtype=np.int64)

@@ -7,14 +7,14 @@ properties give it, for files without a time channel.
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from bampipe.data.readers import moments
-from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size, need
-from bampipe.errors import InputError
+from bampipe.data.readers.arrays import read_arrays
+from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size, need
 
 TIME = "@time"
 
@@ -26,7 +26,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
         InputError: npTDMS is not installed, the file is damaged, a channel is missing, not of
             numbers, or not as long as the others.
     """
-    values: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray | None] = {}
     units: dict[str, str] = {}
     with _channels(path, name) as known:
         timed = [label + TIME for label, channel in known.items() if _increment(channel)]
@@ -35,12 +35,13 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
             channel = known[column.removesuffix(TIME)]
             check_size(len(channel), wanted, name)
             if column not in known:
-                values[column] = np.asarray(channel.time_track(), dtype=np.float64)
+                arrays[column] = np.asarray(channel.time_track(), dtype=np.float64)
                 continue
-            where = f"{name}, channel '{column}'"
-            values[column] = _values(channel, wanted.datetimes.get(column), where)
+            data = np.asarray(channel[:])
+            data = data.astype(object) if data.dtype.kind == "U" else data
+            arrays[column] = data if data.dtype.kind in "iufbMO" else None
             units |= {column: _unit(channel)} if _unit(channel) else {}
-    return RawTrial(aligned(values, name, "channel"), first_row=1, units=units)
+    return replace(read_arrays(arrays, wanted, name, "channel"), units=units)
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
@@ -75,20 +76,3 @@ def _increment(channel: Any) -> bool:
 
 def _unit(channel: Any) -> str:
     return str(channel.properties.get("unit_string", "")).strip()
-
-
-def _values(channel: Any, form: str | None, where: str) -> np.ndarray:
-    data = np.asarray(channel[:])
-    if form is not None:
-        if data.dtype.kind not in "MOU":
-            raise InputError("not text, expected dates and times", where=where)
-        stamps = data if data.dtype.kind == "M" else [str(x) for x in data]
-        return moments.seconds(moments.nanoseconds(stamps, form, where))
-    if data.dtype.kind not in "iufb":
-        stamped = data.dtype.kind == "M"
-        raise InputError(
-            "holds dates and times, expected numbers" if stamped else "not numbers",
-            where=where,
-            remedy='is it the time? then say unit = "datetime" under [time]' if stamped else "",
-        )
-    return data.astype(np.float64)

@@ -1,5 +1,6 @@
 """The comments of a proposal, which are printed once more for its reader, and TOML values."""
 
+import json
 from dataclasses import dataclass, field
 
 from bampipe.lists import join_names
@@ -56,8 +57,7 @@ def _column_of(names: list[str], what: str, unit: str) -> str:
 
 def quoted(text: str) -> str:
     """``text`` as a TOML string."""
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\t", "\\t")
-    return f'"{escaped}"'
+    return json.dumps(text, ensure_ascii=False)
 
 
 def entry(column: str, unit: str, more: str = "") -> str:
