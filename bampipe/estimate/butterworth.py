@@ -3,27 +3,14 @@
 from functools import lru_cache, partial
 
 import numpy as np
-from scipy.signal import butter, periodogram, sosfiltfilt
+from scipy.signal import periodogram
 
 from bampipe.arrays import Array
 from bampipe.estimate.differentiation import Derivatives, differentiate_linearly, extend
+from bampipe.estimate.low_pass import low_pass_at
 
 _REACH = 6
 """Samples on either side that a derivative of an input is made of."""
-
-
-@lru_cache(maxsize=64)
-def _design(cutoff_hz: float, rate_hz: float) -> Array:
-    """Return the second-order section of one pass, which is not to be written to.
-
-    Raises:
-        ValueError: the cut-off is not between 0 and half the sampling rate.
-    """
-    if not 0.0 < cutoff_hz < 0.5 * rate_hz:
-        raise ValueError(
-            f"the cut-off {cutoff_hz:g} Hz is not between 0 and half of {rate_hz:g} Hz"
-        )
-    return np.asarray(butter(2, cutoff_hz, fs=rate_hz, output="sos"), dtype=np.float64)
 
 
 def zero_phase(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, Array, Array]:
@@ -78,12 +65,18 @@ def _difference_weights() -> tuple[Array, Array]:
 
 
 def _low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, int]:
-    """``values`` (T,), continued at both ends and low-passed both ways; samples added at each."""
-    sections = _design(cutoff_hz, rate_hz)
+    """``values`` (T,), continued at both ends and low-passed both ways; samples added at each.
+
+    Raises:
+        ValueError: the cut-off is not between 0 and half the sampling rate.
+    """
+    if not 0.0 < cutoff_hz < 0.5 * rate_hz:
+        raise ValueError(f"cut-off {cutoff_hz:g} Hz is not between 0 and half of {rate_hz:g} Hz")
     reach = int(np.ceil(4.0 * rate_hz / cutoff_hz)) + 2
     longer = extend(values, reach, max(4, int(np.ceil(1.5 * rate_hz / cutoff_hz))))
     added = (len(longer) - len(values)) // 2
-    return np.asarray(sosfiltfilt(sections, longer, padtype=None), dtype=np.float64), added
+    everything = np.arange(len(longer))
+    return low_pass_at(longer[:, None], cutoff_hz, rate_hz, everything)[:, 0], added
 
 
 def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -> Derivatives:

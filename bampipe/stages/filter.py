@@ -299,10 +299,7 @@ def _write_motions(
 
 
 def _motions(
-    path: Path,
-    names: Sequence[str],
-    system: System,
-    left_out: Mapping[str, Sequence[Disturbance]],
+    path: Path, names: Sequence[str], system: System, left_out: Mapping[str, Sequence[Disturbance]]
 ) -> TrialCache[Motion]:
     """The trials just written."""
 
@@ -341,10 +338,15 @@ def _inspect(
     disturbances: Mapping[str, Sequence[Disturbance]],
 ) -> SetupResult:
     """Hold the set-up against the trials ``ids``, those in ``free`` fitted."""
-    motions = []
-    for name in ids:
+    most = _INSPECTED // min(len(ids), MOST_TRIALS)
+
+    def read(number: int) -> Motion:
+        name = ids[number]
         motion = read_motion(path, name, system, disturbances.get(name, ()), every_input=True)
-        motions += deepcopy(shorten([motion], _INSPECTED // min(len(ids), MOST_TRIALS)))
+        return deepcopy(shorten([motion], most)[0])  # a view would keep the whole trial
+
+    in_all = min(row_count(path, ids), most * len(ids))
+    motions = TrialCache(read, len(ids), n_samples, names=ids, in_all=in_all)
     # What brakes do is no part of the bare device: it is judged by braked trials, not fitted.
     folds = Folds.of_trials(ids, (), [name for name in ids if name in free])
     cutoffs = tuple(min(bands[axis].cutoff_hz, HIGHEST_HZ) for axis in system.coordinates)
