@@ -1,12 +1,12 @@
 """Butterworth filter without phase, and central differences."""
 
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
 from scipy.signal import periodogram
 
 from bampipe.arrays import Array
-from bampipe.estimate.differentiation import Derivatives, differentiate_linearly, extend
+from bampipe.estimate.differentiation import Derivatives, extend
 from bampipe.estimate.low_pass import low_pass_at
 
 _REACH = 6
@@ -80,10 +80,21 @@ def _low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array,
 
 
 def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -> Derivatives:
-    """`zero_phase` by `differentiate_linearly`."""
-    method = partial(zero_phase, rate_hz=rate_hz, cutoff_hz=cutoff_hz)
-    edge = int(np.ceil(1.5 * rate_hz / cutoff_hz))
-    return differentiate_linearly(method, position, edge, noise_sd)
+    """Return the motion behind ``position`` (T,) by `zero_phase`, with error bands.
+
+    They are those of white noise of ``noise_sd`` on the samples; motion above the cut-off is lost
+    and is not in them.
+    """
+    length = len(position)
+    # Noise passes otherwise near either end than in the middle.
+    edge = min(int(np.ceil(1.5 * rate_hz / cutoff_hz)), (length + 1) // 2)
+    window = min(length, 4 * edge + 1)
+    squares = sum(np.square(zero_phase(impulse, rate_hz, cutoff_hz)) for impulse in np.eye(window))
+    gains, full = np.sqrt(squares), np.empty((3, length))
+    full[:] = gains[:, window // 2, None]
+    full[:, :edge] = gains[:, :edge]
+    full[:, length - edge :] = gains[:, window - edge :]
+    return Derivatives(*zero_phase(position, rate_hz, cutoff_hz), *(noise_sd * full))
 
 
 def floor_frequency(position: Array, rate_hz: float, noise_sd: float) -> float:

@@ -73,11 +73,11 @@ class Config:
 
     Attributes:
         method: ``kalman`` (fixed-interval smoother), ``butterworth`` (zero-phase filter and
-            central differences), ``savitzky_golay``, or ``auto``, which is the Kalman smoother:
-            of the three it alone bridges gaps with honest error bands and has its bandwidth
-            set by the likelihood of the samples.
+            central differences), or ``auto``, which is the Kalman smoother: it alone bridges
+            gaps with honest error bands and has its bandwidth set by the likelihood of the
+            samples.
         cutoff_hz: bandwidth, Hz, for all axes; 0 takes it from the data, axis by axis: for the
-            Kalman smoother the maximum likelihood over order and process noise, for the others
+            Kalman smoother the maximum likelihood over order and process noise, for the other
             the frequency where the encoder spectrum meets the quantisation floor.
         minimum_bandwidth_hz: a bandwidth taken from the data is held at this or above, Hz:
             changes of direction must not be smeared, friction is read from them.
@@ -91,7 +91,7 @@ class Config:
             there are very many.
     """
 
-    method: Literal["auto", "kalman", "butterworth", "savitzky_golay"] = "auto"
+    method: Literal["auto", "kalman", "butterworth"] = "auto"
     cutoff_hz: NotNegative = 0.0
     minimum_bandwidth_hz: NotNegative = 25.0
     force_cutoff_hz: NotNegative = 0.0
