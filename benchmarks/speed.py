@@ -1,12 +1,15 @@
 """How fast it is, how much memory it takes and how it installs, beside another commit.
 
     python benchmarks/speed.py --beside COMMIT --store
+    python benchmarks/speed.py --beside COMMIT --without long install
     python benchmarks/speed.py --parts first robots --short
 
 Every measurement is a process of its own, taken from this tree and then from the other one, which
 is a git worktree in a temporary folder. Each tree has caches of its own, empty at the beginning;
 both read the same logs. A row is a title, a unit, the number here, the number there, and their
 ratio: below 1, this tree is better; rows of the filter alone are the other way round, and say so.
+On a machine with other work, CPU time counts. On two quiet cores, without the other commit,
+``long`` takes a quarter of an hour, ``install`` and ``diagnosis`` minutes, the others one or two.
 """
 
 from __future__ import annotations
@@ -121,8 +124,15 @@ def measure_first_run(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
     yield "second device, only its own functions to compile", "s", cost.wall
 
 
+def measure_start(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
+    """Start of the command line."""
+    costs = [tree.run("-m", "bampipe", "--help") for _ in range(6)][1:]
+    yield "bampipe --help, least of five", "s", min(cost.wall for cost in costs)
+    yield "bampipe --help, least of five: CPU", "s", min(cost.cpu for cost in costs)
+
+
 def measure_robots(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
-    """`identify` of arms, everything compiled."""
+    """`identify` of arms and of a light drive with much friction, everything compiled."""
     for count, kinds in JOINTS.items():
         rate = 250.0 if short or count < 7 else 1000.0
         seconds = 6.0 if short else 20.0
@@ -135,11 +145,19 @@ def measure_robots(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
         session = tree.home / f"arm{count}"
         shutil.copytree(source, session)
         tree.bampipe("init", str(session))
-        tree.bampipe("run", str(session), "--until", "identify")
-        cost = tree.bampipe("identify", session.name, "--force")
         plural = "s" if count > 1 else ""
         title = f"identify, {count} joint{plural}, 3 × {seconds:g} s at {rate:g} Hz"
-        yield title, "s", cost.wall
+        yield from _identify_again(tree, session, title)
+    session = _made(logs / "drive", lambda at: record("drive", at, 3))
+    yield from _identify_again(tree, session, "identify, light drive on a test bench")
+
+
+def _identify_again(tree: Tree, session: Path, title: str) -> Iterator[Row]:
+    tree.bampipe("run", str(session), "--until", "identify")
+    cost = tree.bampipe("identify", session.name, "--force")
+    yield title, "s", cost.wall
+    yield f"{title}: CPU", "s", cost.cpu
+    yield f"{title}: memory", "MB", cost.memory
 
 
 def measure_diagnosis(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
@@ -186,10 +204,14 @@ def measure_batch(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
     yield f"batch of {count} sessions, 2 jobs: a session", "s", cost.wall / count
     yield f"batch of {count} sessions: CPU a session", "s", cost.cpu / count
     yield f"batch of {count} sessions: largest process", "MB", cost.memory
+    dask = "--engine", "dask", "--runs", "dask", "--until", "compare"
+    cost = tree.bampipe("run", *sessions, *dask)
+    yield f"batch of {count} sessions, Dask, a worker a core: a session", "s", cost.wall / count
+    yield f"batch of {count} sessions, Dask: CPU a session", "s", cost.cpu / count
 
 
 def measure_install(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
-    """Installation into an empty environment from pip's cache, and start of the command line."""
+    """Installation into an empty environment from pip's cache."""
     place = tree.home / "environment"
     source = tree.home / "source"
     shutil.copytree(tree.root, source, ignore=shutil.ignore_patterns(".git", "build", "*.egg-info"))
@@ -204,14 +226,6 @@ def measure_install(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
     took = time.perf_counter() - begun
     yield "install, pip, from its cache", "s", took
     yield "install, size beside an empty environment", "MB", _megabytes(place) - empty
-    subprocess.run([str(place / "bin/bampipe"), "--help"], check=True, stdout=subprocess.DEVNULL)
-    times = []
-    for _ in range(5):
-        begun = time.perf_counter()
-        subprocess.run([str(place / "bin/bampipe"), "--help"], check=True,
-                       stdout=subprocess.DEVNULL)  # fmt: skip
-        times.append(time.perf_counter() - begun)
-    yield "bampipe --help, least of five", "s", min(times)
 
 
 def measure_filter(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
@@ -231,6 +245,7 @@ def measure_filter(tree: Tree, logs: Path, short: bool) -> Iterator[Row]:
 
 
 PARTS: dict[str, Callable[[Tree, Path, bool], Iterator[Row]]] = {
+    "start": measure_start,
     "first": measure_first_run,
     "robots": measure_robots,
     "diagnosis": measure_diagnosis,
@@ -338,6 +353,7 @@ def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--beside", help="a commit to measure beside this tree")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--without", nargs="+", choices=PARTS, default=[])
     parser.add_argument("--short", action="store_true", help="small sizes, to try the parts")
     parser.add_argument("--store", action="store_true", help="write results/speed.json")
     given = parser.parse_args(arguments)
@@ -355,7 +371,8 @@ def main(arguments: Sequence[str]) -> None:
         try:
             for tree in trees.values():
                 tree.home.mkdir()
-            rows = measure(trees, given.parts, folder / "logs", given.short)
+            parts = [part for part in given.parts if part not in given.without]
+            rows = measure(trees, parts, folder / "logs", given.short)
         finally:
             if given.beside:
                 subprocess.run([*worktree, "remove", "--force", str(folder / "tree")], check=True)

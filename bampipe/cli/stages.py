@@ -39,7 +39,7 @@ def ingest(session: SessionArgument, options: StageOptions = DEFAULTS) -> None:
 @stage_command("filter")
 def filter_(
     run: RunArgument = None,
-    method: Annotated[str, typer.Option(help="auto, kalman, butterworth or savitzky_golay.")] = "",
+    method: Annotated[str, typer.Option(help="auto, kalman or butterworth.")] = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
     """Compute velocity and acceleration from the encoders, with error bands.

@@ -23,6 +23,7 @@ from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
 from bampipe.results.floor import compare_with_floor
+from bampipe.trials.cache import MOST_SAMPLES
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.likelihood import (
@@ -38,9 +39,9 @@ from bampipe.trials.likelihood import (
     take_samples,
 )
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.motion import Motion
+from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.noise_floor import NoiseFloor
-from bampipe.trials.replay import StandIn, keep_motion, replay_motions
+from bampipe.trials.replay import StandIn, keep_motion, replay_motion, replay_motions
 from bampipe.trials.residuals import ModelOnTrial
 from bampipe.workers import process_pool
 
@@ -161,11 +162,18 @@ class Session:
             Runaway: the simulated motion grows without bounds.
         """
         stand_in = StandIn(evidence.system, p, evidence.motions, self.trials.sensors.rate_hz)
-        for trial in range(len(evidence.motions)):
-            stand_in.courses[trial]  # once, before the workers inherit it
         seeds = [(self.seed, _SEED, k) for k in range(first, first + count)]
-        with workers((self.trials, evidence, stand_in), min(self.jobs, count)) as spread:
-            return list(spread(_residuals_of_replay, seeds))
+        # A course is followed once: in a session too long to keep all, by the worker that reads it.
+        parts, trials = [seeds], range(len(evidence.motions))
+        if self.jobs > 1 and sum(trial_sizes(evidence.motions)) <= MOST_SAMPLES:
+            parts = [[seed] for seed in seeds]
+            for trial in trials:
+                stand_in.courses[trial]  # before the workers inherit it
+        tasks = [(trial, part) for trial in trials for part in parts]
+        with workers((self.trials, evidence, stand_in), min(self.jobs, len(tasks))) as spread:
+            found = spread(_residuals_of_replays, tasks)
+            by_trial = [[one for _ in parts for one in next(found)] for _ in trials]
+        return [list(replay) for replay in zip(*by_trial, strict=True)]
 
     def replay_stopping(self, recipe: Recipe, evidence: Evidence) -> list[Array]:
         """Residual of a model on a replay without noise whose friction truly stops it, by trial.
@@ -192,12 +200,13 @@ class Session:
         return residuals_of(evidence, replays)
 
     def weight_samples(
-        self, recipe: Recipe, evidence: Evidence, noise: Noise | None = None
+        self, recipe: Recipe, evidence: Evidence, noise: Noise | None = None, count: int = 0
     ) -> Likelihood:
         """The likelihood of the trials of ``evidence``, with noise by replays of its model.
 
         Args:
             recipe: the model; evidence: linearised; noise: by replays of another one instead.
+            count: of replays, at least two; those of the criteria by default.
 
         Raises:
             Runaway: the simulated motion grows without bounds.
@@ -205,7 +214,7 @@ class Session:
         c = self.criteria
         samples = lay_out_samples(evidence, c.block_s)
         if noise is None:
-            replays = self.replay(evidence, evidence.p, c.replicates)
+            replays = self.replay(evidence, evidence.p, count or c.replicates)
             stopping = self.replay_stopping(recipe, evidence)
             noise = describe_noise(replays, stopping, evidence, samples)
         force_sd = self.trials.sensors.force_sd
@@ -268,14 +277,14 @@ class Session:
             evidence, problem, here = moved, tried, there
         return evidence, problem
 
-    def judge(self, recipe: Recipe, p: Array) -> Fit:
-        """A model with given parameters, held against replays of it, on all trials that are judged.
+    def judge(self, recipe: Recipe, p: Array, count: int = 0) -> Fit:
+        """A given model, held against ``count`` replays of it, on all trials that are judged.
 
         Raises:
             Runaway: the simulated motion grows without bounds.
         """
         evidence = self.linearise(recipe, p, judged=True)
-        likelihood = self.weight_samples(recipe, evidence)
+        likelihood = self.weight_samples(recipe, evidence, count=count)
         return Fit(recipe, evidence, likelihood, likelihood.pose(evidence), given=True)
 
     def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
@@ -432,20 +441,26 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
-def _residuals_of_replay(seed: tuple[int, ...]) -> list[Array]:
-    trials, evidence, stand_in = shared()
-    replays = replay_motions(stand_in, trials.sensors, trials.kinematics, seed)
-    return residuals_of(evidence, replays)
+def _residuals_of_replays(task: tuple[int, Sequence[tuple[int, ...]]]) -> list[Array]:
+    """The residuals (K, n_q) of one trial on replays of it, by seed."""
+    (trials, e, stand_in), (trial, seeds) = shared(), task
+    rows = []
+    for seed in seeds:
+        rng = np.random.default_rng([*seed, trial])
+        motion = replay_motion(stand_in, trial, trials.sensors, trials.kinematics, rng)
+        rows.append(ModelOnTrial(e.system, e.p, [motion]).residual)
+    thin = e.band.thin_trials(rows, range(len(e.system.coordinates)))
+    return [values * e.used[trial] for values in thin]
 
 
 def _narrower_friction(evidence: Evidence) -> list[Array]:
     """What Coulomb friction leaves whose sign is narrower than the model's, by trial, (K, n_q)."""
     e = evidence
     width = e.system.sign_widths
-    rows = [
+    rows = (
         dry * (np.tanh(m.qd / (_STOPPING_WIDTH * width)) - np.tanh(m.qd / width))
         for dry, m in zip(dry_friction(e), e.motions, strict=True)
-    ]
+    )
     thin = e.band.thin_trials(rows, range(len(width)))
     return [values * used for values, used in zip(thin, e.used, strict=True)]
 
@@ -453,7 +468,7 @@ def _narrower_friction(evidence: Evidence) -> list[Array]:
 def residuals_of(evidence: Evidence, replays: Sequence[Motion]) -> list[Array]:
     """The residual of a model on replays of its trials, by trial, each (K, n_q)."""
     e = evidence
-    rows = [ModelOnTrial(e.system, e.p, replays, k).residual for k in range(len(replays))]
+    rows = (ModelOnTrial(e.system, e.p, replays, k).residual for k in range(len(replays)))
     thin = e.band.thin_trials(rows, range(len(e.system.coordinates)))
     return [values * used for values, used in zip(thin, e.used, strict=True)]
 

@@ -1,29 +1,16 @@
 """Butterworth filter without phase, and central differences."""
 
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import numpy as np
-from scipy.signal import butter, periodogram, sosfiltfilt
+from scipy.signal import periodogram
 
 from bampipe.arrays import Array
-from bampipe.estimate.differentiation import Derivatives, differentiate_linearly, extend
+from bampipe.estimate.differentiation import Derivatives, extend
+from bampipe.estimate.low_pass import low_pass_at
 
 _REACH = 6
 """Samples on either side that a derivative of an input is made of."""
-
-
-@lru_cache(maxsize=64)
-def _design(cutoff_hz: float, rate_hz: float) -> Array:
-    """Return the second-order section of one pass, which is not to be written to.
-
-    Raises:
-        ValueError: the cut-off is not between 0 and half the sampling rate.
-    """
-    if not 0.0 < cutoff_hz < 0.5 * rate_hz:
-        raise ValueError(
-            f"the cut-off {cutoff_hz:g} Hz is not between 0 and half of {rate_hz:g} Hz"
-        )
-    return np.asarray(butter(2, cutoff_hz, fs=rate_hz, output="sos"), dtype=np.float64)
 
 
 def zero_phase(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, Array, Array]:
@@ -78,19 +65,36 @@ def _difference_weights() -> tuple[Array, Array]:
 
 
 def _low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, int]:
-    """``values`` (T,), continued at both ends and low-passed both ways; samples added at each."""
-    sections = _design(cutoff_hz, rate_hz)
+    """``values`` (T,), continued at both ends and low-passed both ways; samples added at each.
+
+    Raises:
+        ValueError: the cut-off is not between 0 and half the sampling rate.
+    """
+    if not 0.0 < cutoff_hz < 0.5 * rate_hz:
+        raise ValueError(f"cut-off {cutoff_hz:g} Hz is not between 0 and half of {rate_hz:g} Hz")
     reach = int(np.ceil(4.0 * rate_hz / cutoff_hz)) + 2
     longer = extend(values, reach, max(4, int(np.ceil(1.5 * rate_hz / cutoff_hz))))
     added = (len(longer) - len(values)) // 2
-    return np.asarray(sosfiltfilt(sections, longer, padtype=None), dtype=np.float64), added
+    everything = np.arange(len(longer))
+    return low_pass_at(longer[:, None], cutoff_hz, rate_hz, everything)[:, 0], added
 
 
 def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -> Derivatives:
-    """`zero_phase` by `differentiate_linearly`."""
-    method = partial(zero_phase, rate_hz=rate_hz, cutoff_hz=cutoff_hz)
-    edge = int(np.ceil(1.5 * rate_hz / cutoff_hz))
-    return differentiate_linearly(method, position, edge, noise_sd)
+    """Return the motion behind ``position`` (T,) by `zero_phase`, with error bands.
+
+    They are those of white noise of ``noise_sd`` on the samples; motion above the cut-off is lost
+    and is not in them.
+    """
+    length = len(position)
+    # Noise passes otherwise near either end than in the middle.
+    edge = min(int(np.ceil(1.5 * rate_hz / cutoff_hz)), (length + 1) // 2)
+    window = min(length, 4 * edge + 1)
+    squares = sum(np.square(zero_phase(impulse, rate_hz, cutoff_hz)) for impulse in np.eye(window))
+    gains, full = np.sqrt(squares), np.empty((3, length))
+    full[:] = gains[:, window // 2, None]
+    full[:, :edge] = gains[:, :edge]
+    full[:, length - edge :] = gains[:, window - edge :]
+    return Derivatives(*zero_phase(position, rate_hz, cutoff_hz), *(noise_sd * full))
 
 
 def floor_frequency(position: Array, rate_hz: float, noise_sd: float) -> float:

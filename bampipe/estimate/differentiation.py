@@ -1,13 +1,11 @@
 """What every way to differentiate a sampled motion has in common.
 
 A method takes positions on a uniform grid and returns position, velocity and acceleration with
-their standard deviations. Three are implemented: a zero-phase Butterworth filter followed by
-central differences (:mod:`bampipe.estimate.butterworth`), Savitzky-Golay polynomials
-(:mod:`bampipe.estimate.savitzky_golay`) and a Kalman smoother of an integrated white noise
+their standard deviations. Two are implemented: a zero-phase Butterworth filter followed by central
+differences (:mod:`bampipe.estimate.butterworth`) and a Kalman smoother of an integrated white noise
 (:mod:`bampipe.estimate.kalman_smoother`).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -164,35 +162,3 @@ def _end_weights(fit: int, degree: int) -> Array:
     curved = polyder(np.eye(degree + 1), 2) if degree >= 2 else np.zeros((1, degree + 1))
     at_start = [polyval(-1.0, np.eye(degree + 1)), scale**2 * polyval(-1.0, curved)]
     return np.asarray(np.array(at_start) @ fitted)
-
-
-Linear = Callable[[Array], tuple[Array, Array, Array]]
-
-
-def differentiate_linearly(
-    method: Linear, position: Array, edge: int, noise_sd: float
-) -> Derivatives:
-    """Return the motion behind ``position`` (T,) by a linear method, with error bands.
-
-    Motion above the method's cut-off is lost and is not in the bands.
-
-    Args:
-        method: linear; takes (T,), returns position, velocity, acceleration, each (T,).
-        position: samples on a uniform grid.
-        edge: number of samples at either end where noise passes otherwise than in the middle.
-        noise_sd: standard deviation of the white noise on the samples.
-    """
-    length = len(position)
-    edge = min(edge, (length + 1) // 2)
-    window = min(length, 4 * edge + 1)
-    squares = np.zeros((3, window))
-    for sample in range(window):
-        impulse = np.zeros(window)
-        impulse[sample] = 1.0
-        squares += np.square(method(impulse))
-    gains = np.sqrt(squares)
-    full = np.empty((3, length))
-    full[:] = gains[:, window // 2, None]
-    full[:, :edge] = gains[:, :edge]
-    full[:, length - edge :] = gains[:, window - edge :]
-    return Derivatives(*method(position), *(noise_sd * full))

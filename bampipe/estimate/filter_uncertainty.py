@@ -7,6 +7,7 @@ holds whatever the noise is, as long as stretches are independent of each other.
 """
 
 from collections.abc import Callable, Sequence
+from functools import cache
 
 import numpy as np
 
@@ -22,10 +23,7 @@ _SILENT = 1e-20
 
 
 def sandwich_covariance(
-    trials: Sequence[Stored],
-    n_states: int,
-    theta: Array,
-    covariance: Array,
+    trials: Sequence[Stored], n_states: int, theta: Array, covariance: Array
 ) -> tuple[Array, int]:
     """Covariance of the filter's final parameters from the scatter of blocks of time.
 
@@ -71,11 +69,7 @@ def sandwich_covariance(
 
 
 def leave_out(
-    trials: Sequence[Stored],
-    groups: Sequence[int],
-    n_states: int,
-    theta: Array,
-    covariance: Array,
+    trials: Sequence[Stored], groups: Sequence[int], n_states: int, theta: Array, covariance: Array
 ) -> dict[int, Array]:
     """Return the filter's final parameters (nt,) without each group of trials, by group.
 
@@ -126,10 +120,7 @@ def at_block_ends(trial: Stored, block_s: float) -> Stored:
 
 
 def climb(
-    log_likelihood: Callable[[Array], float],
-    start: Array,
-    step: Array,
-    lower: Array,
+    log_likelihood: Callable[[Array], float], start: Array, step: Array, lower: Array
 ) -> tuple[Array, float]:
     """Maximise a likelihood over a few noise levels, one at a time, by doubling steps.
 
@@ -143,7 +134,8 @@ def climb(
     Returns:
         (k,) best logarithms, and the likelihood there.
     """
-    best, value = start.copy(), log_likelihood(start)
+    likely = cache(lambda *levels: log_likelihood(np.array(levels)))  # a pass meets some again
+    best, value = start.copy(), likely(*start)
     for _ in range(_ROUNDS):
         before = value
         for k in range(start.size):
@@ -154,7 +146,7 @@ def climb(
                     tried[k] = max(tried[k] + sign * step[k], lower[k])
                     if tried[k] == best[k]:
                         break
-                    candidate = log_likelihood(tried)
+                    candidate = likely(*tried)
                     if not candidate > value:
                         break
                     best, value, moved_any = tried, candidate, True

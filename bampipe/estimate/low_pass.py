@@ -1,8 +1,9 @@
 """Zero-phase low-pass of many columns at a few kept samples: the inner loop of every comparison."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import groupby, islice
 
 import numpy as np
 from numba import float64, int64
@@ -156,20 +157,17 @@ class Band:
             out[:, chosen] = low_pass_at(values[:, chosen], float(cutoff), self.rate_hz, kept)
         return out
 
-    def thin_trials(self, trials: Sequence[Array], axes: Sequence[int]) -> list[Array]:
+    def thin_trials(self, trials: Iterable[Array], axes: Sequence[int]) -> list[Array]:
         """`thin` for the same columns, each (T, k), of several trials.
 
-        Those of trials of one length go through the filter side by side.
+        Few that follow each other and have one length go through the filter side by side.
         """
-        by_length: dict[int, list[int]] = {}
-        for index, values in enumerate(trials):
-            by_length.setdefault(len(values), []).append(index)
-        found: dict[int, Array] = {}
-        for indices in by_length.values():
-            beside = np.concatenate([trials[i] for i in indices], axis=1)
-            parts = np.split(self.thin(beside, [*axes] * len(indices)), len(indices), axis=1)
-            found |= dict(zip(indices, parts, strict=True))
-        return [found[index] for index in range(len(trials))]
+        found: list[Array] = []
+        for _, alike in groupby(trials, key=len):
+            while few := list(islice(alike, _TOGETHER)):
+                thin = self.thin(np.concatenate(few, axis=1), [*axes] * len(few))
+                found += np.split(thin, len(few), axis=1)
+        return found
 
     def thin_input(self, values: Array) -> Array:
         """`thin` for columns (T, k) that belong to no axis: with the highest cut-off."""

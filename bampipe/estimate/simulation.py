@@ -326,10 +326,9 @@ def simulate_tracking(
     Raises:
         Runaway: the motion grows without bounds.
     """
-    finer = int(np.ceil(dt / _WIDEST_GRID_S - 1e-6)) if len(smooth) else 1
+    u, fine_dt = read_finely(u, dt, smooth)
+    finer, dt = round(dt / fine_dt), fine_dt
     if finer > 1:
-        dt /= finer
-        u = _read_between(u, finer, smooth)
         everything = range(q_ref.shape[1])
         q_ref, qd_ref = (_read_between(ref, finer, everything) for ref in (q_ref, qd_ref))
         brake_gain = None if brake_gain is None else _read_between(brake_gain, finer)
@@ -356,16 +355,23 @@ def simulate_tracking(
     return np.ascontiguousarray(x[::finer]), np.ascontiguousarray(total[::finer])
 
 
+def read_finely(u: Array, dt: float, smooth: Sequence[int]) -> tuple[Array, float]:
+    """Inputs (T, n_u, ...) as finely as smooth ones want them, and the interval of that grid, s."""
+    finer = int(np.ceil(dt / _WIDEST_GRID_S - 1e-6)) if len(smooth) else 1
+    return (u, dt) if finer == 1 else (_read_between(u, finer, smooth), dt / finer)
+
+
 def _read_between(values: Array, finer: int, smooth: Sequence[int] = ()) -> Array:
-    """Columns (T, n) on a grid that is ``finer`` times as fine: linear, or cubic where smooth."""
+    """Columns (T, n, ...) ``finer`` times as finely: linear, or cubic where smooth."""
     coarse = np.arange(len(values))
     fine = np.arange((len(values) - 1) * finer + 1) / finer
-    between = np.empty((len(fine), values.shape[1]))
+    between = np.empty((len(fine), *values.shape[1:]))
     curved = list(smooth) if len(values) > 3 else []
     if curved:
         between[:, curved] = CubicSpline(coarse, values[:, curved])(fine)
-    for column in sorted({*range(values.shape[1])}.difference(curved)):
-        between[:, column] = np.interp(fine, coarse, values[:, column])
+    for place in np.ndindex(values.shape[1:]):
+        if place[0] not in curved:
+            between[:, *place] = np.interp(fine, coarse, values[:, *place])
     return between
 
 

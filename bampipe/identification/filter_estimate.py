@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -201,25 +201,30 @@ class _Filtering:
             lambda fraction, message: self.report_progress(0.35 + 0.6 * fraction, message),
         ).run(attempts, settings)
 
-    def find(self) -> tuple[FilterRun, _Width | None]:
-        """The run that counts, and the narrower width of the sign if readings ask for one."""
+    def find(self) -> tuple[FilterRun, _Width | None, _Widths]:
+        """The run that counts, the narrower width of the sign if readings ask for one, others."""
         found = self.run(self.attempts, self.settings)
-        if self.task.system.model.device.prescribed:
-            return found, None
-        narrowed, step = self.task.narrowed, self.choice.longest_step_s
-        width = _choose_width(found, self.model, self.trials, narrowed, step)
+        widths = self._widths_around(found)
+        width = None if self.task.system.model.device.prescribed else widths.choose()
         if width is None:
-            return found, None
-        declared, self.model = self.model, replace(self.model, functions=narrowed(width.factor))
+            return found, None, widths
+        functions, declared = self.task.narrowed(width.factor), self.model
+        self.model = replace(self.model, functions=functions)
         value, slope = self.model.to_physical(found.theta)
         around = _AROUND * slope * np.sqrt(np.diag(found.covariance))
         with suppress(MotionLost):  # a narrow sign may throw it off at one reversal of many
-            again = self.run([(value, around, 1.0)], width.settings)
+            settings = replace(found.settings, longest_step=widths.step / width.parts)
+            again = self.run([(value, around, 1.0)], settings)
             if again.log_likelihood > found.log_likelihood + _LIKELIER:
                 first = found.first or found.passes
-                return replace(again, restarts=found.restarts, repeats=1, first=first), width
+                again = replace(again, restarts=found.restarts, repeats=1, first=first)
+                return again, width, self._widths_around(again, width.factor)
         self.model = declared
-        return found, None
+        return found, None, widths
+
+    def _widths_around(self, found: FilterRun, width: float = 1.0) -> _Widths:
+        some, step = _some_of(self.trials, found), self.choice.longest_step_s
+        return _Widths(found, self.model, width, some, self.task.narrowed, step)
 
 
 def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
@@ -229,7 +234,7 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
         MotionLost: the filter does not follow the motion.
     """
     filtering = _Filtering(task, progress)
-    found, width = filtering.find()
+    found, width, widths = filtering.find()
     model, count, system = filtering.model, filtering.count, task.system
     problem, motions = task.squares.problem, filtering.motions
     sandwich, blocks = sandwich_covariance(
@@ -237,7 +242,7 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
     )
     value, slope = model.to_physical(constrain(model, found.theta, sandwich))
     scaled = sandwich * np.outer(slope, slope)
-    off, spread = _find_smoothing(found, width, filtering)
+    off, spread = _find_smoothing(width, widths)
     p = np.append(task.start, task.squares.p[-1])
     p[problem.free] = value
     tight = slope * np.sqrt(np.diag(found.covariance))
@@ -280,9 +285,7 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
     )
 
 
-def _find_smoothing(
-    found: FilterRun, width: _Width | None, filtering: _Filtering
-) -> tuple[Array, Array]:
+def _find_smoothing(width: _Width | None, widths: _Widths) -> tuple[Array, Array]:
     """How far the answer is from that without smoothing, and between likely widths, both (nt,).
 
     A machine with dry friction truly stands still, where the model creeps within the width of its
@@ -292,15 +295,10 @@ def _find_smoothing(
     the answer, over some of the trials and in finer steps, for the narrower one may be stiffer.
     What widths that are nearly as likely disagree on is as uncertain.
     """
-    factor, model = 1.0 if width is None else width.factor, filtering.model
-    narrower = replace(model, functions=filtering.task.narrowed(_NARROWER[0] * factor))
-    finer = replace(found.settings, longest_step=0.5 * found.settings.longest_step)
-    trials, off = _some_of(filtering.trials, found), np.zeros(model.free.size)
-    with suppress(FilterFailure):
-        value, likely = _filter_some(model, trials, found, finer)
-        moved, likelier = _filter_some(narrower, trials, found, finer)
-        if likelier > likely:
-            off = (moved - value) / (1.0 - _NARROWER[0])
+    factor, parts = (1.0, 1) if width is None else (width.factor, width.parts)
+    likely, value = widths.filter(factor, 2 * parts)
+    likelier, moved = widths.filter(_NARROWER[0] * factor, 2 * parts)
+    off = (moved - value) / (1.0 - _NARROWER[0]) if likelier > likely > -np.inf else 0.0 * value
     return off, np.zeros(off.size) if width is None else width.spread
 
 
@@ -354,77 +352,75 @@ def _some_of(trials: Sequence[Trial], found: FilterRun) -> tuple[list[Trial], Ar
     return part, _AROUND**2 / share * np.diag(np.diag(found.covariance))
 
 
-def _filter_some(
-    model: FilterModel,
-    some: tuple[list[Trial], Array],
-    found: FilterRun,
-    settings: FilterSettings,
-) -> tuple[Array, float]:
-    """Answer, (nt,) physical, and log likelihood by what `_some_of` returns.
-
-    Raises:
-        FilterFailure: the filter loses the motion.
-    """
-    filtered = filter_trials(model, some[0], found.theta, some[1], settings)
-    likely = sum(float(np.nansum(one.log_likelihood)) for one in filtered.trials)
-    return model.to_physical(filtered.theta)[0], likely
-
-
 @dataclass(frozen=True)
 class _Width:
     """Over which narrower width the filter smooths the sign of a velocity.
 
     Attributes:
-        factor: times the device's; settings: of the filter, with the Runge-Kutta step that suits.
+        factor: times the device's; parts: by which the Runge-Kutta step that suits is divided.
         spread: (n,) how far parameters move between the widths and steps that are nearly as likely.
     """
 
     factor: float
-    settings: FilterSettings
+    parts: int
     spread: Array
 
 
-def _choose_width(
-    found: FilterRun,
-    model: FilterModel,
-    trials: Sequence[Trial],
-    narrowed: Callable[[float], System],
-    step: float,
-) -> _Width | None:
-    """Return the narrower width of the smoothed sign that makes readings likeliest, with its step.
+@dataclass(frozen=True)
+class _Widths:
+    """What narrower widths of the smoothed sign make of some trials, around an answer.
 
-    Friction that stops a machine changes over less than the device says it does, and estimates err
-    in proportion to the rest. None where no narrower width is likelier.
-
-    Args:
-        found: with the declared width; model: the model of that.
+    Attributes:
+        found: the answer; model, width: of the filter that found it.
+        some: parts of trials, and the covariance (nt, nt) to start from, by `_some_of`.
         narrowed: the system by its width, times the device's; step: the longest step, s.
+        filtered: log likelihood and answer by width and by what the step is divided.
     """
-    some = _some_of(trials, found)
-    tried: dict[tuple[float, int], tuple[float, Array]] = {}
 
-    def best(width: float, parts: Sequence[int]) -> float:
-        theirs = model if width == 1.0 else replace(model, functions=narrowed(width))
-        for by in parts:
-            settings = replace(found.settings, longest_step=step / by)
+    found: FilterRun
+    model: FilterModel
+    width: float
+    some: tuple[list[Trial], Array]
+    narrowed: Callable[[float], System]
+    step: float
+    filtered: dict[tuple[float, int], tuple[float, Array]] = field(default_factory=dict)
+
+    def filter(self, width: float, parts: int) -> tuple[float, Array]:
+        """Log likelihood, minus infinity where the motion is lost, and answer, (nt,) physical."""
+        if (width, parts) not in self.filtered:
+            likely, theta = -np.inf, self.found.theta
+            model = self.model
+            if width != self.width:
+                model = replace(model, functions=self.narrowed(width))
+            settings = replace(
+                self.found.settings, longest_step=self.step / parts, stride=_MOVED_SAMPLES
+            )
             with suppress(FilterFailure):
-                value, likely = _filter_some(theirs, some, found, settings)
-                tried[width, by] = likely, value
-        return max((one for (each, _), (one, _) in tried.items() if each == width), default=-np.inf)
+                outcome = filter_trials(model, self.some[0], theta, self.some[1], settings)
+                likely = sum(float(np.nansum(one.log_likelihood)) for one in outcome.trials)
+                theta = outcome.theta
+            self.filtered[width, parts] = likely, model.to_physical(theta)[0]
+        return self.filtered[width, parts]
 
-    ends = (_PARTS[0], _PARTS[-1])
-    declared = best(1.0, ends)
-    if not np.isfinite(declared):  # nothing to hold the others against
-        return None
-    if max(best(width, ends) for width in _NARROWER[:2]) < declared + _LIKELIER:
-        return None
-    most = max(best(width, _PARTS) for width in _NARROWER)
-    chosen = min(
-        (key for key, (likely, _) in tried.items() if likely > most - _LIKELIER),
-        key=lambda key: key[1],
-    )
-    near = [
-        value for likely, value in tried.values() if likely - declared > 0.5 * (most - declared)
-    ]
-    spread = np.max(np.abs(np.array(near) - tried[chosen][1]), axis=0)
-    return _Width(chosen[0], replace(found.settings, longest_step=step / chosen[1]), spread)
+    def choose(self) -> _Width | None:
+        """Return the width that makes readings likeliest; None where no narrower one is likelier.
+
+        Friction that stops a machine changes over less than the device says it does, and estimates
+        err in proportion to the rest.
+        """
+        first, *others = (self.filter(width, _PARTS[1])[0] for width in (1.0, *_NARROWER[:2]))
+        if max(others) < first:  # this is the usual case, and what `_find_smoothing` needs as well
+            return None
+        declared = max(self.filter(1.0, parts)[0] for parts in _PARTS)
+        if not np.isfinite(declared):  # nothing to hold the others against
+            return None
+        best = [max(self.filter(width, parts)[0] for parts in _PARTS) for width in _NARROWER]
+        if max(best[:2]) < declared + _LIKELIER:
+            return None
+        most = max(best)
+        alike = [key for key, (likely, _) in self.filtered.items() if likely > most - _LIKELIER]
+        chosen = min(alike, key=lambda key: key[1])
+        far = 0.5 * (most + declared)
+        near = [value for likely, value in self.filtered.values() if likely > far]
+        spread = np.max(np.abs(np.array(near) - self.filtered[chosen][1]), axis=0)
+        return _Width(*chosen, spread)

@@ -146,11 +146,7 @@ def as_filtered(system: System, motion: Motion, p: Array) -> pd.DataFrame:
 
 
 def tabulate_trace(
-    names: Sequence[str],
-    model: FilterModel,
-    motions: Sequence[Motion],
-    found: FilterRun,
-    rows: int,
+    names: Sequence[str], model: FilterModel, motions: Sequence[Motion], found: FilterRun, rows: int
 ) -> pd.DataFrame:
     """Return how the parameters converged, trial by trial, the search first.
 

@@ -19,7 +19,7 @@ from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
-from bampipe.estimate.simulation import MAX_STEP_S, Runaway, simulate
+from bampipe.estimate.simulation import MAX_STEP_S, Runaway, read_finely, simulate
 from bampipe.physics import System
 from bampipe.physics.control_law import ControlLaw, compile_law
 from bampipe.physics.device import INPUT_ORDERS, derivative
@@ -163,7 +163,7 @@ def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -
     start, u = _start(system, motion, p), motion.inputs(system.inputs)
     if push is not None:
         start[: len(push)] += push
-    x = _simulate(system, start, u, p, float(motion.t[1] - motion.t[0]))
+    x = _simulate(system, start, u, p, float(motion.t[1] - motion.t[0]), system.forced, MAX_STEP_S)
     readings = system.encoder_readings(x, u, p)
     none = np.zeros((len(x), 0))
     return _Run(motion.trial_id, np.hstack([motion.q, motion.qd]), readings, none, none)
@@ -231,22 +231,20 @@ def find_drift(
     usable = [max(motions[k].t[-1] - motions[k].t[0] - 2.0 * _MARGIN_S, 0.0) for k in chosen]
     spacing = sum(usable) / starts
     runs = [
-        run
-        for k, length in zip(chosen, usable, strict=True)
-        for run in _let_go(
-            system, motions[k], parameters[k], length, length if len(chosen) == starts else spacing
+        _let_go(
+            system, motions, k, parameters[k], length, length if len(chosen) == starts else spacing
         )
+        for k, length in zip(chosen, usable, strict=True)
     ]
     found = {axis: AxisDrift(unit=unit, horizons=()) for axis, unit in axes}
     for horizon in HORIZONS_S:
         if all(entry.reason for entry in found.values()):
             break  # the longest runs, which cost most, would say nothing of any axis
-        reached = [reach for run in runs if (reach := next(run, None)) is not None]
+        reached = [reach for run in runs for reach in next(run, [])]
         for i, (axis, _) in enumerate(axes):
             if not found[axis].reason:
-                found[axis] = found[axis].model_copy(
-                    update=_drift(reached, i, horizon, found[axis])
-                )
+                update = _drift(reached, i, horizon, found[axis])
+                found[axis] = found[axis].model_copy(update=update)
     return found
 
 
@@ -264,53 +262,56 @@ def why_not_free(system: System, motions: Sequence[Motion], parameters: Sequence
 
 
 def _let_go(
-    system: System, motion: Motion, parameters: Array, length: float, spacing: float
-) -> list[Iterator[_Reach]]:
-    """Runs from many samples of a trial; ``length`` and ``spacing`` of the starts, s."""
-    p = np.ascontiguousarray(parameters[: len(system.parameters)])
-    u = motion.inputs(system.inputs)
-    dt = float(motion.t[1] - motion.t[0])
+    system: System, motions: Sequence[Motion], trial: int, p: Array, length: float, spacing: float
+) -> Iterator[list[_Reach]]:
+    """Runs from many samples of a trial, by horizon; ``length``, ``spacing`` of the starts, s."""
+    motion, p = motions[trial], np.ascontiguousarray(p[: len(system.parameters)])
+    u, dt = motion.inputs(system.inputs), float(motion.t[1] - motion.t[0])
     true = motion.of_mechanism(system, u, p)
     states = np.hstack([true.q, true.qd, system.memory(*true.kinematics, u, p, true.t)])
     last = len(motion.t) - 1 - round(_MARGIN_S / dt)
-
-    def run(start: int, state: Array | None) -> Iterator[_Reach]:
-        """Let the model run on to each horizon that the trial holds."""
-        at = start
-        for horizon in HORIZONS_S:
-            end = start + round(horizon / dt)
-            if end > last:
-                return
-            if state is not None:
-                state = _simulate_from(system, state, u[at : end + 1], p, dt)
-            at, measured = end, motion.q[start : end + 1]
-            error = np.full(motion.q.shape[1], np.inf)
-            if state is not None:
-                reading = system.encoder_readings(state[None], u[[end]], p)[0]
-                error = np.abs(reading[: error.size] - measured[-1])
-            moves = np.ptp(measured, axis=0) > _MOVES * np.ptp(motion.q, axis=0)
-            yield error, np.abs(measured[-1] - measured[0]), moves
-
     count = int(length / spacing) if spacing > 0.0 else 0
-    starts = (round((_MARGIN_S + (number + 0.5) * spacing) / dt) for number in range(count))
-    return [run(k, states[k]) for k in starts]
+    starts = [round((_MARGIN_S + (number + 0.5) * spacing) / dt) for number in range(count)]
+    running: list[Array | None] = [states[k].copy() for k in starts]
+    travel, done, longest = np.ptp(motion.q, axis=0), 0, round(HORIZONS_S[-1] / dt) + 1
+    seen = [(u[k : k + longest].copy(), motion.q[k : k + longest].copy()) for k in starts]
+    del motion, true, u, states  # of a hundred trials, these windows alone are kept
+    for horizon in HORIZONS_S:
+        steps = round(horizon / dt)
+        inside = [both for k, both in zip(starts, seen, strict=True) if k + steps <= last]
+        if not inside:
+            return
+        windows = np.stack([given[done : steps + 1] for given, _ in inside], axis=-1)
+        fine, fine_dt = read_finely(windows, dt, system.forced)
+        reached, done = list[_Reach](), steps
+        for place, (given, path) in enumerate(inside):
+            measured, state = path[: steps + 1], running[place]
+            if state is not None:
+                state = _simulate_from(system, state, fine[..., place], p, fine_dt)
+            running[place], error = state, np.full(len(travel), np.inf)
+            if state is not None:
+                reading = system.encoder_readings(state[None], given[[steps]], p)[0]
+                error = np.abs(reading[: error.size] - measured[-1])
+            moves = np.ptp(measured, axis=0) > _MOVES * travel
+            reached.append((error, np.abs(measured[-1] - measured[0]), moves))
+        yield reached
 
 
 def _simulate_from(system: System, state: Array, u: Array, p: Array, dt: float) -> Array | None:
-    """The state (nx,) at the last of the inputs (T, n_u); None if the motion runs away."""
+    """The state (nx,) at the last of inputs (T, n_u), `read_finely`; None if it runs away."""
     for step in _STEPS_S:
         with contextlib.suppress(Runaway):
-            return np.asarray(_simulate(system, state, u, p, dt, step)[-1])
+            return np.asarray(_simulate(system, state, u, p, dt, (), step)[-1])
     return None
 
 
 def _simulate(
-    system: System, state: Array, u: Array, p: Array, dt: float, step: float = MAX_STEP_S
+    system: System, state: Array, u: Array, p: Array, dt: float, smooth: Sequence[int], step: float
 ) -> Array:
     """States (T, nx) under the inputs (T, n_u) alone, from ``state`` on."""
     return simulate(
         system.derivative, state, u, p[: len(system.parameters)], dt, width=system.sign_widths,
-        n_noise=len(system.noise), smooth=system.forced, max_step=step,
+        n_noise=len(system.noise), smooth=smooth, max_step=step,
     )  # fmt: skip
 
 

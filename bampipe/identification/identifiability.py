@@ -49,11 +49,7 @@ TIMING = "input_timing"
 
 
 def assess_identifiability(
-    system: System,
-    motions: Sequence[Motion],
-    problem: Problem,
-    p: Array,
-    noise: Noise,
+    system: System, motions: Sequence[Motion], problem: Problem, p: Array, noise: Noise
 ) -> tuple[IdentifiabilityReport, Array]:
     """Say what sensor noise alone leaves open about the parameters at ``p``.
 

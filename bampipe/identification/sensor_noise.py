@@ -77,11 +77,7 @@ class Noise:
 
 
 def sensor_noise(
-    sensors: Sensors,
-    system: System,
-    motions: Sequence[Motion],
-    p: Array,
-    choice: FilterChoice,
+    sensors: Sensors, system: System, motions: Sequence[Motion], p: Array, choice: FilterChoice
 ) -> Noise:
     """Noise of the session's sensors as the filter wants it.
 
@@ -175,7 +171,8 @@ def tune_noise(
         near: (nt,) parameters near the answer, physical, and (nt,) how well they are known.
         choice: fixes levels that are not to be found.
     """
-    quick = replace(settings, longest_step=max(settings.longest_step, _TUNING_STEP_S))
+    longest = max(settings.longest_step, _TUNING_STEP_S)
+    quick = replace(settings, longest_step=longest, stride=TUNING_SAMPLES)  # no distributions
     counts = np.concatenate(clear)
     counts = counts if counts.any() else np.ones(counts.size, dtype=bool)
     value, sd = near
@@ -204,7 +201,7 @@ def tune_noise(
     if choice.force_noise > 0.0:
         step[1:][noise.is_force] = 0.0
     best, _ = climb(log_likelihood, np.zeros(count + 1), step, lower)
-    return replace(with_levels(best), longest_step=settings.longest_step)
+    return replace(with_levels(best), longest_step=settings.longest_step, stride=settings.stride)
 
 
 def noise_levels(system: System, settings: FilterSettings, noise: Noise) -> NoiseLevels:

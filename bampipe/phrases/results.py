@@ -17,7 +17,6 @@ METHODS: Mapping[Method, str] = {
 FILTERS = {
     "kalman": "a Kalman smoother",
     "butterworth": "a zero-phase Butterworth filter",
-    "savitzky_golay": "a Savitzky-Golay filter",
 }
 STANDINGS: Mapping[FloorStatus, str] = {
     "at_floor": "at the noise floor",

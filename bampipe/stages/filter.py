@@ -73,11 +73,11 @@ class Config:
 
     Attributes:
         method: ``kalman`` (fixed-interval smoother), ``butterworth`` (zero-phase filter and
-            central differences), ``savitzky_golay``, or ``auto``, which is the Kalman smoother:
-            of the three it alone bridges gaps with honest error bands and has its bandwidth
-            set by the likelihood of the samples.
+            central differences), or ``auto``, which is the Kalman smoother: it alone bridges
+            gaps with honest error bands and has its bandwidth set by the likelihood of the
+            samples.
         cutoff_hz: bandwidth, Hz, for all axes; 0 takes it from the data, axis by axis: for the
-            Kalman smoother the maximum likelihood over order and process noise, for the others
+            Kalman smoother the maximum likelihood over order and process noise, for the other
             the frequency where the encoder spectrum meets the quantisation floor.
         minimum_bandwidth_hz: a bandwidth taken from the data is held at this or above, Hz:
             changes of direction must not be smeared, friction is read from them.
@@ -91,7 +91,7 @@ class Config:
             there are very many.
     """
 
-    method: Literal["auto", "kalman", "butterworth", "savitzky_golay"] = "auto"
+    method: Literal["auto", "kalman", "butterworth"] = "auto"
     cutoff_hz: NotNegative = 0.0
     minimum_bandwidth_hz: NotNegative = 25.0
     force_cutoff_hz: NotNegative = 0.0
@@ -299,10 +299,7 @@ def _write_motions(
 
 
 def _motions(
-    path: Path,
-    names: Sequence[str],
-    system: System,
-    left_out: Mapping[str, Sequence[Disturbance]],
+    path: Path, names: Sequence[str], system: System, left_out: Mapping[str, Sequence[Disturbance]]
 ) -> TrialCache[Motion]:
     """The trials just written."""
 
@@ -341,10 +338,15 @@ def _inspect(
     disturbances: Mapping[str, Sequence[Disturbance]],
 ) -> SetupResult:
     """Hold the set-up against the trials ``ids``, those in ``free`` fitted."""
-    motions = []
-    for name in ids:
+    most = _INSPECTED // min(len(ids), MOST_TRIALS)
+
+    def read(number: int) -> Motion:
+        name = ids[number]
         motion = read_motion(path, name, system, disturbances.get(name, ()), every_input=True)
-        motions += deepcopy(shorten([motion], _INSPECTED // min(len(ids), MOST_TRIALS)))
+        return deepcopy(shorten([motion], most)[0])  # a view would keep the whole trial
+
+    in_all = min(row_count(path, ids), most * len(ids))
+    motions = TrialCache(read, len(ids), n_samples, names=ids, in_all=in_all)
     # What brakes do is no part of the bare device: it is judged by braked trials, not fitted.
     folds = Folds.of_trials(ids, (), [name for name in ids if name in free])
     cutoffs = tuple(min(bands[axis].cutoff_hz, HIGHEST_HZ) for axis in system.coordinates)

@@ -152,18 +152,18 @@ def _noise_floor(
     """The floor, None where the fitted model cannot be simulated, and what to say of it."""
     progress(0.4, "noise floor")
     count = config.repeats or floor_replays(trials.motions)
+    if count == 1:
+        raise InputError("one replicate has no scatter", where="validate.repeats", remedy="set 2")
     # Where the session holds trials out, these are few, and all are needed to judge by.
     chosen: Sequence[int] = range(len(evidence.motions))
     if all(evidence.folds.judged):
         chosen = draw_trials(evidence.sizes)
     drawn = replace(
-        trials,
-        motions=[trials.motions[k] for k in chosen],
-        folds=trials.folds.subset(chosen),
+        trials, motions=[trials.motions[k] for k in chosen], folds=trials.folds.subset(chosen)
     )
-    session = Session(drawn, Criteria(replicates=count), seed=config.seed)
+    session = Session(drawn, Criteria(), seed=config.seed)
     try:
-        found = session.judge(recipe, p)
+        found = session.judge(recipe, p, count)
     except InputError as error:
         return None, [f"No noise floor: simulating the fitted model failed ({error})."]
     notes = []

@@ -302,14 +302,15 @@ def _slopes_by_timing(
     system = fitted[0].system
     if step == 0.0 or system.takes_timing:
         return ()
-    rows = []
-    for base in fitted:
+
+    def slope(base: ModelOnTrial) -> Array:
         late, early = (
             ModelOnTrial(system, base.p, [base.motion.with_input_timing(by)]).residual
             for by in (step, -step)
         )
-        rows.append((late - early) / (2.0 * step))
-    thin = band.thin_trials(rows, range(len(system.coordinates)))
+        return np.asarray((late - early) / (2.0 * step))
+
+    thin = band.thin_trials(map(slope, fitted), range(len(system.coordinates)))
     return tuple(values * moves for values, moves in zip(thin, used, strict=True))
 
 

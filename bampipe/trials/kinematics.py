@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.arrays import Array, Flags
-from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
+from bampipe.estimate import butterworth, kalman_smoother
 from bampipe.estimate.differentiation import Derivatives
 from bampipe.physics.device import LAST_ORDER
 from bampipe.results.filter import FilterResult
@@ -26,7 +26,7 @@ class AxisFilter:
     Attributes:
         bandwidth_hz: half-power frequency, Hz.
         noise_sd: standard deviation of the white noise of a reading, rad or m.
-        order: of the integrated white noise of the Kalman smoother; 0 for other methods.
+        order: of the integrated white noise of the Kalman smoother; 0 for a Butterworth filter.
     """
 
     bandwidth_hz: float
@@ -39,7 +39,7 @@ class Kinematics:
     """The filters of a session.
 
     Attributes:
-        method: ``kalman``, ``butterworth`` or ``savitzky_golay``.
+        method: ``kalman`` or ``butterworth``.
         rate_hz: sampling rate.
         axes: by coordinate, in order.
         input_cutoff_hz: half-amplitude frequency of the time derivatives of inputs, Hz.
@@ -68,18 +68,14 @@ class Kinematics:
         if self.method == "kalman":
             return kalman_smoother.smooth(position, self._motion_model(axis), seen)
         chosen = self.axes[axis]
-        smooth = butterworth.smooth if self.method == "butterworth" else savitzky_golay.smooth
-        return smooth(position, self.rate_hz, chosen.bandwidth_hz, chosen.noise_sd)
+        return butterworth.smooth(position, self.rate_hz, chosen.bandwidth_hz, chosen.noise_sd)
 
     def derivatives_of(self, axis: int, signal: Array) -> tuple[Array, Array, Array]:
         """What `differentiate` adds for a signal (T,) that is added to the readings."""
         name = list(self.axes)[axis]
         if self.method == "kalman":
             return kalman_smoother.smooth_mean(signal, self._motion_model(name))
-        mean = (
-            butterworth.zero_phase if self.method == "butterworth" else savitzky_golay.smooth_mean
-        )
-        return mean(signal, self.rate_hz, self.axes[name].bandwidth_hz)
+        return butterworth.zero_phase(signal, self.rate_hz, self.axes[name].bandwidth_hz)
 
     def _motion_model(self, axis: str) -> kalman_smoother.MotionModel:
         chosen = self.axes[axis]

@@ -17,7 +17,7 @@ beta and gamma of each axis, and the time by which inputs were sampled late.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -199,7 +199,7 @@ class Likelihood:
         """
         e = evidence
         axes = range(len(samples))
-        applied = e.band.thin_trials([fitted.applied for fitted in e.fitted], axes)
+        applied = e.band.thin_trials((fitted.applied for fitted in e.fitted), axes)
         bare = bare_slopes(e.system, e.motions, e.band, e.p)
         total = [a + b for a, b in zip(bare, e.slopes_by_force, strict=True)]
         turning = [np.zeros_like(r) for r in e.residual]
@@ -294,13 +294,17 @@ class Likelihood:
         timing = evidence.timing if evidence.by_timing else ()
         slopes = evidence.slopes
         n = slopes[0].shape[2]
-        full = []
-        for axis, here in enumerate(samples):
-            columns = np.zeros((len(here.rows), n + 2 * n_q))
-            columns[:, :n] = take_samples(slopes, here, axis)
-            columns[:, n + axis] = -self.noise.bias[axis]
-            columns[:, n + n_q + axis] = -self.noise.stopping[axis]
-            full.append(columns * weights[axis][:, None])
+
+        def weighted_columns() -> Iterator[Array]:
+            """By all unknowns, (n, n_all) each; one axis after the other, for they are large."""
+            for axis, here in enumerate(samples):
+                columns = np.zeros((len(here.rows), n + 2 * n_q))
+                columns[:, :n] = take_samples(slopes, here, axis)
+                columns[:, n + axis] = -self.noise.bias[axis]
+                columns[:, n + n_q + axis] = -self.noise.stopping[axis]
+                columns *= weights[axis][:, None]
+                yield columns
+
         # What lies evenly between two bounds has a standard deviation of 0.29 of their distance.
         of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
         n_timing, none = len(of_timing), np.zeros(n_q)
@@ -315,7 +319,8 @@ class Likelihood:
         weight = [
             s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)
         ]
-        normal = sum(w * (x.T @ x) for w, x in zip(weight, full, strict=True)) + np.diag(precision)
+        products = (w * (x.T @ x) for w, x in zip(weight, weighted_columns(), strict=True))
+        normal = sum(products) + np.diag(precision)
         # What changes nothing over its range stays, as a shape does whose strength is zero.
         size, parameters = np.sqrt(np.diag(normal)), evidence.system.parameters
         reach = np.ones(size.size)
@@ -328,8 +333,9 @@ class Likelihood:
         effects, (log_scale, by_parameters) = evidence.system.model.effects, evidence.log_scale
         by_parameters = np.pad(by_parameters, ((0, 0), (0, 2 * n_q)))
         return Problem(
-            self, tuple(y), tuple(x @ to for x in full), to.T @ (precision[:, None] * to),
-            to.T @ (precision * known), log_scale, by_parameters @ to, to, lower, upper,
+            self, tuple(y), tuple(x @ to for x in weighted_columns()),
+            to.T @ (precision[:, None] * to), to.T @ (precision * known), log_scale,
+            by_parameters @ to, to, lower, upper,
             {item.name: _absence(evidence, item) for item in effects},
             {
                 item.name: np.array([q.sd for q in item.parameters if q.strength and not q.fixed])
@@ -472,31 +478,30 @@ def _correlate(values: Array, samples: Samples, lags: int) -> Array:
     return np.asarray(total / total[0]) if total[0] > 0.0 else np.eye(1, lags + 1)[0]
 
 
-def _error_of_turning(evidence: Evidence) -> list[Array]:
+def _error_of_turning(evidence: Evidence) -> Iterator[Array]:
     """What is not known of friction as a log does not say when between two samples a machine turns.
 
     By trial, each (T, n_q), N.m or N: the change of friction from sample to sample, times the
     standard deviation of a moment that lies evenly between two of them.
     """
     width = evidence.system.sign_widths
-    jumps = [np.gradient(np.tanh(m.qd / width), axis=0) for m in evidence.motions]
-    return [d * j / np.sqrt(12.0) for d, j in zip(dry_friction(evidence), jumps, strict=True)]
+    for dry, motion in zip(dry_friction(evidence), evidence.motions, strict=True):
+        yield dry * np.gradient(np.tanh(motion.qd / width), axis=0) / np.sqrt(12.0)
 
 
-def dry_friction(evidence: Evidence) -> list[Array]:
+def dry_friction(evidence: Evidence) -> Iterator[Array]:
     """What turns with the motion in a model, by trial, each (T, n_q), N.m or N.
 
     Half the difference between moving slowly one way and the other, brakes included.
     """
-    found, slow = [], _SLOW * evidence.system.sign_widths
+    slow = _SLOW * evidence.system.sign_widths
     for at in evidence.fitted:
         q, qd, qdd = at.mechanism.kinematics
         back, on = (
             at.system.residual(q, side * slow + np.zeros_like(qd), qdd, at.memory, at.inputs, at.p)
             for side in (-1.0, 1.0)
         )
-        found.append(0.5 * (back - on))
-    return found
+        yield np.asarray(0.5 * (back - on))
 
 
 def _places(evidence: Evidence, item: BoundEffect, *, strengths: bool) -> list[int]:

@@ -57,6 +57,22 @@ def test_a_replay_has_unit_variance_in_units_of_its_noise(fitted):
         assert spread.max() > 1.5 * spread.min()
 
 
+def test_replays_are_the_same_trial_by_trial_and_in_other_processes(fitted, monkeypatch):
+    """In a session too long to keep what the machine does, each trial is followed once for all."""
+    session, fit = fitted
+    e = fit.evidence
+    alone = session.replay(e, e.p, 3)
+    beside = replace(session, jobs=2)
+    followed = beside.replay(e, e.p, 3)
+    monkeypatch.setattr("bampipe.diagnosis.session.MOST_SAMPLES", 1)
+    long = beside.replay(e, e.p, 3)
+    for one, *others in zip(alone, followed, long, strict=True):
+        assert len(one) == len(e.motions)
+        for other in others:
+            assert all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+    assert not np.array_equal(alone[0][0], alone[1][0])
+
+
 def test_what_a_model_may_be_wrong_by_weighs_less_where_the_force_is_large(fitted):
     _, fit = fitted
     like = fit.likelihood

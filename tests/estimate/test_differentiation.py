@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bampipe.arrays import Array
-from bampipe.estimate import butterworth, kalman_smoother, savitzky_golay
+from bampipe.estimate import butterworth, kalman_smoother
 from bampipe.estimate.differentiation import (
     Derivatives,
     extend,
@@ -16,7 +16,7 @@ from bampipe.trials.motion import TIMING_ORDERS, Motion, input_derivatives
 RATE = 500.0
 RESOLUTION = 5e-5
 NOISE_SD = RESOLUTION / np.sqrt(12.0)
-METHODS = ("kalman", "butterworth", "savitzky_golay")
+METHODS = ("kalman", "butterworth")
 
 
 def motion(seed: int, seconds: float = 8.0) -> tuple[Array, Array, Array]:
@@ -42,8 +42,6 @@ def differentiate(method: str, position: Array, cutoff_hz: float = 40.0) -> Deri
     """Return the motion by ``method``, all with the same bandwidth."""
     if method == "butterworth":
         return butterworth.smooth(position, RATE, cutoff_hz, NOISE_SD)
-    if method == "savitzky_golay":
-        return savitzky_golay.smooth(position, RATE, cutoff_hz, NOISE_SD)
     ratio = kalman_smoother.ratio_for(cutoff_hz, 3, RATE)
     return kalman_smoother.smooth(position, kalman_smoother.MotionModel(3, NOISE_SD, ratio, RATE))
 
@@ -121,12 +119,11 @@ def test_a_parabola_is_kept_to_its_ends(method: str) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_half_of_the_amplitude_at_the_cut_off(method: str) -> None:
-    """The bandwidth means the same for all three (Savitzky-Golay: half the power)."""
+    """The bandwidth means the same for both."""
     t = np.arange(4000) / RATE
     found = differentiate(method, np.sin(2 * np.pi * 25.0 * t), 25.0)
     gain = np.sqrt(2.0) * np.std(found.position[500:-500])
-    expected = np.sqrt(0.5) if method == "savitzky_golay" else 0.5
-    assert gain == pytest.approx(expected, abs=0.05)
+    assert gain == pytest.approx(0.5, abs=0.05)
 
 
 def test_noise_gains_are_those_of_white_noise() -> None:
@@ -210,11 +207,6 @@ class TestUniformGrid:
 def test_cut_off_out_of_range(cutoff: float) -> None:
     with pytest.raises(ValueError, match="cut-off"):
         butterworth.zero_phase(np.zeros(100), RATE, cutoff)
-
-
-def test_window_that_does_not_fit() -> None:
-    with pytest.raises(ValueError, match="window"):
-        savitzky_golay.polynomial(np.zeros(10), RATE, 11)
 
 
 def test_curvature_of_inputs_is_that_of_splines_which_end_at_gaps() -> None:

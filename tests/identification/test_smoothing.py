@@ -1,11 +1,16 @@
 """What the smoothed sign of a velocity adds to intervals, on an arm that truly stands still."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from independent_runs import record_trials
 
 from bampipe.data.run_folder import RunFolder
+from bampipe.estimate.unscented import FilterSettings
 from bampipe.files import write_text
+from bampipe.identification.filter_estimate import _Widths
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import device
 from bampipe.progress import silent
@@ -29,6 +34,26 @@ def test_widths_change_and_nothing_else() -> None:
         assert other.sign_width == 2.0 * one.sign_width
     assert wider.with_sign_widths(0.5).device == plain.device
     assert wider.effects == plain.effects
+
+
+def widths(likely: dict[tuple[float, int], float]) -> _Widths:
+    """With log likelihoods by width and parts of the step; others must not be asked for."""
+    found: Any = SimpleNamespace(settings=FilterSettings(*4 * [np.ones(1)]))
+    filtered = {key: (value, np.array([key[0]])) for key, value in likely.items()}
+    return _Widths(found, None, 1.0, None, None, 1e-3, filtered)  # type: ignore[arg-type]
+
+
+def test_three_filters_answer_where_no_narrower_sign_is_likelier() -> None:
+    assert widths({(1.0, 2): 0.0, (0.5, 2): -20.0, (0.25, 2): -50.0}).choose() is None
+
+
+def test_the_likeliest_width_is_chosen_with_the_longest_step_that_serves() -> None:
+    best = {1.0: 10.0, 0.5: 100.0, 0.25: 200.0, 0.0625: 150.0}
+    likely = {(width, parts): best[width] for width in best for parts in (1, 2, 4)}
+    chosen = widths(likely | {(0.25, 1): 120.0}).choose()
+    assert chosen is not None and (chosen.factor, chosen.parts) == (0.25, 2)
+    assert chosen.spread == pytest.approx(0.1875)  # to 0.0625, likelier than half way to the best
+    assert widths(likely | {(1.0, 4): 171.0}).choose() is None
 
 
 def identified(root, **conditions) -> tuple[IdentifyResult, dict[str, float]]:

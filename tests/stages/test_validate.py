@@ -187,6 +187,15 @@ def test_one_long_trial_is_left_out_in_blocks(tmp_path: Path) -> None:
     assert 10.0 < table["t"].iloc[-1] < 12.0
 
 
+def test_two_replicates_give_a_floor_and_one_is_refused(simulated: RunFolder) -> None:
+    """A long session takes three, fewer than a diagnosis wants."""
+    content = validated(simulated, validate.Config(repeats=2))
+    assert content["floor_replays"] == 2
+    assert all(axis["noise_floor"] > 0.0 for axis in content["axes"].values())
+    with pytest.raises(InputError, match="one replicate has no scatter"):
+        validated(simulated, validate.Config(repeats=1))
+
+
 def test_mistakes_are_told(simulated: RunFolder, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"repeats: found -1, expected 0 or more"):
         configure("validate", {"repeats": -1})
