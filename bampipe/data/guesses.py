@@ -296,12 +296,9 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
     found: dict[str, str] = {}
     sound = {name: v[:_MOST_ROWS] for name, v in values.items() if np.all(np.isfinite(v))}
     if t is None:
-        clocks = [name for name, v in sound.items() if is_time(v)]
-        t = first = sound[clocks[0]] if clocks else None
-        for clock in clocks:  # trials side by side have one each
-            if first is not None and np.ptp(sound[clock] - first) <= np.median(np.diff(first)):
-                found[clock] = "time"
-                del sound[clock]
+        clock = next((name for name, v in sound.items() if is_time(v)), "")
+        found |= {clock: "time"} if clock else {}
+        t = sound.pop(clock, None)
     if len(sound) < 2:
         return found
     matrix = np.column_stack(list(sound.values()))
@@ -331,20 +328,13 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
             found[names[best]] = "force"
     elif positions and len(left) == len(positions):
         found |= {names[k]: "force" for k in left}
-    elif not positions and len(left) % 2 == 0:
+    elif not positions and len(left) == 2:
         seconds = (t - t[0]) * SECONDS.get(time_unit(t, ""), 1.0)
-        half = len(left) // 2  # of trials side by side, or of all positions before all drives
-        for first_of, second_of in ((left[::2], left[1::2]), (left[:half], left[half:])):
-            roles: dict[str, str] = {}
-            for pair in zip(first_of, second_of, strict=True):
-                columns = [matrix[:, k] for k in pair]
-                explained = [driven(seconds, q, u).share for q, u in (columns, columns[::-1])]
-                least, most = sorted(explained)
-                if most >= _MOVED and 1.0 - most < _CLEARLY * (1.0 - least):
-                    order = ("position", "force") if most == explained[0] else ("force", "position")
-                    roles |= dict(zip((names[k] for k in pair), order, strict=True))
-            if len(roles) == len(left):
-                return found | roles
+        explained = [driven(seconds, matrix[:, k], matrix[:, 1 - k]).share for k in left]
+        moved = int(explained[1] > explained[0])
+        least, most = sorted(explained)
+        if most >= _MOVED and 1.0 - most < _CLEARLY * (1.0 - least):
+            found |= {names[moved]: "position", names[1 - moved]: "force"}
     return found
 
 

@@ -44,7 +44,6 @@ from bampipe.trials.comparison import (
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import (
     MeasuredTrials,
-    folds_by_channel,
     read_measured_trials,
     trial_of_block,
 )
@@ -79,8 +78,6 @@ class Config:
         repeats: replicates for the noise floor; 0 takes three to six, fewer for a long session.
         seed: seed of their sensor noise.
         free_run: whether to run the model freely over every trial, and from many starts in it.
-        hold_out_by: a channel that is constant in each trial, such as a gain or a supply voltage:
-            trials at one value of it are held out together. Empty: one trial at a time.
     """
 
     model: str = "base"
@@ -88,7 +85,6 @@ class Config:
     repeats: Count = 0
     seed: Count = 0
     free_run: bool = True
-    hold_out_by: str = ""
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
@@ -98,9 +94,6 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     p = identified(run, config.model, system)
     estimates = run.read(IdentifyResult, config.model)
     trials = read_measured_trials(run, system, timing=estimates.input_timing)
-    if config.hold_out_by:
-        where = "validate.hold_out_by"
-        trials = replace(trials, folds=folds_by_channel(run, trials, config.hold_out_by, where))
     require_sound_motions(system, trials.motions)
     progress(0.1, "held-out fits")
     # Least squares would choose these so that less of the force is left to be explained.

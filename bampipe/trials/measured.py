@@ -10,8 +10,6 @@ from itertools import pairwise
 import numpy as np
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.data.store import read_parquet
-from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.results.identify import InputTiming
@@ -148,36 +146,3 @@ def read_measured_trials(
     may_fit = [block.trial_id for block in blocks] if trials.folds.fitted[alone[0]] else []
     folds = Folds.of_trials([motion.trial_id for motion in parted], held_out, may_fit)
     return replace(trials, motions=parted, folds=folds, blocks=len(blocks))
-
-
-def folds_by_channel(run: RunFolder, trials: MeasuredTrials, channel: str, where: str) -> Folds:
-    """Return folds that leave out together the trials at one value of a channel.
-
-    Raises:
-        InputError: there is one trial, or the channel is not recorded or changes within a trial.
-    """
-    if trials.blocks:
-        raise InputError(
-            "there is one trial only, so nothing to hold out by a channel", where=where
-        )
-    path = run.require("ingest/samples.parquet", "ingest")
-    values = []
-    for motion in trials.motions:
-        frame = read_parquet(path, trial=motion.trial_id)
-        if channel not in frame:
-            raise InputError(f"no channel {channel!r} is recorded", where=where)
-        column = frame[channel].to_numpy(dtype=float)
-        if np.ptp(column) > 1e-9 * np.abs(column).max():
-            raise InputError(
-                f"channel {channel!r} changes within trial {motion.trial_id}",
-                where=where,
-                remedy="name a channel that is constant in each trial",
-            )
-        values.append(float(column[0]))
-    numbers = [sorted(set(values)).index(value) for value in values]
-    unseen = held_out_trials(run)
-    groups = [
-        HELD_OUT if motion.trial_id in unseen else number
-        for motion, number in zip(trials.motions, numbers, strict=True)
-    ]
-    return Folds.of_groups(groups, trials.folds.fitted)

@@ -420,7 +420,7 @@ def test_of_two_joints_without_a_drawing_a_position_has_its_own_drive(tmp_path):
     session, proposal = proposed(tmp_path)
     assert session["encoders"]["joint"]["column"] == "pos_meas1"
     assert session["force"]["columns"] == ["tau1"]
-    assert any("2 columns are positions: of a robot?" in line for line in proposal.check)
+    assert any("if these are a robot's, put its URDF" in line for line in proposal.check)
 
 
 def test_the_files_of_one_recording_are_joined(tmp_path):
@@ -698,35 +698,20 @@ def machine(seed: int, size: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.nd
     return t, q, size * torque + 0.02 * rng.standard_normal(t.size)
 
 
-@pytest.mark.parametrize("layout", ["numbers", "words", "no names"])
-def test_trials_side_by_side_are_told_from_joints(tmp_path, layout):
-    (t, *one), (_, *two), (_, *three) = (machine(seed) for seed in (1, 2, 3))
-    if layout == "no names":
-        columns = [t, *one, t, *two, t, *three]
-        np.savetxt(tmp_path / "a.txt", np.column_stack(columns), "%.6f")
-        moved = [{f"column_{k}": f"column_{k + step}" for k in (1, 2, 3)} for step in (3, 6)]
-    else:
-        tags = ("1", "2", "3") if layout == "numbers" else ("train", "valid", "test")
-        names = [f"{what}_{tag}" for tag in tags for what in ("angle", "torque")]
-        write_table(tmp_path / "a.csv", dict(zip(["time_s", *names], [t, *one, *two, *three],
-            strict=True)))  # fmt: skip
-        moved = [{f"{w}_{tags[0]}": f"{w}_{tag}" for w in ("angle", "torque")} for tag in tags[1:]]
-    session, proposal = proposed(tmp_path)
-    assert [trial.get("columns") for trial in session["trials"]] == [None, *moved]
-    assert any("are of one axis in 3 trials" in line for line in proposal.check)
-    if layout == "numbers":
-        read = samples(tmp_path, tmp_path / "out", "a_3")
-        np.testing.assert_allclose(read["q_joint"], three[0], atol=1e-6)
-        np.testing.assert_allclose(read["force_drive"], three[1], atol=1e-5)
-
-
-def test_two_joints_are_no_trials_of_one(tmp_path):
-    (t, *one), (_, *two) = machine(1), machine(2, size=1.7)
+def test_trials_side_by_side_are_read_as_the_session_says(tmp_path):
+    (t, *one), (_, *two) = machine(1), machine(2)
     names = ("time_s", "angle_1", "torque_1", "angle_2", "torque_2")
     write_table(tmp_path / "a.csv", dict(zip(names, [t, *one, *two], strict=True)))
     session, proposal = proposed(tmp_path)
-    assert not any("columns" in trial for trial in session["trials"])
-    assert any("2 columns are positions: of a robot?" in line for line in proposal.check)
+    assert len(session["trials"]) == 1
+    assert any("if other trials', say so by columns in [[trials]]" in x for x in proposal.check)
+    path = tmp_path / "session.toml"
+    further = '[[trials]]\nfile = "a.csv"\nkind = "free"\n'
+    further += 'columns = { angle_1 = "angle_2", torque_1 = "torque_2" }\n'
+    path.write_text(f"{path.read_text()}\n{further}")
+    read = samples(tmp_path, tmp_path / "out", "a_2")
+    np.testing.assert_allclose(read["q_joint"], two[0], atol=1e-6)
+    np.testing.assert_allclose(read["force_drive"], two[1], atol=1e-5)
 
 
 def test_a_record_of_unknown_rate_is_not_cut_and_lost_rows_are_counted(tmp_path):

@@ -32,7 +32,6 @@ from bampipe.setup.proposal.matching import Matcher
 from bampipe.setup.proposal.notes import UNKNOWN, Notes, quoted
 from bampipe.setup.proposal.positions import fresh_readings, signed_readings
 from bampipe.setup.proposal.robot import LEAST_AT_JOINT, RobotColumns, find_robot_columns
-from bampipe.setup.proposal.side_by_side import find_trials
 from bampipe.setup.proposal.tables import clock_of, encoders_table, input_tables
 
 SESSION = "session.toml"
@@ -102,9 +101,14 @@ def propose(
         _check_robot(chosen, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
-    beside = _beside(chosen.device, axes, match, notes)
-    aside = {name for trial in beside for name in trial.values()} | match.used
-    left = [column.name for column in found.columns if column.name not in aside]
+    if len(match.rivals) > 1 and len(chosen.device.coordinates) == 1:
+        measured = join_names(column.name for column in axes.values())
+        notes.check.append(
+            f"of {join_names(match.rivals, 6)}, {measured} is the measured position; if these are a"
+            " robot's, put its URDF beside the logs; if other trials', say so by columns in"
+            " [[trials]]"
+        )
+    left = [column.name for column in found.columns if column.name not in match.used]
     lines = [
         *_head(folder, chosen.name, clock.rate),
         *(["[csv]", f"names = [{', '.join(map(quoted, names))}]", ""] if names else []),
@@ -112,7 +116,7 @@ def propose(
         *encoders,
         *inputs,
         *([f"# not used: {', '.join(left)}", ""] if left else []),
-        *_trials_tables(chosen.device, axes, match, notes, beside, UNKNOWN not in clock.rate),
+        *_trials_tables(chosen.device, axes, match, notes, UNKNOWN not in clock.rate),
     ]
     return ProposedSession(
         session="\n".join(lines) + "\n",
@@ -223,36 +227,11 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
         )
 
 
-def _beside(
-    device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes
-) -> list[dict[str, str]]:
-    """Further trials in the same file, their columns by those of the first; and that in words."""
-    rivals = match.rivals
-    if len(device.coordinates) > 1 or not axes or len(rivals) < 2:
-        return []
-    axis, column = next(iter(axes.items()))
-    trials = find_trials(match, column, device.coordinate(axis).unit)
-    if trials:
-        names = join_names([column.name, *(trial[column.name] for trial in trials)], 4)
-        notes.check.append(
-            f"{names} are of one axis in {len(trials) + 1} trials, side by side in a"
-            " file: the same mass and friction explain all of them"
-        )
-        return trials
-    notes.check.append(f"of {join_names(rivals, 6)}, {column.name} is the measured position")
-    notes.check.append(
-        f"{len(rivals)} columns are positions: of a robot? put its URDF beside the"
-        " logs; of other trials? say so by columns in [[trials]]"
-    )
-    return []
-
-
 def _trials_tables(
     device: Device,
     axes: Mapping[str, SurveyedColumn],
     match: Matcher,
     notes: Notes,
-    beside: Sequence[Mapping[str, str]],
     timed: bool,
 ) -> list[str]:
     """Propose the trials and their kinds; a long single record is cut at rests of its axis.
@@ -260,7 +239,7 @@ def _trials_tables(
     Not where its rate is not known: then nobody can say after how many seconds.
     """
     trials = match.found.trials
-    alone = len(trials) == 1 and not beside and timed
+    alone = len(trials) == 1 and timed
     cuts, where = _cuts(match) if alone else ([], "")
     if alone and axes and not cuts:
         cuts, where = guesses.stretches(match.t, next(iter(axes.values())).values), "at rests"
@@ -269,12 +248,9 @@ def _trials_tables(
         note = notes.guess(f"one record, cut {where}, so that each part can be held out")
         lines.append(note.strip())
     for trial in trials:
-        spans = [(*span, dict[str, str]()) for span in pairwise([None, *cuts, None])]
-        for start_s, end_s, named in [*spans, *((None, None, names) for names in beside)]:
+        for start_s, end_s in pairwise([None, *cuts, None]):
             lines += ["[[trials]]", f"file = {quoted(trial.file)}"]
             lines += _trial_kind(trial.file, device, notes)
-            pairs = ", ".join(f"{quoted(a)} = {quoted(b)}" for a, b in sorted(named.items()))
-            lines += [f"columns = {{ {pairs} }}"] if named else []
             lines += [f"recording = {trial.recording}"] if trial.recording else []
             lines += [f"start_s = {start_s}"] if start_s is not None else []
             lines += [f"end_s = {end_s}"] if end_s is not None else []
