@@ -2,10 +2,8 @@
 
 import json
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 from conftest import misfits
 from measured import REAL, bampipe, estimates, need, result
@@ -17,12 +15,6 @@ pytestmark = pytest.mark.long
 HELD_OUT_GAIN = 200
 FULL_DUTY = 885.0
 """Count at which the motor is always on: the manual's limit of the pulse width."""
-GAIN = 4096.0 / (2.0 * np.pi) / 256.0 / FULL_DUTY
-"""Duty for one radian and one count of the gain register.
-
-The encoder has 4096 steps a turn. 256 is the duty logged over gain times position error, alike in
-every log below saturation; the manual of the series says 128.
-"""
 HEAD = """
 schema = "bampipe.session/1"
 session_id = "{name}"
@@ -37,17 +29,15 @@ joint = {{ column = "position", unit = "rad", resolution = 1.5339807878853584e-3
 duty = {{ column = "load", unit = "", scale = {duty!r}, wrap_bits = 16, signed = true }}
 supply = {{ column = "input_volts", unit = "V" }}
 goal = {{ column = "goal_position", unit = "rad" }}
-gain = {{ column = "kp", unit = "1/rad", scale = {gain!r} }}
 """
 
 
-def write_session(folder: Path, logs: list[Path], name: str, held: Sequence[Path] = ()) -> Path:
+def write_session(folder: Path, logs: list[Path], name: str) -> Path:
     folder.mkdir()
-    text = HEAD.format(name=name, duty=1.0 / FULL_DUTY, gain=GAIN)
+    text = HEAD.format(name=name, duty=1.0 / FULL_DUTY)
     for log in logs:
         shutil.copy(log, folder / log.name)
         text += f'[[trials]]\nfile = "{log.name}"\nkind = "free"\n'
-        text += "hold_out = true\n" * (log in held)
     (folder / "session.toml").write_text(text)
     return folder
 
@@ -96,38 +86,3 @@ def test_the_diagnosis_ranks_what_the_load_costs_first(runs):
     assert best["p_value"] < 0.01
     assert best["held_out_rmse_after"] < best["held_out_rmse_before"]
     assert misfits(runs[0]) == []
-
-
-@pytest.fixture(scope="module")
-def by_gain(runs, tmp_path_factory) -> Path:
-    """The run of all logs in which trials of one gain are held out together."""
-    root = tmp_path_factory.mktemp("by_gain")
-    logs = sorted(runs[0].parent.glob("session_*/*.json"))
-    held = [log for log in logs if log.parent.name == "session_held"]
-    session = write_session(root / "session", logs, "all", held)
-    pipeline = root / "by_gain.toml"
-    pipeline.write_text(
-        'schema = "bampipe.pipeline/1"\nname = "by_gain"\n'
-        'stages = ["ingest", "filter", "identify", "validate"]\n'
-        '[settings.identify]\nmethod = "least-squares"\n'
-        "[settings.validate]\nnoise_floor = false\n"
-    )
-    bampipe("run", session, "--pipeline", pipeline, "--runs", root)
-    bampipe("extend", root / "all", "load_dependent_friction:joint")
-    return root / "all"
-
-
-def free_run_error(run: Path, model: str) -> float:
-    """Mean absolute error of the free run over the logs at the held-out gain, rad."""
-    gains = read_parquet(run / "ingest/samples.parquet").groupby("trial_id").gain.first()
-    trials = result(run, f"models/{model}/validate.json")["free_run"]["trials"]
-    chosen = [name for name in trials if gains[name] == pytest.approx(HELD_OUT_GAIN * GAIN)]
-    assert len(chosen) == 3
-    return float(np.mean([trials[name]["joint"]["mean_absolute"] for name in chosen]))
-
-
-def test_free_runs_at_a_gain_not_seen_come_closer_with_load_dependent_friction(by_gain):
-    """The makers' own models, fitted to free runs: 0.054 rad, load-dependent friction 0.035."""
-    plain = free_run_error(by_gain, "base")
-    loaded = free_run_error(by_gain, "base+load_dependent_friction.joint")
-    assert loaded < 0.054 < plain, (loaded, plain)
