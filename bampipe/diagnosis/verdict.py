@@ -144,12 +144,11 @@ def rank_effects(
 
     Sets that are ``mentioned`` have at least that probability.
 
-    The error without an effect of the set, beside the others, or with another one alone, follows
-    from the log evidence by the independent samples of the axis.
+    The error without an effect of the set, beside the others, is that of the linear problem; that
+    with another one alone follows from the log evidence by the independent samples of the axis.
     """
     initial, final = selection.initial, selection.final
-    pairs = zip(final.evidence.system.parameters, final.evidence.p, strict=True)
-    values = {q.name: float(value) for q, value in pairs}
+    values = final.effect_parameters
     own = {item.name: item.parameters for item in final.evidence.system.model.effects}
     unchosen = (e for e in selection.gains if e not in selection.effects)
     others = sorted(unchosen, key=lambda e: -selection.gains[e])
@@ -161,7 +160,11 @@ def rank_effects(
         gain = selection.weighed.drops.get(effect, 0.0) if is_chosen else selection.gains[effect]
         axes = effect_axes(initial, final, effect)
         axis = max(axes, key=lambda a: float(left[a]))
-        ratio = float(np.exp(-gain / max(fit.problem.independent[axis], 1.0)))
+        if is_chosen:
+            without = final.problem.solve_without(effect).left[axis]
+            ratio = float(np.sqrt(final.solved.left[axis] / max(without, 1e-300)))
+        else:
+            ratio = float(np.exp(-gain / max(initial.problem.independent[axis], 1.0)))
         here = float(fit.held_out_rmse[axis])
         system = fit.evidence.system
         rows.append(

@@ -80,10 +80,9 @@ def _low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array,
 
 
 def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -> Derivatives:
-    """Return the motion behind ``position`` (T,) by `zero_phase`, with error bands.
+    """Return the motion behind ``position`` (T,), with error bands of white noise of ``noise_sd``.
 
-    They are those of white noise of ``noise_sd`` on the samples; motion above the cut-off is lost
-    and is not in them.
+    Motion above the cut-off is lost and is not in them.
     """
     length = len(position)
     # Noise passes otherwise near either end than in the middle.

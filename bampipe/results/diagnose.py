@@ -173,14 +173,11 @@ class DiagnoseResult(Result):
 
     def fitted_of(self, effects: Names) -> dict[str, float]:
         """Return the fitted parameters of ``effects``; none where it has not fitted them all."""
-        ahead = {effect: f"{effect.replace(':', '.')}." for effect in effects}
-        found = {
-            effect: {k: v for k, v in self.fitted.items() if k.startswith(start)}
-            for effect, start in ahead.items()
-        }
-        if not all(found.values()):
-            return {}
-        return {name: value for one in found.values() for name, value in one.items()}
+        found = [
+            {k: v for k, v in self.fitted.items() if k.startswith(f"{effect.replace(':', '.')}.")}
+            for effect in effects
+        ]
+        return {k: v for one in found for k, v in one.items()} if all(found) else {}
 
     @property
     def alternatives(self) -> dict[str, Names]:

@@ -148,11 +148,9 @@ class Evidence:
         refits from there where it is not: a Gauss-Newton step alone leads shapes astray.
         """
         folds, free, steps = self.folds, list(self.free), dict[int, Array]()
-        problem = (
-            None
-            if self.is_linear
-            else problem_of(self.system, self.motions, self.band, held=self.held)
-        )
+        problem = None
+        if not self.is_linear:
+            problem = problem_of(self.system, self.motions, self.band, held=self.held)
         for group in sorted(set(folds.groups)):
             others = [k for k in folds.fitted_trials if folds.groups[k] != group]
             steps[group] = np.zeros(len(free))
