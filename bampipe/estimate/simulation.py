@@ -207,7 +207,7 @@ def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt):  # type: igno
     force, rate, curvature, bandwidth = arm.force, arm.rate, arm.curvature, arm.bandwidth
     brake, brake_gain = brakes.columns, brakes.gain
     n, nf = plant.width.shape[0], force.shape[0]
-    # Force of the arm, its rate, what it is drawn to; speed as the brakes' controller sees it.
+    # Force of the arm, its rate, the target force; speed as the brakes' controller sees it.
     pull, pull_rate, goal, speed = np.zeros(nf), np.zeros(nf), np.zeros(nf), np.zeros(n)
     steps = np.zeros((9, max(x.shape[1], u.shape[1])))
     fade = np.exp(-bandwidth * dt)

@@ -9,6 +9,7 @@ import pandas as pd
 from scipy import stats
 
 from bampipe.arrays import Array, Flags, Indices
+from bampipe.estimate.bounded import invert_scaled
 from bampipe.estimate.influence import RemovedStretch
 from bampipe.estimate.least_squares import Problem
 from bampipe.phrases.results import TIMING_AT_LIMIT, describe_unidentified
@@ -245,9 +246,7 @@ def _differs_from_zero(value: Array, covariance: Array) -> bool:
     sd = np.sqrt(np.diag(covariance))
     if np.any((sd == 0.0) & (value != 0.0)):
         return True
-    z = value / np.where(sd > 0.0, sd, 1.0)
-    correlation = covariance / np.outer(*[np.where(sd > 0.0, sd, 1.0)] * 2)
-    distance = z @ np.linalg.pinv(correlation, hermitian=True) @ z
+    distance = value @ invert_scaled(covariance) @ value
     return bool(distance > stats.chi2.ppf(0.95, len(value)))
 
 

@@ -179,7 +179,7 @@ class Payload(Declaration):
 
     mass: Positive = Field(description="kg")
     center: Triple = Field(default=(0.0, 0.0, 0.0), description="In the frame of the tip, m")
-    inertia: Sextuple = Field(default=(0.0,) * 6, description="As of a joint's body")
+    inertia: Sextuple = Field(default=(0.0,) * 6, description="As for the body of a joint")
 
 
 class Robot(Declaration):

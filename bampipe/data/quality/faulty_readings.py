@@ -218,9 +218,9 @@ def _sides(motions: list[SmoothedMotion]) -> Array:
 
 @np.errstate(over="ignore", invalid="ignore")
 def refuse_new_zero(table: TrialTable) -> None:
-    """Refuse a trial in which a force is zeroed anew: one step is most of what motion leaves.
+    """Refuse a trial in which a force sensor was re-zeroed: its unexplained part is a single step.
 
-    Where nothing else acts that may be switched on, such as a brake.
+    Devices with another input that may be switched on, such as a brake, are not tested.
     """
     every = max(1, len(table) // _MOST_ROWS)
     force, motions = table.session.force, _motions(table, every)

@@ -81,7 +81,7 @@ class Quantity:
     """A quantity that a residual may follow.
 
     Attributes:
-        words: what it is, such as ``position``, ``extension speed``.
+        words: name in a sentence, such as ``position``, ``extension speed``.
         text: in an expression of an effect.
         quantity: ``position``, ``speed``, ``velocity``, ``direction``, ``load``, ``time``,
             ``command`` (of a brake or of an input that is no force), ``reading`` (of a force).
