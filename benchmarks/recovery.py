@@ -282,7 +282,7 @@ effects = {json.dumps(case.effects)}
     if case.given == ("auto",):
         validate.execute(run, run.root, validate.Config(model=RIGHT, free_run=False), silent)
         axes = run.read(ValidateResult, RIGHT).axes.values()
-        over_floor = tuple(round(a.published_rmse / (a.noise_floor or np.nan), 3) for a in axes)
+        over_floor = tuple(round(a.held_out_rmse / (a.noise_floor or np.nan), 3) for a in axes)
     return Outcome(
         case,
         hidden=case.effects,

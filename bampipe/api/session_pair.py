@@ -214,7 +214,8 @@ def _compare_states(a: _Side, here: Evidence, there: Evidence) -> tuple[StateCha
     """Return the residual of the model of ``a`` on both sessions by state, in equal bins."""
     spread, found, every = a.covariance(here), [], []
     for axis, name in enumerate(a.system.coordinates):
-        pairs = zip(variables(here, axis), variables(there, axis), strict=True)
+        known = [variables(e.fitted, e.band, axis) for e in (here, there)]
+        pairs = zip(*known, strict=True)
         for one, other in ((x, y) for x, y in pairs if x.name in _MAPPED_VARIABLES):
             x, y = (np.concatenate(v.values) for v in (one, other))
             edges = np.unique(np.quantile(np.append(x, y), np.linspace(0.0, 1.0, _MAP_BINS + 1)))

@@ -218,9 +218,8 @@ def _print_ladder(rungs: Sequence[Rung]) -> None:
     for rung in rungs:
         cells = [rung.model, rung.added or ""]
         for axis in axes:
-            error, floor = rung.sound_error(axis), rung.sound_floor(axis)
-            shown = "refused" if axis in rung.refused else format_cell(error)
-            cells += [shown, format_cell(error / floor) if error and floor else ""]
+            error, floor = rung.held_out_rmse.get(axis), rung.noise_floor.get(axis)
+            cells += [format_cell(error), format_cell(error / floor) if error and floor else ""]
         rows.append(cells)
     units = rungs[0].unit
     heads = (head for axis in axes for head in (f"{axis}, {units.get(axis, '')}", "/ floor"))

@@ -37,7 +37,11 @@ class _Sine:
 
 def describe(evidence: Evidence, axis: int) -> str:
     """The residual's shape in one sentence: what it varies with most, where, which way."""
-    known = [v for v in variables(evidence, axis) if v.name not in ("trial", "direction")]
+    known = [
+        v
+        for v in variables(evidence.fitted, evidence.band, axis)
+        if v.name not in ("trial", "direction")
+    ]
     maps = [residual_map(evidence, axis, v, 3 * BINS) for v in known]
     best = int(np.argmax([m.share for m in maps]))
     most, variable = maps[best], known[best]

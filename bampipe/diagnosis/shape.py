@@ -1,15 +1,18 @@
 """The shape of a residual: maps of it, worst windows, explainable share."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from bampipe.arrays import Array, Indices
+from bampipe.estimate.low_pass import Band
 from bampipe.physics.effect import state_units
 from bampipe.results.diagnose import WorstWindow
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.measured import trial_of_block
 from bampipe.trials.motion import Motion
+from bampipe.trials.residuals import ModelOnTrial
 
 BINS = 16
 _LEAST = 12
@@ -48,9 +51,9 @@ class Map:
     share: float
 
 
-def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
-    """What the residual of one axis is mapped against."""
-    system, band = evidence.system, evidence.band
+def variables(fitted: Sequence[ModelOnTrial], band: Band, axis: int) -> tuple[Variable, ...]:
+    """What the residual of one axis is mapped against, of a model on each trial."""
+    system = fitted[0].system
     coordinate = system.model.device.coordinates[axis]
     unit = coordinate.unit
     columns: dict[str, tuple[str, list[Array]]] = {}
@@ -58,10 +61,10 @@ def variables(evidence: Evidence, axis: int) -> tuple[Variable, ...]:
     def put(name: str, in_unit: str, values: Array) -> None:
         columns.setdefault(name, (in_unit, []))[1].append(values)
 
-    for index, motion in enumerate(evidence.motions):
+    for index, here in enumerate(fitted):
+        motion, memory = here.motion, here.memory
         kept = band.thinned_rows(len(motion.t))
-        memory = evidence.fitted[index].memory
-        load = evidence.fitted[index].applied[:, axis]
+        load = here.applied[:, axis]
         since, distance = since_reversal(motion, axis)
         put("position", unit, motion.q[kept, axis])
         put("velocity", f"{unit}/s", motion.qd[kept, axis])

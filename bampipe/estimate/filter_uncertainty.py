@@ -68,34 +68,6 @@ def sandwich_covariance(
     return np.asarray(found), len(gains)
 
 
-def leave_out(
-    trials: Sequence[Stored], groups: Sequence[int], n_states: int, theta: Array, covariance: Array
-) -> dict[int, Array]:
-    """Return the filter's final parameters (nt,) without each group of trials, by group.
-
-    What a trial added in information form is taken off again: exact where the model is linear in
-    its parameters and the filter near its answer throughout.
-
-    Args:
-        trials: as of `sandwich_covariance`; groups: of each of them.
-        n_states, theta, covariance: as of `sandwich_covariance`.
-    """
-    information = np.linalg.inv(covariance)
-    vector = information @ theta
-    gained: dict[int, tuple[Array, Array]] = {}
-    for trial, group in zip(trials, groups, strict=True):
-        after = np.linalg.inv(trial.covariance[-1][n_states:, n_states:])
-        end = after @ trial.mean[-1][n_states:]
-        matrix, moment = gained.get(group, (np.zeros_like(after), np.zeros_like(end)))
-        gained[group] = matrix + after - information, moment + end - vector
-        information, vector = after, end
-    final = trials[-1].mean[-1][n_states:]
-    return {
-        group: final + np.linalg.lstsq(information - matrix, matrix @ final - moment, rcond=None)[0]
-        for group, (matrix, moment) in gained.items()
-    }
-
-
 def choose_block(seconds: Sequence[float], parameters: int, longest_s: float) -> float:
     """Return the shortest length of blocks, s, of which trials hold enough for a sandwich.
 

@@ -173,7 +173,6 @@ def minimise(
     most_iterations: int = 30,
     *,
     known: KnownSlopes | None = None,
-    at_start: Sequence[Stacked] | None = None,
     tolerance: float = 1e-10,
 ) -> Linearised:
     """Find the free parameters that leave the least squares, weighted by axis, within their bounds.
@@ -187,7 +186,6 @@ def minimise(
         trials: which trials to use; all by default.
         most_iterations: the most Gauss-Newton steps; with 0 the model is linearised at ``start``.
         known: slopes that need not be taken again.
-        at_start: these trials linearised at ``start``, where they have been.
         tolerance: change of the cost, the negative log likelihood a sample, at which it ends.
 
     Raises:
@@ -197,7 +195,7 @@ def minimise(
     chosen = list(range(problem.n_trials)) if trials is None else list(trials)
     p = np.array(start, dtype=float)
     p[problem.free] = np.clip(p[problem.free], problem.lower, problem.upper)
-    stacked = at_start or [stacked_residual(problem, trial, p, known) for trial in chosen]
+    stacked = [stacked_residual(problem, trial, p, known) for trial in chosen]
     for trial, s in zip(chosen, stacked, strict=True):
         _require_finite(problem, trial, s, p)
     if most_iterations and sum(int(s.used.sum()) for s in stacked) <= problem.free.size:

@@ -2,22 +2,28 @@
 
 A body's mass, first moment and inertia are those of some distribution of mass exactly where its
 pseudo-inertia, a symmetric 4 by 4 matrix linear in the ten numbers, has no negative eigenvalue
-(Wensing, Kim and Slotine 2018, IEEE Robotics and Automation Letters 3(1)). Written by its
-logarithmic Cholesky factor, every value is possible (Rucker and Wensing 2022, ibid. 7(2)).
+(Wensing, Kim and Slotine 2018, IEEE Robotics and Automation Letters 3(1)). These numbers are a
+convex cone.
 """
 
 import numpy as np
 
-from bampipe.arrays import Array
+from bampipe.arrays import Array, Indices
+from bampipe.estimate.bounded import invert_scaled
 
-_NUMBERS = 10
-_SMALLEST = 1e-6
+_SMALLEST = 1e-3
 """Least eigenvalue of a pseudo-inertia that a search starts from, of the largest."""
 _ROUNDING = 1e-9
 """Of the largest eigenvalue: a negative one beyond it is no rounding."""
-_MOST_STEPS, _CONVERGED = 200, 1e-10
-_LOWEST = -14.0
-"""Of a logarithm: a body as thin as e^-14 of its length is flat."""
+_ANCHOR = 1e-4
+"""Of the weight of each number, by which the estimate holds it where the others leave it open."""
+_FIRST, _SHARPER, _GAP = 1e-6, 10.0, 1e-6
+"""Weight of the cost over the barrier at first, its growth, and the cost by which the end may be
+above the least."""
+_STEPS, _CENTRED, _SHORTEST = 50, 1e-6, 1e-9
+"""Most steps at one weight, the fall of a step that ends them, and the least share of a step."""
+_AT_BOUND = 1e-2
+"""Standard deviations beside a bound from which on a number lies at it."""
 
 
 def pseudo_inertia(numbers: Array) -> Array:
@@ -34,11 +40,7 @@ def pseudo_inertia(numbers: Array) -> Array:
     )
 
 
-def _numbers_of(matrix: Array) -> Array:
-    """The ten numbers of a pseudo-inertia, or of its derivative."""
-    s = matrix[:3, :3]
-    inertia = np.trace(s) * np.eye(3) - s
-    return np.concatenate([[matrix[3, 3]], matrix[:3, 3], inertia[np.triu_indices(3)]])
+_UNIT_BODIES = np.array([pseudo_inertia(row) for row in np.eye(10)])
 
 
 def is_possible(numbers: Array) -> bool:
@@ -47,79 +49,78 @@ def is_possible(numbers: Array) -> bool:
     return bool(values[0] >= -_ROUNDING * max(abs(values[-1]), 1e-300))
 
 
-def nearest_possible(value: Array, weight: Array, start: Array) -> Array:
-    """Return possible numbers of several bodies nearest to an estimate.
+def nearest_possible(
+    value: Array, weight: Array, bodies: Indices, start: Array, bounds: tuple[Array, Array]
+) -> Array:
+    """Return the numbers nearest to an estimate that are possible, (n,).
 
-    Minimises ``(x - value)^T weight (x - value)`` over what bodies can have, by Levenberg and
-    Marquardt's method in the logarithmic Cholesky factors.
+    Minimises ``(x - value)^T weight (x - value)`` where bodies can have their numbers and the
+    others are within their bounds: a convex problem, solved by Newton's method with a logarithmic
+    barrier (Boyd and Vandenberghe 2004, Convex Optimization, 11.3).
 
     Args:
-        value: (bodies, 10), the estimate.
-        weight: (10 bodies, 10 bodies), such as the inverse of its covariance.
-        start: (bodies, 10), where to start, possible or not, such as a drawing's.
-
-    Returns:
-        (bodies, 10).
+        value: (n,), the estimate; weight: (n, n), such as the inverse of its covariance.
+        bodies: (bodies, 10) places of the numbers of each body.
+        start: (bodies, 10), where these start, possible or not, such as a drawing's.
+        bounds: least and largest values, (n,) each, of what is no number of a body.
     """
-    factors = np.concatenate([_factor(body) for body in start])
-    target, damping = value.ravel(), 1e-3
-    found, slope = _bodies(factors)
-    cost = _cost(found - target, weight)
-    for _ in range(_MOST_STEPS):
-        gradient = slope.T @ (weight @ (found - target))
-        normal = slope.T @ weight @ slope
-        size = np.diag(normal) + 1e-12 * np.max(np.diag(normal))
-        step = np.linalg.solve(normal + damping * np.diag(size), -gradient)
-        tried = _bounded(factors + np.clip(step, -1.0, 1.0))
-        there, slope_there = _bodies(tried)
-        cost_there = _cost(there - target, weight)
-        if cost_there <= cost:
-            gained, damping = cost - cost_there, max(0.3 * damping, 1e-12)
-            factors, found, slope, cost = tried, there, slope_there, cost_there
-            if gained <= _CONVERGED * max(cost, 1e-300):
+    size = np.diag(weight)
+    weight = weight + np.diag(np.where(size > 0.0, _ANCHOR * size, 1.0))
+    sd = 1.0 / np.sqrt(np.diag(weight))
+    others = np.setdiff1d(np.arange(value.size), bodies)
+    low, high = (each[others] for each in bounds)
+    inside = np.minimum(sd[others], 0.1 * (high - low))
+    x = value.copy()
+    x[others] = np.clip(value[others], low + inside, high - inside)
+    x[bodies] = [_inside(body) for body in start]
+
+    def barrier(x: Array) -> tuple[float, Array, Array]:
+        """The barrier, infinite outside, its gradient (n,) and its Hessian (n, n)."""
+        matrices = np.array([pseudo_inertia(body) for body in x[bodies]])
+        gaps = np.concatenate([x[others] - low, high - x[others]])
+        eigenvalues = np.linalg.eigvalsh(matrices)
+        height, gradient, hessian = np.inf, np.zeros(x.size), np.zeros((x.size, x.size))
+        if eigenvalues.min() > 0.0 and gaps.min(initial=1.0) > 0.0:
+            height = -float(np.log(eigenvalues).sum() + np.log(gaps[np.isfinite(gaps)]).sum())
+            below, above = np.split(1.0 / gaps, 2)
+            gradient[others], hessian[others, others] = above - below, below**2 + above**2
+            for body, matrix in zip(bodies, matrices, strict=True):
+                change = np.linalg.solve(matrix, _UNIT_BODIES)
+                gradient[body] = -np.trace(change, axis1=1, axis2=2)
+                hessian[np.ix_(body, body)] = np.einsum("kij,lji->kl", change, change)
+        return height, gradient, hessian
+
+    limits, sharpness = 4 * len(bodies) + 2 * len(others), _FIRST
+    while True:
+        for _ in range(_STEPS):
+            height, gradient, hessian = barrier(x)
+            pull = sharpness * weight @ (x - value)
+            downhill = gradient + pull
+            step = -invert_scaled(hessian + sharpness * weight) @ downhill
+            promised, share = -float(downhill @ step), 1.0
+            if promised < _CENTRED:
                 break
-        elif damping > 1e12:
+            while share > _SHORTEST:
+                quadratic = share * pull @ step + 0.5 * share**2 * sharpness * step @ weight @ step
+                change = barrier(x + share * step)[0] - height + quadratic
+                if change < -0.1 * share * promised:
+                    break
+                share *= 0.5
+            x = x + share * step
+        if limits < _GAP * sharpness:
             break
-        else:
-            damping *= 5.0
-    return found.reshape(-1, _NUMBERS)
+        sharpness *= _SHARPER
+    near = _AT_BOUND * sd[others]
+    x[others] = np.where(x[others] < low + near, low, x[others])
+    x[others] = np.where(x[others] > high - near, high, x[others])
+    return x
 
 
-def _cost(off: Array, weight: Array) -> float:
-    return float(off @ weight @ off)
-
-
-def _factor(numbers: Array) -> Array:
-    """Logarithms of the diagonal and entries above it of U with U U^T the pseudo-inertia."""
+def _inside(numbers: Array) -> Array:
+    """Numbers near to these of a body that is not flat."""
     values, vectors = np.linalg.eigh(pseudo_inertia(numbers))
     least = _SMALLEST * max(values[-1], 1e-12)
     matrix = (vectors * np.maximum(values, least)) @ vectors.T
-    turned = np.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
-    return np.concatenate([np.log(np.diag(turned)), turned[np.triu_indices(4, 1)]])
-
-
-def _bounded(factors: Array) -> Array:
-    table = factors.reshape(-1, _NUMBERS).copy()
-    table[:, :4] = np.maximum(table[:, :4], _LOWEST)
-    return table.ravel()
-
-
-def _bodies(factors: Array) -> tuple[Array, Array]:
-    """Numbers of all bodies (10 bodies,) and their slopes by the factors, (10 b, 10 b)."""
-    table = factors.reshape(-1, _NUMBERS)
-    numbers, slopes = np.empty_like(table), np.zeros((factors.size, factors.size))
-    above = np.triu_indices(4, 1)
-    for b, row in enumerate(table):
-        upper = np.diag(np.exp(row[:4]))
-        upper[above] = row[4:]
-        numbers[b] = _numbers_of(upper @ upper.T)
-        for k in range(_NUMBERS):
-            moved = np.zeros((4, 4))
-            if k < 4:
-                moved[k, k] = upper[k, k]
-            else:
-                moved[above[0][k - 4], above[1][k - 4]] = 1.0
-            change = moved @ upper.T
-            own = slice(b * _NUMBERS, (b + 1) * _NUMBERS)
-            slopes[own, b * _NUMBERS + k] = _numbers_of(change + change.T)
-    return numbers.ravel(), slopes
+    s = matrix[:3, :3]
+    inertia = np.trace(s) * np.eye(3) - s
+    return np.concatenate([[matrix[3, 3]], matrix[:3, 3], inertia[np.triu_indices(3)]])

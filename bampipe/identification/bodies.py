@@ -3,16 +3,16 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from bampipe.arrays import Array, Indices
-from bampipe.estimate.bounded import invert_scaled
+from bampipe.arrays import Array
 from bampipe.estimate.possible_bodies import is_possible, nearest_possible
+from bampipe.identification.choice import describe_worse
 from bampipe.identification.least_squares_estimate import SquaresFit
 from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.physics.base_parameters import base_parameters
 from bampipe.physics.newton_euler import INERTIAL
-from bampipe.physics.robot import Robot
 from bampipe.results.identify import BaseEstimate
 
 _SHOWN = 0.5
@@ -22,8 +22,9 @@ _SHOWN = 0.5
 def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list[str]]:
     """The fit with inertial numbers that some body can have, the nearest; and what to tell of it.
 
-    Nearest is what explains the trials and the drawing least badly: the normal equations of the
-    fit weigh, and what is no inertial number follows.
+    Nearest is what explains the trials and the drawing least badly: the normal equations of the fit
+    weigh, and what is no inertial number follows. Where these explain the trials far worse, the fit
+    stays as it is: the model lacks something.
     """
     robot = system.model.device.robot
     if robot is None:
@@ -34,44 +35,36 @@ def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list
     wrong = [name for name, body in zip(names, value, strict=True) if not is_possible(body)]
     if not wrong:
         return squares, []
-    weight, others, slope = _weight(squares, robot, places)
     drawn = np.array([joint.inertial for joint in robot.joints])
-    found = nearest_possible(value, weight, drawn)
-    p, problem = squares.p.copy(), squares.problem
-    p[places] = found.ravel()
-    p[others] += slope @ (found - value).ravel()
-    inside = np.isin(squares.free, others)
-    moved = squares.free[inside]
-    p[moved] = np.clip(p[moved], problem.lower[inside], problem.upper[inside])
-    note = (
-        f"No body has the inertial numbers that fit {join_names(wrong)} best: the nearest possible"
-        " ones are given."
-    )
-    return replace(squares, p=p), [note]
+    p = _find_nearest(system, squares, places.reshape(-1, INERTIAL), drawn)
+    nearest = f"No body has the inertial numbers that fit {join_names(wrong)} best: the nearest"
+    error, of_fit = (squares.held_out_rmse(values) for values in (p, squares.p))
+    if worse := describe_worse(system, error, of_fit, "these numbers"):
+        return squares, [f"{nearest} possible ones are not given, for they {worse}."]
+    return replace(squares, p=p), [f"{nearest} possible ones are given."]
 
 
-def _weight(squares: SquaresFit, robot: Robot, places: Indices) -> tuple[Array, Indices, Array]:
-    """Weight of a change of the inertial numbers, all others refitted, and how these follow.
+def _find_nearest(system: System, squares: SquaresFit, places: Array, drawn: Array) -> Array:
+    """The nearest parameters (n_p + 1,) with possible bodies, whose numbers are at ``places``.
 
-    Returns:
-        (10 b, 10 b); the places of the other free parameters, and their change (n, 10 b) for one
-        of each inertial number.
+    ``places`` and the drawing's numbers, ``drawn``, are (b, 10).
     """
-    normal, count = squares.information, squares.free.size
-    column = {int(place): k for k, place in enumerate(squares.free)}
-    size = np.array([p.sd for p in robot.parameters])
-    weight = np.diag(1.0 / size**2)
-    own = [k for k, place in enumerate(places) if int(place) in column]
-    inner = [column[int(places[k])] for k in own]
-    free = [k for k in range(count) if k not in inner and not squares.at_bound[k]]
-    others = [*free, *range(count, len(normal))]
-    cross = normal[np.ix_(others, inner)]
-    follow = -invert_scaled(normal[np.ix_(others, others)]) @ cross
-    block = normal[np.ix_(inner, inner)] + cross.T @ follow
-    slope = np.zeros((len(free), len(places)))
-    slope[:, own] = follow[: len(free)]
-    weight[np.ix_(own, own)] = 0.5 * (block + block.T)
-    return weight, squares.free[free], slope
+    unseen = np.setdiff1d(places, squares.free)  # no motion shows them: the drawing weighs
+    of_drawing = [system.parameters[k].sd ** -2.0 for k in unseen]
+    weight = block_diag(squares.information, np.diag(of_drawing))
+    at = np.full(len(weight), -1)  # nuisance parameters are none of the model's
+    at[: squares.free.size], at[len(weight) - unseen.size :] = squares.free, unseen
+    of_model = np.flatnonzero(at >= 0)
+    value, low, high = np.zeros(len(at)), np.full(len(at), -np.inf), np.full(len(at), np.inf)
+    value[of_model] = squares.p[at[of_model]]
+    low[: squares.free.size], high[: squares.free.size] = (
+        squares.problem.lower,
+        squares.problem.upper,
+    )
+    bodies = np.array([[int(np.flatnonzero(at == place)[0]) for place in b] for b in places])
+    p = squares.p.copy()
+    p[at[of_model]] = nearest_possible(value, weight, bodies, drawn, (low, high))[of_model]
+    return p
 
 
 def base_estimates(system: System, p: Array, covariance: Array) -> tuple[BaseEstimate, ...] | None:

@@ -48,7 +48,7 @@ class Estimate:
         method: that made it.
         covariance: (n, n) of the estimated parameters of the model.
         at_bound: (n,) which lie at the limit of their range.
-        held_out: by trial, (n_p + 1,) the parameters without the trials that it is left out with.
+        held_out_rmse: error on trials that it is left without, by axis, (n_q,), N.m or N.
         details: by parameter, further fields of its record.
         report: further fields of the result.
         tabulate: makes the tables of the states, trial by trial or all in one, and the table of the
@@ -62,7 +62,7 @@ class Estimate:
     problem: Problem
     covariance: Array
     at_bound: Flags
-    held_out: Sequence[Array]
+    held_out_rmse: Array
     details: Sequence[dict[str, float]]
     report: dict[str, Any]
     tabulate: Callable[[], tuple[Iterable[pd.DataFrame], pd.DataFrame]]
@@ -109,6 +109,7 @@ def collect_result(
     estimate: Estimate,
     identifiability: IdentifiabilityReport,
     trials: Sequence[str],
+    moves: Mapping[str, Array],
     worst: RemovedStretch,
     late: tuple[float, float],
     **further: Any,
@@ -117,6 +118,8 @@ def collect_result(
 
     Args:
         estimate: the published one; trials: names of the trials.
+        moves: (n_free,) change of what is estimated, the timing last where it is, without each
+            trial, or block of a single one, by name.
         worst: the second that moves least squares most.
         late: timing of the inputs that residuals go by, and its standard deviation, s.
         further: fields of the result as they are; notes among them on how it came about.
@@ -146,7 +149,7 @@ def collect_result(
     if timing.limit > 0.0 and abs(late[0]) >= NORMAL_95 * late[1]:
         taken = float(np.clip(late[0], -timing.limit, timing.limit))
     timing = timing.model_copy(update={"of_residual": taken})
-    influence = _assess_influence(names, estimate, trials, worst)
+    influence = _assess_influence(names, sd, timing.sd, trials, moves, worst)
     notes = further.pop("notes")
     return IdentifyResult(
         headline=warning + _headline(parameters),
@@ -185,21 +188,27 @@ def _headline(parameters: Mapping[str, ParameterEstimate]) -> str:
 
 
 def _assess_influence(
-    names: Sequence[str], estimate: Estimate, trials: Sequence[str], worst: RemovedStretch
+    names: Sequence[str],
+    sd: Array,
+    timing_sd: float,
+    trials: Sequence[str],
+    moves: Mapping[str, Array],
+    worst: RemovedStretch,
 ) -> Influence:
     """Return how far each trial, and the worst second, move the parameters."""
-    moved = [
-        (p[estimate.free] - estimate.value) / np.maximum(estimate.sd, np.finfo(float).tiny)
-        for p in estimate.held_out
-    ]
     count = len(names)
+    every = (*names, "input_timing")
+    known = dict(zip(every, np.maximum([*sd, timing_sd], np.finfo(float).tiny), strict=True))
     place = int(np.argmax(np.abs(worst.move[:count])))
     trial, move = trials[worst.trial], float(worst.move[place])
     stands_out = abs(move) > max(_MOVES, _OUTLYING * float(worst.typical[place]))
     return Influence(
         trials={
-            name: dict(zip(names, (float(x) for x in row), strict=True))
-            for name, row in zip(trials, moved, strict=True)
+            trial: {
+                name: float(by / known[name])
+                for name, by in zip(every[: len(row)], row, strict=True)
+            }
+            for trial, row in moves.items()
         },
         worst_second=WorstSecond(
             trial=trial,

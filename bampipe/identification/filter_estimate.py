@@ -10,7 +10,7 @@ import numpy as np
 
 from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
-from bampipe.estimate.filter_uncertainty import choose_block, leave_out, sandwich_covariance
+from bampipe.estimate.filter_uncertainty import choose_block, sandwich_covariance
 from bampipe.estimate.unscented import (
     FilterFailure,
     FilterModel,
@@ -273,7 +273,7 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
         problem=problem,
         covariance=covariance,
         at_bound=at_bound[:count],
-        held_out=_leave_out(p, found, filtering, sandwich),
+        held_out_rmse=task.squares.held_out_rmse(p),
         details=[{"filter_sd": tight[k], "smoothing_sd": smoothing[k]} for k in range(count)],
         report=report,
         tabulate=lambda: (
@@ -320,23 +320,6 @@ def _describe_smoothing(
             " velocity is smoothed, where a machine stands still."
         )
     return tuple(said)
-
-
-def _leave_out(p: Array, found: FilterRun, filtering: _Filtering, covariance: Array) -> list[Array]:
-    """Return the parameters (n_p + 1,) without the trials that each is left out with."""
-    folds, model = filtering.task.squares.trials.folds, filtering.model
-    if folds.nothing_held_out:
-        return [p] * len(folds.groups)
-    groups = [folds.groups[filtering.of_trial[place]] for place in found.order]
-    without = leave_out(
-        found.ends, groups, model.n_states, found.search_theta, found.search_covariance
-    )
-    parameters = {}
-    for group, theta in without.items():
-        parameters[group] = p.copy()
-        value, _ = model.to_physical(constrain(model, theta, covariance))
-        parameters[group][filtering.task.squares.free] = value
-    return [parameters[group] for group in folds.groups]
 
 
 def _some_of(trials: Sequence[Trial], found: FilterRun) -> tuple[list[Trial], Array]:

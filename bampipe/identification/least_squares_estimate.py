@@ -25,15 +25,16 @@ from bampipe.estimate.least_squares import (
     minimise,
 )
 from bampipe.estimate.simulation import Runaway
+from bampipe.estimate.standstill import find_moving_samples
 from bampipe.identification.estimates import Estimate, input_timing
 from bampipe.identification.filter_tables import as_filtered
 from bampipe.physics import System
 from bampipe.physics.recipe import Recipe
 from bampipe.results.identify import Convergence, StateBound
 from bampipe.trials.likelihood import lay_out_samples, solve_bounded, take_samples
-from bampipe.trials.measured import MeasuredTrials
+from bampipe.trials.measured import MeasuredTrials, cut_blocks
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import problem_of
+from bampipe.trials.residuals import problem_of, rms
 
 _REPLICATES = 6
 _LACKING = 3.0
@@ -192,17 +193,64 @@ class SquaresFit:
         return p
 
     @cached_property
-    def held_out(self) -> list[Array]:
-        """By trial, (n_p + 1,) the parameters without the trials that it is left out with."""
-        groups = np.array(self.trials.folds.groups)
-        if self.trials.folds.nothing_held_out:
-            return [self.p] * len(groups)
-        samples = self.fit.likelihood.samples
-        found = {
-            group: self.refit([groups[here.trial] != group for here in samples])
-            for group in np.unique(groups)
-        }
-        return [found[group] for group in groups]
+    def parts(self) -> Sequence[Motion]:
+        """What is left out in turn: trials, or blocks of a single one."""
+        motions: Sequence[Motion] = self.trials.motions
+        return motions if len(motions) > 1 else cut_blocks(motions[0], self.trials.band)
+
+    @cached_property
+    def moves(self) -> list[Array]:
+        """Change of what is estimated, (n,), without each part; see `Influence`.
+
+        Of a single trial a period of the band on either side is left out, too.
+        """
+        samples, band = self.fit.likelihood.samples, self.trials.band
+        if len(self.parts) == 1:
+            return [np.zeros(self.free.size)]
+        if len(self.trials.motions) > 1:
+            groups = np.array(self.trials.folds.groups)
+            found = {
+                group: self._move([groups[here.trial] != group for here in samples])
+                for group in np.unique(groups)
+            }
+            return [found[group] for group in groups]
+        gap_s = 1.0 / min(band.cutoff_hz)
+        (t,), parts = (
+            [motion.t[band.thinned_rows(len(motion.t))] for motion in motions]
+            for motions in (self.trials.motions, self.parts)
+        )
+        return [
+            self._move(
+                [
+                    (t[here.rows] < part[0] - gap_s) | (t[here.rows] > part[-1] + gap_s)
+                    for here in samples
+                ]
+            )
+            for part in parts
+        ]
+
+    def _move(self, kept: Sequence[Flags]) -> Array:
+        return np.asarray((self.refit(kept) - self.p)[self.free])
+
+    def held_out_rmse(self, p: Array) -> Array:
+        """Error of an estimate on each part that it is left without, by axis, (n_q,), N.m or N.
+
+        ``p`` (n_p + 1,) is the estimate, whichever method made it; it moves as least squares do.
+        """
+        problem, free = self.problem, self.free
+        if self.parts is not self.trials.motions:
+            system, timed = self.fit.evidence.system, self.trials.timed
+            problem = problem_of(system, self.parts, self.trials.band, timing=timed)
+        band, numbers = problem.band, range(problem.n_trials)
+
+        def residual(number: int) -> Array:
+            without = p.copy()
+            moved = p[free] + self.moves[number]
+            without[free] = np.clip(moved, problem.lower, problem.upper)
+            return band.thin(problem.residual(number, without))
+
+        used = (find_moving_samples(problem.standstill[number], band) for number in numbers)
+        return rms(map(residual, numbers), used)
 
     def find_worst_second(self) -> RemovedStretch:
         """The second of a trial without which some parameter would move most."""
@@ -313,7 +361,7 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
         problem=squares.problem,
         covariance=squares.covariance[:count, :count],
         at_bound=squares.at_bound[:count],
-        held_out=squares.held_out,
+        held_out_rmse=squares.held_out_rmse(squares.p),
         details=[{"least_squares_bias": bias} for bias in squares.bias[:count]],
         report={
             "input_timing": input_timing(squares.p, squares.problem, squares.covariance),

@@ -1,20 +1,23 @@
 """What each term of an identified model contributes to the force, sample by sample and in bins."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from bampipe.arrays import Array, Indices
+from bampipe.arrays import Array, Flags, Indices
 from bampipe.diagnosis.shape import Variable, number_bins, variables
 from bampipe.errors import InputError
+from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.results.identify import Covariance
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.terms import EffectText, ModelTerm, TermCurve, TermsResult
-from bampipe.trials.evidence import Evidence
+from bampipe.trials.comparison import ComparedTrial
+from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import draw_trials
-from bampipe.trials.residuals import ModelOnTrial
+from bampipe.trials.residuals import ModelOnTrial, rms
 
 _BINS = 24
 _FEWEST = 8
@@ -34,7 +37,34 @@ class _Part(NamedTuple):
     strengths: tuple[int, ...]
 
 
-def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: str) -> TermsResult:
+@dataclass(frozen=True)
+class _Samples:
+    """A model on the trials that are binned.
+
+    Attributes:
+        fitted: by trial; used: which of their thinned samples count, (K, n_q).
+        error: of the model, by axis, (n_q,), N.m or N.
+    """
+
+    fitted: Sequence[ModelOnTrial]
+    band: Band
+    used: Flags
+    error: Array
+
+    def residual(self, p: Array) -> Array:
+        """The residual with other parameters, (n_p,), thinned but not low-passed, (K, n_q)."""
+        found = (replace(one, p=p).residual for one in self.fitted)
+        return np.concatenate([one[self.band.thinned_rows(len(one))] for one in found])
+
+
+def describe_terms(
+    system: System,
+    trials: MeasuredTrials,
+    compared: Sequence[ComparedTrial],
+    p: Array,
+    covariance: Covariance,
+    model: str,
+) -> TermsResult:
     """Return the equations of a model with its numbers, and the curve of each term.
 
     A curve is the force that the term takes: the residual of the model without it minus that of the
@@ -42,13 +72,14 @@ def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: 
     measured forces cancel in the difference, and filtering the force alone would distort the curve.
     Of a long session, trials drawn from all are binned (`draw_trials`).
 
-    ``p`` (n_p,) and ``covariance`` are those published for the model of that name.
+    ``p`` (n_p,) and ``covariance`` are those published for the model of that name; ``compared`` are
+    all trials.
     """
-    system = evidence.system
-    error = evidence.rmse()
-    chosen = draw_trials(evidence.sizes)
-    if len(chosen) < len(evidence.motions):
-        evidence = evidence.subset(chosen)
+    error = rms([c.residual for c in compared], [c.used for c in compared])
+    chosen = draw_trials([len(c.t) * trials.band.step for c in compared])
+    fitted = [ModelOnTrial(system, p, trials.motions, k) for k in chosen]
+    used = np.concatenate([compared[k].used for k in chosen])
+    samples = _Samples(fitted, trials.band, used, error)
     from bampipe.physics.readable import model_equations
 
     values = {item.name: float(value) for item, value in zip(system.parameters, p, strict=True)}
@@ -57,10 +88,10 @@ def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: 
     except InputError:  # they take too long to derive
         equations = ()
     known = {
-        axis: [v for v in variables(evidence, axis) if v.name not in ("trial", "time")]
+        axis: [v for v in variables(fitted, trials.band, axis) if v.name not in ("trial", "time")]
         for axis in range(len(system.coordinates))
     }
-    present = _residual(evidence, p)
+    present = samples.residual(p)
     return TermsResult(
         model=model,
         equations=equations,
@@ -69,7 +100,7 @@ def describe_terms(evidence: Evidence, p: Array, covariance: Covariance, model: 
                 name=part.name,
                 text=part.text,
                 parameters=tuple(system.parameters[i].name for i in part.parameters),
-                curves=tuple(_curves(evidence, p, present, error, covariance, part, known)),
+                curves=tuple(_curves(samples, p, present, covariance, part, known)),
             )
             for part in _parts(system)
         ),
@@ -96,28 +127,20 @@ def _parts(system: System) -> Iterator[_Part]:
         yield _Part(bound.name, EffectText.of(bound.effect), tuple(own), tuple(strengths))
 
 
-def _residual(evidence: Evidence, p: Array) -> Array:
-    """Return the residual over all trials, thinned, (K, n_q)."""
-    e = evidence
-    found = (ModelOnTrial(e.system, p, e.motions, k).residual for k in range(len(e.motions)))
-    return np.concatenate([one[e.band.thinned_rows(len(one))] for one in found])
-
-
 def _curves(
-    evidence: Evidence,
+    samples: _Samples,
     p: Array,
     present: Array,
-    error: Array,
     covariance: Covariance,
     part: _Part,
     known: dict[int, list[Variable]],
 ) -> Iterator[TermCurve]:
     if not part.strengths:
         return
-    system = evidence.system
+    system, residual = samples.fitted[0].system, samples.residual
     without = p.copy()
     without[list(part.strengths)] = 0.0
-    force = _residual(evidence, without) - present
+    force = residual(without) - present
     names = [system.parameters[i].name for i in part.parameters]
     free = [i for i, name in zip(part.parameters, names, strict=True) if name in covariance.names]
     rows = [covariance.names.index(system.parameters[i].name) for i in free]
@@ -127,11 +150,11 @@ def _curves(
         moved = p.copy()
         step = _STEP * max(abs(p[i]), system.parameters[i].sd, 1e-12)
         moved[i] += step
-        slopes.append((present - _residual(evidence, moved)) / step)
+        slopes.append((present - residual(moved)) / step)
     for axis, name in enumerate(system.coordinates):
-        use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
+        use = samples.used[:, axis]
         own = force[use, axis]
-        if not own.size or np.sqrt(np.mean(own**2)) < _LEAST_SHARE * error[axis]:
+        if not own.size or np.sqrt(np.mean(own**2)) < _LEAST_SHARE * samples.error[axis]:
             continue
         own_states = ("", part.name.replace(":", "."))
         causes = [v for v in known[axis] if v.name.partition(" of ")[2] in own_states]

@@ -6,7 +6,7 @@ from bampipe.results.floor import FLOOR_WRONG, FloorStatus
 from bampipe.results.identify import EffectEstimate, IdentifyResult, Method
 from bampipe.results.ingest import DeadStretch, IngestResult, MainsHum
 from bampipe.results.intervals import NORMAL_95
-from bampipe.results.rounding import round_with_sd, significant
+from bampipe.results.rounding import round_with_sd
 from bampipe.results.setup import SetupResult
 from bampipe.results.validate import JudgedError
 
@@ -97,11 +97,5 @@ def find_failed_checks(
         if (white and not white.white) or (independent and not independent.independent):
             yield f"{axis}, innovations: {tests.sentence}"
     for axis, error in errors.items():
-        if error.estimate == "refused":
-            yield (
-                f"{axis}: the published parameters are refused, they err by"
-                f" {significant(error.published_rmse)} {error.unit} where parameters refitted"
-                f" without each trial err by {significant(error.held_out_rmse)}"
-            )
         if error.standing in FLOOR_WRONG:
             yield f"{axis}: the error is {STANDINGS[error.standing]}"

@@ -21,9 +21,9 @@ def describe_held_out(validated: ValidateResult) -> str:
     if not names:
         return "nothing could be held out, so that the error is that of the fit"
     if len(validated.trials) == 1:
-        return "each part of the trial predicted with parameters fitted to its other parts"
+        return "each part of the trial predicted with the estimate that its other parts give"
     if len(names) == len(validated.trials):
-        return "each trial predicted with parameters fitted to others"
+        return "each trial predicted with the estimate that the others give"
     if len(names) > _MOST_NAMED:
         return f"{len(names)} of the {len(validated.trials)} trials, which no parameter has seen"
     trials = "trial" if len(names) == 1 else "trials"
@@ -34,13 +34,6 @@ def judge_session(results: Results) -> Callout:
     """Return the verdict on the session: good where no check failed and nothing is outdated."""
     validated = results.read(ValidateResult, results.model)
     failed = validated.failed_checks if validated else ()
-    if validated is not None and validated.is_refused:
-        command = f"`bampipe identify {results.root.name} --method least-squares`"
-        return Callout(
-            "attention",
-            "The published parameters are refused",
-            f"{command} uses another estimator.\n{_list_failures(failed)}",
-        )
     found = _judge_model(results, validated)
     if found.tone == "good" and failed:
         title = f"{found.title}, but {count_noun(len(failed), 'check')} failed"

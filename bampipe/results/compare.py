@@ -26,12 +26,9 @@ class Rung(Record):
     held_out_rmse: dict[str, Size]
     noise_floor: dict[str, Size | None] = Field(description="null where none was computed")
     standing: dict[str, FloorStatus]
-    refused: Names = Field(
-        default=(), description="Axes whose published parameters are refused: their error is none"
-    )
     confirmed: bool = Field(
-        description="A model without a parent; or one whose parent is confirmed, whose parameters "
-        "are not refused, and whose held-out error is lower than its parent's; not one without a "
+        description="A model without a parent; or one whose parent is confirmed and whose "
+        "held-out error is lower than its parent's; not one without a "
         "noise floor where its parent has one"
     )
     unit: dict[str, str]
@@ -41,14 +38,6 @@ class Rung(Record):
     )
     free_run: dict[str, FreeRunError] = Field(default={}, description="By axis")
     drift: dict[str, AxisDrift] = Field(default={}, description="By axis: short free runs")
-
-    def sound_error(self, axis: str) -> float | None:
-        """Held-out error of an axis; None where its parameters are refused."""
-        return None if axis in self.refused else self.held_out_rmse.get(axis)
-
-    def sound_floor(self, axis: str) -> float | None:
-        """Noise floor of an axis; None where there is none or its parameters are refused."""
-        return None if axis in self.refused else self.noise_floor.get(axis)
 
     def median_drift(self, axis: str) -> dict[float, float]:
         """Median drift of one axis, rad or m, by horizon in s; empty where there is none."""

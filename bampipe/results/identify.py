@@ -89,8 +89,9 @@ class Influence(Record):
     """How far parts of the data move the parameters."""
 
     trials: dict[str, dict[str, float]] = Field(
-        description="By trial and parameter: change of the published estimate where the trial is "
-        "left out, in standard deviations"
+        description="By trial, or block of a single one, then by parameter and `input_timing`: "
+        "change of the estimate by least squares where it is left out, in published standard "
+        "deviations. Of more than ten trials every tenth is left out together"
     )
     worst_second: WorstSecond
 
@@ -310,6 +311,16 @@ class IdentifyResult(Result):
         default=None, description="Independent blocks of time"
     )
     restarts: Count | None = Field(default=None, description="Attempts until the filter followed")
+
+    def moves_without(self, trial: str) -> dict[str, float]:
+        """Change of each parameter and of ``input_timing`` without a trial, or block of one.
+
+        Nothing moves without a trial that was not fitted.
+        """
+        sd = {name: entry.sd for name, entry in self.parameters.items()}
+        sd["input_timing"] = self.input_timing.sd
+        moves = self.influence.trials.get(trial, {})
+        return {name: move * sd[name] for name, move in moves.items()}
 
     @property
     def inertial(self) -> frozenset[str]:

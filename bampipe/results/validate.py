@@ -14,8 +14,7 @@ class AxisError(Record):
 
     rmse: Size = Field(description="Parameters as identified")
     rmse_without_friction: Size
-    held_out_rmse: Size = Field(description="Each trial by the fit to the others")
-    published_rmse: Size = Field(description="With the published parameters, on the same trials")
+    held_out_rmse: Size = Field(description="Each trial by the estimate without it")
     relative_error_percent: Size = Field(description="100 rmse / RMS of the measured torque")
     held_out_relative_error_percent: Size = Field(
         description="100 held_out_rmse / root mean square of the measured torque"
@@ -31,20 +30,11 @@ class JudgedError(AxisError):
     """Error of one axis over all trials, compared with its noise floor."""
 
     noise_floor: Size | None = Field(
-        description="held_out_rmse of the fitted model's own replicates, same sensors and filters; "
+        description="Error of the fitted model's own replicates, same sensors and filters; "
         "null where none was computed"
     )
     noise_floor_sd: Size = Field(description="Scatter of one replicate")
     standing: FloorStatus
-    expected_ratio: Annotated[float, Field(ge=1)] = Field(
-        default=1.0,
-        description="published_rmse over held_out_rmse if the published parameters were true, from "
-        "a replicate; computed where the ratio exceeds 1.2 on the trials",
-    )
-    estimate: Literal["accepted", "refused"] = Field(
-        description="Refused where published_rmse is more than 1.2 times held_out_rmse and more "
-        "than 1.2 times what is expected"
-    )
 
 
 class TrialError(Record):
@@ -53,7 +43,7 @@ class TrialError(Record):
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, AxisError]
 
-    held_out: bool = Field(description="Predicted by a fit to the other trials")
+    held_out: bool = Field(description="Predicted by the estimate without it")
 
     @property
     def axes(self) -> dict[str, AxisError]:
@@ -137,8 +127,3 @@ class ValidateResult(Result):
         description="Handle force by component, identified parameters"
     )
     free_run: FreeRun | None = None
-
-    @property
-    def is_refused(self) -> bool:
-        """Whether the published parameters of any axis are refused."""
-        return any(error.estimate == "refused" for error in self.axes.values())

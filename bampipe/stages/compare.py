@@ -79,7 +79,6 @@ def _rung(
         held_out_rmse={axis: entry.held_out_rmse for axis, entry in axes.items()},
         noise_floor={axis: entry.noise_floor for axis, entry in axes.items()},
         standing={axis: entry.standing for axis, entry in axes.items()},
-        refused=tuple(axis for axis, entry in axes.items() if entry.estimate == "refused"),
         confirmed=not parent,
         unit={axis: entry.unit for axis, entry in axes.items()},
         free_run_mode=free.mode if free else None,
@@ -88,7 +87,7 @@ def _rung(
         drift=free.drift if free else {},
     )
     before = earlier.get(parent)
-    if before is None or not before.confirmed or validated.is_refused:
+    if before is None or not before.confirmed:
         return rung
     return rung.model_copy(update={"confirmed": rung.improves_on(before)})
 

@@ -178,7 +178,9 @@ def _result(
     known = sorted({entry.effect.partition(":")[0] for entry in ranking[:_DESCRIBED]})
     maps = {}
     for i, axis in enumerate(names):
-        drawn = [residual_map(given, i, variable) for variable in variables(given, i)]
+        drawn = [
+            residual_map(given, i, variable) for variable in variables(given.fitted, given.band, i)
+        ]
         maps[axis] = {m.variable: ResidualMap.of(m, variance_share=m.share) for m in drawn}
     result = DiagnoseResult(
         model=config.model,
@@ -225,7 +227,7 @@ def _map_variables(evidence: Evidence) -> pd.DataFrame:
         "t": np.concatenate([motion.t[k] for motion, k in zip(motions, rows, strict=True)]),
     }
     for i, axis in enumerate(evidence.system.coordinates):
-        for variable in variables(evidence, i):
+        for variable in variables(evidence.fitted, band, i):
             columns[f"{axis}.{variable.name}"] = np.concatenate(variable.values)
     return pd.DataFrame(columns)
 

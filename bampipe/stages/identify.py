@@ -23,6 +23,7 @@ from bampipe.identification.calibration import (
 )
 from bampipe.identification.choice import (
     describe_methods,
+    describe_worse,
     find_objections,
     tabulate_methods,
     why_not_filtered,
@@ -131,7 +132,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if by_filter is not None:
         by_filter = replace(by_filter, covariance=by_filter.covariance + unseen)
     published, others = _choose(task, by_squares, by_filter)
-    methods = tabulate_methods(system, squares, published, others, lost)
+    methods = tabulate_methods(system, published, others, lost)
     if published.method == "least-squares":
         notes += _describe_squares(task, squares)
         if by_filter is not None:
@@ -154,6 +155,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         estimate,
         identifiability,
         trial_names(motions),
+        dict(zip(trial_names(squares.parts), squares.moves, strict=True)),
         squares.find_worst_second(),
         _find_timing(task, squares, held),
         model=config.model,
@@ -266,7 +268,9 @@ def _choose(
     if by_filter is None:
         return by_squares, []
     if task.config.method == "ukf":
-        return by_filter, [by_squares]
+        worse = describe_worse(task.system, by_filter.held_out_rmse, by_squares.held_out_rmse)
+        doubts = (*by_filter.doubts, *([f"its parameters {worse}"] if worse else ()))
+        return replace(by_filter, doubts=doubts), [by_squares]
     objections = find_objections(task.system, by_filter, by_squares)
     if objections:
         return by_squares, [replace(by_filter, doubts=objections)]

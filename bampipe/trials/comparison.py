@@ -6,17 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.arrays import Array, Flags
-from bampipe.errors import InputError
+from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
 from bampipe.results.validate import AxisError
-from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.motion import force_columns
-from bampipe.trials.replay import UNLIKE, StandIn, replay_motions
-from bampipe.trials.residuals import ModelOnTrial, rms
-
-_EXPECTED_SEED = 3
-"""After the user's: of the replay that shows how the published parameters would look if true."""
+from bampipe.trials.residuals import ModelOnTrial, rms, standstill_of
 
 
 @dataclass(frozen=True)
@@ -39,34 +34,42 @@ class ComparedTrial:
     judged: bool
 
 
-def compare_trial(evidence: Evidence, number: int, p: Array, late_s: float = 0.0) -> ComparedTrial:
+def compare_trial(
+    system: System, trials: MeasuredTrials, number: int, published: Array, unseen: Array
+) -> ComparedTrial:
     """Compare one trial with the model as published, held out, and without friction.
 
-    ``p`` (n_p,) and ``late_s`` are published; the latter as far as it is not taken off the trials.
+    Args:
+        published: (n_p + 1,) parameters, and the timing of the inputs as far as it is not taken off
+            the trials, s; unseen: the same without the trial.
     """
-    system, motion = evidence.system, evidence.motions[number]
-    timed = [motion.with_input_timing(late_s)]
+    motion, band, folds = trials.motions[number], trials.band, trials.folds
     dry = (effect for effect in system.model.effects if effect.effect.is_dry_friction)
     strengths = {item.name for effect in dry for item in effect.parameters if item.strength}
-    frictionless = p.copy()
+    frictionless = published.copy()
     for i, item in enumerate(system.parameters):
         if item.name in strengths or item.name.startswith(("viscous.", "coulomb.")):
             frictionless[i] = 0.0
-    band, folds = evidence.band, evidence.folds
+
+    def residual_of(p: Array) -> Array:
+        timed = motion.with_input_timing(float(p[-1]))
+        return band.thin(ModelOnTrial(system, p[:-1], [timed]).residual)
+
     u = motion.inputs(system.inputs)
-    applied = ModelOnTrial(system, p, [motion]).applied
+    applied = ModelOnTrial(system, published[:-1], [motion]).applied
     rows = band.thinned_rows(len(motion.t))
-    residual = band.thin(ModelOnTrial(system, p, timed).residual)
+    used = find_moving_samples(standstill_of(motion, system, band.rate_hz), band)
+    residual = residual_of(published)
     return ComparedTrial(
         trial_id=motion.trial_id,
         t=motion.t[rows],
-        used=evidence.used[number],
+        used=used,
         measured=band.thin(applied),
         residual=residual,
-        residual_held_out=evidence.held_out_residual(number),
-        residual_without_friction=band.thin(ModelOnTrial(system, frictionless, timed).residual),
+        residual_held_out=residual_of(unseen) * used,
+        residual_without_friction=residual_of(frictionless),
         force=band.thin_input(u[:, force_columns(system)]),
-        force_residual=system.least_force(motion.q[rows], residual, u[rows], p),
+        force_residual=system.least_force(motion.q[rows], residual, u[rows], published[:-1]),
         judged=folds.judged[number] and not folds.nothing_held_out,
     )
 
@@ -85,7 +88,6 @@ def axis_errors(system: System, compared: Sequence[ComparedTrial]) -> dict[str, 
     unseen = [c for c in compared if c.judged] or compared
     where = [c.used for c in unseen]
     held_out = rms([c.residual_held_out for c in unseen], where)
-    published = published_rmse(compared)
     count = np.maximum(sum(keep.sum(axis=0) for keep in where), 1)
     mean = sum(np.sum(c.measured * c.used, axis=0) for c in unseen) / count
     spread = rms([c.measured - mean for c in unseen], where)
@@ -96,7 +98,6 @@ def axis_errors(system: System, compared: Sequence[ComparedTrial]) -> dict[str, 
             rmse=rmse[i],
             rmse_without_friction=without[i],
             held_out_rmse=held_out[i],
-            published_rmse=published[i],
             relative_error_percent=_percent(rmse[i], size[i]),
             held_out_relative_error_percent=_percent(held_out[i], unseen_size[i]),
             fit_percent=100.0 * (1.0 - held_out[i] / spread[i]) if spread[i] > 0.0 else None,
@@ -104,34 +105,3 @@ def axis_errors(system: System, compared: Sequence[ComparedTrial]) -> dict[str, 
         )
         for i, axis in enumerate(system.coordinates)
     }
-
-
-def published_rmse(compared: Sequence[ComparedTrial]) -> Array:
-    """Error of the published parameters by axis on the trials that are judged, (n_q,)."""
-    unseen = [c for c in compared if c.judged] or compared
-    return rms([c.residual for c in unseen], [c.used for c in unseen])
-
-
-def expected_published_ratio(
-    evidence: Evidence, trials: MeasuredTrials, p: Array, seed: int
-) -> Array:
-    """Return published over held-out error, at least 1, were the published parameters true, (n_q,).
-
-    A refit takes on what filtering does to a change of direction; the truth does not. How much
-    worse it therefore looks, a replay of it shows.
-    """
-    nothing = np.ones(len(evidence.system.coordinates))
-    published = StandIn(evidence.system, p, evidence.motions, trials.sensors.rate_hz)
-    try:
-        replays = replay_motions(
-            published, trials.sensors, trials.kinematics, (seed, _EXPECTED_SEED)
-        )
-        again = gather_evidence(
-            evidence.system, replays, evidence.band, evidence.p, evidence.folds, held=evidence.held
-        )
-    except InputError:
-        return nothing
-    if np.any(again.held_out_rmse > UNLIKE * evidence.held_out_rmse):
-        return nothing
-    replayed = [compare_trial(again, number, p) for number in range(len(again.motions))]
-    return np.maximum(published_rmse(replayed) / np.maximum(again.held_out_rmse, 1e-300), 1.0)

@@ -1,4 +1,4 @@
-"""A model fitted to the trials of a session, its residual linearised there, and held-out errors."""
+"""A model fitted to the trials of a session, and its residual linearised there."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from bampipe.arrays import Array, Flags
 from bampipe.estimate.least_squares import (
     KnownSlopes,
     Problem,
-    Stacked,
     as_measured,
     minimise,
     stacked_residual,
@@ -23,13 +22,11 @@ from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import ModelOnTrial, problem_of, rms
+from bampipe.trials.residuals import ModelOnTrial, problem_of
 from bampipe.trials.scale import log_scale, slopes_by_force
 
-_REFITS = 6
-"""Most Gauss-Newton steps of a refit that starts at the fit to all trials."""
 _CONVERGED = 1e-8
-"""Change of the negative log likelihood a sample at which a fit or refit ends: a hundredth of a
+"""Change of the negative log likelihood a sample at which a fit ends: a hundredth of a
 standard deviation of a parameter over ten thousand samples, and no digit of an error."""
 
 
@@ -140,81 +137,6 @@ class Evidence:
         count = np.maximum(self.sums.count.sum(axis=0), 1.0)
         return np.asarray(np.sqrt(self.sums.yy.sum(axis=0) / count))
 
-    @cached_property
-    def held_out_steps(self) -> tuple[Array, ...]:
-        """Change of the free parameters when the trials of a group are left out, by trial.
-
-        By the normal equations at the fit to all where the model is linear in its parameters; by
-        refits from there where it is not: a Gauss-Newton step alone leads shapes astray.
-        """
-        folds, free, steps = self.folds, list(self.free), dict[int, Array]()
-        problem = None
-        if not self.is_linear:
-            problem = problem_of(self.system, self.motions, self.band, held=self.held)
-        for group in sorted(set(folds.groups)):
-            others = [k for k in folds.fitted_trials if folds.groups[k] != group]
-            steps[group] = np.zeros(len(free))
-            if not others or folds.nothing_held_out:
-                continue  # nothing is left out
-            if problem is None:
-                rest = self.sums.subset(others)
-                steps[group] = rest.solve(self.weight, self.lower, self.upper)
-            elif len(others) < len(folds.fitted_trials):
-                here = [Stacked(self.residual[k], self.jacobian[k], self.used[k]) for k in others]
-                refit = minimise(
-                    problem, np.append(self.p, 0.0), others, _REFITS, tolerance=_CONVERGED,
-                    at_start=here if problem.multiplied is None else None,
-                )  # fmt: skip
-                steps[group] = refit.p[free] - self.p[free]
-        return tuple(steps[group] for group in folds.groups)
-
-    @cached_property
-    def held_out_rmse(self) -> Array:
-        """Error on trials that the parameters have not seen, (n_q,), N.m or N.
-
-        See `held_out_steps` for the parameters without each group of trials.
-        """
-        judged = [k for k, counts in enumerate(self.folds.judged) if counts]
-        if self.is_linear:
-            sums, steps, none = self.sums, self.held_out_steps, np.zeros(self.sums.yy.shape[1])
-            squares = sum((sums.subset([k]).squares(steps[k])[0] for k in judged), none)
-            count = sum((sums.count[k] for k in judged), none)
-            return np.asarray(np.sqrt(squares / np.maximum(count, 1.0)))
-        return rms((self.held_out_residual(k) for k in judged), [self.used[k] for k in judged])
-
-    @property
-    def held(self) -> list[str]:
-        """Parameters that are not estimated."""
-        return [q.name for i, q in enumerate(self.system.parameters) if i not in self.free]
-
-    @property
-    def is_linear(self) -> bool:
-        """Whether the residual is linear in all free parameters together."""
-        return self.system.is_linear_in(self.free)
-
-    def held_out_residual(self, trial: int) -> Array:
-        """The residual of a trial with parameters that have not seen it, (K, n_q)."""
-        if trial not in self._held_out:
-            step = self.held_out_steps[trial]
-            if self.is_linear or not step.any():
-                found = self.residual[trial] + self.jacobian[trial] @ step
-            else:
-                p = self.held_out_parameters(trial)
-                on_trial = ModelOnTrial(self.system, p, self.motions, trial)
-                found = self.band.thin(on_trial.residual) * self.used[trial]
-            self._held_out[trial] = found
-        return self._held_out[trial]
-
-    @cached_property
-    def _held_out(self) -> dict[int, Array]:
-        return {}
-
-    def held_out_parameters(self, trial: int) -> Array:
-        """Those parameters, (n_p,)."""
-        p = self.p.copy()
-        p[list(self.free)] += self.held_out_steps[trial]
-        return p
-
 
 def gather_evidence(
     system: System,
@@ -226,7 +148,6 @@ def gather_evidence(
     most_iterations: int = 12,
     like: Evidence | None = None,
     timing: tuple[float, float] = (0.0, 0.0),
-    held: Sequence[str] = (),
 ) -> Evidence:
     """Fit a model to the fitted trials by least squares and linearise it there on all.
 
@@ -235,12 +156,11 @@ def gather_evidence(
         like: a model with some more effects or some less, where that has been fitted: slopes that
             are the same for both are taken from it.
         timing: least and largest change of the inputs' timing, s, that may be weighed beside it.
-        held: parameters that stay as given.
 
     Raises:
         ValueError: fewer samples than parameters, where steps are to be taken.
     """
-    problem = problem_of(system, motions, band, held=held)
+    problem = problem_of(system, motions, band)
     fitted = folds.fitted_trials
     known = None
     if like is not None and like.motions is motions and like.band == band:

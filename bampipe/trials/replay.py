@@ -42,10 +42,6 @@ from bampipe.trials.motion import (
 from bampipe.trials.residuals import ModelOnTrial, standstill_of
 from bampipe.trials.sensors import Sensors
 
-UNLIKE = 3.0
-"""Residual that a fit leaves of a replay, over that of the measurement, beyond which the replay is
-no likeness of the machine: sound ones leave 0.01 to 1.15 (without force noise), those of a Stribeck
-friction that its fit has sharpened up to 1.9, that of a stiff damper 77."""
 _FARTHEST = 0.1
 """Of a joint's travel: how far the replay of a robot may be from the measured motion. Sound
 replays of simulated arms stay within 0.2 %, without a drive's delay within 0.7 %; without a spring

@@ -46,30 +46,13 @@ def test_parameters_come_back_from_a_replayed_session():
         assert value == pytest.approx(TRUTH[parameter.name], rel=0.02), parameter.name
 
 
-def test_held_out_errors_are_those_of_refits_without_each_trial():
-    """Up to the weights of the axes, which are those of the fit to all, for a linear model."""
-    recipe = bam(["stribeck:yaw"])
-    session = made(recipe, {"stribeck.yaw.force": 1.1, "stribeck.yaw.speed": 0.05}, trials=3)
-    for model, tolerance in ((bam(), 0.01), (recipe, 0.03)):
-        system = system_of(model)
-        found = gather_evidence(system, session.motions, BAND, system.prior, session.folds)
-        square, count = np.zeros(3), np.zeros(3)
-        for k, motion in enumerate(session.motions):
-            others = [m for i, m in enumerate(session.motions) if i != k]
-            refit = gather_evidence(system, others, BAND, found.p, folds(2))
-            unseen = gather_evidence(system, [motion], BAND, refit.p, folds(1), most_iterations=0)
-            square += unseen.sums.yy[0]
-            count += unseen.sums.count[0]
-        assert found.held_out_rmse == pytest.approx(np.sqrt(square / count), rel=tolerance)
-
-
 def test_slopes_are_those_of_the_last_parameters_after_a_nonlinear_fit():
     """Slopes that no parameter changes are carried from one iteration to the next."""
     recipe = bam(["presliding:yaw"])
     session = made(recipe, {"presliding.yaw.force": 0.8, "presliding.yaw.distance": 0.03}, trials=2)
     system = system_of(recipe)
     found = gather_evidence(system, session.motions, BAND, system.prior, session.folds)
-    assert not found.is_linear and np.abs(found.p - system.prior).max() > 0.2
+    assert np.abs(found.p - system.prior).max() > 0.2
     anew = gather_evidence(system, session.motions, BAND, found.p, session.folds, most_iterations=0)
     for carried, fresh in zip(found.jacobian, anew.jacobian, strict=True):
         np.testing.assert_allclose(carried, fresh, rtol=1e-6, atol=1e-9)
@@ -105,7 +88,6 @@ def test_a_fit_that_takes_slopes_from_a_model_like_it_is_the_same(effects):
         found = gather_evidence(system, *given, system.prior, session.folds, like=other)
         for one, two in zip(found.jacobian, alone.jacobian, strict=True):
             np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-7 * np.abs(two).max())
-        np.testing.assert_allclose(found.held_out_rmse, alone.held_out_rmse, rtol=1e-6)
 
 
 def test_standstill_is_left_out_and_quick_reversals_stay():

@@ -5,6 +5,7 @@ import numpy as np
 from bampipe.estimate.possible_bodies import is_possible, nearest_possible
 
 RNG = np.random.default_rng(3)
+PLACES, EVERY = np.arange(20).reshape(2, 10), np.full(20, np.inf)
 
 
 def body(points: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -32,23 +33,26 @@ def test_point_masses_are_possible_and_their_negatives_are_not() -> None:
 def test_a_possible_estimate_is_its_own_nearest() -> None:
     value, start = bodies(2), bodies(2)
     weight = np.diag(RNG.uniform(1.0, 10.0, 20))
-    np.testing.assert_allclose(nearest_possible(value, weight, start), value, atol=1e-4)
+    found = nearest_possible(value.ravel(), weight, PLACES, start, (-EVERY, EVERY))
+    np.testing.assert_allclose(found, value.ravel(), atol=1e-4)
 
 
 def test_the_nearest_is_possible_and_no_other_is_nearer() -> None:
+    """Beside the bodies there are a friction that cannot be negative, and what has no bounds."""
     truth = bodies(2)
-    value = truth + RNG.normal(0.0, 1.0, truth.shape)
-    root = RNG.normal(size=(20, 20))
-    weight = root @ root.T + np.eye(20)
-    found = nearest_possible(value, weight, truth)
-    assert all(is_possible(numbers) for numbers in found)
+    value = np.append(truth.ravel() + RNG.normal(0.0, 1.0, 20), [-0.5, 2.0])
+    root = RNG.normal(size=(22, 22))
+    weight = root @ root.T + np.eye(22)
+    low, high = -np.append(EVERY, [0.0, np.inf]), np.append(EVERY, [3.0, np.inf])
+    found = nearest_possible(value, weight, PLACES, truth, (low, high))
+    assert all(is_possible(numbers) for numbers in found[PLACES])
+    assert found[20] >= 0.0
 
     def distance(numbers: np.ndarray) -> float:
-        off = (numbers - value).ravel()
-        return float(off @ weight @ off)
+        return float((numbers - value) @ weight @ (numbers - value))
 
-    # Possible numbers are a convex cone: towards any other of them it goes up.
+    # What is possible is convex: towards any other of it it goes up.
     for _ in range(200):
-        other = bodies(2)
+        other = np.append(bodies(2).ravel(), [RNG.uniform(0.0, 3.0), RNG.normal()])
         for share in (1e-3, 1e-2, 0.1):
             assert distance((1.0 - share) * found + share * other) > distance(found) * (1 - 1e-6)

@@ -19,15 +19,20 @@ from bampipe.results.ingest import IngestResult
 from bampipe.results.validate import ValidateResult
 from bampipe.stages import identify, validate
 
-NAMED: Any = SimpleNamespace(parameters=[SimpleNamespace(name=f"p{k}") for k in range(3)])
+NAMED: Any = SimpleNamespace(
+    parameters=[SimpleNamespace(name=f"p{k}") for k in range(3)],
+    coordinates=("yaw", "pitch"), torque_units=("N.m", "N.m"),
+)  # fmt: skip
 
 
-def estimate(value: list[float], sd: float, doubts: tuple[str, ...] = ()) -> Estimate:
-    """Three parameters with one standard deviation."""
+def estimate(
+    value: list[float], sd: float, doubts: tuple[str, ...] = (), error: float = 0.1
+) -> Estimate:
+    """Three parameters with one standard deviation, and an error on the second axis."""
     problem: Any = SimpleNamespace(free=np.arange(3))
     return Estimate(
         "ukf", np.array([*value, 0.0]), problem, sd**2 * np.eye(3), np.zeros(3, dtype=bool),
-        [], [{}] * 3, {}, lambda: (None, None), doubts,  # type: ignore[arg-type, return-value]
+        np.array([0.1, error]), [{}] * 3, {}, lambda: (None, None), doubts,  # type: ignore[arg-type, return-value]
     )  # fmt: skip
 
 
@@ -44,12 +49,25 @@ def test_a_filter_that_agrees_and_is_more_precise_is_published() -> None:
         (estimate([1.0, 2.5, 3.0], 0.05), r"the latter puts `p1` at 2\.5.* than by chance"),
         (estimate([1.0, 2.0, 3.0], 0.12), r"standard deviations are 1\.20 times the former's"),
         (estimate([1.0, 2.0, 3.0], 0.05, ("it is off",)), "it is off"),
+        (
+            estimate([1.0, 2.0, 3.0], 0.05, error=0.13),
+            r"err by 0\.130 N\.m on trials left out \(pitch\), those of least squares by 0\.100",
+        ),
     ],
-    ids=["far", "loose", "doubted"],
+    ids=["far", "loose", "doubted", "worse"],
 )
 def test_what_speaks_against_a_filter_is_said(filtered: Estimate, words: str) -> None:
     (said,) = find_objections(NAMED, filtered, SQUARES)
     assert re.search(words, said)
+
+
+@pytest.mark.parametrize(("error", "doubts"), [(0.11, 0), (0.13, 1)])
+def test_a_filter_that_was_asked_for_is_published_with_its_larger_error(
+    error: float, doubts: int
+) -> None:
+    task: Any = SimpleNamespace(system=NAMED, config=identify.Config(method="ukf"))
+    published, others = identify._choose(task, SQUARES, estimate([1.0, 2.0, 3.0], 0.1, (), error))
+    assert len(published.doubts) == doubts and others == [SQUARES]
 
 
 def test_many_parameters_may_differ_by_more_than_few() -> None:

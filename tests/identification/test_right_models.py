@@ -15,8 +15,8 @@ def extended(run, effect):
 
 
 @pytest.mark.long
-def test_friction_that_fades_with_speed_is_found_and_not_refused(tmp_path):
-    """A fit to filtered motions sharpens it; beside that fit the truth looks a third worse."""
+def test_friction_that_fades_with_speed_is_found_and_leaves_the_floor(tmp_path):
+    """A plain fit to filtered motions sharpens it, and leaves a third less than the truth does."""
     run, truth = record_run(tmp_path, "bam", 7301, "stribeck:extension", rate_hz=500.0)
     found, judged = extended(run, "stribeck:extension")
     assert found["effects"]["stribeck:extension"]["identified"]
@@ -24,8 +24,7 @@ def test_friction_that_fades_with_speed_is_found_and_not_refused(tmp_path):
     for name, value in truth.items():
         near = 0.15 if name.endswith(".speed") else 0.05
         assert parameters[name]["estimate"] == pytest.approx(value, rel=near), name
-    assert not judged.get("refused")
-    assert judged["axes"]["extension"]["estimate"] == "accepted"
+    assert judged["axes"]["extension"]["standing"] == "at_floor"
 
 
 @pytest.mark.long

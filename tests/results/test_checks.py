@@ -20,7 +20,7 @@ SOUND: dict[str, Any] = {
         "input_timing": {"estimate": 5e-4, "sd": 1e-4, "limit": 1e-3},
         "innovations": {"yaw": {"whiteness": {"white": True}, "inputs": {"independent": True}}},
     },
-    "yaw": {"standing": "above_floor", "estimate": "accepted"},
+    "yaw": {"standing": "above_floor"},
 }  # fmt: skip
 TIMING = {"estimate": -9.9e-4, "limit": 1e-3}
 COUNTS = {"noise_sd": {"force_x": 0.5}, "unit": "N", "look_like_counts": ["force_x"]}
@@ -53,7 +53,6 @@ def test_a_sound_model_fails_none() -> None:
         ("fit", {"input_timing": TIMING | {"sd": 1e-4}}, "input timing: -0.99 ± 0.10 ms"),
         ("fit", {"innovations": NOT_WHITE}, "yaw, innovations: Not white"),
         ("fit", {"innovations": DRIVEN}, "yaw, innovations: Not so"),
-        ("yaw", {"estimate": "refused"}, "yaw: the published parameters are refused"),
         ("yaw", {"standing": "floor_implausible"}, "yaw: the error is far below its noise floor"),
         ("yaw", {"standing": "floor_missing"}, "yaw: the error is without a noise floor"),
     ],

@@ -17,7 +17,6 @@ ERROR = AxisError(
     rmse=1.0,
     rmse_without_friction=2.0,
     held_out_rmse=1.5,
-    published_rmse=1.5,
     relative_error_percent=10.0,
     held_out_relative_error_percent=15.0,
     fit_percent=None,

@@ -129,9 +129,9 @@ def test_wrong_parameters_show(simulated: RunFolder, tmp_path: Path) -> None:
     write_json(simulated.path("models/base/identify.json"), content)
     wrong = validated(simulated, config)["axes"]
     identified(simulated)
-    assert wrong["yaw"]["rmse"] > 5.0 * right["yaw"]["rmse"]
-    assert wrong["pitch"]["rmse"] == pytest.approx(right["pitch"]["rmse"])
-    assert wrong["yaw"]["held_out_rmse"] == pytest.approx(right["yaw"]["held_out_rmse"], rel=1e-4)
+    for error in ("rmse", "held_out_rmse"):
+        assert wrong["yaw"][error] > 5.0 * right["yaw"][error]
+        assert wrong["pitch"][error] == pytest.approx(right["pitch"][error])
 
 
 def test_parameters_are_judged_with_the_timing_that_they_were_found_with(tmp_path: Path) -> None:
@@ -145,8 +145,7 @@ def test_parameters_are_judged_with_the_timing_that_they_were_found_with(tmp_pat
     write_json(path, published)
     without = validated(run)
     for axis, entry in content["axes"].items():
-        assert entry["estimate"] == "accepted", (axis, entry)
-        assert entry["published_rmse"] < 0.9 * without["axes"][axis]["published_rmse"], axis
+        assert entry["held_out_rmse"] < 0.9 * without["axes"][axis]["held_out_rmse"], axis
 
 
 def test_residuals_add_up(simulated: RunFolder, tmp_path: Path) -> None:
@@ -177,7 +176,7 @@ def test_one_short_trial_holds_nothing_out(tmp_path: Path) -> None:
 def test_one_long_trial_is_left_out_in_blocks(tmp_path: Path) -> None:
     run = identified(simulated_run(tmp_path / "one", trials=1, seconds=12.0))
     content = validated(run)
-    assert content["notes"][0].startswith("One trial: it is left out in")
+    assert content["notes"][0].startswith("One trial: it is predicted in")
     assert content["headline"].startswith("fit on held-out trials")
     assert all(entry["held_out"] for entry in content["trials"].values())
     table = read_parquet(run.path("models/base/residuals.parquet"))

@@ -47,8 +47,7 @@ def _tabulate_errors(results: Results, rungs: Sequence[Rung], axes: Sequence[str
     for rung in rungs:
         cells = []
         for axis in axes:
-            error, floor = rung.sound_error(axis), rung.sound_floor(axis)
-            text = "refused" if axis in rung.refused else format_digits(error)
+            text, floor = format_digits(rung.held_out_rmse.get(axis)), rung.noise_floor.get(axis)
             cells.append(f"{text} ({format_digits(floor)})" if floor else text)
         added = f"`{rung.added}`" if rung.added else ""
         rows.append((_name_version(rungs, rung), added, *cells))
@@ -130,8 +129,8 @@ def _draw(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Figur
     figure, panels = style.make_grid(len(axes), len(axes), 2.3, extra=0.0, column_width=1.95)
     x = np.arange(len(rungs))
     for panel, axis in zip(panels, axes, strict=True):
-        error = _make_array(rung.sound_error(axis) for rung in rungs)
-        floor = _make_array(rung.sound_floor(axis) for rung in rungs)
+        error = _make_array(rung.held_out_rmse.get(axis) for rung in rungs)
+        floor = _make_array(rung.noise_floor.get(axis) for rung in rungs)
         panel.plot(x, error, "o-", color=style.BLUE, ms=4.5, lw=1.3, label="held-out error")
         panel.plot(x, floor, "s--", color=style.VERMILLION, ms=3.0, lw=1.0, label="noise floor")
         both = np.concatenate([error, floor])
@@ -162,8 +161,7 @@ def _describe_change(rungs: Sequence[Rung], axes: Sequence[str]) -> str:
     """Return the change of the error of each axis from the first version to the last."""
     parts = []
     for axis in axes:
-        sound = [rung for rung in rungs if axis not in rung.refused] or rungs
-        before, after = (rung.sound_error(axis) for rung in (rungs[0], sound[-1]))
+        before, after = (rung.held_out_rmse.get(axis) for rung in (rungs[0], rungs[-1]))
         if before and after:
             change = 100.0 * (after / before - 1.0)
             verb = "falls" if change <= -1.0 else "rises" if change >= 1.0 else ""

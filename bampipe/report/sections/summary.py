@@ -101,9 +101,7 @@ def _explain_rejection(results: Results, compared: CompareResult) -> str:
     better = [rung for rung in compared.ladder if rung.has_lower_error_than(first)]
     if not better:
         return f"Of {len(compared.ladder)} models none has a lower error than `{first.model}`."
-    validated = results.read(ValidateResult, better[-1].model)
-    refused = validated is not None and validated.is_refused
-    why = "its parameters are refused" if refused else "the version it builds on is not confirmed"
+    why = "the version it builds on is not confirmed"
     if better[-1].has_lost_its_floor(first):
         why = "it has no noise floor, or an error far below it, which cannot be judged"
     return (
