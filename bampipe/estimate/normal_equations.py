@@ -14,9 +14,6 @@ import numpy as np
 from bampipe.arrays import Array, Flags
 from bampipe.estimate.bounded import solve_bounded
 
-_CANCELLED = 1e-8
-"""Share of a sum of squares below which what a fit leaves of it may be rounding."""
-
 
 @dataclass(frozen=True)
 class NormalEquations:
@@ -92,21 +89,12 @@ class NormalEquations:
         moment = weight @ self.xy.sum(axis=0) + self.precision * self.known
         return solve_bounded(normal, moment, lower, upper)
 
-    def squares(self, values: Array) -> Array:
-        """Sum of squared residuals left with coefficients ``values`` (P,), (K, n_q).
-
-        At least what rounding may have left of it: the difference of large sums is never zero.
-        """
-        fitted = (self.xx @ values) @ values
-        left = self.yy - 2.0 * self.xy @ values + fitted
-        if np.any(left < _CANCELLED * self.yy):
-            size = np.abs(values)
-            terms = self.yy + 2.0 * np.abs(self.xy) @ size
-            terms += (np.abs(self.xx) @ size) @ size
-            left = np.maximum(left, np.finfo(float).eps * terms)
-        return np.asarray(left)
-
     def mean_square(self, values: Array) -> Array:
-        """Mean squared residual over all trials with coefficients ``values``, (n_q,)."""
+        """Mean squared residual over all trials with coefficients ``values`` (P,), (n_q,).
+
+        At least what rounding may leave of it: the difference of large sums is never zero.
+        """
+        left = self.yy - 2.0 * self.xy @ values + (self.xx @ values) @ values
+        least = np.finfo(float).eps * self.yy
         count = np.maximum(self.count.sum(axis=0), 1.0)
-        return np.asarray(self.squares(values).sum(axis=0) / count)
+        return np.asarray(np.maximum(left, least).sum(axis=0) / count)

@@ -204,53 +204,39 @@ class SquaresFit:
 
         Of a single trial a period of the band on either side is left out, too.
         """
-        samples, band = self.fit.likelihood.samples, self.trials.band
+        band, groups = self.trials.band, self.trials.folds.groups
         if len(self.parts) == 1:
             return [np.zeros(self.free.size)]
-        if len(self.trials.motions) > 1:
-            groups = np.array(self.trials.folds.groups)
-            found = {
-                group: self._move([groups[here.trial] != group for here in samples])
-                for group in np.unique(groups)
-            }
+        if len(groups) > 1:
+            of_sample = np.repeat(groups, [len(r) for r in self.fit.evidence.residual])
+            found = {group: self._move_without(of_sample == group) for group in set(groups)}
             return [found[group] for group in groups]
+        t, *blocks = (m.t[band.thinned_rows(len(m.t))] for m in (*self.trials.motions, *self.parts))
         gap_s = 1.0 / min(band.cutoff_hz)
-        (t,), parts = (
-            [motion.t[band.thinned_rows(len(motion.t))] for motion in motions]
-            for motions in (self.trials.motions, self.parts)
-        )
         return [
-            self._move(
-                [
-                    (t[here.rows] < part[0] - gap_s) | (t[here.rows] > part[-1] + gap_s)
-                    for here in samples
-                ]
-            )
-            for part in parts
+            self._move_without((t >= block[0] - gap_s) & (t <= block[-1] + gap_s))
+            for block in blocks
         ]
 
-    def _move(self, kept: Sequence[Flags]) -> Array:
-        return np.asarray((self.refit(kept) - self.p)[self.free])
+    def _move_without(self, gone: Flags) -> Array:
+        found = self.refit([~gone[here.rows] for here in self.fit.likelihood.samples])
+        return np.asarray((found - self.p)[self.free])
 
     def held_out_rmse(self, p: Array) -> Array:
         """Error of an estimate on each part that it is left without, by axis, (n_q,), N.m or N.
 
         ``p`` (n_p + 1,) is the estimate, whichever method made it; it moves as least squares do.
         """
-        problem, free = self.problem, self.free
-        if self.parts is not self.trials.motions:
-            system, timed = self.fit.evidence.system, self.trials.timed
-            problem = problem_of(system, self.parts, self.trials.band, timing=timed)
-        band, numbers = problem.band, range(problem.n_trials)
+        trials, limits = self.trials, (self.problem.lower, self.problem.upper)
+        problem = problem_of(self.fit.evidence.system, self.parts, trials.band, timing=trials.timed)
 
-        def residual(number: int) -> Array:
+        def residual(part: int) -> Array:
             without = p.copy()
-            moved = p[free] + self.moves[number]
-            without[free] = np.clip(moved, problem.lower, problem.upper)
-            return band.thin(problem.residual(number, without))
+            without[self.free] = np.clip(p[self.free] + self.moves[part], *limits)
+            return trials.band.thin(problem.residual(part, without))
 
-        used = (find_moving_samples(problem.standstill[number], band) for number in numbers)
-        return rms(map(residual, numbers), used)
+        used = (find_moving_samples(still, trials.band) for still in problem.standstill)
+        return rms(map(residual, range(problem.n_trials)), used)
 
     def find_worst_second(self) -> RemovedStretch:
         """The second of a trial without which some parameter would move most."""

@@ -1,4 +1,4 @@
-"""Numbers that no body has: the nearest possible ones, unless these explain the trials far worse."""
+"""Numbers that no body has: the nearest possible ones, unless these err far more."""
 
 import numpy as np
 import pytest

@@ -27,7 +27,6 @@ JUDGED = JudgedError(
     noise_floor=1.4,
     noise_floor_sd=0.1,
     standing="at_floor",
-    estimate="accepted",
 )
 
 

@@ -13,10 +13,8 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.files import read_json, write_text
-from bampipe.identification.estimates import Estimate
-from bampipe.identification.filter_estimate import FilterTask
 from bampipe.identification.filter_run import MotionLost
-from bampipe.progress import Progress, silent
+from bampipe.progress import silent
 from bampipe.run.settings import configure
 from bampipe.stages import identify
 
@@ -110,28 +108,6 @@ def test_least_squares_stand_in_where_the_filter_loses_the_motion(
     assert_recovered(content, TRUTH)
     with pytest.raises(InputError, match="grew without bound; try least squares"):
         identified(simulated, replace(FAST, method="ukf"))
-
-
-def test_what_a_trial_told_the_filter_is_taken_off_without_running_it_again(tmp_path: Path) -> None:
-    run = simulated_run(tmp_path / "all", trials=3, seconds=6.0)
-    by_count: dict[int, Estimate] = {}
-
-    def noting(task: FilterTask, progress: Progress) -> Estimate:
-        count = len(task.squares.trials.motions)
-        by_count[count] = original(task, progress)
-        return by_count[count]
-
-    original = identify.estimate_by_filter
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(identify, "estimate_by_filter", noting)
-        identify.execute(run, tmp_path / "one", FAST, silent)
-        some = identify.read_motions
-        patched.setattr(identify, "read_motions", lambda *a, **k: list(some(*a, **k))[:2])
-        identify.execute(run, tmp_path / "two", FAST, silent)
-    again = by_count[2]
-    without = by_count[3].held_out[2][again.free]
-    assert np.max(np.abs(without - again.value) / again.sd) < 0.3
-    assert np.max(np.abs(by_count[3].value - again.value) / again.sd) > 0.6
 
 
 @pytest.mark.long
