@@ -23,8 +23,8 @@ def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list
     """The fit with inertial numbers that some body can have, the nearest; and what to tell of it.
 
     Nearest is what explains the trials and the drawing least badly: the normal equations of the fit
-    weigh, and what is no inertial number follows. Where these explain the trials far worse, the fit
-    stays as it is: the model lacks something.
+    weigh, and what is no inertial number follows. Where the nearest explain the trials far worse,
+    the fit stays as it is: the model lacks something, such as a counterbalance.
     """
     robot = system.model.device.robot
     if robot is None:
@@ -39,7 +39,7 @@ def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list
     p = _find_nearest(system, squares, places.reshape(-1, INERTIAL), drawn)
     nearest = f"No body has the inertial numbers that fit {join_names(wrong)} best: the nearest"
     error, of_fit = (squares.held_out_rmse(values) for values in (p, squares.p))
-    if worse := describe_worse(system, error, of_fit, "these numbers"):
+    if worse := describe_worse(system, error, of_fit, "the fit"):
         return squares, [f"{nearest} possible ones are not given, for they {worse}."]
     return replace(squares, p=p), [f"{nearest} possible ones are given."]
 
@@ -49,21 +49,18 @@ def _find_nearest(system: System, squares: SquaresFit, places: Array, drawn: Arr
 
     ``places`` and the drawing's numbers, ``drawn``, are (b, 10).
     """
-    unseen = np.setdiff1d(places, squares.free)  # no motion shows them: the drawing weighs
+    count, unseen = squares.free.size, np.setdiff1d(places, squares.free)
+    # What no motion shows is weighed by the drawing.
     of_drawing = [system.parameters[k].sd ** -2.0 for k in unseen]
     weight = block_diag(squares.information, np.diag(of_drawing))
     at = np.full(len(weight), -1)  # nuisance parameters are none of the model's
-    at[: squares.free.size], at[len(weight) - unseen.size :] = squares.free, unseen
-    of_model = np.flatnonzero(at >= 0)
+    at[:count], at[len(at) - unseen.size :] = squares.free, unseen
     value, low, high = np.zeros(len(at)), np.full(len(at), -np.inf), np.full(len(at), np.inf)
-    value[of_model] = squares.p[at[of_model]]
-    low[: squares.free.size], high[: squares.free.size] = (
-        squares.problem.lower,
-        squares.problem.upper,
-    )
+    value[at >= 0] = squares.p[at[at >= 0]]
+    low[:count], high[:count] = squares.problem.lower, squares.problem.upper
     bodies = np.array([[int(np.flatnonzero(at == place)[0]) for place in b] for b in places])
-    p = squares.p.copy()
-    p[at[of_model]] = nearest_possible(value, weight, bodies, drawn, (low, high))[of_model]
+    found, p = nearest_possible(value, weight, bodies, drawn, (low, high)), squares.p.copy()
+    p[at[at >= 0]] = found[at >= 0]
     return p
 
 

@@ -42,11 +42,3 @@ def test_an_estimate_moves_and_errs_as_a_fit_to_the_rest(
         square = sum(np.sum(r**2, axis=0) for r in left)
         error = np.sqrt(square / sum(used.sum(axis=0) for used in fit.fit.evidence.used))
         np.testing.assert_allclose(fit.held_out_rmse(fit.p), error, rtol=0.02)
-
-
-def test_a_trial_too_short_for_blocks_moves_nothing() -> None:
-    trials = made(bam(), {}, trials=1, seconds=4.0)
-    system = system_of(bam())
-    fit = fit_squares(trials, bam(), system, system.prior, 2.0)
-    assert [m.trial_id for m in fit.parts] == ["t01"] and not fit.moves[0].any()
-    np.testing.assert_allclose(fit.held_out_rmse(fit.p), fit.fit.evidence.rmse(), rtol=0.05)

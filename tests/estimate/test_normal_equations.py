@@ -9,24 +9,15 @@ TRIALS, COUNT, AXES, P = 3, 40, 2, 5
 FREE = np.full(P, np.inf)
 
 
-def samples(width: int) -> list[np.ndarray]:
-    return [RNG.normal(size=(COUNT, AXES, width)) for _ in range(TRIALS)]
-
-
-def residuals() -> list[np.ndarray]:
-    return [RNG.normal(size=(COUNT, AXES)) for _ in range(TRIALS)]
-
-
 def test_what_is_known_beforehand_counts_as_so_many_samples() -> None:
     """A coefficient known as 3 with variance 1/4 is as four samples of it that read 3."""
-    slopes, left = samples(P), residuals()
+    slopes, left = RNG.normal(size=(TRIALS, COUNT, AXES, P)), RNG.normal(size=(TRIALS, COUNT, AXES))
     used = [np.ones((COUNT, AXES), dtype=bool)] * TRIALS
     precision, known = np.zeros(P), np.zeros(P)
     precision[1], known[1] = 4.0, 3.0
     weight = np.ones(AXES)
     found = NormalEquations.from_samples(slopes, left, used, precision, known)
-    rows = np.concatenate([s.reshape(-1, P) for s in slopes])
-    target = -np.concatenate([r.ravel() for r in left])
+    rows, target = slopes.reshape(-1, P), -left.ravel()
     unit = np.zeros((4, P))
     unit[:, 1] = 1.0
     expected = np.linalg.lstsq(np.vstack([rows, unit]), np.append(target, [3.0] * 4), rcond=None)[0]

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 from independent_runs import record_run
 
+import bampipe
+from bampipe.files import read_json
+
 DAYS = {
     "noise five times what is stated": {"noise_factor": 5.0},
     "mains hum and coarse encoders": {"hum": 10.0, "coarse": 8.0},
@@ -51,3 +54,15 @@ def test_a_damper_that_outruns_its_rate_in_some_trials_is_identified_from_the_ot
     assert max(map(abs, off.values())) < 4.0, off
     axes = run.validation("base")
     assert (axes.held_out_rmse < 1.25 * axes.noise_floor).all()
+
+
+@pytest.mark.long
+def test_an_effect_that_is_not_there_does_not_count_as_identified(tmp_path):
+    run, _ = record_run(tmp_path, "axis", 19)
+    run = bampipe.extend(run, "stribeck:carriage")
+    found = read_json(run.root / "models/base+stribeck.carriage/identify.json")
+    entry = found["effects"]["stribeck:carriage"]
+    assert not entry["identified"]
+    assert any("`stribeck.carriage." in reason for reason in entry["reasons"])
+    assert found["headline"].startswith("not identified: stribeck:carriage; ")
+    assert found["notes"][0].startswith("`stribeck:carriage` does not count as identified: ")

@@ -55,10 +55,6 @@ def test_a_trial_held_out_moves_no_parameter_and_is_what_counts(spoilt: RunFolde
         assert entry["noise_floor"] < 0.2 * entry["held_out_rmse"]
     table = read_parquet(spoilt.path("models/base/residuals.parquet"))
     assert set(table.loc[table["held_out"], "trial_id"]) == {SPOILT}
-
-
-def test_neither_fits_nor_the_diagnosis_see_it(spoilt: RunFolder) -> None:
-    judged(spoilt, True)
     assert free_trials(spoilt, fitted=True) == KEPT
     assert free_trials(spoilt) == (*KEPT, SPOILT)
     trials = read_measured_trials(spoilt, compile_model(Model(registry.device("bam"))))

@@ -34,8 +34,9 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunFolder]:
 
 def validated(run: RunFolder, config: validate.Config | None = None) -> dict:
     """Execute the stage in the run folder; return validate.json, checked."""
-    validate.execute(run, run.root, config or validate.Config(), silent)
-    content = read_json(run.path("models/base/validate.json"))
+    config = config or validate.Config()
+    validate.execute(run, run.root, config, silent)
+    content = read_json(run.path(f"models/{config.model}/validate.json"))
     assert schema_misfits(content, "validate") == []
     return content
 
@@ -103,9 +104,7 @@ def test_what_brakes_do_is_judged_in_the_trials_in_which_they_act(tmp_path: Path
         text = MODEL.replace("[]", effects).replace('"base"', f'"{name}"', 1)
         write_text(run.path(f"models/{name}/model.toml"), text)
         identify.execute(run, run.root, replace(SQUARES, model=name), silent)
-        validate.execute(run, run.root, validate.Config(model=name), silent)
-        content = read_json(run.path(f"models/{name}/validate.json"))
-        assert schema_misfits(content, "validate") == []
+        content = validated(run, validate.Config(model=name))
         ratios[name] = {
             axis: entry["held_out_rmse"] / entry["noise_floor"]
             for axis, entry in content["axes"].items()
