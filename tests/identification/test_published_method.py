@@ -62,9 +62,7 @@ def test_what_speaks_against_a_filter_is_said(filtered: Estimate, words: str) ->
 
 
 @pytest.mark.parametrize(("error", "doubts"), [(0.11, 0), (0.13, 1)])
-def test_a_filter_that_was_asked_for_is_published_with_its_larger_error(
-    error: float, doubts: int
-) -> None:
+def test_a_filter_that_errs_more_is_published_on_request(error: float, doubts: int) -> None:
     task: Any = SimpleNamespace(system=NAMED, config=identify.Config(method="ukf"))
     published, others = identify._choose(task, SQUARES, estimate([1.0, 2.0, 3.0], 0.1, (), error))
     assert len(published.doubts) == doubts and others == [SQUARES]

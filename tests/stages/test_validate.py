@@ -120,7 +120,7 @@ def test_what_brakes_do_is_judged_in_the_trials_in_which_they_act(tmp_path: Path
     assert found["sd"] < 0.01 * hidden_value
 
 
-def test_wrong_parameters_show(simulated: RunFolder, tmp_path: Path) -> None:
+def test_wrong_parameters_show(simulated: RunFolder) -> None:
     content = read_json(simulated.path("models/base/identify.json"))
     content["parameters"]["coulomb.yaw"]["estimate"] *= 1.5
     config = validate.Config(noise_floor=False)
