@@ -116,11 +116,10 @@ class Dictionary:
         """Compute a candidate at one shape; None where it does nothing in these trials."""
         e, item, values = self.evidence, self.candidates[key[0]], self.values(key)
         with np.errstate(all="ignore"):
-            columns, change = added_columns(e, item, values)
-        by_trial = columns if item.linear_indices else [c[:, :, None] for c in change]
+            columns = added_columns(e, item, values)
         found = {}
         for axis, here in enumerate(self.samples):
-            rows = take_samples(by_trial, here, axis)
+            rows = columns[here.rows, axis]
             if not (np.abs(rows) < _DIVERGED).all():
                 return None
             if rows.any():
@@ -154,7 +153,7 @@ class Dictionary:
         e, system = self.evidence, item.system
         if not (system.driven or system.force_fed):
             return {}
-        rows = slopes_by_force(system, e.motions, e.band, probes)
+        rows = slopes_by_force(system, e.joined, e.band, probes)
         if item.is_joint:
             own = e.slopes_by_force
             rows = tuple(r - o[..., None] for r, o in zip(rows, own, strict=True))
@@ -177,15 +176,14 @@ class Dictionary:
     @cached_property
     def _applied_by_model(self) -> list[Array]:
         """The applied force by the model, low-passed, by trial, each (K, n_q)."""
-        return [self.evidence.band.thin(fitted.applied) for fitted in self.evidence.fitted]
+        return self.evidence.thin(lambda at: at.applied)
 
     @cached_property
     def _spectra(self) -> list[Array]:
         return find_spectra(self._applied_by_model)
 
     def _applied(self, system: System, p: Array) -> list[Array]:
-        e = self.evidence
-        return [e.band.thin(ModelOnTrial(system, p, [motion]).applied) for motion in e.motions]
+        return self.evidence.thin(lambda at: ModelOnTrial(system, p, [at.motion]).applied)
 
     def scale_without(
         self, name: str, absence: Mapping[int, float]
@@ -200,7 +198,7 @@ class Dictionary:
             return {}, unchanged
         p = e.p.copy()
         p[list(moved)] += list(moved.values())
-        rows = slopes_by_force(e.system, e.motions, e.band, [p])
+        rows = slopes_by_force(e.system, e.joined, e.band, [p])
         slopes = self._by_axis(
             [r[..., 0] - own for r, own in zip(rows, e.slopes_by_force, strict=True)]
         )

@@ -141,15 +141,19 @@ class Session:
 
         Or, where asked for, on those by which it is ``judged``.
         """
-        t = self.trials
-        found = gather_evidence(
+        t = self._chosen[judged]
+        return gather_evidence(
             system_of(recipe), t.motions, t.band, p, t.folds,
             most_iterations=0, timing=t.timing,
             like=like,
         )  # fmt: skip
-        chosen = t.folds.judged if judged else [g != HELD_OUT for g in t.folds.groups]
-        kept = [k for k, counts in enumerate(chosen) if counts]
-        return found if len(kept) == len(t.motions) else found.subset(kept)
+
+    @cached_property
+    def _chosen(self) -> list[MeasuredTrials]:
+        """The trials that choose a model, and those by which one is judged."""
+        choosing = np.array(self.trials.folds.groups) != HELD_OUT
+        both = choosing, self.trials.folds.judged
+        return [self.trials.subset(np.flatnonzero(counts).tolist()) for counts in both]
 
     def replay(self, evidence: Evidence, p: Array, count: int, first: int = 0) -> list[list[Array]]:
         """Residuals of a model on replays of itself, by trial, each (K, n_q).

@@ -84,6 +84,7 @@ class Problem:
             torque constant, an axis for one parameter only; -1 of others, and of all by default.
             Small, such a factor leaves a small residual and explains nothing: the likelihood is
             that of what is measured.
+        parts: rows between which the low-pass begins anew, where a trial stands for several.
     """
 
     residual: Residual
@@ -100,6 +101,7 @@ class Problem:
     known: Array
     slopes: Slopes | None = None
     multiplied: Indices | None = None
+    parts: Callable[[int], Sequence[slice]] = lambda trial: (slice(None),)
 
 
 def residual_and_slopes(
@@ -155,8 +157,11 @@ def stacked_residual(
     axes, numbers = np.nonzero(slopes.any(axis=0))
     columns = np.empty((count, n_q + axes.size))
     columns[:, :n_q], columns[:, n_q:] = base, slopes[:, axes, numbers]
-    thin = problem.band.thin(columns, np.concatenate([np.arange(n_q), axes]))
-    used = find_moving_samples(problem.standstill[trial], problem.band)
+    rows = (columns[part] for part in problem.parts(trial))
+    thin = np.concatenate(problem.band.thin_trials(rows, [*range(n_q), *map(int, axes)]))
+    still = problem.standstill[trial]
+    moving = (find_moving_samples(still[part], problem.band) for part in problem.parts(trial))
+    used = np.concatenate([*moving])
     if known is None:
         slope = np.zeros((len(thin), n_q, n_free))
     else:
@@ -298,8 +303,9 @@ def _require_finite(problem: Problem, trial: int, stacked: Stacked, p: Array) ->
         culprit = f"as soon as parameter number {index + 1}, {p[index]:.4g}, changes"
     else:
         return
+    place = f" on trial number {trial + 1}" if problem.n_trials > 1 else ""
     raise InputError(
-        f"the model gives no finite force on trial number {trial + 1} {culprit}",
+        f"the model gives no finite force{place} {culprit}",
         where="least squares",
         remedy="narrow the bounds of the newest effect's parameters, or change their priors",
     )

@@ -294,7 +294,7 @@ def find_jump_growth(comparison: Comparison, found: DetectionLimit) -> float:
     for side in (1.0, -1.0):
         qd = np.zeros_like(motion.qd)
         qd[:, axis] = side * speed
-        sliding = replace(motion, qd=qd, qdd=np.zeros_like(qd), _columns={})
+        sliding = replace(motion, qd=qd, qdd=np.zeros_like(qd))
         base = ModelOnTrial(e.system, e.p, [sliding])
         own += side * float(base.residual[:, axis].mean())
         more += side * float(added_residual(item, p, base)[:, axis].mean())

@@ -1,8 +1,6 @@
 """The internal states of effects along a motion: which steps generated code takes, and how many."""
 
-import hashlib
-from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -28,8 +26,11 @@ switched. Ramps and sines change by at most twice as much from one sample to the
 reading makes neighbours large."""
 _STEP_SHARE = 0.02
 """Least share of the command's range that counts as switching: not a quantised slow change."""
-_KEPT_BYTES = 1 << 26
+_KEPT = 16
 """Results kept for the next time: of two models on the same motion most states are the same."""
+
+StateKey = tuple[str, tuple[str, ...], tuple[bytes, ...]]
+"""All that states along a motion depend on: module, names of the inputs, and other numbers."""
 
 
 @dataclass(frozen=True)
@@ -41,54 +42,46 @@ class StateGroup:
         places: their numbers among the internal states of the model.
         uses: numbers of the columns of q, qd and u and of the parameters that their rates take.
         commands: which of those columns of u may be switched.
-        parameters: numbers of all parameters that the states depend on.
     """
 
     module: str
     places: Sequence[int]
     uses: Mapping[str, Sequence[int]]
     commands: Sequence[int]
-    parameters: Sequence[int]
 
-    def integrate(self, module: ModuleType, along: Sequence[Array], z0: Array) -> Array:
-        """Return the states along the motion of one trial, (T, n); see `System.memory`.
+    def integrate(
+        self,
+        module: ModuleType,
+        along: Sequence[Array],
+        z0: Array,
+        inputs: Sequence[str],
+        parts: Sequence[slice],
+        known: dict[StateKey, Array],
+    ) -> Array:
+        """Return the states along a motion, (T, n); see `System.memory`.
 
         Args:
-            module: the generated code; along: q, qd, qdd, u, p and t of the trial.
-            z0: the states at its start, (n,).
+            module: the generated code; along: q, qd, qdd, u, p and t of the motion.
+            z0: the states at the start of each part, (parts, n); inputs: names of the columns of u.
+            parts: where they begin anew; known: along this very motion, to which these are added.
         """
         q, qd, qdd, u, p, t = along
-        uses = self.uses
-        columns = (q[:, uses["q"]], qd[:, uses["qd"]], qdd[:, uses["qd"]], u[:, uses["u"]])
-        arrays = [
-            np.ascontiguousarray(x, dtype=np.float64) for x in (*columns, p[uses["p"]], t, z0)
-        ]
-        digest = hashlib.sha256(f"{module.__name__} {self.commands}".encode())
-        for array in arrays:
-            digest.update(array.data)
-        return _kept.find(digest.digest(), lambda: _integrate(module, self.commands, arrays))
-
-
-class _LastUsed:
-    """Arrays by the hash of all that they depend on, as many as `_KEPT_BYTES` hold."""
-
-    def __init__(self) -> None:
-        self._arrays: OrderedDict[bytes, Array] = OrderedDict()
-        self._bytes = 0
-
-    def find(self, key: bytes, compute: Callable[[], Array]) -> Array:
-        """The array of ``key``, computed where it is not known."""
-        if key not in self._arrays:
-            found = compute()
-            self._bytes += found.nbytes
-            while self._arrays and self._bytes > _KEPT_BYTES:
-                self._bytes -= self._arrays.popitem(last=False)[1].nbytes
-            self._arrays[key] = found
-        self._arrays.move_to_end(key)
-        return self._arrays[key]
-
-
-_kept = _LastUsed()
+        uses, p = self.uses, p[self.uses["p"]]
+        numbers = [np.array([*uses["q"], -1, *uses["qd"]]), p, z0]
+        names = tuple(inputs[i] for i in uses["u"])
+        key = module.__name__, names, tuple(x.tobytes() for x in numbers)
+        found = known.pop(key, None)
+        if found is None:
+            columns = (q[:, uses["q"]], qd[:, uses["qd"]], qdd[:, uses["qd"]], u[:, uses["u"]])
+            *arrays, p, z0 = [np.asarray(x, float, order="C") for x in (*columns, t, p, z0)]
+            found = np.empty((len(t), z0.shape[1]))
+            for part, start in zip(parts, z0, strict=True):
+                *rows, moments = (x[part] for x in arrays)
+                found[part] = _integrate(module, self.commands, (*rows, p, moments, start))
+            while len(known) >= _KEPT:
+                del known[next(iter(known))]
+        known[key] = found  # the last used last
+        return found
 
 
 def _integrate(module: ModuleType, commands: Sequence[int], arrays: Sequence[Array]) -> Array:

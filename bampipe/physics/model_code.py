@@ -61,17 +61,8 @@ def effects_code(model: Model) -> Generation:
     for k, places in enumerate(group_states(equations)):
         sources[f"memory{k}"], uses = memory_source(equations, places)
         commands = [c for c, i in enumerate(uses["u"]) if equations.u[i] not in uncommanded]
-        starts = set().union(*(sp.sympify(equations.initial[i]).free_symbols for i in places))
-        numbers = {i for i, p in enumerate(equations.p) if p in starts} | {*uses["p"]}
-        groups.append(
-            {
-                "module": f"memory{k}",
-                "places": places,
-                "uses": uses,
-                "commands": commands,
-                "parameters": sorted(numbers),
-            }
-        )
+        group = {"module": f"memory{k}", "places": places, "uses": uses, "commands": commands}
+        groups.append(group)
     return facts | {"state_groups": groups}, sources
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from bampipe import generated_code
 from bampipe.arrays import Array, Indices
 from bampipe.physics.device import INPUT_ORDERS, derivative
-from bampipe.physics.memory import StateGroup
+from bampipe.physics.memory import StateGroup, StateKey
 from bampipe.physics.model import Model
 from bampipe.physics.newton_euler import INERTIAL
 from bampipe.physics.parameter import Parameter
@@ -398,7 +398,10 @@ class System:
         """Internal states at the start of a trial, (n_z,), from the first q (n_q,) and u (n_u,)."""
         return np.array([float(v) for v in self._arrays.initial_memory(q, u, p)])
 
-    def memory(self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array) -> Array:
+    def memory(
+        self, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array,
+        parts: Sequence[slice] = (slice(None),), known: dict[StateKey, Array] | None = None,
+    ) -> Array:  # fmt: skip
         """Internal states along the motion of one trial, (T, n_z).
 
         Integrated by RK4, or by exponential steps where its rate is linear in the state, along
@@ -409,18 +412,18 @@ class System:
         Args:
             q, qd, qdd, u, p: as in `required`.
             t: time, (T,), s.
+            parts: rows of each trial, where these are several one after the other.
+            known: states along this very motion, of any model; those found are added.
         """
-        out = np.zeros((len(q), len(self.memory_names)))
+        out = np.empty((len(q), len(self.memory_names)))
+        first = [part.start or 0 for part in parts]
+        z0 = _stack(self._arrays.initial_memory(q[first].T, u[first].T, p), len(first))
+        known = {} if known is None else known
         for group in self.state_groups:
-            out[:, group.places] = self.memory_of(group, q, qd, qdd, u, p, t)
+            module, start = self._state_modules[group.module], z0[:, group.places]
+            along = (q, qd, qdd, u, p, t)
+            out[:, group.places] = group.integrate(module, along, start, self.inputs, parts, known)
         return out
-
-    def memory_of(
-        self, group: StateGroup, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array
-    ) -> Array:
-        """`memory` of one of `state_groups`, (T, n): it changes with ``group.parameters`` alone."""
-        z0 = self.initial_memory(q[0], u[0], p)[group.places]
-        return group.integrate(self._state_modules[group.module], (q, qd, qdd, u, p, t), z0)
 
     @cached_property
     def _state_modules(self) -> dict[str, ModuleType]:

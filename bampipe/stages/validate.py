@@ -1,7 +1,6 @@
 """Stage validate: inverse-dynamics torque and handle force against the measured ones (Fig. 9)."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
@@ -149,10 +148,7 @@ def _noise_floor(
     chosen: Sequence[int] = range(len(trials.motions))
     if all(trials.folds.judged):
         chosen = draw_trials(trial_sizes(trials.motions))
-    drawn = replace(
-        trials, motions=[trials.motions[k] for k in chosen], folds=trials.folds.subset(chosen)
-    )
-    session = Session(drawn, Criteria(), seed=config.seed)
+    session = Session(trials.subset(chosen), Criteria(), seed=config.seed)
     try:
         found = session.judge(recipe, p, count)
     except InputError as error:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -18,10 +19,9 @@ from bampipe.estimate.least_squares import (
 )
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.normal_equations import NormalEquations
-from bampipe.estimate.standstill import find_moving_samples
 from bampipe.physics import System
 from bampipe.trials.folds import Folds
-from bampipe.trials.motion import Motion
+from bampipe.trials.motion import Motion, join_short, trial_sizes
 from bampipe.trials.residuals import ModelOnTrial, problem_of
 from bampipe.trials.scale import log_scale, slopes_by_force
 
@@ -36,7 +36,7 @@ class Evidence:
 
     Attributes:
         p: parameters at which it is linearised, (n_p,).
-        fitted: the model with these parameters on each of the trials.
+        joined: the trials as one where they are short, see `join_short`; each else.
         folds: which trials were fitted, and which are left out together.
         residual: low-passed and thinned, by trial, each (K, n_q), N.m or N.
         jacobian: derivative of ``residual`` by the free parameters, by trial, (K, n_q, n_free);
@@ -47,9 +47,8 @@ class Evidence:
         lower, upper: bounds of their change, (n_free,).
         precision, known: what is known of their change beforehand, (n_free,); see
             `NormalEquations`.
-        by_timing: derivative of ``residual`` by the time by which inputs were sampled after
-            positions, by trial, (K, n_q), N.m/s or N/s; nothing where that is not open.
-        timing: least and largest change of that time, s.
+        timing: least and largest change of the time by which inputs were sampled after positions,
+            s; both zero where that is not open.
         factors: by which parameters multiply the measured force of each axis, (n_q,), as a torque
             constant does a current; nothing where none does.
     """
@@ -57,7 +56,7 @@ class Evidence:
     system: System
     p: Array
     motions: Sequence[Motion]
-    fitted: tuple[ModelOnTrial, ...]
+    joined: Sequence[Motion]
     band: Band
     folds: Folds
     residual: tuple[Array, ...]
@@ -68,22 +67,8 @@ class Evidence:
     upper: Array
     precision: Array
     known: Array
-    by_timing: tuple[Array, ...] = ()
     timing: tuple[float, float] = (0.0, 0.0)
     factors: tuple[float, ...] = ()
-
-    def subset(self, trials: Sequence[int]) -> Evidence:
-        """The same on some trials, given by number, linearised where it is."""
-        return replace(
-            self,
-            motions=[self.motions[k] for k in trials],
-            fitted=tuple(self.fitted[k] for k in trials),
-            folds=self.folds.subset(trials),
-            residual=tuple(self.residual[k] for k in trials),
-            jacobian=tuple(self.jacobian[k] for k in trials),
-            used=tuple(self.used[k] for k in trials),
-            by_timing=tuple(self.by_timing[k] for k in trials if self.by_timing),
-        )
 
     @property
     def slopes(self) -> list[Array]:
@@ -97,9 +82,44 @@ class Evidence:
         return [np.append(x, by[:, :, None], axis=2) for x, by in pairs]
 
     @cached_property
+    def fitted(self) -> tuple[ModelOnTrial, ...]:
+        """The model on each of the trials."""
+        return _on_each(self.system, self.p, self.motions)
+
+    @cached_property
+    def along(self) -> tuple[ModelOnTrial, ...]:
+        """The model along `joined`."""
+        return _on_each(self.system, self.p, self.joined)
+
+    def thin(self, of: Callable[[ModelOnTrial], Array]) -> list[Array]:
+        """What a function (T, n_q) of `along` gives, low-passed and thinned, by trial."""
+        rows = (x[part] for at in self.along for x in [of(at)] for part in at.motion.parts)
+        return self.band.thin_trials(rows, range(len(self.system.coordinates)))
+
+    @cached_property
+    def by_timing(self) -> tuple[Array, ...]:
+        """Derivative of `residual` by the time by which inputs were sampled late, N.m/s or N/s.
+
+        By trial, each (K, n_q); nothing where that is not open, or a delay has its place.
+        """
+        step = 0.25 * (self.timing[1] - self.timing[0])
+        if step == 0.0 or self.system.takes_timing:
+            return ()
+
+        def slope(base: ModelOnTrial) -> Array:
+            late, early = (
+                ModelOnTrial(self.system, self.p, [base.motion.with_input_timing(by)]).residual
+                for by in (step, -step)
+            )
+            return np.asarray((late - early) / (2.0 * step))
+
+        rows = zip(self.thin(slope), self.used, strict=True)
+        return tuple(values * moves for values, moves in rows)
+
+    @cached_property
     def slopes_by_force(self) -> tuple[Array, ...]:
-        """What `scale.slopes_by_force` returns of the model, by trial, each (K, n_q, n_forces)."""
-        each = slopes_by_force(self.system, self.motions, self.band, [self.p])
+        """What `scale.slopes_by_force` returns of `joined`, each (K, n_q, n_forces)."""
+        each = slopes_by_force(self.system, self.joined, self.band, [self.p])
         return tuple(slope[..., 0] for slope in each)
 
     @cached_property
@@ -109,7 +129,7 @@ class Evidence:
         See `scale.log_scale`, (n_q,) and (n_q, n), by the same parameters as `slopes`.
         """
         value, slopes = log_scale(
-            self.system, self.motions, self.band, self.used, self.p, self.free, self.slopes_by_force
+            self.system, self.joined, self.band, self.used, self.p, self.free, self.slopes_by_force
         )
         return value, np.pad(slopes, ((0, 0), (0, 1 if self.by_timing else 0)))
 
@@ -160,42 +180,33 @@ def gather_evidence(
     Raises:
         ValueError: fewer samples than parameters, where steps are to be taken.
     """
-    problem = problem_of(system, motions, band)
-    fitted = folds.fitted_trials
-    known = None
-    if like is not None and like.motions is motions and like.band == band:
-        known = _common_slopes(like, system, problem)
+    if like is not None and (like.motions is not motions or like.band != band):
+        like = None
+    joined = like.joined if like is not None else join_short(motions)
+    # To be linearised, all trials can be taken at once.
+    taken, fitted = (motions, folds.fitted_trials) if most_iterations else (joined, [0])
+    problem = problem_of(system, taken, band)
+    known = None if like is None else _common_slopes(like, system, problem)
     found = minimise(
         problem, np.append(start, 0.0), fitted, most_iterations, known=known, tolerance=_CONVERGED
     )
-    stacked = dict(zip(fitted, found.stacked, strict=True))
-    for trial in range(len(motions)):
-        if trial not in stacked:
-            stacked[trial] = stacked_residual(problem, trial, found.p, known)
-    value = found.p[problem.free]
-    order = range(len(motions))
-    measured = as_measured(problem, found.p, [stacked[k] for k in order])
-    fitted_trials = tuple(ModelOnTrial(system, found.p[:-1], motions, k) for k in order)
-    used = tuple(stacked[k].used for k in order)
+    by_trial = dict(zip(fitted, found.stacked, strict=True))
+    stacked = [
+        by_trial.get(k) or stacked_residual(problem, k, found.p, known) for k in range(len(taken))
+    ]
+    value, slopes = found.p[problem.free], as_measured(problem, found.p, stacked)
+    ends = np.cumsum([len(band.thinned_rows(n)) for n in trial_sizes(motions)])[:-1]
+
+    def split(values: Sequence[Any]) -> tuple[Any, ...]:
+        return tuple(values if len(values) == len(motions) else np.split(values[0], ends))
+
     return Evidence(
-        system,
-        found.p[:-1],
-        motions,
-        fitted_trials,
-        band,
-        folds,
-        tuple(stacked[k].residual for k in order),
-        tuple(s.slope for s in measured),
-        used,
-        tuple(int(i) for i in problem.free),
-        problem.lower - value,
-        problem.upper - value,
-        problem.precision,
-        problem.known - value,
-        _slopes_by_timing(fitted_trials, band, used, timing),
-        timing,
-        _factors(problem, found.p, len(system.coordinates)),
-    )
+        system, found.p[:-1], motions, joined, band, folds,
+        split([s.residual for s in stacked]), split([s.slope for s in slopes]),
+        split([s.used for s in stacked]), tuple(int(i) for i in problem.free),
+        problem.lower - value, problem.upper - value, problem.precision, problem.known - value,
+        timing, _factors(problem, found.p, len(system.coordinates)),
+    )  # fmt: skip
 
 
 def _factors(problem: Problem, p: Array, axes: int) -> tuple[float, ...]:
@@ -209,27 +220,8 @@ def _factors(problem: Problem, p: Array, axes: int) -> tuple[float, ...]:
     return tuple(found.tolist())
 
 
-def _slopes_by_timing(
-    fitted: Sequence[ModelOnTrial],
-    band: Band,
-    used: Sequence[Flags],
-    timing: tuple[float, float],
-) -> tuple[Array, ...]:
-    """`Evidence.by_timing`; nothing where the timing is not open, or a delay has its place."""
-    step = 0.25 * (timing[1] - timing[0])
-    system = fitted[0].system
-    if step == 0.0 or system.takes_timing:
-        return ()
-
-    def slope(base: ModelOnTrial) -> Array:
-        late, early = (
-            ModelOnTrial(system, base.p, [base.motion.with_input_timing(by)]).residual
-            for by in (step, -step)
-        )
-        return np.asarray((late - early) / (2.0 * step))
-
-    thin = band.thin_trials(map(slope, fitted), range(len(system.coordinates)))
-    return tuple(values * moves for values, moves in zip(thin, used, strict=True))
+def _on_each(system: System, p: Array, motions: Sequence[Motion]) -> tuple[ModelOnTrial, ...]:
+    return tuple(ModelOnTrial(system, p, motions, k) for k in range(len(motions)))
 
 
 def _common_slopes(like: Evidence, system: System, problem: Problem) -> KnownSlopes | None:
@@ -238,8 +230,8 @@ def _common_slopes(like: Evidence, system: System, problem: Problem) -> KnownSlo
     A slope that no parameter changes is that of the model without any effect. None are where other
     samples stand still for the one than for the other, as where a brake counts.
     """
-    still = (find_moving_samples(s, problem.band) for s in problem.standstill)
-    if not all(np.array_equal(a, b) for a, b in zip(still, like.used, strict=True)):
+    brakes = {*system.model.device.brakes.values()}
+    if brakes & {*system.inputs} != brakes & {*like.system.inputs}:
         return None
     held = {like.system.parameters[i].name: k for k, i in enumerate(like.free)}
     constant = like.system.constant
@@ -252,7 +244,8 @@ def _common_slopes(like: Evidence, system: System, problem: Problem) -> KnownSlo
     places = np.flatnonzero(holds)
     taken = [source[k] for k in places]
     slopes = []
-    for jacobian in like.jacobian:
+    joined = problem.n_trials < len(like.jacobian)
+    for jacobian in [np.concatenate(like.jacobian)] if joined else like.jacobian:
         columns = np.zeros((*jacobian.shape[:2], problem.free.size))
         columns[:, :, places] = jacobian[:, :, taken]
         slopes.append(columns)

@@ -199,8 +199,8 @@ class Likelihood:
         """
         e = evidence
         axes = range(len(samples))
-        applied = e.band.thin_trials((fitted.applied for fitted in e.fitted), axes)
-        bare = bare_slopes(e.system, e.motions, e.band, e.p)
+        applied = e.thin(lambda at: at.applied)
+        bare = bare_slopes(e.system, e.joined, e.band, e.p)
         total = [a + b for a, b in zip(bare, e.slopes_by_force, strict=True)]
         turning = [np.zeros_like(r) for r in e.residual]
         if bias_error:
@@ -499,13 +499,13 @@ def dry_friction(evidence: Evidence) -> Iterator[Array]:
     Half the difference between moving slowly one way and the other, brakes included.
     """
     slow = _SLOW * evidence.system.sign_widths
-    for at in evidence.fitted:
+    for at in evidence.along:
         q, qd, qdd = at.mechanism.kinematics
         back, on = (
             at.system.residual(q, side * slow + np.zeros_like(qd), qdd, at.memory, at.inputs, at.p)
             for side in (-1.0, 1.0)
         )
-        yield np.asarray(0.5 * (back - on))
+        yield from (0.5 * (back - on)[part] for part in at.motion.parts)
 
 
 def _places(evidence: Evidence, item: BoundEffect, *, strengths: bool) -> list[int]:

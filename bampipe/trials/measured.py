@@ -71,6 +71,13 @@ class MeasuredTrials:
         moved = tuple(m.with_input_timing(late_s - self.late_s) for m in self.motions)
         return replace(self, motions=moved, late_s=late_s)
 
+    def subset(self, chosen: Sequence[int]) -> MeasuredTrials:
+        """The same with some of the trials, given by number."""
+        if len(chosen) == len(self.motions):
+            return self
+        motions = [self.motions[k] for k in chosen]
+        return replace(self, motions=motions, folds=self.folds.subset(chosen))
+
     @property
     def weighed(self) -> list[Motion]:
         """All by which effects are weighed: those with brakes on, too, but none held out."""

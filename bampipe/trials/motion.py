@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import takewhile
-from typing import Protocol
+from itertools import product, takewhile
+from typing import Any, Protocol
 
 import numpy as np
 
-from bampipe.arrays import Array, Flags
+from bampipe.arrays import Array, Flags, Indices
+from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.trials.cache import TrialCache
@@ -17,8 +18,8 @@ from bampipe.trials.cache import TrialCache
 TIMING_ORDERS = 3
 """Time derivatives by which inputs are moved in time: half a sample, at the highest frequency of a
 residual, to 0.7 %. By the first alone it is 20 %, which looks like a lag."""
-
-
+_MOST_JOINED = 100_000
+"""Samples, of all axes, up to which the trials of a session are gone through at once."""
 SAMPLED = ("t", "q", "qd", "qdd", "qd_sd")
 """Fields of a motion with one row a sample."""
 
@@ -57,6 +58,7 @@ class Motion:
         left_out: (T, n_q) samples that count no more than those at rest: of a replay, what its
             trial leaves out; of a trial, its disturbances. None where there are none.
         filters: that q, qd and qdd went through; None where they are no readings of encoders.
+        parts: rows of each trial, where several have been joined.
     """
 
     trial_id: str
@@ -68,7 +70,9 @@ class Motion:
     channels: Mapping[str, Array]
     left_out: Flags | None = None
     filters: EncoderFilters | None = None
-    _columns: dict[tuple[str, ...], Array] = field(default_factory=dict, repr=False, compare=False)
+    parts: Sequence[slice] = (slice(None),)
+    _states: dict[Any, Array] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _kept: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def inputs(self, names: Sequence[str]) -> Array:
         """The channels called ``names`` as columns, (T, len(names)); do not write to them.
@@ -77,15 +81,25 @@ class Motion:
             KeyError: there is no such channel.
         """
         key = tuple(names)
-        if key not in self._columns:
+        if key not in self._kept:
             columns = [self.t if name == "t" else self.channels[name] for name in key]
-            self._columns[key] = np.column_stack(columns) if key else np.empty((self.t.size, 0))
-        return self._columns[key]
+            self._kept[key] = np.column_stack(columns) if key else np.empty((self.t.size, 0))
+        return np.asarray(self._kept[key])
 
     @property
     def kinematics(self) -> tuple[Array, Array, Array]:
         """Positions, rates and accelerations, each (T, n_q)."""
         return self.q, self.qd, self.qdd
+
+    def thinned_rows(self, band: Band) -> Indices:
+        """Indices of the samples that the thinning of a low-pass keeps."""
+        kept = ((part.start or 0) + band.thinned_rows(len(self.t[part])) for part in self.parts)
+        return np.concatenate([*kept])
+
+    def memory(self, system: System, p: Array) -> Array:
+        """Internal states of a model with parameters ``p``, (n_p,), along this motion, (T, n_z)."""
+        u = self.inputs(system.inputs)
+        return system.memory(*self.kinematics, u, p, self.t, self.parts, self._states)
 
     def of_mechanism(self, system: System, u: Array, p: Array) -> Motion:
         """The motion of the mechanism, which is `System.offset` from what its encoders read.
@@ -97,15 +111,15 @@ class Motion:
             return self
         offset = system.offset(self.q, u, p)
         moved = [values.copy() for values in self.kinematics]
-        for axis in np.flatnonzero(offset.any(axis=0)):
-            added = offset[:, axis]
+        for axis, part in product(np.flatnonzero(offset.any(axis=0)), self.parts):
+            added, t = offset[part, axis], self.t[part]
             if self.filters is None:
-                rate = np.gradient(added, self.t)
-                parts = added, rate, np.gradient(rate, self.t)
+                rate = np.gradient(added, t)
+                orders = added, rate, np.gradient(rate, t)
             else:
-                parts = self.filters.derivatives_of(int(axis), added)
-            for total, part in zip(moved, parts, strict=True):
-                total[:, axis] += part
+                orders = self.filters.derivatives_of(int(axis), added)
+            for total, order in zip(moved, orders, strict=True):
+                total[part, axis] += order
         return replace(self, q=moved[0], qd=moved[1], qdd=moved[2])
 
     def rows(self, which: slice) -> Motion:
@@ -115,12 +129,33 @@ class Motion:
             **{name: getattr(self, name)[which] for name in SAMPLED},
             channels={name: values[which] for name, values in self.channels.items()},
             left_out=None if self.left_out is None else self.left_out[which],
-            _columns={},
+            parts=(slice(None),),
         )
+
+    def split(self) -> list[Motion]:
+        """Each of the trials that have been joined."""
+        return [self.rows(part) for part in self.parts] if len(self.parts) > 1 else [self]
 
     def with_channels(self, changed: Mapping[str, Array]) -> Motion:
         """The same motion with some channels replaced."""
-        return replace(self, channels={**self.channels, **changed}, _columns={})
+        return self._tell(replace(self, channels={**self.channels, **changed}), changed)
+
+    def _tell(self, other: Motion, changed: Collection[str]) -> Motion:
+        """Tell a motion of which some channels have changed the states that take none of them."""
+        alike = {key: z for key, z in self._states.items() if not {*changed} & {*key[1]}}
+        other._states.update(alike)
+        return other
+
+    def with_more(self, force: str) -> tuple[Motion, Array]:
+        """The same motion with a little more of a force all the time, and how much, (T,)."""
+        if force not in self._kept:
+            values = self.channels[force]
+            step = np.empty_like(values)
+            for part in self.parts:
+                step[part] = 1e-6 * max(float(np.abs(values[part]).max()), 1e-6)
+            self._kept[force] = self.with_channels({force: values + step}), step
+        more, step = self._kept[force]
+        return self._tell(more, (force,)), step
 
     def with_input_timing(self, late_s: float) -> Motion:
         """The same motion with inputs that were sampled ``late_s`` after the positions moved back.
@@ -140,6 +175,20 @@ class Motion:
                     total += factor * self.channels[term]
                 moved[order] = total
         return self.with_channels(moved)
+
+
+def join_short(motions: Sequence[Motion]) -> Sequence[Motion]:
+    """All trials as one where they are short: a call costs as much as thousands of samples."""
+    sizes = trial_sizes(motions)
+    if len(motions) == 1 or sum(sizes) * motions[0].q.shape[1] > _MOST_JOINED:
+        return motions
+    names = set[str].intersection(*({*m.channels} for m in motions))
+    out = [m.left_out if m.left_out is not None else np.zeros(m.q.shape, bool) for m in motions]
+    sampled: dict[str, Any] = {n: np.concatenate([getattr(m, n) for m in motions]) for n in SAMPLED}
+    channels = {name: np.concatenate([m.channels[name] for m in motions]) for name in names}
+    parts = [slice(end - size, end) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
+    whole = replace(motions[0], trial_id="", **sampled, channels=channels, parts=parts)
+    return [replace(whole, left_out=np.concatenate(out))]
 
 
 def input_derivatives(name: str) -> tuple[str, ...]:

@@ -315,7 +315,7 @@ def _moved_on(motion: Motion, forces: Sequence[str], samples: float) -> Motion:
         np.column_stack([_shifted(column, samples) for column in values.T])
         for values in motion.kinematics
     )
-    return replace(motion, q=q, qd=qd, qdd=qdd, channels=channels, _columns={})
+    return replace(motion, q=q, qd=qd, qdd=qdd, channels=channels)
 
 
 def read_by_sensors(
@@ -393,7 +393,7 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
     try:
         for count, motion in enumerate(motions, start=1):
             with temporary_space():
-                stored = pickle.dumps(replace(motion, _columns={}), pickle.HIGHEST_PROTOCOL)
+                stored = pickle.dumps(replace(motion), pickle.HIGHEST_PROTOCOL)
                 (folder / str(count - 1)).write_bytes(stored)
     except BaseException:
         shutil.rmtree(folder)

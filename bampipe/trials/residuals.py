@@ -5,10 +5,9 @@ standstill and invents delays; so the residual as a whole, the sign of the veloc
 goes through one low-pass before anything is fitted, and is thinned to what that leaves independent.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Generic, TypeVar
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -21,8 +20,6 @@ from bampipe.estimate.standstill import find_standstill, find_turns
 from bampipe.physics import System
 from bampipe.trials.cache import TrialCache
 from bampipe.trials.motion import Motion
-
-Found = TypeVar("Found")
 
 
 def problem_of(
@@ -45,44 +42,40 @@ def problem_of(
         turning: whether samples count in which an axis turns round.
     """
     n = len(system.parameters)
-    # Of differences by many parameters few change some internal states or the bodies' forces.
-    by_offset = [*system.moved_by, n] if system.moves_sensors else []
-    states = [
-        _Remembered[Array]([*group.parameters, *by_offset, n]) for group in system.state_groups
-    ]
-    bodies = _Remembered[Array]([*system.of_bodies, *by_offset])
-    moved = _Remembered[tuple[Array, Array, Array]](by_offset)
+    by_offset, by_body = list(system.moved_by), list(system.of_bodies)
 
-    def mechanism(trial: int, motion: Motion, u: Array, p: Array) -> tuple[Array, Array, Array]:
-        return moved.find(trial, p, lambda: motion.of_mechanism(system, u, p[:n]).kinematics)
+    # Of differences by many parameters few change how the mechanism moves or the bodies' forces.
+    @lru_cache(maxsize=2)
+    def move(trial: int, late_s: float, offset: tuple[float, ...]) -> Motion:
+        motion, p = motions[trial].with_input_timing(late_s), system.prior
+        p[by_offset] = offset
+        return motion.of_mechanism(system, motion.inputs(system.inputs), p)
 
-    def inputs_at(motion: Motion, p: Array) -> Array:
-        return motion.with_input_timing(float(p[n])).inputs(system.inputs)
+    @lru_cache(maxsize=2)
+    def bodies(trial: int, late_s: float, offset: tuple[float, ...], *own: float) -> Array:
+        p = system.prior
+        p[by_body] = own
+        return system.body_forces(*move(trial, late_s, offset).kinematics, p)
 
     def left_out(trial: int) -> Flags:
-        still = standstill_of(motions[trial], system, band.rate_hz)
-        return still if turning else still | find_turns(motions[trial].qd, band.rate_hz)
+        each, rate = motions[trial].split(), band.rate_hz
+        still = np.concatenate([standstill_of(m, system, rate) for m in each])
+        return still if turning else still | np.concatenate([find_turns(m.qd, rate) for m in each])
 
     def residual(trial: int, p: Array) -> Array:
-        motion = motions[trial]
-        u = inputs_at(motion, p)
-        true = mechanism(trial, motion, u, p)
-        z = np.empty((len(motion.t), len(system.memory_names)))
-        for group, known in zip(system.state_groups, states, strict=True):
-            follow = partial(system.memory_of, group, *true, u, p[:n], motion.t)
-            z[:, group.places] = known.find(trial, p, follow)
-        forces = bodies.find(trial, p, lambda: system.body_forces(*true, p[:n]))
-        return system.residual(*true, z, u, p[:n], forces)
+        place = trial, float(p[n]), tuple(p[by_offset])
+        motion, forces = move(*place), bodies(*place, *p[by_body])
+        at, u, z = motion.kinematics, motion.inputs(system.inputs), motion.memory(system, p[:n])
+        return system.residual(*at, z, u, p[:n], forces)
 
     def slopes(trial: int, p: Array, wanted: Sequence[int]) -> tuple[list[int], Array]:
         numbers = [free[k] for k in wanted]
         given = [k for k, i in enumerate(numbers) if i in system.lasting]
-        motion = motions[trial]
         if not given:
-            return given, np.empty((len(motion.q), len(system.coordinates), 0))
-        u = inputs_at(motion, p)
-        true = mechanism(trial, motion, u, p)
-        return given, system.slopes([numbers[k] for k in given], *true, u)
+            return given, np.empty((len(motions[trial].q), len(system.coordinates), 0))
+        motion = move(trial, float(p[n]), tuple(p[by_offset]))
+        u = motion.inputs(system.inputs)
+        return given, system.slopes([numbers[k] for k in given], *motion.kinematics, u)
 
     parameters = system.parameters
     free = [i for i, item in enumerate(parameters) if not item.fixed and item.name not in held]
@@ -127,6 +120,7 @@ def problem_of(
         known=np.array(known),
         slopes=slopes,
         multiplied=multiplied,
+        parts=lambda trial: motions[trial].parts,
     )
 
 
@@ -170,23 +164,6 @@ def _multiplied(system: System, free: Sequence[int]) -> Indices | None:
         if len(moved) == 1:
             found[k] = axes[int(moved[0])]
     return found if np.any(found >= 0) else None
-
-
-class _Remembered(Generic[Found]):
-    """The last values of a function of a trial and of the parameters numbered ``uses``."""
-
-    def __init__(self, uses: Iterable[int]) -> None:
-        self.uses = list(uses)
-        self._known: dict[tuple[int, bytes], Found] = {}
-
-    def find(self, trial: int, p: Array, compute: Callable[[], Found]) -> Found:
-        """The value for parameters ``p``, (n_p,), computed where it is not known."""
-        key = trial, p[self.uses].tobytes()
-        if key not in self._known:
-            if any(other != trial for other, _ in self._known) or len(self._known) > 1:
-                self._known.clear()
-            self._known[key] = compute()
-        return self._known[key]
 
 
 def standstill_of(motion: Motion, system: System, rate_hz: float) -> Flags:
@@ -250,20 +227,16 @@ class ModelOnTrial:
     @property
     def mechanism(self) -> Motion:
         """The trial as the mechanism moved, by the model."""
-        if not self.system.moves_sensors:
-            return self.motion
-        q, qd, qdd = self._moved
-        return replace(self.motion, q=q, qd=qd, qdd=qdd)
+        return self._moved if self.system.moves_sensors else self.motion
 
     @cached_property
-    def _moved(self) -> tuple[Array, Array, Array]:
-        return self.motion.of_mechanism(self.system, self.inputs, self.p).kinematics
+    def _moved(self) -> Motion:
+        return self.motion.of_mechanism(self.system, self.inputs, self.p)
 
     @cached_property
     def memory(self) -> Array:
         """Internal states, (T, n_z)."""
-        at = self.mechanism
-        return self.system.memory(*at.kinematics, self.inputs, self.p, at.t)
+        return self.mechanism.memory(self.system, self.p)
 
     @cached_property
     def residual(self) -> Array:

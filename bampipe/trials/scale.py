@@ -34,7 +34,7 @@ def bare_slopes(
     return tuple(
         system.input_map(m.q[kept], m.inputs(system.inputs)[kept], p)
         for m in motions
-        for kept in [band.thinned_rows(len(m.t))]
+        for kept in [m.thinned_rows(band)]
     )
 
 
@@ -48,26 +48,27 @@ def slopes_by_force(
     (K, n_q, n_forces, m), at the thinned samples.
     """
     shape = len(system.coordinates), len(system.model.device.forces), len(probes)
-    kept = [band.thinned_rows(len(m.t)) for m in motions]
+    kept = [m.thinned_rows(band) for m in motions]
     if not (system.driven or system.force_fed):
         return tuple(np.zeros((len(rows), *shape)) for rows in kept)
     return tuple(_slopes(system, m, rows, probes) for m, rows in zip(motions, kept, strict=True))
 
 
 def _slopes(system: System, motion: Motion, kept: Indices, probes: Sequence[Array]) -> Array:
-    u, forces, p = motion.inputs(system.inputs), system.model.device.forces, probes[0]
-    motion = motion.of_mechanism(system, u, p)
-    at = motion.q[kept], motion.qd[kept], motion.qdd[kept]
-    z = system.memory(*motion.kinematics, u, p, motion.t)
-    here, slopes = [system.contribution(*at, z[kept], u[kept], p) for p in probes], []
-    for force in forces:
-        more, column = u.copy(), system.inputs.index(force)
-        step = 1e-6 * max(float(np.abs(more[:, column]).max()), 1e-6)
-        more[:, column] += step
-        if system.force_fed:
-            z = system.memory(*motion.kinematics, more, p, motion.t)
-        changed = [system.contribution(*at, z[kept], more[kept], p) for p in probes]
-        slopes.append([(new - old) / step for new, old in zip(changed, here, strict=True)])
+    p, slopes = probes[0], []
+    motion = motion.of_mechanism(system, motion.inputs(system.inputs), p)
+
+    def added(motion: Motion, z: Array) -> Array:
+        at = motion.q[kept], motion.qd[kept], motion.qdd[kept]
+        u = motion.inputs(system.inputs)[kept]
+        return np.array([system.contribution(*at, z[kept], u, p) for p in probes])
+
+    z = motion.memory(system, p)
+    here = added(motion, z)
+    for force in system.model.device.forces:
+        more, step = motion.with_more(force)
+        changed = added(more, more.memory(system, p) if system.force_fed else z)
+        slopes.append((changed - here) / step[kept, None])
     return np.moveaxis(np.array(slopes), (0, 1), (2, 3))
 
 
@@ -102,12 +103,13 @@ def log_scale(
     nothing = np.zeros(len(system.coordinates)), np.zeros((len(system.coordinates), len(free)))
     if not system.parameters_by_force:
         return nothing
-    bare = bare_slopes(system, motions, band, p)
+    bare = np.concatenate(bare_slopes(system, motions, band, p))
+    ends = np.cumsum([len(moves) for moves in used])[:-1]
 
     def mean_log(added: Sequence[Array]) -> Array | None:
         if all((np.abs(slope) <= NO_SLOPE).all() for slope in added):
             return None
-        logs = [log_of_share(a, b) for a, b in zip(bare, added, strict=True)]
+        logs = np.split(log_of_share(bare, np.concatenate(added)), ends)
         total = sum(np.sum(x * moves, axis=0) for x, moves in zip(logs, used, strict=True))
         return np.asarray(total / np.maximum(sum(moves.sum(axis=0) for moves in used), 1))
 

@@ -162,7 +162,6 @@ class Change:
             qdd=orders[2][:, :n],
             qd_sd=np.sqrt(sd**2 @ (self.gain[:n] ** 2).T) / self.time,
             channels={**motion.channels, **channels},
-            _columns={},
         )
 
     def of_band(self, band: Band) -> Band:
