@@ -1,6 +1,7 @@
 """Columns of candidates: what each adds to the residual, over a grid of its shapes, made once."""
 
 import itertools
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -83,7 +84,8 @@ class Dictionary:
         ]
         states = self.candidates[name].system.model.effects[-1].effect.states
         most = _MOST_OF_STATES if len(ranges) > 3 else _MOST_OF_THREE
-        while np.prod(counts) > (most if states else _MOST):
+        most = max(most if states else _MOST, math.prod(r.least for r in ranges))
+        while np.prod(counts) > most:
             dense = [(n - 1) / r.extent for n, r in zip(counts, ranges, strict=True)]
             counts[int(np.argmax(dense))] -= 1
         # Few values are better off amid the parts of a range than at its ends.

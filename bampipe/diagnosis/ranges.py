@@ -29,6 +29,12 @@ _GIVE = (1e-4, 0.1)
 samples where friction changes its sign."""
 _LOSS = (1e-2, 3.0)
 """Of the load, at the highest load."""
+_GAP = (5e-4, 0.1)
+"""Of the travel: play that matters and that is not another machine."""
+_DRIVE = (0.05, 0.5)
+"""Of the inertia of an axis: what of it is a drive."""
+_GAPS, _DRIVES = 28, 8
+"""Values of these that are tried: of a gap a fifth wider the impact comes too late to fit."""
 _LIGHTEST = 6.0
 """Inertia of an axis over that of the lightest part of it that matters."""
 _TIME = (2.0, 3.0)
@@ -55,6 +61,7 @@ class SearchRange:
         around: middle of the travel for a position outside of it. Then ``low`` and ``high`` are
             reciprocals of its distance from there, through 0 from one side to the other.
         farthest: the farthest such distance.
+        least: of a grid, the fewest values.
         apart: values may be no farther apart where they are tried one by one, in the unit; such a
             range is even.
     """
@@ -65,11 +72,12 @@ class SearchRange:
     around: float | None = None
     farthest: float = np.inf
     apart: float = np.inf
+    least: int = 1
 
     @property
     def fewest(self) -> int:
         """Values of a grid that lie near enough."""
-        return 1 + int(np.ceil((self.high - self.low) / self.apart))
+        return max(self.least, 1 + int(np.ceil((self.high - self.low) / self.apart)))
 
     @property
     def extent(self) -> float:
@@ -178,7 +186,8 @@ class MachineScale:
             i = list(self.coordinates).index(item.axes[0])
             travel = max(float(self.highest[i] - self.lowest[i]), 1e-300)
             return SearchRange(low, high, True, apart=2.0 * np.pi * _WAVES_APART / travel)
-        return SearchRange(low, high, True)
+        least = 1 if item.effect.ahead is None else _GAPS if parameter.strength else _DRIVES
+        return SearchRange(low, high, True, least=least)
 
     def _sizes(self, item: BoundEffect, parameter: Parameter) -> dict[str, tuple[float, float]]:
         """Ranges of lengths, speeds and the like at the target of an effect, by unit."""
@@ -199,8 +208,11 @@ class MachineScale:
         lightness = 1.0 / max(float(self.inertia[i]), 1e-300)
         highest = 2.0 * np.pi * _RESONANCE * self.band_hz[i]
         per_force = force.replace(".", "/")
+        length = _GAP if item.effect.ahead else _TRAVEL
+        inertia = float(self.inertia[i])
         return found | {
-            unit: (_TRAVEL[0] * travel, _TRAVEL[1] * travel),
+            unit: (length[0] * travel, length[1] * travel),
+            "kg.m2" if unit == "rad" else "kg": (_DRIVE[0] * inertia, _DRIVE[1] * inertia),
             "1/s": (0.0, highest),
             f"{unit}/s": (_SPEED[0] * speed, _SPEED[1] * speed),
             f"1/{unit}": (2 * np.pi * _WAVES[0] / travel, 2 * np.pi * _WAVES[1] / travel),

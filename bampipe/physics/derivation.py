@@ -15,6 +15,7 @@ import sympy as sp
 
 from bampipe.errors import InputError
 from bampipe.physics.device import LAST_ORDER, derivative
+from bampipe.physics.effect import Ahead, BoundEffect
 from bampipe.physics.equations import Dependence, Equations
 from bampipe.physics.lagrange import allow, check_inertia, lagrange
 from bampipe.physics.model import Model
@@ -32,7 +33,7 @@ from bampipe.physics.robot import gravity_vector
 from bampipe.physics.roles import find_compensation, find_delays
 from bampipe.physics.signals import ActingInputs, order_of_action
 from bampipe.physics.time_limit import OutOfTime, time_limit
-from bampipe.physics.vocabulary import Vocabulary, constant_symbol
+from bampipe.physics.vocabulary import Symbols, Vocabulary, constant_symbol
 
 LONGEST_S = 60.0
 """Processor time that a derivation may take: the BAM takes 1 s, a planar arm with four links 23 s.
@@ -66,8 +67,8 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
 def _assemble_equations(d: Vocabulary) -> Equations:
     forces = _map_inputs(d)
     terms = _collect_terms(d, forces)
+    motion = _shift_inertia(d, _combine_motion(d, terms.energies), terms)
     _check_dependence(d, forces, terms)
-    motion = _combine_motion(d, terms.energies)
     offset_rate = [d.ddt(e) if e != 0 else e for e in terms.offset]
     rates, initial = ([entry[k] for entry in terms.states.values()] for k in (0, 1))
     parts = [*forces.noisy, *terms.other, *rates, *initial, *terms.offset, *offset_rate]
@@ -184,9 +185,16 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
         if effect.uses_weight:
             d.weight = [sp.diff(sum(e.potential for e in energies), q) for q in d.q]
             d.pull = [w - t for w, t in zip(d.weight, pull, strict=True)]
+        if effect.uses_inertia:
+            known, torque = _apply_lagrange(d, energies), d.table(device.torque, "torque")
+            d.inertia = [row[i] for i, row in enumerate(known.mass)]
+            d.bias = [h - t for h, t in zip(known.bias, torque, strict=True)]
         symbols = d.effect_symbols(
             item, prompt_force if by_axis is offset else delivered_force, forces.side
         )
+        if effect.ahead is not None:
+            for i, added in enumerate(_move_bias(d, item, effect.ahead, symbols)):
+                other[i] += added
         for key, tree in effect.expressions.items():
             value, place = d.rebuild_for(item, tree, symbols, key), item.target_of(key)
             label = f"effect {item.name!r}: {key}"
@@ -211,6 +219,17 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
             states[z] = signals.put_in(rate), signals.put_in_initial(initial)
     other = [signals.put_in(e) for e in other]
     return _Terms(energies, other, offset, {z: states[z] for z in d.z.values()})
+
+
+def _move_bias(d: Vocabulary, item: BoundEffect, ahead: Ahead, symbols: Symbols) -> list[Any]:
+    """Put the bias where the mechanism is, ahead of an encoder; return what that adds, by axis."""
+    i = d.axes.index(item.target)
+    position = d.rebuild_for(item, ahead.position, symbols, "ahead.position")
+    rate = d.rebuild_for(item, ahead.rate, symbols, "ahead.rate")
+    true = {d.q[i]: d.q[i] + position, d.qd[i]: d.qd[i] + rate}
+    moved = [h.subs(true, simultaneous=True) for h in d.bias]
+    symbols["axis_bias"] = moved[i]
+    return [h - m for h, m in zip(d.bias, moved, strict=True)]
 
 
 def _find_prompt_forces(d: Vocabulary, forces: _Forces) -> list[Any]:
@@ -302,6 +321,20 @@ def _combine_motion(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
         _add(energy_motion.bias, bodies.bias), _add(energy_motion.dynamics, bodies.dynamics),
         energy_motion.kinetic + bodies.kinetic, energy_motion.potential + bodies.potential,
     )  # fmt: skip
+
+
+def _shift_inertia(d: Vocabulary, motion: _Motion, terms: _Terms) -> _Motion:
+    """Move what is a torque by the acceleration of its own axis to the mass matrix."""
+    mass, dynamics = [list(row) for row in motion.mass], list(motion.dynamics)
+    for i, acceleration in enumerate(d.qdd):
+        slope = sp.diff(terms.other[i], acceleration)
+        if slope != 0:
+            allowed = [*d.q, *d.p.values(), *_constants(d)]
+            allow("what a torque has per acceleration", [slope], allowed, "positions and parameters")
+            terms.other[i] = terms.other[i].subs(acceleration, 0)
+            mass[i][i] -= slope
+            dynamics[i] -= slope * acceleration
+    return motion._replace(mass=mass, dynamics=dynamics)
 
 
 def _add(one: Sequence[Any], other: Sequence[Any]) -> list[Any]:

@@ -86,6 +86,13 @@ class State(NamedDeclaration):
     description: str = Field(default="", description="What it is, in a few words")
 
 
+class Ahead(Declaration):
+    """Where the mechanism is that hand and gravity act on, beside what the encoder says."""
+
+    position: Expression = Field(description="How far it is ahead of the encoder")
+    rate: Expression = Field(description="How much faster it moves")
+
+
 class Effect(DeclaredFile):
     """An effect: one physical term that a model may have; `bind` places it on a device."""
 
@@ -159,6 +166,12 @@ class Effect(DeclaredFile):
         default=(), description="Internal states, by name, where it has memory"
     )
 
+    ahead: Ahead | None = Field(
+        default=None,
+        description="Of a torque on an axis: where the mechanism behind its encoder is, for gravity,"
+        " Coriolis and centrifugal forces on every axis",
+    )
+
     @cached_property
     def expressions(self) -> Mapping[str, ast.expr]:
         """Its expressions: ``torque``, or ``torque.<place>`` where there is one a place."""
@@ -212,6 +225,8 @@ class Effect(DeclaredFile):
                 yield InputError(f"{key!r} must be {form}")
             elif self.scope == "axis_pair" and placed and value and not set(value) <= set(PAIR):
                 yield InputError(f"the places of {key!r} are {' and '.join(PAIR)}")
+        if self.ahead and (self.kind, self.scope) != ("torque", "axis"):
+            yield InputError("'ahead' has a meaning for a torque on an axis only")
         if self.link and self.kind == "energy":
             yield InputError("'link' has no meaning for kind 'energy'")
         if not self.expressions:
@@ -265,6 +280,7 @@ class Effect(DeclaredFile):
         """Every name that its expressions use."""
         trees = [*self.expressions.values()]
         trees += [tree for state in self.states for tree in (state.rate, state.initial)]
+        trees += [self.ahead.position, self.ahead.rate] if self.ahead else []
         return set().union(*map(expression.names, trees))
 
     @property
@@ -276,6 +292,11 @@ class Effect(DeclaredFile):
     def uses_weight(self) -> bool:
         """Whether it acts on the slope of the potential energy."""
         return bool(self.terms & {"weight", "pull"})
+
+    @property
+    def uses_inertia(self) -> bool:
+        """Whether it acts on what the energies require of its axis."""
+        return self.ahead is not None or bool(self.names & {"axis_inertia", "axis_bias"})
 
     @property
     def uses_pull(self) -> bool:

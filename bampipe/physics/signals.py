@@ -19,12 +19,13 @@ def order_of_action(effects: Iterable[BoundEffect]) -> list[BoundEffect]:
     """Effects in the order in which they act, whatever the order in which they were added.
 
     Link by link, then what acts on the mechanism itself, last what acts on all dry friction or on
-    all weights; among those alike, names decide.
+    all weights or inertia; among those alike, names decide.
     """
 
     def order_key(item: BoundEffect) -> tuple[int, bool, str]:
         link = item.effect.acting_link
-        last = "dry" in item.effect.names or item.effect.uses_weight
+        effect = item.effect
+        last = "dry" in effect.names or effect.uses_weight or effect.uses_inertia
         return (_ORDER[link] if link else len(_ORDER), last, item.name)
 
     return sorted(effects, key=order_key)

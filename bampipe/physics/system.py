@@ -107,6 +107,8 @@ class System:
         """Numbers of the parameters of effects that alone change how a measured force acts."""
         names, found = [q.name for q in self.parameters], set[int]()
         for item in self.model.effects if self.driven or self.force_fed else ():
+            if item.effect.ahead is not None:
+                continue
             alone = compile_model(Model(self.model.device, (item.name,), (item.effect,)))
             if alone.driven or alone.force_fed:
                 found |= {names.index(q.name) for q in item.parameters}

@@ -292,7 +292,8 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Findings) -> dict
         symbols[f"viscous_{axis}"] = torque * second / unit
         if axis == item.target and item.effect.scope == "axis":
             symbols |= {"q": unit, "qd": unit / second, "brake": torque, "side_load": None}
-            symbols |= dict.fromkeys((*terms, "dry"), torque)
+            symbols |= dict.fromkeys((*terms, "dry", "axis_bias"), torque)
+            symbols |= {"qdd": unit / second**2, "axis_inertia": torque * second**2 / unit}
             symbols["viscous"] = torque * second / unit
             if axis in device.side_load:
                 side = device.side_load[axis]
@@ -341,6 +342,10 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
     }
     for key, tree in effect.expressions.items():
         check.expression(tree, symbols, key, wanted[key.partition(".")[0]](item.target_of(key)))
+    if effect.ahead is not None:
+        at, second = symbols.get("q"), _UNITS["s"]
+        check.expression(effect.ahead.position, symbols, "ahead.position", at)
+        check.expression(effect.ahead.rate, symbols, "ahead.rate", at and at / second)
     for state in effect.states:
         own = symbols[state.name]
         rate = None if own is None else own / _UNITS["s"]

@@ -34,6 +34,9 @@ class Vocabulary:
             put together, before the first effect that uses it.
         weight: by coordinate, slope of the potential energy; filled like `dry`.
         pull: by coordinate, the same less the torque of springs and the like; filled like `dry`.
+        inertia: by coordinate, its entry on the diagonal of the mass matrix; filled like `dry`.
+        bias: by coordinate, what of the energies does not depend on acceleration, less the device's
+            own torques; filled like `dry`.
         base: what every expression of the device may use.
     """
 
@@ -57,7 +60,8 @@ class Vocabulary:
                 self.z[item.prefix, state.name] = symbol
         self.special = {"sgn": self.sgn, "ddt": self.ddt}
         self.sizes: dict[str, int] = {}
-        self.dry, self.weight, self.pull = ([sp.S.Zero] * len(self.axes) for _ in range(3))
+        zeros = [sp.S.Zero] * len(self.axes)
+        self.dry, self.weight, self.pull, self.inertia, self.bias = (zeros for _ in range(5))
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
         self.base |= {
@@ -174,7 +178,8 @@ class Vocabulary:
             symbols |= {"q": self.q[i], "qd": self.qd[i], "side_load": side[i]}
             own = ("applied", "load", "viscous", "coulomb", "weight", "pull")
             symbols |= {n: symbols[f"{n}_{a}"] for n in own}
-            symbols["dry"] = self.dry[i]
+            symbols |= {"dry": self.dry[i], "qdd": self.qdd[i]}
+            symbols |= {"axis_inertia": self.inertia[i], "axis_bias": self.bias[i]}
             symbols["brake"] = self.channel.get(device.brakes.get(a, ""), sp.S.Zero)
         elif item.effect.scope == "axis_pair":
             for letter, axis in zip(PAIR, item.axes, strict=True):

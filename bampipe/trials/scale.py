@@ -12,7 +12,7 @@ from scipy.signal import csd
 
 from bampipe.arrays import Array, Flags, Indices
 from bampipe.estimate.low_pass import Band
-from bampipe.physics import System
+from bampipe.physics import Model, System, compile_model
 from bampipe.trials.motion import Motion
 
 NO_SLOPE = 1e-3
@@ -47,6 +47,14 @@ def slopes_by_force(
     At parameters ``probes``, m times (n_p,), that give the same internal states; each
     (K, n_q, n_forces, m), at the thinned samples.
     """
+    model = system.model
+    passing = [e for e in model.effects if e.effect.ahead is None]
+    if len(passing) < len(model.effects):
+        # A contact hands on later what a gap holds back: as a delay, it takes nothing off.
+        names = [q.name for q in system.parameters]
+        known = [e.effect for e in passing]
+        system = compile_model(Model(model.device, [e.name for e in passing], known))
+        probes = [p[[names.index(q.name) for q in system.parameters]] for p in probes]
     shape = len(system.coordinates), len(system.model.device.forces), len(probes)
     kept = [m.thinned_rows(band) for m in motions]
     if not (system.driven or system.force_fed):
