@@ -29,12 +29,12 @@ _GIVE = (1e-4, 0.1)
 samples where friction changes its sign."""
 _LOSS = (1e-2, 3.0)
 """Of the load, at the highest load."""
-_GAP = (5e-4, 0.1)
+_GAP = (1e-3, 0.06)
 """Of the travel: play that matters and that is not another machine."""
 _DRIVE = (0.05, 0.5)
 """Of the inertia of an axis: what of it is a drive."""
-_GAPS, _DRIVES = 28, 8
-"""Values of these that are tried: of a gap a fifth wider the impact comes too late to fit."""
+_GAPS, _DRIVES = 15, 4
+"""Values of these that are tried: of a gap half as wide again the impact comes too late to fit."""
 _LIGHTEST = 6.0
 """Inertia of an axis over that of the lightest part of it that matters."""
 _TIME = (2.0, 3.0)
@@ -186,7 +186,8 @@ class MachineScale:
             i = list(self.coordinates).index(item.axes[0])
             travel = max(float(self.highest[i] - self.lowest[i]), 1e-300)
             return SearchRange(low, high, True, apart=2.0 * np.pi * _WAVES_APART / travel)
-        least = 1 if item.effect.ahead is None else _GAPS if parameter.strength else _DRIVES
+        is_length = item.axes and parameter.unit == self.coordinates[item.axes[0]][0]
+        least = 1 if item.effect.ahead is None else _GAPS if is_length else _DRIVES
         return SearchRange(low, high, True, least=least)
 
     def _sizes(self, item: BoundEffect, parameter: Parameter) -> dict[str, tuple[float, float]]:

@@ -332,9 +332,7 @@ def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
     for key, strength in zip(added(tuple(sorted(keys))), solution.strengths, strict=True):
         item = search.dictionary.candidates[key[0]]
         values = search.dictionary.values(key)
-        # What an impact that comes too late leaves out says nothing of the width of the gap.
-        is_contact = item.system.model.effects[-1].effect.ahead is not None
-        share = 1.0 if item.linear_indices or is_contact else float(strength[0])
+        share = 1.0 if item.linear_indices else float(strength[0])
         known |= {
             q.name: share * v if q.strength else v
             for i, v in zip(item.searched_indices, values, strict=True)

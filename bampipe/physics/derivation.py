@@ -229,7 +229,8 @@ def _move_bias(d: Vocabulary, item: BoundEffect, ahead: Ahead, symbols: Symbols)
     true = {d.q[i]: d.q[i] + position, d.qd[i]: d.qd[i] + rate}
     moved = [h.subs(true, simultaneous=True) for h in d.bias]
     symbols["axis_bias"] = moved[i]
-    return [h - m for h, m in zip(d.bias, moved, strict=True)]
+    share = d.rebuild_for(item, ahead.share, symbols, "ahead.share")
+    return [share * (h - m) for h, m in zip(d.bias, moved, strict=True)]
 
 
 def _find_prompt_forces(d: Vocabulary, forces: _Forces) -> list[Any]:

@@ -89,6 +89,7 @@ class State(NamedDeclaration):
 class Ahead(Declaration):
     """Where the mechanism is that hand and gravity act on, beside what the encoder says."""
 
+    share: Expression = Field(description="What part of it is there, 0 to 1")
     position: Expression = Field(description="How far it is ahead of the encoder")
     rate: Expression = Field(description="How much faster it moves")
 
@@ -280,7 +281,7 @@ class Effect(DeclaredFile):
         """Every name that its expressions use."""
         trees = [*self.expressions.values()]
         trees += [tree for state in self.states for tree in (state.rate, state.initial)]
-        trees += [self.ahead.position, self.ahead.rate] if self.ahead else []
+        trees += [self.ahead.share, self.ahead.position, self.ahead.rate] if self.ahead else []
         return set().union(*map(expression.names, trees))
 
     @property

@@ -344,6 +344,7 @@ def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
         check.expression(tree, symbols, key, wanted[key.partition(".")[0]](item.target_of(key)))
     if effect.ahead is not None:
         at, second = symbols.get("q"), _UNITS["s"]
+        check.expression(effect.ahead.share, symbols, "ahead.share", PURE)
         check.expression(effect.ahead.position, symbols, "ahead.position", at)
         check.expression(effect.ahead.rate, symbols, "ahead.rate", at and at / second)
     for state in effect.states:

@@ -81,10 +81,13 @@ def problem_of(
     free = [i for i, item in enumerate(parameters) if not item.fixed and item.name not in held]
     lower = [parameters[i].lower for i in free]
     upper = [parameters[i].upper for i in free]
+    # When an impact comes is far from linear in what decides it: a secant over a few per cent.
+    contact = {q.name for e in system.model.effects if e.effect.ahead for q in e.parameters}
     step = [
         1.0
         if system.linear[i]
-        else 1e-4 * max(abs(parameters[i].prior), parameters[i].sd, np.finfo(float).tiny)
+        else (3e-2 if parameters[i].name in contact else 1e-4)
+        * max(abs(parameters[i].prior), parameters[i].sd, np.finfo(float).tiny)
         for i in free
     ]
     known = [parameters[i].prior for i in free]

@@ -61,7 +61,6 @@ PAIRS = list(one_a_kind(once([
     *(p for p in pairs("bam", [("x", "xy")]) if "force" in p[1] and "force" in p[2]),
     ("bam", "base_tilt", "handle_payload"),
     ("bam", "encoder_scale:yaw", "transmission_compliance:yaw"),
-    ("bam", "backlash:yaw", "encoder_scale:yaw"),
 ])))  # fmt: skip
 
 

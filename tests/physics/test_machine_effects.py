@@ -220,23 +220,55 @@ def test_dry_friction_is_all_that_turns_with_the_motion():
     assert gone[1] - gone[0] == pytest.approx(40.0 + 1.5 * 200.0, rel=1e-6)
 
 
-def test_a_motor_load_taken_for_play_is_that_at_standstill():
+def test_a_motor_load_taken_for_wind_up_is_that_at_standstill():
     """Back EMF depends on the rate, of which an offset of the encoder must be free."""
-    system = compile_model(Model(registry.device("servo_pendulum"), ["backlash:joint"]))
+    effects = ["transmission_compliance:joint"]
+    system = compile_model(Model(registry.device("servo_pendulum"), effects))
     assert system.moves_sensors
+
+
+def test_behind_play_the_arm_moves_apart_from_the_drive_that_its_encoder_sees():
+    device = registry.device("bam")
+    system, bare = (compile_model(Model(device, e)) for e in (["backlash:pitch"], []))
+    own = {"share": 1.0, "gap": 0.02, "drive_inertia": 0.4, "frequency": 50.0, "damping": 0.8}
+    p = with_values(system, {f"backlash.pitch.{name}": value for name, value in own.items()})
+    n = len(bare.parameters)
+    q, qd, rate = np.array([0.3, 0.2, 1.0]), np.array([0.4, 0.5, 0.1]), 0.7
+    forces = {"force_x": 3.0, "force_y": 8.0, "force_z": 2.0}
+
+    def derivative(model, x, p):
+        dx = np.zeros(len(x))
+        u = np.array([forces.get(name, 0.0) for name in model.inputs])
+        model.derivative(x, u, p, np.zeros(len(model.noise)), dx)
+        return dx
+
+    for lead in (0.004, 0.013):
+        there, moves = q + [0.0, lead, 0.0], qd + [0.0, rate - qd[1], 0.0]
+        arm = derivative(bare, np.concatenate([there, moves]), p[:n])[3:]
+        mass = bare.mass_matrix(q[None], p[:n])[0]
+        behind = mass[1, 1] - own["drive_inertia"]
+        pressed = behind * (50.0**2 * (lead - 0.01) + 2 * 0.8 * 50.0 * (rate - qd[1]))
+        contact = pressed if lead > 0.01 else 0.0
+        friction = p[system.index("viscous.pitch")] * qd[1] + p[system.index("coulomb.pitch")]
+        found = derivative(system, np.concatenate([q, qd, [lead, rate]]), p)
+        assert found[6] == pytest.approx(rate - qd[1])
+        # Only the contact and its own friction accelerate what the encoder sees.
+        assert found[4] == pytest.approx((contact - friction) / own["drive_inertia"], rel=1e-2)
+        # The extension feels gravity and centrifugal force where the arm is.
+        assert found[5] == pytest.approx(arm[2], rel=1e-6)
 
 
 @pytest.mark.parametrize(
     ("machine", "effects"),
     [
-        ("slider", ("force_delay", "backlash:carriage")),
+        ("slider", ("force_delay", "transmission_compliance:carriage")),
         ("servo_pendulum", ("force_delay", "transmission_compliance:joint")),
-        ("slider", ("actuator_lag:motor", "backlash:carriage")),
+        ("slider", ("actuator_lag:motor", "transmission_compliance:carriage")),
         ("servo_pendulum", ("channel_lag:supply", "transmission_compliance:joint")),
     ],
 )
-def test_play_and_wind_up_go_with_a_force_that_is_late(machine, effects):
-    """Their offset is differentiated, which neither a state nor a last derivative allows."""
+def test_wind_up_goes_with_a_force_that_is_late(machine, effects):
+    """Its offset is differentiated, which neither a state nor a last derivative allows."""
     system = compile_model(Model(registry.device(machine), effects))
     q, qd, qdd, u, t = smooth(system)
     p = typical(system, 1.0)

@@ -18,7 +18,7 @@ ROBOT = device_from(ARM)
     [
         (device("bam"), ()),
         (device("bam"), ("stribeck:yaw", "handle_payload")),
-        (device("bam"), ("backlash:yaw", "force_bias:x")),
+        (device("bam"), ("transmission_compliance:yaw", "force_bias:x")),
         (ROBOT, ()),
         (ROBOT, ("shear_thinning:one", "friction_of_sum:one-two")),
         (ROBOT, ("gear_loss:two", "encoder_scale:one")),
