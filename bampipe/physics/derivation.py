@@ -331,7 +331,9 @@ def _shift_inertia(d: Vocabulary, motion: _Motion, terms: _Terms) -> _Motion:
         slope = sp.diff(terms.other[i], acceleration)
         if slope != 0:
             allowed = [*d.q, *d.p.values(), *_constants(d)]
-            allow("what a torque has per acceleration", [slope], allowed, "positions and parameters")
+            allow(
+                "what a torque has per acceleration", [slope], allowed, "positions and parameters"
+            )
             terms.other[i] = terms.other[i].subs(acceleration, 0)
             mass[i][i] -= slope
             dynamics[i] -= slope * acceleration

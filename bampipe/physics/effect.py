@@ -169,8 +169,8 @@ class Effect(DeclaredFile):
 
     ahead: Ahead | None = Field(
         default=None,
-        description="Of a torque on an axis: where the mechanism behind its encoder is, for gravity,"
-        " Coriolis and centrifugal forces on every axis",
+        description="Of a torque on an axis: where the mechanism behind its encoder is, for the"
+        " gravity, Coriolis and centrifugal forces on every axis",
     )
 
     @cached_property

@@ -113,6 +113,7 @@ NAMED = [
     ),
     ("wrist", 56, "unbalance:a", ("force_bias:a", "torque_ripple:a", "return_spring:a")),
     ("damper", 57, "upper_stop:piston", ("return_spring:piston", "quadratic_drag:piston")),
+    ("bam", 59, "backlash:yaw", ("presliding:yaw", "maxwell_slip:yaw")),
     ("axis", 58, "maxwell_slip:carriage", ("presliding:carriage", "stribeck:carriage")),
 ]
 

@@ -243,8 +243,8 @@ def test_behind_play_the_arm_moves_apart_from_the_drive_that_its_encoder_sees():
         return dx
 
     for lead in (0.004, 0.013):
-        there, moves = q + [0.0, lead, 0.0], qd + [0.0, rate - qd[1], 0.0]
-        arm = derivative(bare, np.concatenate([there, moves]), p[:n])[3:]
+        there = [q[0], q[1] + lead, q[2], qd[0], rate, qd[2]]
+        arm = derivative(bare, np.array(there), p[:n])[3:]
         mass = bare.mass_matrix(q[None], p[:n])[0]
         behind = mass[1, 1] - own["drive_inertia"]
         pressed = behind * (50.0**2 * (lead - 0.01) + 2 * 0.8 * 50.0 * (rate - qd[1]))
