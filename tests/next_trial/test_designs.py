@@ -278,7 +278,8 @@ def test_a_machine_that_winds_up_follows_the_design_and_its_encoders_do_not():
     motion = rehearsal.record(max(designs, key=lambda design: design.strokes[0].slow), 0)
     left = BAND.thin(ModelOnTrial(system, p, [motion]).residual)[:, 0]
     stiff = BAND.thin(ModelOnTrial(system_of(bam()), p[:-1], [motion]).residual)[:, 0]
-    assert np.std(left) < 0.05 * np.std(stiff)
+    # Noise of the force moves such a model's encoder, too.
+    assert np.std(left) < 0.1 * np.std(stiff)
 
 
 def test_a_path_has_the_velocity_and_acceleration_that_it_says():
