@@ -31,7 +31,7 @@ def test_a_child_is_identified_as_its_parent_was(tmp_path: Path) -> None:
     stages = {
         "identify:base": made({"model": "base", "method": "least-squares"}),
         "validate:base": made({"model": "base", "seed": 3}),
-        "diagnose:base": made({"model": "base", "seed": 2, "without": ["backlash:carriage"]}),
+        "diagnose:base": made({"model": "base", "seed": 2, "without": ["quadratic_drag:carriage"]}),
         f"validate:{child}": made({"model": child, "seed": 4}),
     }
     write_result(tmp_path, RunResult, schema=record.SCHEMA, stages=stages)
@@ -39,7 +39,7 @@ def test_a_child_is_identified_as_its_parent_was(tmp_path: Path) -> None:
     assert given == {
         "identify": {"method": "least-squares"},
         "validate": {"seed": 3},
-        "diagnose": {"seed": 2, "without": ["backlash:carriage"]},
+        "diagnose": {"seed": 2, "without": ["quadratic_drag:carriage"]},
     }
     # What came to nothing in the parent may count in the child.
     changed = {"validate": {"seed": 4}, "diagnose": {"seed": 2}}
@@ -113,7 +113,7 @@ def test_a_child_that_was_never_identified_is_removed(
     ("effects", "start"),
     [
         (("stribeck:carriage",), {"stribeck.carriage.speed": 0.02}),
-        (("stribeck:carriage", "backlash:carriage"), {}),
+        (("stribeck:carriage", "quadratic_drag:carriage"), {}),
     ],
     ids=["as fitted", "one not fitted"],
 )
@@ -138,7 +138,7 @@ def test_what_came_to_nothing_is_not_weighed_again(
 ) -> None:
     """The next best is tried, and at last the diagnosis says what the loop has found."""
     ran: list[object] = []
-    left = ["backlash:joint", "transmission_compliance:joint"]
+    left = ["quadratic_drag:joint", "transmission_compliance:joint"]
 
     def run(_: loop.LoopOptions, first: str, last: str, model: str, changed: object = None) -> None:
         ran.extend([changed or None] if first == "diagnose" else [])
@@ -161,7 +161,7 @@ def test_what_came_to_nothing_is_not_weighed_again(
     ]
     assert ran == [
         None,
-        {"diagnose": {"without": ("backlash:joint",)}},
+        {"diagnose": {"without": ("quadratic_drag:joint",)}},
         {"diagnose": {"without": tuple(left)}},
     ]
 

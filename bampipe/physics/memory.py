@@ -103,7 +103,8 @@ def _integrate(module: ModuleType, commands: Sequence[int], arrays: Sequence[Arr
             continue
         fastest = module.memory(q, qd, qdd, u, p, t, z0, steps, out)
         enough = STABLE if steps > 1 else ACCURATE
-        if fastest < enough and np.all(np.abs(out) < _RUNAWAY):
+        # What grows without bounds at a stable step does so with any number of them.
+        if fastest < enough and (steps > 1 or np.all(np.abs(out) < _RUNAWAY)):
             break
         least = steps * fastest / STABLE
     return np.delete(out, at + np.arange(at.size), axis=0) if at.size else out

@@ -15,9 +15,9 @@ from bampipe.stages.diagnose import _require_known
 
 def test_what_is_no_effect_cannot_be_left_out() -> None:
     recipe = Recipe(registry.device("slider").declaration, (), ())
-    _require_known(("backlash:carriage",), recipe, "without")
-    with pytest.raises(InputError, match="no effect of this device, did you mean 'backlash:"):
-        _require_known(("backlsh:carriage",), recipe, "also")
+    _require_known(("stribeck:carriage",), recipe, "without")
+    with pytest.raises(InputError, match="no effect of this device, did you mean 'stribeck:"):
+        _require_known(("stribek:carriage",), recipe, "also")
 
 
 @pytest.fixture(scope="module")
