@@ -67,8 +67,9 @@ def derive(model: Model, named_constants: bool = False) -> Equations:
 def _assemble_equations(d: Vocabulary) -> Equations:
     forces = _map_inputs(d)
     terms = _collect_terms(d, forces)
-    motion = _shift_inertia(d, _combine_motion(d, terms.energies), terms)
+    inertia = _take_inertia(d, terms.other)
     _check_dependence(d, forces, terms)
+    motion = _add_inertia(d, _combine_motion(d, terms.energies), inertia)
     offset_rate = [d.ddt(e) if e != 0 else e for e in terms.offset]
     rates, initial = ([entry[k] for entry in terms.states.values()] for k in (0, 1))
     parts = [*forces.noisy, *terms.other, *rates, *initial, *terms.offset, *offset_rate]
@@ -324,19 +325,24 @@ def _combine_motion(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
     )  # fmt: skip
 
 
-def _shift_inertia(d: Vocabulary, motion: _Motion, terms: _Terms) -> _Motion:
-    """Move what is a torque by the acceleration of its own axis to the mass matrix."""
-    mass, dynamics = [list(row) for row in motion.mass], list(motion.dynamics)
-    for i, acceleration in enumerate(d.qdd):
-        slope = sp.diff(terms.other[i], acceleration)
-        if slope != 0:
-            allowed = [*d.q, *d.p.values(), *_constants(d)]
-            allow(
-                "what a torque has per acceleration", [slope], allowed, "positions and parameters"
-            )
-            terms.other[i] = terms.other[i].subs(acceleration, 0)
-            mass[i][i] -= slope
-            dynamics[i] -= slope * acceleration
+def _take_inertia(d: Vocabulary, other: list[Any]) -> list[Any]:
+    """Take what effects have per acceleration of their own axis out of Q_other; by axis."""
+    found: list[Any] = [sp.S.Zero for _ in d.axes]
+    for i in {d.axes.index(e.target) for e in d.model.effects if "qdd" in e.effect.names}:
+        found[i], other[i] = sp.diff(other[i], d.qdd[i]), other[i].subs(d.qdd[i], 0)
+    allowed = [*d.q, *d.p.values(), *_constants(d)]
+    allow("what a torque has per acceleration", found, allowed, "positions and parameters")
+    return found
+
+
+def _add_inertia(d: Vocabulary, motion: _Motion, taken: Sequence[Any]) -> _Motion:
+    """Put into the mass matrix what `_take_inertia` has found."""
+    mass = [
+        [m - (taken[i] if i == j else 0) for j, m in enumerate(row)]
+        for i, row in enumerate(motion.mass)
+    ]
+    products = [x * qdd for x, qdd in zip(taken, d.qdd, strict=True)]
+    dynamics = [f - x for f, x in zip(motion.dynamics, products, strict=True)]
     return motion._replace(mass=mass, dynamics=dynamics)
 
 

@@ -220,13 +220,6 @@ def test_dry_friction_is_all_that_turns_with_the_motion():
     assert gone[1] - gone[0] == pytest.approx(40.0 + 1.5 * 200.0, rel=1e-6)
 
 
-def test_a_motor_load_taken_for_wind_up_is_that_at_standstill():
-    """Back EMF depends on the rate, of which an offset of the encoder must be free."""
-    effects = ["transmission_compliance:joint"]
-    system = compile_model(Model(registry.device("servo_pendulum"), effects))
-    assert system.moves_sensors
-
-
 def test_behind_play_the_arm_moves_apart_from_the_drive_that_its_encoder_sees():
     device = registry.device("bam")
     system, bare = (compile_model(Model(device, e)) for e in (["backlash:pitch"], []))
