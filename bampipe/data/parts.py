@@ -2,7 +2,7 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -71,7 +71,11 @@ def join_parts(
     if len(found) < 2:
         return [], []
     kinds = {name: _kind(name, columns, role) for name, columns in found.items()}
-    own = {kind: _common(n for n in found if kinds[n] == kind) for kind in set(kinds.values())}
+    # Words that all files of a kind have; numbers, if there are several, tell trials apart.
+    own = {
+        kind: frozenset[str].intersection(*({*_words(n)} for n in found if kinds[n] == kind))
+        for kind in set(kinds.values())
+    }
     shared = frozenset.intersection(*own.values())
     groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name, kind in kinds.items():
@@ -127,11 +131,6 @@ def _words(name: str) -> list[str]:
         _AXIS.sub(lambda axis: f" {axis[1].lower()}{axis[2]} ", name.rpartition(".")[0]),
     )
     return [part.lower() for part in parts]
-
-
-def _common(names: Iterable[str]) -> frozenset[str]:
-    """Words that all of these names have; numbers, if there are several, tell trials apart."""
-    return frozenset.intersection(*(frozenset(_words(name)) for name in names))
 
 
 def _called(words: Sequence[str], own: frozenset[str], said: Sequence[str]) -> str:

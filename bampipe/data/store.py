@@ -52,7 +52,11 @@ class ParquetAppender(ExitStack):
             self._writer = _writer(self._stream, table.schema)
         elif table.schema != self._writer.schema:
             table = table.cast(self._writer.schema)
-        for start, stop in pairwise(_trial_bounds(table)):
+        bounds = [0, table.num_rows]
+        if "trial_id" in table.column_names:
+            ids = table.column("trial_id").to_pandas().to_numpy()
+            bounds[1:1] = (np.flatnonzero(ids[1:] != ids[:-1]) + 1).tolist()
+        for start, stop in pairwise(bounds):
             part = table.slice(start, stop - start)
             self._writer.write_table(part, row_group_size=max(part.num_rows, 1))
 
@@ -178,13 +182,6 @@ def _writer(stream: BinaryIO, schema: pa.Schema) -> pq.ParquetWriter:
         write_statistics=["trial_id"] if "trial_id" in schema.names else False,
         store_schema=False,
     )
-
-
-def _trial_bounds(table: pa.Table) -> list[int]:
-    if "trial_id" not in table.column_names or table.num_rows == 0:
-        return [0, table.num_rows]
-    ids = table.column("trial_id").to_pandas().to_numpy()
-    return [0, *(np.flatnonzero(ids[1:] != ids[:-1]) + 1).tolist(), table.num_rows]
 
 
 def _footer(path: Path) -> tuple[pq.FileMetaData, Mapping[str, Sequence[int]]]:

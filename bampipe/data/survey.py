@@ -330,7 +330,9 @@ class _Logs:
             trials = [trial for trial, has in zip(trials, shared, strict=True) if best <= has]
             if trials and (axes or self._completeness(self._labels(trials[0])) == _WHOLE):
                 self._leave_out([p for t in trials for p in (t.file, *(x.file for x in t.parts))])
-                self.remarks += [_describe_join(trials[0])]
+                ways = join_names(dict.fromkeys(_JOINED[part.join] for part in trials[0].parts))
+                files = join_names([trials[0].file, *(part.file for part in trials[0].parts)])
+                self.remarks += [f"{files} are taken as one recording, joined {ways}"]
                 return trials, [c for c in self._labels(trials[0]) if c in best]
             if not whole:
                 self._refuse_parted(names[0], reasons)
@@ -497,13 +499,6 @@ def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
     kept = [mask for mask in known if 2 * mask.sum() > len(mask)]
     complete = np.logical_and.reduce(kept) if kept else np.ones(len(known[0]), dtype=bool)
     return complete if 2 * complete.sum() > len(complete) else np.ones_like(complete)
-
-
-def _describe_join(first: TrialEntry) -> str:
-    """What was joined to make a recording."""
-    ways = join_names(dict.fromkeys(_JOINED[part.join] for part in first.parts))
-    files = join_names([first.file, *(part.file for part in first.parts)])
-    return f"{files} are taken as one recording, joined {ways}"
 
 
 def _by_looks(

@@ -4,11 +4,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bampipe.data.quality.table import TrialTable, counted, find_runs, longest_run
+from bampipe.data.quality.table import TrialTable, find_runs, longest_run
 from bampipe.data.session import SECONDS, Channel, Encoder, Session
 from bampipe.data.session.channels import LARGEST_CONDITION
 from bampipe.data.units import unit
 from bampipe.errors import InputError
+from bampipe.lists import count_noun
 from bampipe.results.ingest import DeadStretch
 
 _MOST_MISSING, _AROUND_S = 0.2, 0.1
@@ -54,9 +55,9 @@ def fill_missing(table: TrialTable) -> None:
     # Sensors that begin late or end early leave the rest as it is.
     start, stop = int(sound[0]), int(sound[-1]) + 1
     if (start > 0 or stop < len(table)) and 2 * (stop - start) >= len(table):
-        dropped = len(table) - (stop - start)
+        dropped = count_noun(len(table) - (stop - start), "row")
         table.keep(slice(start, stop))
-        table.repairs.append(f"{counted(dropped, 'row')} with missing samples at the ends dropped")
+        table.repairs.append(f"{dropped} with missing samples at the ends dropped")
     for name in channels:
         _refuse_missing(table, name, ~np.isfinite(table.columns[name]))
     for name in channels:
@@ -71,14 +72,14 @@ def fill_missing(table: TrialTable) -> None:
                     ends = {"start_s": max(0.0, float(first)), "end_s": float(last)}
                     table.dead.append(DeadStretch(column=name, missing=True, **ends))
             table.repairs.append(
-                f"column '{name}': {counted(int(missing.sum()), 'missing sample')} interpolated"
+                f"column '{name}': {count_noun(int(missing.sum()), 'missing sample')} interpolated"
             )
 
 
 def take_out(table: TrialTable, column: str, wild: np.ndarray) -> None:
     """Mark wild readings (T,) of a column as missing, and say so; `fill_missing` fills them."""
     table.columns[column][wild] = np.nan
-    words = counted(int(wild.sum()), "wild reading")
+    words = count_noun(int(wild.sum()), "wild reading")
     table.repairs.append(f"column '{column}': {words} taken out")
 
 

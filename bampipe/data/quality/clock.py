@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.arrays import Array
-from bampipe.data.quality.table import TrialTable, counted, find_runs, in_times
+from bampipe.data.quality.table import TrialTable, find_runs, in_times
 from bampipe.data.session import SECONDS
+from bampipe.lists import count_noun
 
 COARSEST_STAMP = 0.05
 """Share of a step to which time stamps may be rounded: their scatter is a third of it."""
@@ -158,7 +159,7 @@ def time_to_seconds(table: TrialTable) -> None:
     blank = np.logical_and.reduce([~np.isfinite(values) for values in table.columns.values()])
     if blank.any() and not blank.all():
         table.keep(~blank)
-        table.repairs.append(f"{counted(int(blank.sum()), 'row')} that hold no number dropped")
+        table.repairs.append(f"{count_noun(int(blank.sum()), 'row')} that hold no number dropped")
     missing = ~np.isfinite(table.t)
     count = int(missing.sum())
     if count:
@@ -166,7 +167,7 @@ def time_to_seconds(table: TrialTable) -> None:
             at = int(np.argmax(missing))
             raise table.fault(f"{count} time stamps are missing", column=table.clock, at=at)
         table.keep(~missing)
-        table.repairs.append(f"{counted(count, 'row')} without a time stamp dropped")
+        table.repairs.append(f"{count_noun(count, 'row')} without a time stamp dropped")
     _unwrap_clock(table)
     steps = np.diff(table.t)
     steps = steps[steps > 0]
@@ -233,7 +234,7 @@ def put_in_order(table: TrialTable) -> None:
     if 0 < lone.sum() <= _few(table, len(table)):
         table.keep(~lone)
         table.repairs.append(
-            f"{counted(int(lone.sum()), 'row')} with a time stamp out of order dropped"
+            f"{count_noun(int(lone.sum()), 'row')} with a time stamp out of order dropped"
         )
         t = table.t
     mixed = np.maximum.accumulate(t)[:-1] > np.minimum.accumulate(t[::-1])[::-1][1:]
@@ -255,8 +256,10 @@ def put_in_order(table: TrialTable) -> None:
         elif len(falls) == 1:
             at, step = int(falls[0]), float(np.median(np.diff(t)))
             size = t[at] - t[at + 1] + step
+            moved = np.abs(np.diff(positions))
+            goes_on = moved[:, at] <= _SEAM * np.delete(moved, at, axis=1).max(axis=1)
             # After a lone stamp that is wrong, the clock is where it was.
-            if (stop - at) * step > 0.5 * size and _goes_on(positions, at):
+            if (stop - at) * step > 0.5 * size and goes_on.all():
                 t[at + 1 :] += size
                 table.repairs.append(
                     f"the clock is set back by {size:.3g} s at row {table.rows[at + 1]}: bridged"
@@ -264,15 +267,8 @@ def put_in_order(table: TrialTable) -> None:
     if late:
         table.keep(order)
         table.repairs.append(
-            f"{counted(late, 'row')} written out of order sorted by their time stamps"
+            f"{count_noun(late, 'row')} written out of order sorted by their time stamps"
         )
-
-
-def _goes_on(positions: np.ndarray, at: int) -> bool:
-    """Whether positions (n, T) go on from row ``at`` to the next as they do elsewhere."""
-    steps = np.abs(np.diff(positions))
-    others = np.delete(steps, at, axis=1).max(axis=1)
-    return bool(np.all(steps[:, at] <= _SEAM * others))
 
 
 def drop_backward_stamps(table: TrialTable) -> None:
@@ -301,10 +297,11 @@ def drop_backward_stamps(table: TrialTable) -> None:
             remedy='log them more finely; of evenly sampled rows, [time] unit = "samples" counts',
         )
     table.keep(~(repeated | behind))
-    if counts[0]:
-        table.repairs.append(f"{counted(counts[0], 'row')} with a repeated time stamp dropped")
-    if counts[1]:
-        table.repairs.append(f"{counted(counts[1], 'row')} with a time stamp out of order dropped")
+    for count, what in zip(
+        counts, ("a repeated time stamp", "a time stamp out of order"), strict=True
+    ):
+        if count:
+            table.repairs.append(f"{count_noun(count, 'row')} with {what} dropped")
 
 
 def cut_stretch(table: TrialTable) -> None:
@@ -338,7 +335,7 @@ def keep_longest_stretch(table: TrialTable) -> None:
     start, stop = int(bounds[longest]), int(bounds[longest + 1])
     share = (stop - start) / len(table)
     widest = float(steps[gaps].max())
-    words = f"{counted(len(gaps), 'gap')} of up to {widest:.3g} s in the time stamps"
+    words = f"{count_noun(len(gaps), 'gap')} of up to {widest:.3g} s in the time stamps"
     if share < table.limits.sound_share:
         raise table.fault(
             f"{words}, and the longest stretch between them holds {share:.0%} of the samples,"
@@ -347,9 +344,9 @@ def keep_longest_stretch(table: TrialTable) -> None:
             at=int(gaps[0]),
         )
     first, last = table.rows[start], table.rows[stop - 1]
-    dropped = len(table) - (stop - start)
+    dropped = count_noun(len(table) - (stop - start), "row")
     table.keep(slice(start, stop))
-    table.repairs.append(f"{words}: rows {first} to {last} kept, {counted(dropped, 'row')} dropped")
+    table.repairs.append(f"{words}: rows {first} to {last} kept, {dropped} dropped")
 
 
 def refuse_length(table: TrialTable) -> None:
@@ -359,12 +356,12 @@ def refuse_length(table: TrialTable) -> None:
     duration = float(table.t[-1]) + step
     if len(table) < 4 or duration < table.limits.shortest_s * (1 - 1e-6):
         raise table.fault(
-            f"{counted(len(table), 'sample')} over {duration:.3g} s,"
+            f"{count_noun(len(table), 'sample')} over {duration:.3g} s,"
             f" less than {table.limits.shortest_s:g} s"
         )
     if duration > LONGEST_TRIAL_S:
         raise table.fault(
-            f"{counted(len(table), 'sample')} over {duration:.3g} s, which is more than a year",
+            f"{count_noun(len(table), 'sample')} over {duration:.3g} s, which is more than a year",
             column=table.clock,
             remedy="check the unit of the time column and sample_rate_hz",
         )
@@ -389,8 +386,8 @@ def note_clock(table: TrialTable) -> None:
     if gaps.any():
         lost = int(np.sum(np.rint(steps[gaps] / median) - 1))
         table.notes.append(
-            f"{counted(int(gaps.sum()), 'small gap')} in the time stamps,"
-            f" about {counted(lost, 'sample')} missing, longest {steps.max():.3g} s"
+            f"{count_noun(int(gaps.sum()), 'small gap')} in the time stamps,"
+            f" about {count_noun(lost, 'sample')} missing, longest {steps.max():.3g} s"
         )
     jitter = float(np.std(steps[~gaps]))
     if jitter > 0.05 * median:

@@ -4,8 +4,9 @@ import numpy as np
 
 from bampipe.arrays import Array, Indices
 from bampipe.data.quality.channels import fill_missing, take_out
-from bampipe.data.quality.table import TrialTable, counted, in_times
+from bampipe.data.quality.table import TrialTable, in_times
 from bampipe.data.session import Encoder
+from bampipe.lists import count_noun
 
 FASTEST = {"rad": 20.0, "m": 4.0}
 """Speed below which a step is never taken for a wild reading, rad/s and m/s."""
@@ -206,7 +207,7 @@ def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> No
             remedy="did the brake slip? or is it a free trial?",
         )
     if encoder.resolution is not None and moved < (limits.locked_steps - 0.5) * encoder.resolution:
-        steps = counted(round(moved / encoder.resolution), "encoder step")
+        steps = count_noun(round(moved / encoder.resolution), "encoder step")
         raise table.fault(
             f"locked {encoder.axis} deflects by {steps} only, too little for a stiffness",
             column=encoder.column,

@@ -151,11 +151,6 @@ def longest_run(which: np.ndarray) -> tuple[int, int]:
     return int(starts[longest]), int(stops[longest] - starts[longest])
 
 
-def counted(count: int, noun: str) -> str:
-    """``3 rows``, ``1 row``."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
 def in_times(count: int) -> str:
     """``3 times``, ``once``."""
     return "once" if count == 1 else f"{count} times"

@@ -17,11 +17,12 @@ from bampipe.errors import InputError
 LARGEST_WIDTH = 64
 _STAMPED = "MO"
 """Kinds of arrays of dates and times: NumPy's own, and of texts."""
-_RUN = re.compile(
+RUN = re.compile(
     r"(?i)(.+?(?=\[)|(?:.*[./_])?(?:trial|run|rep|test|take|rec|recording|exp|experiment|measurement"
     r"|messung|versuch|essai|episode|demo|trajectory|traj|log)s?_?(?=\d))"
     r"(?:\[([^\[\]:]+)\]|(\d+))[./]([^\[\]]+)"
 )
+"""Name of an array of one of several recordings in a file."""
 _TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
 
 
@@ -88,11 +89,6 @@ def columns_of_arrays(arrays: Mapping[str, np.ndarray | None]) -> dict[str, str]
     return {column: "datetime" if column in moment else "" for column in found}
 
 
-def is_run(label: str) -> bool:
-    """Whether an array may be of one of several recordings in a file, by its name."""
-    return _RUN.fullmatch(label) is not None
-
-
 def split_index(column: str, names: Container[str]) -> tuple[str, int | None]:
     """``("X", 2)`` for ``X[2]``, where there is no variable of that whole name."""
     match = re.fullmatch(r"(.+)\[(\d{1,3})\]", column)
@@ -149,7 +145,7 @@ def _join_runs(
     begun: dict[str, tuple[int, ...]] = {}
     runs: dict[str, dict[str, str]] = {}
     for label, array in found.items():
-        match = _RUN.fullmatch(label)
+        match = RUN.fullmatch(label)
         if match and len(labels("", array.shape)) == 1 < array.size:
             runs.setdefault(f"{match[1]}[:].{match[4]}", {})[match[2] or match[3]] = label
     timed = {name.partition("[")[0]: list(own) for name, own in runs.items() if _TIMES.search(name)}

@@ -14,8 +14,8 @@ import numpy as np
 
 from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import (
+    RUN,
     columns_of_arrays,
-    is_run,
     labels,
     pick,
     read_arrays,
@@ -84,7 +84,7 @@ def columns(path: Path, name: str) -> dict[str, str]:
                 units |= dict.fromkeys(labels(column, data.shape), _unit(data))
             elif place is not None:
                 named[f"{column.rpartition('/')[0]}[{place}]"] = column
-        if any(is_run(label) for label in shapes):
+        if any(map(RUN.fullmatch, shapes)):
             runs = columns_of_arrays(_vectors(file))
             if any("[:]" in column for column in runs):
                 return runs

@@ -188,21 +188,18 @@ class _Elements:
             yield label, plain.strip("\0 ")
             return
         yield label, None
-        count = math.prod(extents)
-        if kind == _CELL_CLASS and depth < _DEEPEST and count <= _MOST_FIELDS:
-            for number in range(count):
-                body = self.take()[1]
-                if len(body):
-                    yield from _Elements(body, self._order).arrays(f"{label}[{number}]", depth + 1)
-        if kind != _STRUCT_CLASS or depth >= _DEEPEST:
+        count, fields = math.prod(extents), [""]
+        if kind not in (_CELL_CLASS, _STRUCT_CLASS) or depth >= _DEEPEST:
             return
-        width, names = int(self.numbers()[0]), self.text()
-        fields = [names[k : k + width].partition("\0")[0] for k in range(0, len(names), width)]
+        if kind == _STRUCT_CLASS:
+            width, names = int(self.numbers()[0]), self.text()
+            starts = range(0, len(names), width)
+            fields = ["." + names[k : k + width].partition("\0")[0] for k in starts]
         if count * len(fields) > _MOST_FIELDS:
             return
         for number in range(count):
-            own = label if count == 1 else f"{label}[{number}]"
+            own = label if count == 1 and kind == _STRUCT_CLASS else f"{label}[{number}]"
             for field in fields:
                 body = self.take()[1]
                 if len(body):
-                    yield from _Elements(body, self._order).arrays(f"{own}.{field}", depth + 1)
+                    yield from _Elements(body, self._order).arrays(own + field, depth + 1)

@@ -154,7 +154,8 @@ def _samples(
             notes = ("last line is cut off: 1 row dropped",)
     else:
         content = _with_lists(_parsed(text, name))
-    lists = _lists_of_samples(content)
+    items = content.items() if isinstance(content, dict) else [("", content)]
+    lists = {str(k): v for k, v in items if isinstance(v, list) and v and isinstance(v[0], dict)}
     single = all(_is_sample(items[0]) for items in lists.values())
     if not (lists and single) and (arrays := dict(_arrays(content))):
         return arrays, _numbers(content), notes
@@ -183,16 +184,6 @@ def _parsed(text: str, where: str) -> object:
         raise InputError(
             f"not sound JSON{line}", where=where, remedy="was the log cut off? copy it again"
         ) from error
-
-
-def _lists_of_samples(content: object) -> dict[str, list[object]]:
-    """Lists of objects with named values, by their key; "" for the whole content."""
-    items = content.items() if isinstance(content, dict) else [("", content)]
-    return {
-        str(key): value
-        for key, value in items
-        if isinstance(value, list) and value and isinstance(value[0], dict)
-    }
 
 
 def _is_sample(value: object) -> bool:

@@ -8,7 +8,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -108,7 +107,7 @@ def find_form(head: str, name: str) -> Form | None:
         )
     if _are(_FORTRAN, lines):
         return Form("exponents of Fortran", lambda line: _FORTRAN.sub(r"\1E\2", line))
-    for find in (_protocol_fields, _elements, _named_numbers):
+    for find in (_protocol_fields, _elements, _PAIR.findall):
         if pairs := _pairs(lines, find):
             return pairs
     for delimiter in (*_DELIMITERS, " "):
@@ -167,21 +166,14 @@ def _grouped(table: Sequence[list[str]], delimiter: str) -> Form | None:
         sure = re.compile(rf".*{decimal}\d*" if sign in ",." else ".*")
         own = [cell for cell in numbers if sign in cell]
         if own and all(map(group.fullmatch, own)) and any(map(sure.fullmatch, own)):
-            said = f"digits in thousands, as in {own[-1]}"
-            return Form(said, _by_row(delimiter, partial(_without, sign, group)))
+
+            def rewrite(line: str, sign: str = sign, group: re.Pattern[str] = group) -> str:
+                row = cells(line, delimiter)
+                row = [x.replace(sign, "") if group.fullmatch(x) else x for x in row]
+                return delimiter.join(f'"{x}"' if delimiter in x else x for x in row)
+
+            return Form(f"digits in thousands, as in {own[-1]}", rewrite)
     return None
-
-
-def _without(sign: str, group: re.Pattern[str], cell: str) -> str:
-    return cell.replace(sign, "") if group.fullmatch(cell) else cell
-
-
-def _by_row(delimiter: str, act: Callable[[str], str]) -> Callable[[str], str]:
-    def rewrite(line: str) -> str:
-        row = map(act, cells(line, delimiter))
-        return delimiter.join(f'"{cell}"' if delimiter in cell else cell for cell in row)
-
-    return rewrite
 
 
 def _are(kind: re.Pattern[str], lines: Sequence[str]) -> bool:
@@ -190,7 +182,7 @@ def _are(kind: re.Pattern[str], lines: Sequence[str]) -> bool:
 
 def _stamped(lines: Sequence[str]) -> Form:
     inner = [match[2] for match in map(_STAMPED.match, lines) if match]
-    pairs = _pairs(inner, _named_numbers)
+    pairs = _pairs(inner, _PAIR.findall)
     joint = (
         "," if pairs else next((d for d in _DELIMITERS if _are(re.compile(f"[{d}]"), inner)), " ")
     )
@@ -204,10 +196,6 @@ def _stamped(lines: Sequence[str]) -> Form:
         return f"{stamp}{joint}{rest}"
 
     return Form("times stand before each line", rewrite, ("time", *pairs.names) if pairs else ())
-
-
-def _named_numbers(line: str) -> list[tuple[str, str]]:
-    return _PAIR.findall(line)
 
 
 def _protocol_fields(line: str) -> list[tuple[str, str]]:
