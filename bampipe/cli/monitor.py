@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,8 @@ from bampipe.errors import InputError
 from bampipe.run import models
 
 if TYPE_CHECKING:
+    from rich.live import Live
+
     from bampipe.data.stream import SampleStream
     from bampipe.monitor.monitor import Monitor
 
@@ -71,6 +74,8 @@ def monitor(
 
     Example: logger | bampipe monitor - --run 2026-10-03_s01 --session sessions/2026-10-03_s01
     """
+    from rich.live import Live
+
     from bampipe.data.run_folder import RunFolder
     from bampipe.monitor import monitor as monitoring
     from bampipe.monitor import start as monitor_start
@@ -100,8 +105,9 @@ def monitor(
     stream = monitor_start.open_stream(samples, system, session, strict, remark)
     watch = monitoring.Monitor(system, start, options, remark)
     try:
-        with _Output(sys.stdout.isatty() and not json, every) as output:
-            follow(stream, watch, output, wait=not once and samples != "-")
+        on_screen = sys.stdout.isatty() and not json
+        with Live(auto_refresh=False) if on_screen else nullcontext() as screen:
+            follow(stream, watch, _Output(screen, every), wait=not once and samples != "-")
     finally:
         if stream.descriptor != 0:
             os.close(stream.descriptor)
@@ -130,23 +136,10 @@ def follow(stream: SampleStream, watch: Monitor, output: _Output, wait: bool) ->
 class _Output:
     """JSON lines, one an interval of data; on a terminal a table drawn a few times a second."""
 
-    def __init__(self, screen: bool, every: float) -> None:
+    def __init__(self, screen: Live | None, every: float) -> None:
         self._every, self._next, self._drawn = every, -float("inf"), 0.0
         self._alarm = False
-        self._screen: Any = None
-        if screen:
-            from rich.live import Live
-
-            self._screen = Live(auto_refresh=False)
-
-    def __enter__(self) -> _Output:
-        if self._screen:
-            self._screen.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._screen:
-            self._screen.stop()
+        self._screen = screen
 
     def show(self, watch: Monitor, stream: SampleStream, final: bool = False) -> None:
         """Show the current state if it is time to."""

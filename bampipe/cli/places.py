@@ -9,12 +9,6 @@ from bampipe.run import record
 from bampipe.run.session_name import session_folder, session_id
 
 
-def _known_runs(runs: Path) -> list[Path]:
-    """Return the run folders in ``runs``, the most recent first."""
-    found = [path.parent for path in runs.glob(f"*/{record.FILE}")]
-    return sorted(found, key=lambda root: (root / record.FILE).stat().st_mtime_ns, reverse=True)
-
-
 def run_folder_of(argument: str, runs: Path) -> Path | None:
     """Return the run folder: a bare name is first of all one in ``runs``, anything else a path."""
     is_name = argument == Path(argument).name
@@ -34,7 +28,8 @@ def find_run(argument: str | None, runs: Path) -> Path:
     Raises:
         InputError: there is no such run.
     """
-    known = _known_runs(runs)
+    files = sorted(runs.glob(f"*/{record.FILE}"), key=lambda file: -file.stat().st_mtime_ns)
+    known = [file.parent for file in files]
     if argument is None and not known:
         raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
     root = known[0] if argument is None else run_folder_of(argument, runs)

@@ -366,11 +366,7 @@ class Watcher:
 
     def follow(self, run: str, step: str) -> Progress:
         """Return what a step calls to say how far it is."""
-
-        def show_progress(fraction: float, message: str) -> None:
-            self(Event(run, step, "progress", fraction, message))
-
-        return show_progress
+        return lambda fraction, message: self(Event(run, step, "progress", fraction, message))
 
     def _write(self, event: Event, name: str) -> None:
         """A line where a step starts, and one every so often while it goes on."""

@@ -346,7 +346,7 @@ class Comparison:
         chances, weights = [self.confusions(found) for found in then], self.weights()
         before, axes = self.confusions(self.contrasts_now), self.fit.evidence.system.coordinates
         expected = []
-        for pair, now in self.contrasts_now.items():
+        for pair in self.contrasts_now:
             left = np.median([found[pair].left for found in then], axis=0).tolist()
             expected.append(
                 ExpectedConfusion(
@@ -354,8 +354,6 @@ class Comparison:
                     weight=weights[pair],
                     before=before[pair],
                     after=float(np.median([found[pair] for found in chances])),
-                    distance_before=now.distance,
-                    distance_after=float(np.median([found[pair].distance for found in then])),
                     left=dict(zip(axes, left, strict=True)),
                 )
             )

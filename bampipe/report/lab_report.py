@@ -68,13 +68,23 @@ def _summarise(trends: TrendsResult, pages: Mapping[str, str]) -> Section:
     if not odd:
         judged = all(verdict == "in control" for verdict in verdicts.values())
         title = "No session stands out" if judged else "Too few sessions for control limits"
-        blocks.append(Callout("good" if judged else "note", title, _describe_limits(trends)))
+        text = "Every parameter lies within its control limits, and no diagnosis names an effect."
+        if trends.series and not any(one.has_limits for one in trends.series):
+            text = (
+                f"Control limits need {trends.fewest_sessions} sessions of a device; until then "
+                "only the diagnoses of single sessions count."
+            )
+        blocks.append(Callout("good" if judged else "note", title, text))
     if len(odd) > _MOST_CALLOUTS:
         more = count_noun(len(odd) - _MOST_CALLOUTS, "more session")
         blocks.append(Paragraph(f"The table below has {more} that stand out."))
+    links = {
+        session: f"[{session}]({folder}/report.html) ([explore]({folder}/explore.html))"
+        for session, folder in pages.items()
+    }
     rows = [
         (
-            _link_session(one.session, pages),
+            links.get(one.session, one.session),
             one.recorded[:16].replace("T", " ") or NONE,
             f"`{one.model}`",
             f"{format_digits(one.worst[0])} ({one.worst[1]})" if one.worst else NONE,
@@ -99,23 +109,6 @@ def _show_session(one: SessionVerdict) -> Callout:
     remedy = f" Next: `{one.remedy}`." if one.remedy else ""
     tone: Tone = "unknown" if one.verdict == "not diagnosed" else "attention"
     return Callout(tone, f"{one.session}: {one.verdict}", f"{sentence}.{remedy}")
-
-
-def _link_session(session: str, pages: Mapping[str, str]) -> str:
-    """Return the session's name with links to its pages."""
-    if session not in pages:
-        return session
-    folder = pages[session]
-    return f"[{session}]({folder}/report.html) ([explore]({folder}/explore.html))"
-
-
-def _describe_limits(trends: TrendsResult) -> str:
-    if trends.series and not any(one.has_limits for one in trends.series):
-        return (
-            f"Control limits need {trends.fewest_sessions} sessions of a device; until then only "
-            "the diagnoses of single sessions count."
-        )
-    return "Every parameter lies within its control limits, and no diagnosis names an effect."
 
 
 def _show_charts(trends: TrendsResult) -> list[Section]:

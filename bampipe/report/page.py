@@ -21,7 +21,6 @@ from bampipe.report.document import (
 )
 
 _TEMPLATE = Path(__file__).parent / "templates" / "page.html"
-_TAGS = {"strong": "strong", "code": "code"}
 
 
 def render_page(document: Document, beside: str = "") -> str:
@@ -61,7 +60,7 @@ def _render_spans(text: str, *, breaking: bool = False) -> str:
         safe = html.escape(body)
         if breaking and kind == "code":
             safe = re.sub(r"(?<=[._+:])", "<wbr>", safe)
-        parts.append(f"<{_TAGS[kind]}>{safe}</{_TAGS[kind]}>" if kind in _TAGS else safe)
+        parts.append(safe if kind == "plain" else f"<{kind}>{safe}</{kind}>")
     return "".join(parts)
 
 

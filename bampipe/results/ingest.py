@@ -91,11 +91,6 @@ class IngestResult(Result):
     session_id: str = Field(min_length=1)
     device: str = Field(min_length=1)
     device_file: str | None = Field(description="The session's own; null for a built-in device")
-    device_digest: str = Field(
-        default="",
-        pattern="^([0-9a-f]{64})?$",
-        description="SHA-256 of the content of the session's own device file",
-    )
     driven: bool = Field(default=False, description="Whether a motor drives the device, not a hand")
     default_effects: Names = Field(
         default=(), description="Effects that the device file gives the base model"

@@ -66,8 +66,6 @@ class ExpectedConfusion(Record):
     weight: Share = Field(description="Box-Hill weight of the pair: product of the odds")
     before: Share = Field(description="By the probabilities of the diagnosis")
     after: Share = Field(description="Median over people who follow it")
-    distance_before: Size = Field(description="Expected log likelihood ratio, nats")
-    distance_after: Size
     left: dict[str, Size] = Field(
         description="By axis: error on the new trial of the wrong one refitted, over the noise"
     )

@@ -8,7 +8,7 @@ from functools import partial
 from bampipe.errors import InputError
 from bampipe.run import record
 from bampipe.run.events import Listener
-from bampipe.run.publish import check_address, publish
+from bampipe.run.publish import open_place, publish
 from bampipe.run.request import Outcome, Request
 from bampipe.run.runner import run_session
 from bampipe.workers import process_pool, send_to_parent
@@ -34,7 +34,7 @@ def limit_threads(jobs: int) -> None:
 def run_and_publish(request: Request, listen: Listener) -> Outcome:
     """Run one session and, where asked, publish its run folder."""
     if request.publish:
-        check_address(request.publish)
+        open_place(request.publish)  # an address may be refused before hours of work
     outcome = run_session(request, listen)
     if request.publish:
         with record.lock(request.root, request.wait, listen):

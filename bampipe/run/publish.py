@@ -23,12 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bampipe.errors import InputError
-from bampipe.files import (
-    digest_content,
-    digest_file,
-    json_text,
-    parse_json,
-)
+from bampipe.files import digest_content, digest_file, json_text, parse_json
 from bampipe.run import record
 from bampipe.run.session_name import is_name
 
@@ -54,7 +49,7 @@ def publish(root: Path, url: str) -> str:
     }
     hashes = {name: digest_file(path) for name, path in files.items()}
     version = digest_content(hashes)[:16]
-    system, base = _open(url)
+    system, base = open_place(url)
     here = f"{base}/{root.name}"
     with _driver("cannot be published", url):
         current = _current(system, here)
@@ -74,7 +69,7 @@ def publish(root: Path, url: str) -> str:
 
 def published(url: str) -> list[str]:
     """Return the sessions published below ``url``, sorted."""
-    system, base = _open(url)
+    system, base = open_place(url)
     with _driver("cannot be read", url):
         if not system.exists(base):
             return []
@@ -98,13 +93,14 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
     Raises:
         InputError: nothing published, a file does not match its hash, or there is another run.
     """
-    system, base = _open(url)
+    system, base = open_place(url)
     here, root = f"{base}/{session}", runs / session
     with _driver("cannot be fetched", url):
         current = _current(system, here)
         if current is None:
             raise InputError(f"no session {session!r} is published", where=url)
-        if root.exists() and _is_same(root, current.files):
+        stored = ((root / name, known) for name, known in current.files.items())
+        if root.exists() and all(p.is_file() and digest_file(p) == known for p, known in stored):
             return root
         if root.exists() and not force:
             raise InputError(
@@ -133,13 +129,8 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
     return root
 
 
-def check_address(url: str) -> None:
-    """Refuse an address at which nothing can be published, before hours of work."""
-    _open(url)
-
-
-def _open(url: str) -> tuple[Any, str]:
-    """Return the file system and the path on it."""
+def open_place(url: str) -> tuple[Any, str]:
+    """Return the file system and the path on it; InputError where nothing can be there."""
     try:
         from fsspec.core import url_to_fs
     except ImportError as error:
@@ -180,10 +171,3 @@ def _size(system: Any, path: str) -> int | None:
         return int(system.info(path)["size"])
     except FileNotFoundError:
         return None
-
-
-def _is_same(root: Path, files: dict[str, str]) -> bool:
-    return all(
-        (root / name).is_file() and digest_file(root / name) == known
-        for name, known in files.items()
-    )

@@ -102,15 +102,10 @@ class _Runner:
         summary = self.state.records[step.name].summary
         return StepResult(step.name, "unchanged", "", 0.0, summary)
 
-    def check_settings(self) -> None:
-        """Refuse a mistake in the settings of any stage before one runs."""
-        for stage in selected(self.request):
-            for step in self.state.steps(stage):
-                if self.state.settings(step).keys() - {"model"}:
-                    self.state.declared(step)
-
     def run(self) -> Outcome:
-        self.check_settings()
+        for step in (one for stage in selected(self.request) for one in self.state.steps(stage)):
+            if self.state.settings(step).keys() - {"model"}:
+                self.state.declared(step)  # a mistake is refused before any stage runs
         results: list[StepResult] = []
         pipeline = self.request.pipeline
         for stage in selected(self.request):

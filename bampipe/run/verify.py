@@ -18,24 +18,17 @@ def verify(root: Path) -> list[tuple[str, str]]:
     found: dict[str, str] = {record.FILE: "damaged"} if record.is_damaged(root) else {}
     recorded: set[str] = {record.FILE}
     for made in content.stages.values():
-        for name, written in made.outputs.items():
-            recorded.add(name)
-            path = root / name
-            if not path.is_file():
-                found[name] = "gone"
-            elif digest_file(path) != written:
-                found[name] = "changed"
-        for name, written in made.inputs.items():
-            if name.startswith(record.SESSION):
-                continue
-            recorded.add(name)
-            path = root / name
-            if name in found:
-                continue
-            if not path.is_file():
-                found[name] = "gone"
-            elif digest_input(path) != written and path.suffix == ".toml":
-                found[name] = "changed"
+        inputs = {n: d for n, d in made.inputs.items() if not n.startswith(record.SESSION)}
+        for names, digest in ((made.outputs, digest_file), (inputs, digest_input)):
+            for name, written in names.items():
+                recorded.add(name)
+                path = root / name
+                # What a stage read is held here if it is text; all else, where it was written.
+                held = names is made.outputs or path.suffix == ".toml"
+                if not path.is_file():
+                    found.setdefault(name, "gone")
+                elif held and digest(path) != written:
+                    found.setdefault(name, "changed")
     place = content.place.session
     for stage in base.READS_SESSION:
         if stage not in content.stages:

@@ -134,8 +134,9 @@ class Comparison:
 
     @property
     def drawn(self) -> Mounting:
-        """All as it is drawn."""
-        return Mounting.as_drawn(len(self.ratio), self.robot.gravity)
+        """All as it is drawn, under gravity as it is stated."""
+        n, gravity = len(self.ratio), np.array(self.robot.gravity, dtype=float)
+        return Mounting(np.ones(n), np.zeros(n), gravity)
 
     def reread(self, gain: Array, time: float = 1.0) -> Comparison:
         """With other readings of the joints, see `JointMotion.reread`."""

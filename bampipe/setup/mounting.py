@@ -49,11 +49,6 @@ class Mounting:
     gravity: Array
     hangs: bool = False
 
-    @classmethod
-    def as_drawn(cls, n: int, gravity: Sequence[float]) -> Mounting:
-        """Every joint as the drawing has it, and gravity as it is stated, m/s2."""
-        return cls(np.ones(n), np.zeros(n), np.array(gravity, dtype=float))
-
     @property
     def changed(self) -> list[int]:
         """Numbers of the joints that are not counted as they are drawn."""

@@ -96,11 +96,11 @@ def judge_setup(
     if not np.isfinite(share).all():
         return None
     spread = CERTAIN * _standard_errors(evidence)
-    objections = [
-        _objection(item, value, margin)
-        for item, value, margin in zip(system.parameters, evidence.p, spread, strict=True)
-    ]
-    return Plausibility(share, moving, evidence.p, np.array(objections))
+    priors = np.array([item.prior for item in system.parameters])
+    nearest = np.clip(priors, evidence.p - spread, evidence.p + spread)
+    distance = np.array(list(map(distance_from_prior, system.parameters, nearest)))
+    objections = 0.5 * np.minimum(distance**2, FARTHEST**2)
+    return Plausibility(share, moving, evidence.p, objections)
 
 
 def axes_without_pose(system: System, motions: Sequence[Motion]) -> list[int]:
@@ -184,8 +184,3 @@ def distance_from_prior(item: Parameter, value: float) -> float:
     if item.lower >= 0.0 and item.prior == 0.0 and value > 0.0:
         return math.log2(1.0 + value / item.sd)
     return (value - item.prior) / item.sd
-
-
-def _objection(item: Parameter, value: float, margin: float) -> float:
-    nearest = min(max(item.prior, value - margin), value + margin)
-    return 0.5 * min(distance_from_prior(item, nearest) ** 2, FARTHEST**2)

@@ -445,7 +445,6 @@ def _choose(
         "measurement_noise_sd": noise_sd,
         "quantisation_sd": resolution / float(np.sqrt(12.0)),
         "resolution": resolution,
-        "likelihood_bandwidth_hz": {str(k): f.model.bandwidth_hz for k, f in fits.items()},
         "log_likelihood": {str(k): f.log_likelihood for k, f in fits.items()},
         "spectrum_floor_hz": floor,
     }

@@ -23,7 +23,7 @@ from bampipe.data.session import Session, TrialEntry, read_session
 from bampipe.data.store import ParquetAppender, write_parquet
 from bampipe.declarations.session_device import placeholders, session_device
 from bampipe.errors import InputError
-from bampipe.files import digest_content, toml_text
+from bampipe.files import toml_text
 from bampipe.lists import count_noun
 from bampipe.phrases import results as phrases
 from bampipe.physics.device import Device
@@ -220,7 +220,6 @@ def _description(
         device=device.name,
         device_file=session.device if own else None,
         placeholders=tuple(placeholders(device.declaration)) if own else (),
-        device_digest=digest_content(device.declaration) if own else "",
         driven=bool(device.drive),
         default_effects=device.default_effects,
         sample_rate_hz=rate,

@@ -316,7 +316,7 @@ def test_a_sentence_says_what_goes_beyond_the_trials_at_hand():
 def made_proposal(after: float, farther: tuple[str, ...] = ()) -> Proposal:
     pair = ExpectedConfusion(
         between=("force_gain:x", "base_tilt"), weight=1.0, before=0.4, after=after,
-        distance_before=0.1, distance_after=9.0, left={"yaw": 1.0},
+        left={"yaw": 1.0},
     )  # fmt: skip
     return Proposal(
         sentence="Move yaw.", seconds=20.0, moves={}, pose={}, worth=-after, information_gain=0.0,

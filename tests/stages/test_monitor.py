@@ -308,7 +308,7 @@ def followed(begun: tuple, text: str, folder: Path) -> dict:
     watch = Monitor(system, start, MonitorOptions(), lambda _: None)
     stream = open_stream(str(path), system, None, False, lambda _: None)
     try:
-        follow(stream, watch, _Output(False, 1.0), wait=False)
+        follow(stream, watch, _Output(None, 1.0), wait=False)
     finally:
         os.close(stream.descriptor)
     json.dumps(watch.report(), allow_nan=False)

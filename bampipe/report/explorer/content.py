@@ -410,9 +410,9 @@ def _make_candidates(diagnosis: DiagnoseResult, label: str) -> Content:
         for entry in diagnosis.ranking
     ]
     head = ["Effect", "Axis", "Without", "With", "Unit", "Probability", "p"]
+    head.append("Indistinguishable from")
     note = (
         "Held-out error without and with each effect; p: probability that replicates give any "
         "candidate as large a gain."
     )
-    head.append("Indistinguishable from")
     return {"title": f"Candidate effects, {label}", "note": note, "head": head, "rows": rows}

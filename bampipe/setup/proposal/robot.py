@@ -272,7 +272,12 @@ def find_robot_columns(
     if best is None or (beyond and not sound):
         return RobotColumns(joints, pair(positions, drives))
     if not (positions.named or drives.named or sound):
-        ordered = _in_alphabetical_order(device, positions), _in_alphabetical_order(device, drives)
+        # ROS publishes joints so: the first column is the first name of the alphabet.
+        order = [sorted(joints).index(name) for name in joints]
+        ordered = (
+            replace(positions, columns=tuple(positions.columns[k] for k in order)),
+            replace(drives, columns=tuple(drives.columns[k] for k in order)),
+        )
         other = explain(*ordered)
         if other is not None and mean_left(other.drives) < _BETTER * left:
             notes.check.append(
@@ -325,13 +330,6 @@ def _geared(
 
 def _joints(device: Device) -> list[str]:
     return [c.name for c in device.coordinates]
-
-
-def _in_alphabetical_order(device: Device, group: Group) -> Group:
-    """Columns as ROS publishes joints: the first column is the first name of the alphabet."""
-    names = _joints(device)
-    order = [sorted(names).index(name) for name in names]
-    return replace(group, columns=tuple(group.columns[k] for k in order))
 
 
 def _in_unit_of_range(logged: Logged, group: Group) -> Group | None:
