@@ -73,7 +73,7 @@ def join_parts(
     kinds = {name: _kind(name, columns, role) for name, columns in found.items()}
     # Words that all files of a kind have; numbers, if there are several, tell trials apart.
     own = {
-        kind: frozenset[str].intersection(*({*_words(n)} for n in found if kinds[n] == kind))
+        kind: frozenset.intersection(*(frozenset(_words(n)) for n in found if kinds[n] == kind))
         for kind in set(kinds.values())
     }
     shared = frozenset.intersection(*own.values())

@@ -83,10 +83,8 @@ def test_only_effects_that_meet_are_taken_together():
     ]
     assert names("stribeck:carriage", "actuator_lag:motor") == ["stribeck:carriage"]
     assert names("stribeck:carriage", "force_bias:motor") == ["stribeck:carriage"]
-    assert names("encoder_scale:yaw", "transmission_compliance:yaw", device="bam") == [
-        "transmission_compliance:yaw",
-        "encoder_scale:yaw",
-    ]
+    both = ["transmission_compliance:yaw", "encoder_scale:yaw"]
+    assert names(*reversed(both), device="bam") == both
     assert names("stribeck:yaw", "transmission_compliance:yaw", device="bam") == ["stribeck:yaw"]
 
 

@@ -6,9 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from diagnosis.sessions import BAND, KINEMATICS, SENSORS, bam
 
-from bampipe.diagnosis.session import system_of
 from bampipe.next_trial.design_sentence import describe_design
 from bampipe.next_trial.discrimination import Alternative, Comparison, chance_of_confusion
 from bampipe.next_trial.forecast import Forecast
@@ -42,7 +40,6 @@ from bampipe.results.next import (
     Proposal,
 )
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import ModelOnTrial
 
 SEEN = Envelope(
     low=np.array([-0.7, -0.4, 0.8]),
@@ -265,21 +262,6 @@ def test_no_design_is_tried_twice(axes):
     slow = [d for d in list_primitives(one, 20.0, [0], True) if d.strokes[0].fast < 0.3]
     # All of the range, its middle and a few per cent of it are the same strokes at that speed.
     assert len({round(d.strokes[0].low + d.strokes[0].high, 6) for d in slow}) == len(slow)
-
-
-def test_a_machine_that_winds_up_follows_the_design_and_its_encoders_do_not():
-    """A quick trial leaves next to nothing of the model that made it, and much of one without."""
-    recipe = bam(["transmission_compliance:yaw"])
-    system = system_of(recipe)
-    values = {"transmission_compliance.yaw.compliance": 0.006}
-    p = np.array([values.get(item.name, item.prior) for item in system.parameters])
-    rehearsal = Rehearsal(system, p, SENSORS, KINEMATICS, SEEN, 0)
-    designs = list_primitives(SEEN, 8.0, [0], with_rests=False)
-    motion = rehearsal.record(max(designs, key=lambda design: design.strokes[0].slow), 0)
-    left = BAND.thin(ModelOnTrial(system, p, [motion]).residual)[:, 0]
-    stiff = BAND.thin(ModelOnTrial(system_of(bam()), p[:-1], [motion]).residual)[:, 0]
-    # Noise of the force moves such a model's encoder, too.
-    assert np.std(left) < 0.1 * np.std(stiff)
 
 
 def test_a_path_has_the_velocity_and_acceleration_that_it_says():

@@ -186,10 +186,10 @@ def test_absent_at_zero_strength_and_there_at_typical(case):
 PLACES = ("", "yaw", "x", "xy", "yaw-extension")
 ELSEWHERE = ("extension", "z")
 # Impacts across play need forces that go with the motion: it is found on simulated sessions.
-SMOOTH = [c for c in CASES if not c.startswith("backlash")]
 RECOVERED = [
-    *(c for c in SMOOTH if c.partition(":")[2] in PLACES),
-    *(pytest.param(c, marks=pytest.mark.long) for c in SMOOTH if c.partition(":")[2] in ELSEWHERE),
+    pytest.param(c, marks=[pytest.mark.long] * (place in ELSEWHERE))
+    for c, place in ((c, c.partition(":")[2]) for c in CASES if not c.startswith("backlash"))
+    if place in (*PLACES, *ELSEWHERE)
 ]
 
 
