@@ -193,8 +193,4 @@ class DiagnoseResult(Result):
     @property
     def unnamed_axes(self) -> Names:
         """Axes with a residual that no effect of the library explains."""
-        return tuple(
-            axis
-            for axis, entry in self.axes.items()
-            if entry.remains and entry.verdict != "no_verdict"
-        )
+        return tuple(a for a, e in self.axes.items() if e.remains and e.verdict != "no_verdict")

@@ -59,13 +59,18 @@ class ExpectedSd(Record):
         return f"{self.after:.2g}" if self.is_sharp else f"{self.low:.2g} to {self.high:.2g}"
 
 
-class ExpectedConfusion(Record):
-    """Chance of taking one alternative for another."""
+class PlannedConfusion(Record):
+    """Chance of taking one alternative for another, without and with new trials."""
 
     between: Names = Field(description="Each by its effects, joined by +")
-    weight: Share = Field(description="Box-Hill weight of the pair: product of the odds")
     before: Share = Field(description="By the probabilities of the diagnosis")
     after: Share = Field(description="Median over people who follow it")
+
+
+class ExpectedConfusion(PlannedConfusion):
+    """The same with one new trial, and what it shows."""
+
+    weight: Share = Field(description="Box-Hill weight of the pair: product of the odds")
     left: dict[str, Size] = Field(
         description="By axis: error on the new trial of the wrong one refitted, over the noise"
     )
@@ -139,14 +144,6 @@ class PlannedSd(ExpectedSd):
     """Standard deviation with the trials of a plan, and the required limit."""
 
     asked: Size
-
-
-class PlannedConfusion(Record):
-    """Chance of confusing two effects, without and with the trials of a plan."""
-
-    between: Names
-    before: Share
-    after: Share
 
 
 class Plan(Record):

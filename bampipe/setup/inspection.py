@@ -328,23 +328,17 @@ def _sign(correction: Correction, session: IngestResult) -> str:
     return f"{name} has the wrong sign: negate {entry}"
 
 
-def describe_size(correction: Correction) -> str:
-    """By how much signals read too much or too little."""
-    factor = correction.factor
-    off = f"{number(1.0 / factor)} times too much"
-    if factor > 1.0:
-        off = f"{number(factor)} times too little"
-    verb = "read" if len(correction.signals) > 1 else "reads"
-    return f"{join_names(correction.signals)} {verb} about {off}"
-
-
 def _scale(correction: Correction, session: IngestResult) -> str:
     fixes = dict.fromkeys(_scale_fix(name, correction, session) for name in correction.signals)
     channels = [f"channels.{name}" for name in correction.signals if name in session.channels]
     if len(channels) == len(correction.signals) > 1:
         fixes = {f"multiply scale of {join_names(channels)} by {number(correction.factor)}": None}
+    factor, verb = correction.factor, "read" if len(correction.signals) > 1 else "reads"
+    off = f"{number(factor)} times too little"
+    if factor <= 1.0:
+        off = f"{number(1.0 / factor)} times too much"
     like = f", as {correction.meant} read as {correction.stated}" if correction.meant else ""
-    return f"{describe_size(correction)}{like}: {'; '.join(fixes)}"
+    return f"{join_names(correction.signals)} {verb} about {off}{like}: {'; '.join(fixes)}"
 
 
 def _scale_fix(name: str, correction: Correction, session: IngestResult) -> str:

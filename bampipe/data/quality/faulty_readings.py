@@ -119,20 +119,14 @@ def find_equal_runs(values: np.ndarray, t: np.ndarray) -> list[tuple[int, int]]:
     equal = int(np.sum((stops - starts - 1)[~long]))
     share = equal / max(equal + moved.size, 1)
     least = np.log(_CHANCE) / np.log(max(share, 1e-3)) if share < 1.0 else np.inf
+    limits = {x: int(np.sum(values == x)) for x in (values.min(), values.max())}
     found = [
         (int(start), int(stop))
         for start, stop in zip(starts[long], stops[long], strict=True)
-        if stop - start > least and not _at_limit(values, start, stop)
+        # At the highest or lowest reading, no other sample may stand there, too.
+        if least < stop - start >= limits.get(values[start], 0)
     ]
     return found if sum(stop - start for start, stop in found) < _MOST_DEAD * values.size else []
-
-
-def _at_limit(values: np.ndarray, start: int, stop: int) -> bool:
-    """Whether a run is at the highest or lowest reading, which others have, too."""
-    here = values[start]
-    if here not in (values.min(), values.max()):
-        return False
-    return int(np.sum(values == here)) > stop - start
 
 
 def find_rails(values: np.ndarray) -> dict[float, Flags]:

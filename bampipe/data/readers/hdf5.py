@@ -5,7 +5,8 @@ or a column of a matrix (``log/pose[2]``). What lies outside the file is not fol
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from bampipe.data.readers.arrays import (
     recorded,
     split_index,
 )
-from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
+from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size
 from bampipe.errors import InputError
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -45,7 +46,7 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
         if any("[:]" in column for column in wanted.columns):
             return read_arrays(_vectors(file), wanted, name, what)
         known = _list_columns(file)
-        values: dict[str, np.ndarray] = {}
+        arrays: dict[str, np.ndarray | None] = {}
         units: dict[str, str] = {}
         for column in wanted.columns:
             where = f"{name}, {what} '{column}'"
@@ -54,19 +55,20 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
             own = next((n for n in (own, own.replace(".", "/")) if n in known), own)
             _require_column(file, own, [*known], name, where)
             data, field, place = known[own]
-            index = index if place is None else place
-            moment = column in wanted.datetimes
-            _check(data, _kind(data, field), moment, where)
             check_size(math.prod(data.shape), wanted, name)
-            if moment:
-                stamps = _stamps(data, field, index, wanted.datetimes[column], where)
-                values[column] = moments.seconds(stamps)
-            else:
-                cells = data[()] if field is None else data[field]
-                values[column] = np.asarray(pick(cells, index, where), dtype=np.float64)
+            kind = _kind(data, field)
+            text = kind.kind in "OS" or data.attrs.get("MATLAB_class") == b"char"
+            arrays[column] = None
+            if column in wanted.datetimes if text else kind.kind in "iufb":
+                if kind.kind == "S" and kind.itemsize > moments.LONGEST:
+                    what = f"a text of {kind.itemsize} bytes, expected a date and time"
+                    raise InputError(what, where=where)
+                cells = data[()] if field is None else _read_field(data, field)
+                cells = pick(cells, index if place is None else place, where)
+                arrays[column] = np.array(_texts(cells), dtype=object) if text else cells
             unit = "" if matlab else _unit(data)
             units |= {column: unit} if unit else {}
-    return RawTrial(aligned(values, name, what), first_row=1, units=units)
+    return replace(read_arrays(arrays, wanted, name, what), units=units)
 
 
 def columns(path: Path, name: str) -> dict[str, str]:
@@ -163,35 +165,19 @@ def _names(data: Any) -> list[str]:
     beside = dict(_datasets(data.parent)).get(items.rpartition("/")[2])
     if not len(found) and beside is not None and beside.shape == (width,):
         found = beside[()]
-    texts = [x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in found]
+    texts = _texts(found)
     return texts if data.ndim == 2 and len(texts) == width and len(set(texts)) == width else []
 
 
-def _check(data: Any, kind: Any, moment: bool, where: str) -> None:
-    text = kind.kind in "OS" or data.attrs.get("MATLAB_class") == b"char"
-    if moment != text or (not moment and kind.kind not in "iufb"):
-        raise InputError(
-            "not text, expected dates and times"
-            if moment
-            else "not numbers, expected a vector of real numbers",
-            where=where,
-        )
+def _read_field(data: Any, field: str) -> np.ndarray:
+    """A field of all rows, in blocks: rows may be wide, and memory that HDF5 lacks ends it."""
+    starts = range(0, max(data.shape[:1], default=0), _BLOCK_ROWS)
+    parts = [data[k : k + _BLOCK_ROWS][field] for k in starts]
+    return np.concatenate(parts) if parts else np.asarray(data[field])
 
 
-def _stamps(data: Any, field: str | None, index: int | None, form: str, where: str) -> np.ndarray:
-    """Dates and times as ns, (T,) int64, read in blocks of bounded size."""
-    kind = _kind(data, field)
-    if kind.kind == "S" and kind.itemsize > moments.LONGEST:
-        raise InputError(f"a text of {kind.itemsize} bytes, expected a date and time", where=where)
-    stamps = np.empty(len(pick(np.empty(data.shape, dtype="V0"), index, where)), dtype=np.int64)
-    axis = int(np.argmax(data.shape))
-    for start in range(0, len(stamps), _BLOCK_ROWS):
-        block = data[(slice(None),) * axis + (slice(start, start + _BLOCK_ROWS),)]
-        cells = np.moveaxis(block if field is None else block[field], axis, 0)
-        cells = cells.reshape(len(cells), -1)[:, index or 0]
-        text = [x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in cells]
-        stamps[start : start + len(text)] = moments.nanoseconds(text, form, where, start + 1)
-    return stamps
+def _texts(cells: Iterable[Any]) -> list[str]:
+    return [x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in cells]
 
 
 def _unit(data: Any) -> str:

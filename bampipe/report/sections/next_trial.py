@@ -10,7 +10,6 @@ from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.next import (
     Detectable,
-    ExpectedConfusion,
     ExpectedSd,
     NextResult,
     PlannedConfusion,
@@ -47,9 +46,7 @@ def section(results: Results) -> Section | None:
     return Section(TITLE, tuple(blocks))
 
 
-def tabulate_confusion(
-    title: str, heads: str, pairs: Sequence[ExpectedConfusion | PlannedConfusion]
-) -> Table:
+def tabulate_confusion(title: str, heads: str, pairs: Sequence[PlannedConfusion]) -> Table:
     """Tabulate the probability of confusing two effects, without and with new trials."""
     rows = [
         (

@@ -46,25 +46,20 @@ def section(results: Results) -> Section:
 
 def _describe_sampling(results: Results) -> str:
     session = results.session
-    text = f"{_describe_rate(results)}."
+    grid = session.sample_rate_hz
+    read = results.trials[results.trials["n_samples"] > 1]
+    rate = float(((read["n_samples"] - 1) / read["duration_s"]).median())
+    text = f"Sampled at {format_decimals(grid, 0)} Hz."
+    if math.isfinite(rate) and abs(rate - grid) > _SAME_RATE * grid:
+        text = (
+            f"Sampled at {format_digits(rate)} Hz on average, put on a grid of "
+            f"{format_decimals(grid, 0)} Hz when filtered."
+        )
     if noise := session.force.noise_sd:
         each = join_names(f"{name} {format_digits(sd, 2)}" for name, sd in noise.items())
         text += f" Noise of a sample: {each} {format_unit(session.force.unit)}."
     remarks = (*session.sensor_warnings, *map(phrases.describe_hum, session.mains_hum))
     return " ".join([text, *(f"{line[:1].upper()}{line[1:]}." for line in remarks)])
-
-
-def _describe_rate(results: Results) -> str:
-    """Return the mean sampling rate, and that of the grid if it differs."""
-    grid = results.session.sample_rate_hz
-    read = results.trials[results.trials["n_samples"] > 1]
-    rate = float(((read["n_samples"] - 1) / read["duration_s"]).median())
-    if not math.isfinite(rate) or abs(rate - grid) <= _SAME_RATE * grid:
-        return f"Sampled at {format_decimals(grid, 0)} Hz"
-    return (
-        f"Sampled at {format_digits(rate)} Hz on average, put on a grid of "
-        f"{format_decimals(grid, 0)} Hz when filtered"
-    )
 
 
 def _tabulate_trials(results: Results) -> Table:

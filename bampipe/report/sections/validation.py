@@ -110,9 +110,12 @@ def _tabulate_drift(
                 cells += [format_digits(factor * x, 2) for x in shown] or [NONE] * 3
             rows.append((axis, *cells, unit))
         heads = (f">in {h:g} s | >90 % | >moved" for h in horizons)
+        held_out, count = sum(t.held_out for t in validated.trials.values()), len(validated.trials)
+        which = "each trial" if held_out in (0, count) else "each held-out trial"
+        which += ", with parameters fitted to other trials" if held_out and count > 1 else ""
         note = (
             f"The model runs freely under the recorded inputs from many moments of "
-            f"{_describe_trials(validated)} Distance from the measured position, median and 90 % "
+            f"{which}. Distance from the measured position, median and 90 % "
             "quantile, and the distance that the axis itself has moved by then."
         )
         columns = " | ".join(("Axis", *heads, "Unit"))
@@ -121,15 +124,6 @@ def _tabulate_drift(
         lines = (f"{axis}: {why[:1].lower()}{why[1:]}" for axis, why in reasons.items())
         blocks.append(Bullets(tuple(lines)))
     return blocks
-
-
-def _describe_trials(validated: ValidateResult) -> str:
-    """Name the trials of the free runs, and their parameters, at the end of a sentence."""
-    held_out = sum(trial.held_out for trial in validated.trials.values())
-    if not held_out or len(validated.trials) == 1:
-        return "each trial."
-    which = "each trial" if held_out == len(validated.trials) else "each held-out trial"
-    return f"{which}, with parameters fitted to other trials."
 
 
 def _read_trial(results: Results) -> pd.DataFrame | None:

@@ -130,16 +130,11 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
 def _in_two_columns(seconds: SurveyedColumn, rest: SurveyedColumn, notes: Notes) -> ProposedClock:
     """Whole seconds and the nanoseconds on top of them, as ROS has them."""
     t = seconds.values - seconds.values[0] + 1e-9 * (rest.values - rest.values[0])
-    rate_hz = guesses.sample_rate(t)
     note = notes.guess(f"seconds in {seconds.name}, nanoseconds on top in {rest.name}")
-    lines = (
-        f"column = {quoted(seconds.name)}",
-        'unit = "s"',
-        f"nanoseconds = {quoted(rest.name)}{note}",
-    )
-    return ProposedClock(
-        t, (seconds.name, rest.name), _table(*lines), _stamped_rate(rate_hz, notes)
-    )
+    on_top = f"nanoseconds = {quoted(rest.name)}{note}"
+    table = _table(f"column = {quoted(seconds.name)}", 'unit = "s"', on_top)
+    rate = _stamped_rate(guesses.sample_rate(t), notes)
+    return ProposedClock(t, (seconds.name, rest.name), table, rate)
 
 
 def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
