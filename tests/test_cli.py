@@ -454,6 +454,7 @@ def ingested(tmp_path: Path) -> Path:
         (["absent.toml:yaw"], "absent.toml: no such file"),
         (["stribeck:yaw", "--auto"], "--auto chooses the effects itself"),
         (["stribeck:yaw"], "is missing"),
+        ([], "no effect named"),
     ],
 )
 def test_a_refused_extension_leaves_nothing(
@@ -462,10 +463,6 @@ def test_a_refused_extension_leaves_nothing(
     assert message in one_line_error(*command("extend", ingested, *arguments))
     models = {path.name for path in (ingested / "models").glob("*")}
     assert models <= {"base"}
-
-
-def test_extend_needs_an_effect(command: Command) -> None:
-    assert "no effect named" in one_line_error(*command("extend"))
 
 
 def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:

@@ -254,8 +254,9 @@ def start(toy: Toy, *arguments: str, pause: float = 0.0) -> subprocess.Popen[str
     )
 
 
-def run_arguments(toy: Toy) -> list[str]:
-    return ["run", str(toy.session), "--pipeline", str(toy.pipeline_file), "--runs", str(toy.runs)]
+def run_arguments(toy: Toy, sessions: Path | None = None) -> list[str]:
+    session, runs = str(sessions or toy.session), str(toy.runs)
+    return ["run", session, "--pipeline", str(toy.pipeline_file), "--runs", runs]
 
 
 def test_kill_in_mid_stage_leaves_the_previous_result(toy: Toy) -> None:
@@ -529,18 +530,8 @@ def test_one_failing_session_stops_no_other(toy: Toy) -> None:
 @pytest.mark.slow
 def test_worker_processes_survive_a_death_and_give_the_same_bytes(toy: Toy) -> None:
     several(toy, {"a": "1", "b": "two", "c": "die", "d": "4", "e": "5 6"})
-    process = start(
-        toy,
-        "run",
-        str(toy.folder / "many" / "*"),
-        "--pipeline",
-        str(toy.pipeline_file),
-        "--runs",
-        str(toy.folder / "parallel"),
-        "--jobs",
-        "2",
-        "--json",
-    )
+    many = run_arguments(toy, toy.folder / "many" / "*")
+    process = start(toy, *many, "--jobs", "2", "--json")
     out, _ = process.communicate()
     found = {Path(item["run"]).name: item["state"] for item in json.loads(out)["sessions"]}
     assert found == {"a": "done", "b": "refused", "c": "crashed", "d": "done", "e": "done"}
@@ -548,7 +539,7 @@ def test_worker_processes_survive_a_death_and_give_the_same_bytes(toy: Toy) -> N
     for name in ("a", "d", "e"):
         root = toy.folder / "serial" / name
         run_session(replace(toy.request(), root=root, session=toy.folder / "many" / name))
-        assert contents(root) == contents(toy.folder / "parallel" / name)
+        assert contents(root) == contents(toy.runs / name)
 
 
 def test_lock_is_free_after_a_crash(toy: Toy) -> None:

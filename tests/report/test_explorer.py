@@ -83,11 +83,21 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return synthetic_run.write_all(tmp_path_factory.mktemp("runs") / "s01")
 
 
+@pytest.fixture
+def own_run(run: Path, tmp_path: Path) -> Path:
+    """A copy of the run that a test may change."""
+    return Path(shutil.copytree(run, tmp_path / "s02"))
+
+
+def write_page(root: Path) -> Path:
+    path = root.parent / "explore.html"
+    path.write_text(explorer_page(Results(root), "device bam"), encoding="utf-8")
+    return path
+
+
 @pytest.fixture(scope="module")
 def page_file(run: Path) -> Path:
-    path = run.parent / "explore.html"
-    path.write_text(explorer_page(Results(run), "device bam"), encoding="utf-8")
-    return path
+    return write_page(run)
 
 
 def test_the_page_names_no_address_but_the_report(page_file: Path) -> None:
@@ -100,13 +110,11 @@ def test_the_page_names_no_address_but_the_report(page_file: Path) -> None:
     assert "Copyright (c) 2022 Leon Sorokin" in text
 
 
-def test_text_from_files_cannot_break_the_page(run: Path, tmp_path: Path) -> None:
-    root = tmp_path / "s02"
-    shutil.copytree(run, root)
-    frame = pd.read_parquet(root / "ingest/trials.parquet")
+def test_text_from_files_cannot_break_the_page(own_run: Path) -> None:
+    frame = pd.read_parquet(own_run / "ingest/trials.parquet")
     frame["kind"] = "</script><script>alert(1)</script>"
-    write_parquet(root / "ingest/trials.parquet", frame)
-    assert "<script>alert" not in explorer_page(Results(root), "")
+    write_parquet(own_run / "ingest/trials.parquet", frame)
+    assert "<script>alert" not in explorer_page(Results(own_run), "")
 
 
 def test_a_session_that_was_only_read_has_a_page(tmp_path: Path) -> None:
@@ -153,11 +161,7 @@ def opened(browser: Any) -> Iterator[Opened]:
     complaints: list[str] = []
     contexts = []
 
-    def open_page(
-        path: Path,
-        width: int = 1280,
-        scheme: str = "light",
-    ) -> Any:
+    def open_page(path: Path, width: int = 1280, scheme: str = "light") -> Any:
         context = browser.new_context(
             viewport={"width": width, "height": 900}, color_scheme=scheme, accept_downloads=True
         )
@@ -393,9 +397,7 @@ def test_a_session_without_results_opens(opened: Opened, tmp_path: Path, empty: 
     if empty:
         path = root / "ingest/samples.parquet"
         write_parquet(path, pd.read_parquet(path).iloc[:0])
-    page_path = tmp_path / "page.html"
-    page_path.write_text(explorer_page(Results(root), ""))
-    page = opened(page_path)
+    page = opened(write_page(root))
     assert (page.locator("#plots figure").count() == 0) == empty
     if empty:
         assert "No trial of this session could be used" in page.locator("#plots").inner_text()
@@ -407,17 +409,13 @@ def test_a_session_without_results_opens(opened: Opened, tmp_path: Path, empty: 
 
 @pytest.mark.parametrize("diagnosed", [True, False])
 def test_correlations_come_with_the_variables_of_a_diagnosis(
-    opened: Opened, run: Path, tmp_path: Path, diagnosed: bool
+    opened: Opened, own_run: Path, diagnosed: bool
 ) -> None:
-    root = tmp_path / "s05"
-    shutil.copytree(run, root)
     if not diagnosed:
-        for path in root.glob("models/*/*"):
+        for path in own_run.glob("models/*/*"):
             if path.name in ("diagnose.json", "map_variables.parquet"):
                 path.unlink()
-    path = tmp_path / "page.html"
-    path.write_text(explorer_page(Results(root), ""))
-    page = opened(path)
+    page = opened(write_page(own_run))
     assert figure(page, "autocorrelation of the residual").count() == 1
     drawn = page.locator("figure.plot").filter(has_text="correlation with motion and load")
     assert drawn.count() == int(diagnosed)
@@ -457,19 +455,14 @@ JOINTS = {
 }  # fmt: skip
 
 
-def test_the_pose_is_that_at_the_cursor(opened: Opened, run: Path, tmp_path: Path) -> None:
+def test_the_pose_is_that_at_the_cursor(opened: Opened, own_run: Path) -> None:
     """Ends of links in the drawing against rotations by SciPy; axes as scales of other devices."""
-    root = tmp_path / "s06"
-    shutil.copytree(run, root)
-    path = tmp_path / "page.html"
-    path.write_text(explorer_page(Results(root), ""))
-    page = opened(path)
+    page = opened(write_page(own_run))
     assert page.locator("#pose circle.dial").count() == 2
     page.context.close()
-    write_text(root / "ingest/device.toml", toml_text({"robot": {"joints": JOINTS}}))
-    path.write_text(explorer_page(Results(root), ""))
-    page = opened(path)
-    samples = pd.read_parquet(root / "ingest/samples.parquet")
+    write_text(own_run / "ingest/device.toml", toml_text({"robot": {"joints": JOINTS}}))
+    page = opened(write_page(own_run))
+    samples = pd.read_parquet(own_run / "ingest/samples.parquet")
     trial = samples[samples["trial_id"] == synthetic_run.FREE[0]].reset_index(drop=True)
     drawn = []
     page.locator(".canvas").first.focus()
@@ -527,10 +520,8 @@ def test_two_sessions_stand_on_one_page(opened: Opened, run: Path, tmp_path: Pat
     assert shown["measured (N·m)"].notna().all()
     table = csv_of(page, "Parameter map").set_index("parameter")
     assert table.loc["mass", "s08 base"] == 123.0 != table.loc["mass", "s07 base"]
-    write_json(
-        roots[1] / "ingest/session.json",
-        read_json(roots[1] / "ingest/session.json") | {"device": "x"},
-    )
+    session = read_json(roots[1] / "ingest/session.json") | {"device": "x"}
+    write_json(roots[1] / "ingest/session.json", session)
     with pytest.raises(InputError, match="two runs of one device"):
         write_page_of_two(*roots)
 
@@ -548,8 +539,7 @@ def test_a_zoom_into_three_channels_of_a_million_samples_takes_a_moment(
         noise = 0.02 * np.random.default_rng(number).standard_normal(count)
         columns[f"q_{axis}"] = 10.0 * np.sin((1.3 + 0.6 * number) * t) + noise
     write_parquet(root / "ingest/samples.parquet", pd.DataFrame(columns))
-    path = tmp_path / "large.html"
-    path.write_text(explorer_page(Results(root), ""))
+    path = write_page(root)
     assert path.stat().st_size < 5.3e6
     page = opened(path)
     page.locator(".canvas").first.focus()

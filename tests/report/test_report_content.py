@@ -60,6 +60,12 @@ def full_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return synthetic_run.write_all(tmp_path_factory.mktemp("runs") / "s01")
 
 
+@pytest.fixture
+def own_run(full_run: Path, tmp_path: Path) -> Path:
+    """A copy of the run that a test may change."""
+    return Path(shutil.copytree(full_run, tmp_path / "s01"))
+
+
 @pytest.fixture(scope="module")
 def full(full_run: Path) -> Report:
     return build_run_report(Results(full_run), quiet)
@@ -116,15 +122,14 @@ def test_trials_set_aside_and_repaired_say_why(full: Report) -> None:
     assert "interpolated" in row_of(full.html, "t03_free")[-1]
 
 
-def test_a_long_remark_of_several_trials_stands_once_below_the_table(tmp_path: Path) -> None:
-    root = synthetic_run.write_all(tmp_path / "s01")
-    path = root / "ingest/trials.parquet"
+def test_a_long_remark_of_several_trials_stands_once_below_the_table(own_run: Path) -> None:
+    path = own_run / "ingest/trials.parquet"
     trials = pd.read_parquet(path)
     said = "from {} s of the record; time stamps jitter by {} ms: put on a uniform grid by cubics"
     trials.loc[:1, "repairs"] = [said.format(*numbers) for numbers in ((0, 0.9), (15, 1.25))]
     trials.loc[2, "repairs"] = "12 samples missing at 3.2 s"
     write_parquet(path, trials)
-    page = page_of(root)
+    page = page_of(own_run)
     assert [row_of(page, f"t0{n}_free")[-1] for n in (1, 2, 3)] == [
         "from 0 s of the record", "from 15 s of the record", "12 samples missing at 3.2 s",
     ]  # fmt: skip
@@ -164,13 +169,11 @@ def test_each_effect_found_is_explained(full: Report) -> None:
     assert "Friction builds up over a distance. torque = -z" in words
 
 
-def test_a_simulated_session_says_so_and_who_recorded_what(full_run: Path, tmp_path: Path) -> None:
-    root = tmp_path / "s01"
-    shutil.copytree(full_run, root)
+def test_a_simulated_session_says_so_and_who_recorded_what(own_run: Path) -> None:
     said = {"simulated": True, "operator": "A. Lee", "device_serial": "B-3", "notes": "warm room"}
-    path = root / "ingest/session.json"
+    path = own_run / "ingest/session.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **said}))
-    words = text_of(page_of(root))
+    words = text_of(page_of(own_run))
     assert "simulated, device bam B-3, recorded 2026-10-03 10:12 UTC, by A. Lee" in words
     assert "Notes: warm room." in words
     assert "It replicates nothing that was measured" in words
@@ -197,13 +200,12 @@ def test_ladder_shows_every_version_and_what_moved(full: Report) -> None:
     ],
 )
 def test_the_verdict_on_the_session_is_that_of_its_diagnosis(
-    tmp_path: Path, verdict: str, sets: dict[tuple[str, ...], float], title: str
+    own_run: Path, verdict: str, sets: dict[tuple[str, ...], float], title: str
 ) -> None:
-    root = synthetic_run.write_all(tmp_path / "s01")
     axes = {"pitch": {"verdict": "nothing_missing"}, "yaw": {"verdict": verdict}}
     fields = diagnosis(axes, sets)
-    write_result(root, DiagnoseResult, model=synthetic_run.CHILD, **fields)
-    assert title in text_of(page_of(root))
+    write_result(own_run, DiagnoseResult, model=synthetic_run.CHILD, **fields)
+    assert title in text_of(page_of(own_run))
 
 
 def test_stiffness_in_both_units_of_bandwidth(full: Report) -> None:
@@ -231,39 +233,33 @@ def test_provenance_lists_inputs_versions_and_keys_in_order(full: Report) -> Non
     assert places == sorted(places)
 
 
-def test_settings_that_all_models_share_stand_once(full_run: Path, tmp_path: Path) -> None:
-    root = tmp_path / "run"
-    shutil.copytree(full_run, root)
-    record = json.loads((root / "run.json").read_text())
+def test_settings_that_all_models_share_stand_once(own_run: Path) -> None:
+    record = json.loads((own_run / "run.json").read_text())
     stages = record["stages"]
     shared = {"seed": 3, "model": "base"}
     stages["identify:base"]["config"] = shared
     stages["identify:other"] = stages["identify:base"] | {"config": shared | {"model": "other"}}
     stages["filter"]["config"] = {"band_hz": 5.0}
-    (root / "run.json").write_text(json.dumps(record))
-    table = page_of(root)
+    (own_run / "run.json").write_text(json.dumps(record))
+    table = page_of(own_run)
     table = table[table.index("Settings of each stage") :]
     assert row_of(table, "identify")[1] == "seed = 3"
     assert row_of(table, "filter")[1] == "band_hz = 5.0"
     assert "identify:other" not in table
 
 
-def test_results_older_than_their_inputs_are_named_first(
-    full: Report, full_run: Path, tmp_path: Path
-) -> None:
+def test_results_older_than_their_inputs_are_named_first(full: Report, own_run: Path) -> None:
     assert "older than their inputs" not in full.html
-    root = tmp_path / "run"
-    shutil.copytree(full_run, root)
-    record = json.loads((root / "run.json").read_text())
+    record = json.loads((own_run / "run.json").read_text())
     # A device file counts by what it says where it is read, by its bytes where it is written.
     record["stages"]["ingest"]["outputs"]["ingest/device.toml"] = "b" * 64
     record["stages"]["identify:base"]["inputs"]["ingest/device.toml"] = "d" * 64
-    (root / "run.json").write_text(json.dumps(record))
-    assert Results(root).outdated == ()
+    (own_run / "run.json").write_text(json.dumps(record))
+    assert Results(own_run).outdated == ()
     record["stages"]["ingest"]["outputs"]["ingest/x"] = "f" * 64
-    (root / "run.json").write_text(json.dumps(record))
-    assert Results(root).outdated == ("filter", "identify:base", "stiffness")
-    page = page_of(root)
+    (own_run / "run.json").write_text(json.dumps(record))
+    assert Results(own_run).outdated == ("filter", "identify:base", "stiffness")
+    page = page_of(own_run)
     place = page.index("older than their inputs")
     assert place < page.index("<table") and "identify:base" in page[place:][:400]
 
@@ -277,35 +273,26 @@ def test_all_figures_of_the_paper(full: Report) -> None:
         assert f"the paper's {place}" in text_of(full.html)
 
 
-def test_what_did_not_run_along_the_data_has_no_picture_of_its_convergence(
-    full_run: Path, tmp_path: Path
-) -> None:
-    root = tmp_path / "run"
-    shutil.copytree(full_run, root)
-    results = Results(root)
-    path = root / "models" / results.model / "trace.parquet"
+def test_what_did_not_run_along_the_data_has_no_picture_of_its_convergence(own_run: Path) -> None:
+    path = own_run / "models" / Results(own_run).model / "trace.parquet"
     trace = pd.read_parquet(path)
     for rows, expected in ((trace, True), (trace.groupby("trial_id").tail(1), False)):
         write_parquet(path, rows.reset_index(drop=True))
-        blocks = identification.section(Results(root)).blocks
+        blocks = identification.section(Results(own_run)).blocks
         assert ("convergence" in [getattr(b, "name", "") for b in blocks]) is expected
 
 
-def test_the_drift_of_a_model_is_a_table_and_its_absence_a_sentence(
-    full_run: Path, tmp_path: Path
-) -> None:
-    root = tmp_path / "run"
-    shutil.copytree(full_run, root)
-    results = Results(root)
+def test_the_drift_of_a_model_is_a_table_and_its_absence_a_sentence(own_run: Path) -> None:
+    results = Results(own_run)
     validated = results.read(ValidateResult)
     assert validated is not None
     why = "In 0.5 s the model drifts further than the axis moves."
     step = {"horizon_s": 0.1, "median": 0.0012, "quantile_90": 0.0034, "displacement": 0.2}
     drift = {"unit": "rad", "horizons": [step | {"windows": 40}], "reason": why}
     content = validated.model_dump(mode="json") | {"free_run": {"drift": {"yaw": drift}}}
-    path = root / "models" / results.model / "validate.json"
+    path = own_run / "models" / results.model / "validate.json"
     path.write_text(json.dumps(content))
-    blocks = validation.section(Results(root)).blocks
+    blocks = validation.section(Results(own_run)).blocks
     table = next(b for b in blocks if getattr(b, "caption", "").startswith("Drift"))
     assert list(table.rows) == [("yaw", "1.2", "3.4", "200", "mrad")]
     assert any(f"yaw: {why[:1].lower()}{why[1:]}" in getattr(b, "items", ()) for b in blocks)
@@ -394,24 +381,20 @@ def test_bad_source_date_epoch_is_one_line(tmp_path: Path, monkeypatch: pytest.M
         build_run_report(Results(tmp_path), quiet)
 
 
-def test_green_means_that_no_check_failed(tmp_path: Path) -> None:
-    root = synthetic_run.write_all(tmp_path / "s01")
-    path = root / f"models/{synthetic_run.CHILD}/validate.json"
+def test_green_means_that_no_check_failed(own_run: Path) -> None:
+    path = own_run / f"models/{synthetic_run.CHILD}/validate.json"
     content = json.loads(path.read_text())
-    assert "callout good" in page_of(root)
+    assert "callout good" in page_of(own_run)
     content["failed_checks"] = ["yaw, innovations: Not white: 60 % of their variance is left."]
     path.write_text(json.dumps(content))
-    page = page_of(root)
+    page = page_of(own_run)
     start = text_of(page)[:1500]
     assert "nothing is missing, but 1 check failed" in start
     assert "Yaw, innovations: Not white: 60 % of their variance is left." in start
     assert "callout good" not in page
 
 
-def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(
-    full_run: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(full_run, tmp_path / "s01")
+def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(own_run: Path) -> None:
     name, formula = "bump_by_position:yaw", "height*exp(-((q - place)/width)**2)"
     curve = {
         "variable": "position", "variable_unit": "rad", "at": [-0.1, 0.0, 0.1],
@@ -426,10 +409,9 @@ def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(
         "sentence": "Yaw: a force on the axis that has a bump at one position.",
     }  # fmt: skip
     effect = {"axis": "yaw", "expression": formula, "acts_as": "force", "curve": curve}
-    write_result(
-        tmp_path / "s01", DraftResult, axes={"yaw": axis}, effects={name: effect}, selected=[name]
-    )
-    report = build_run_report(Results(tmp_path / "s01"), quiet)
+    drafted = {"axes": {"yaw": axis}, "effects": {name: effect}, "selected": [name]}
+    write_result(own_run, DraftResult, **drafted)
+    report = build_run_report(Results(own_run), quiet)
     assert "Drafts" in report.sections
     words = text_of(report.html)
     assert "Yaw: a force on the axis that has a bump at one position." in words
@@ -443,13 +425,12 @@ def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(
 
 
 def test_a_model_that_is_not_there_changes_nothing_in_the_run(
-    tmp_path: Path, command: Callable[..., tuple[int, str, str]]
+    own_run: Path, command: Callable[..., tuple[int, str, str]]
 ) -> None:
-    root = synthetic_run.write_all(tmp_path / "s01")
-    before = (root / "run.json").read_bytes()
-    code, _, err = command("report", root, "--model", "bse")
+    before = (own_run / "run.json").read_bytes()
+    code, _, err = command("report", own_run, "--model", "bse")
     assert code == 2 and "no results for model 'bse'" in err and "base" in err
-    assert (root / "run.json").read_bytes() == before and not (root / "report").exists()
+    assert (own_run / "run.json").read_bytes() == before and not (own_run / "report").exists()
 
 
 def test_long_names_break_behind_underscores_so_that_neighbours_do_not_touch():
