@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 import threading
 import time
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from bampipe.errors import InputError, printable
 from bampipe.progress import Progress
+from bampipe.report.wording import break_lines
 from bampipe.run.events import Event
 from bampipe.run.request import Outcome
 
@@ -96,8 +96,12 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     raw = [list(row) for row in rows]
     cells = [[format_cell(cell) for cell in row] for row in raw]
     last = len(head) - 1  # nothing follows it, so it may be of any length
+    # Names of models, and of several effects, are long.
     lines = [
-        [[cell] if column == last else _break_name(cell) for column, cell in enumerate(row)]
+        [
+            [cell] if column == last else break_lines(cell, WIDEST_CELL, "+ ").split("\n")
+            for column, cell in enumerate(row)
+        ]
         for row in cells
     ]
     widths = [
@@ -120,16 +124,6 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     for row in lines:
         for parts in zip_longest(*row, fillvalue=""):
             say(join(parts))
-
-
-def _break_name(text: str) -> list[str]:
-    """Break the name of a model, or of several effects, into lines where it is long."""
-    found = [""]
-    for part in re.split(r"(?<=[+ ])", text):
-        if len(found[-1]) + len(part) > WIDEST_CELL and found[-1]:
-            found.append("")
-        found[-1] += part
-    return found
 
 
 def _is_scalar(value: object) -> bool:

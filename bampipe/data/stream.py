@@ -78,27 +78,21 @@ class StreamLayout:
                 where=where,
                 remedy="log it as a signed number",
             )
-        force = session.force
-        columns = [clock.column, *(e.column for e in session.encoders)]
-        columns += [*(b.column for b in session.brakes), *(c.column for c in session.channels)]
-        columns += list(force.columns) if force else []
-        names = ["t", *(f"q_{e.axis}" for e in session.encoders)]
-        names += [*(f"brake_{b.axis}" for b in session.brakes), *(c.name for c in session.channels)]
-        names += list(force.names) if force else []
-        gain, offset = np.zeros((len(columns), len(names))), np.zeros(len(names))
-        scales = [(session.tick, 0.0), *((e.scale, -e.zero * e.scale) for e in session.encoders)]
-        scales += [(1.0, 0.0) for _ in session.brakes]
-        scales += [(c.scale, c.offset) for c in session.channels]
-        at = len(scales)
-        np.fill_diagonal(gain[:at, :at], [scale for scale, _ in scales])
-        offset[:at] = [shift for _, shift in scales]
-        if force:
+        known = [(clock.column, "t", session.tick, 0.0)]
+        known += [(e.column, f"q_{e.axis}", e.scale, -e.zero * e.scale) for e in session.encoders]
+        known += [(b.column, f"brake_{b.axis}", 1.0, 0.0) for b in session.brakes]
+        known += [(c.column, c.name, c.scale, c.offset) for c in session.channels]
+        columns, names, scales, offset = map(list, zip(*known, strict=True))
+        gain = np.diag(scales)
+        if force := session.force:
             matrix = np.array(force.calibration).T
-            gain[at:, at:] = matrix
-            offset[at:] = -np.array(force.zero) @ matrix
+            gain = np.pad(gain, ((0, len(force.columns)), (0, len(force.names))))
+            gain[len(known) :, len(known) :] = matrix
+            offset += (-np.array(force.zero) @ matrix).tolist()
+            columns, names = [*columns, *force.columns], [*names, *force.names]
         may_lack = np.zeros(len(columns), dtype=bool)
         may_lack[1 : 1 + len(session.encoders)] = True
-        return StreamLayout(tuple(columns), tuple(names), gain, offset, may_lack)
+        return StreamLayout(tuple(columns), tuple(names), gain, np.array(offset), may_lack)
 
 
 @dataclass

@@ -29,13 +29,14 @@ def protocol_sheet(plan: Plan, session: str, model: str, by_hand: bool) -> bytes
         plan: what to record; session, model: of the plan.
         by_hand: whether a person moves the device, or else its drives.
     """
-    versions = [_sheet(plan, session, model, by_hand, listed) for _, listed in _VERSIONS]
     return typeset.render_sheet(
-        [replace(one, scale=scale) for one, (scale, _) in zip(versions, _VERSIONS, strict=True)], 0
+        _sheet(plan, session, model, by_hand, listed, scale) for scale, listed in _VERSIONS
     )
 
 
-def _sheet(plan: Plan, session: str, model: str, by_hand: bool, listed: int) -> Document:
+def _sheet(
+    plan: Plan, session: str, model: str, by_hand: bool, listed: int, scale: float
+) -> Document:
     """Return the sheet with at most ``listed`` parameters."""
     blocks: list[Block] = [Paragraph(plan.sentence)]
     if plan.trials:
@@ -61,6 +62,7 @@ def _sheet(plan: Plan, session: str, model: str, by_hand: bool, listed: int) -> 
         f"Trials to record: {session}",
         f"Model {model}, {format_decimals(plan.seconds, 0)} s in all",
         tuple(sections),
+        scale,
     )
 
 

@@ -4,7 +4,6 @@ Colours are those of Okabe and Ito (2008). Lines that matter also differ in dash
 """
 
 import io
-import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from itertools import pairwise
@@ -19,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from bampipe.report import document
-from bampipe.report.wording import choose_scale, format_unit
+from bampipe.report.wording import break_lines, choose_scale, format_unit
 
 INK = "#1c2024"
 FAINT = "#b4b8bd"
@@ -154,16 +153,6 @@ def _touch(axes: Axes) -> bool:
 def label_axis(quantity: str, unit: str, most: int = _LABEL) -> str:
     """Return the label of an axis: quantity and unit as printed, in lines if it is long."""
     return break_lines(f"{quantity} ({format_unit(unit)})" if unit else quantity, most)
-
-
-def break_lines(text: str, most: int) -> str:
-    """Return ``text`` in lines of ``most`` letters, broken at spaces and behind underscores."""
-    found = [""]
-    for part in re.findall(r"[^ _]*[ _]|[^ _]+", text):
-        if found[-1] and len((found[-1] + part).rstrip()) > most:
-            found.append("")
-        found[-1] += part
-    return "\n".join(line.rstrip() for line in found)
 
 
 def break_heading(name: str, columns: int) -> str:

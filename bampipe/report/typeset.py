@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -45,15 +45,14 @@ def render_pdf(document: Document, recorded: int) -> bytes:
     return _print(document, recorded)[0]
 
 
-def render_sheet(versions: Sequence[Document], recorded: int) -> bytes:
-    """Return the first of ``versions`` that fits on one page as PDF, or the last of them.
+def render_sheet(versions: Iterable[Document]) -> bytes:
+    """Return the first of ``versions``, the fullest first, that fits on one page, else the last.
 
-    Args:
-        versions: of one document, the fullest first; recorded: as for `render_pdf`.
+    As PDF, without a date in the file.
     """
     printed = b""
     for document in versions:
-        printed, pages = _print(document, recorded)
+        printed, pages = _print(document, 0)
         if pages == 1:
             break
     return printed

@@ -121,6 +121,16 @@ def format_p_value(value: float | None) -> str:
     return "< 0.001" if value < 0.001 else format_digits(value, 2)
 
 
+def break_lines(text: str, most: int, behind: str = " _") -> str:
+    """Return ``text`` in lines of ``most`` letters, broken behind these marks."""
+    found = [""]
+    for part in re.split(f"(?<=[{behind}])", text):
+        if found[-1] and len((found[-1] + part).rstrip()) > most:
+            found.append("")
+        found[-1] += part
+    return "\n".join(line.rstrip() for line in found)
+
+
 def split_name(name: str) -> str:
     """Return a name from a file as words: ``brake_residual_torque`` with spaces."""
     return name.replace("_", " ")

@@ -19,7 +19,7 @@ from bampipe.report import style, typeset
 from bampipe.report.build import Report, build_run_report
 from bampipe.report.run_results import Results
 from bampipe.report.sections import identification, validation
-from bampipe.report.wording import name_parameter
+from bampipe.report.wording import break_lines, name_parameter
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.draft import DraftResult
 from bampipe.results.validate import ValidateResult
@@ -436,7 +436,7 @@ def test_a_model_that_is_not_there_changes_nothing_in_the_run(
 def test_long_names_break_behind_underscores_so_that_neighbours_do_not_touch():
     assert style.break_heading("shoulder_pan_joint", 6) == "shoulder_\npan_joint"
     assert style.break_heading("shoulder_pan_joint", 3) == "shoulder_pan_joint"
-    assert style.break_lines("two words, joint_1", 9) == "two\nwords,\njoint_1"
+    assert break_lines("two words, joint_1", 9) == "two\nwords,\njoint_1"
     assert style.label_axis("wrist_1_joint, torque", "N·m", 20) == "wrist_1_joint,\ntorque (N·m)"
 
 

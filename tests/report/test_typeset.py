@@ -41,8 +41,8 @@ def test_a_table_that_would_leave_a_hole_is_broken(rows: int, words: int, pages:
 
 def test_a_sheet_is_the_first_version_that_fits_on_one_page() -> None:
     versions = [document(*lines(count)) for count in (80, 20, 10)]
-    assert render_sheet(versions, 0) == render_pdf(versions[1], 0)
-    assert render_sheet(versions[:1], 0) == render_pdf(versions[0], 0)
+    assert render_sheet(versions) == render_pdf(versions[1], 0)
+    assert render_sheet(versions[:1]) == render_pdf(versions[0], 0)
 
 
 def test_columns_are_read_and_empty_ones_left_out() -> None:

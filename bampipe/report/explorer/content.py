@@ -314,18 +314,18 @@ def _list_verdicts(versions: Sequence[_Version]) -> list[Content]:
 
 
 def _describe_effect(diagnosis: DiagnoseResult, axis: str, name: str, share: float) -> Content:
-    ranked = next(
-        (one for one in diagnosis.ranking if (one.effect, one.axis) == (name, axis)), None
-    )
+    ranked = [
+        {**one.model_dump(mode="json"), "unit": format_unit(one.unit)}
+        for one in diagnosis.ranking
+        if (one.effect, one.axis) == (name, axis)
+    ]
     said = diagnosis.descriptions.get(name.partition(":")[0])
     sets = [
         {"effects": " + ".join(one.effects) or "none", "probability": one.probability}
         for one in diagnosis.sets
         if name in one.effects
     ]
-    entry = None if ranked is None else ranked.model_dump(mode="json", exclude={"effect", "axis"})
-    if entry is not None:
-        entry["unit"] = format_unit(entry["unit"])
+    entry = next(iter(ranked), None)
     text = None if said is None else said.model_dump(mode="json")
     return {"name": name, "probability": share, "ranked": entry, "said": text, "sets": sets}
 

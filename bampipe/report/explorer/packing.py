@@ -53,9 +53,9 @@ class Packer:
         codes[finite] = np.rint((values[finite] - low) / step).astype(np.uint16)
         once = np.diff(codes, prepend=codes.dtype.type(0))
         twice = np.diff(once, prepend=once.dtype.type(0))
-        order = 1 + int(_sum_steps(twice) < _sum_steps(once))
-        steps = (once, twice)[order - 1].view(np.int16)
-        return PackedColumn(self._add(_fold_bytes(steps)), order, low, step)
+        both = [steps.view(np.int16) for steps in (once, twice)]
+        order = int(np.argmin([np.abs(steps.astype(np.float64)).sum() for steps in both]))
+        return PackedColumn(self._add(_fold_bytes(both[order])), order + 1, low, step)
 
     def pack_times(self, seconds: NDArray[np.float64]) -> int:
         """Return the number of the block of ``seconds``: microseconds, differences taken twice."""
@@ -69,10 +69,6 @@ class Packer:
             self._known[raw] = len(self.blocks)
             self.blocks.append(base64.b64encode(packed).decode("ascii"))
         return self._known[raw]
-
-
-def _sum_steps(steps: NDArray[np.uint16]) -> float:
-    return float(np.abs(steps.view(np.int16).astype(np.float64)).sum())
 
 
 def _fold_bytes(steps: NDArray[np.signedinteger]) -> bytes:

@@ -239,21 +239,15 @@ def _draw_movement(
     one, keep = _find_movement(speed), style.thin(len(error), 2500)
     top.plot(speed[keep], error[keep], ".", ms=2.2, mew=0, color=style.BLUE, alpha=0.5)
     top.plot(speed[one], error[one], color=style.VERMILLION, lw=1.2, label="one movement")
-    _draw_arrow(top, speed[one], error[one])
+    count = len(speed[one])
+    if count >= 12:
+        start, ahead = count // 5, count // 5 + max(2, count // 25)
+        tail, head = ((speed[one][k], error[one][k]) for k in (start, ahead))
+        look = {"arrowstyle": "-|>", "color": style.VERMILLION, "mutation_scale": 13}
+        top.annotate("", xy=head, xytext=tail, arrowprops=look)
     style.set_limits(top, [np.quantile(error, [0.001, 0.999]), error[one]])
     shown = t[one] - t[one][0]
     bottom.plot(shown, measured[one], color=style.INK, lw=1.4, label="measured")
     bottom.plot(shown, without[one], color=style.ORANGE, ls=(0, (4, 1.5)), lw=1.1,
                 label="predicted without friction")  # fmt: skip
     bottom.axhline(0.0, color=style.INK, lw=0.5)
-
-
-def _draw_arrow(panel: Any, x: np.ndarray, y: np.ndarray) -> None:
-    if len(x) < 12:
-        return
-    start = len(x) // 5
-    ahead = start + max(2, len(x) // 25)
-    panel.annotate(
-        "", xy=(x[ahead], y[ahead]), xytext=(x[start], y[start]),
-        arrowprops={"arrowstyle": "-|>", "color": style.VERMILLION, "mutation_scale": 13},
-    )  # fmt: skip
