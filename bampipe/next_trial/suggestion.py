@@ -110,9 +110,8 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
     axes = [axis for axis in seen.moved_axes if axis in acts] or seen.moved_axes
     space = DesignSpace(rehearsal, _SUGGESTED_S, axes, with_rests=True, with_brakes=True)
     best = rank_designs(space, lambda motion: -comparison.confusion_with(motion))[0]
-    confusions, contrasts = comparison.expect(best.expected_motions), comparison.contrasts_now
-    pairs = zip(confusions, contrasts.values(), strict=True)
-    expected, now = max(pairs, key=lambda pair: pair[0].weight * pair[0].before)
+    confusions = comparison.expect(best.expected_motions)
+    expected = max(confusions, key=lambda one: one.weight * one.before)
     if expected.after > min(1.0 - session.criteria.probability, expected.before / AS_FORECAST):
         return None
     axis = max(expected.left, key=lambda name: expected.left[name])
@@ -120,9 +119,7 @@ def suggest_trial(session: Session, final: Fit, result: DiagnoseResult) -> Sugge
     design = describe_design(best.design, seen, e.system.model.device)
     before, after = expected.before, expected.after
     return SuggestedTrial(
-        between=expected.between, axis=axis, design=design, separation=expected.left[axis],
-        separation_now=float(now.left[e.system.coordinates.index(axis)]),
-        confusion=after, confusion_now=before,
+        between=expected.between, axis=axis, design=design, confusion=after, confusion_now=before,
         sentence=f"To distinguish {first} from {second}, record this trial: {design} The chance of"
         f" confusing them would fall from {say_chance(before)} to {say_chance(after)}.",
     )  # fmt: skip

@@ -96,8 +96,6 @@ class SuggestedTrial(Record):
     between: Names
     axis: str = Field(description="On which they differ most")
     design: str
-    separation: Size = Field(description="Error of the wrong one there, refitted, in noise floors")
-    separation_now: Size = Field(description="The same on the present trials")
     confusion: Share = Field(description="Probability of taking one for the other, with that trial")
     confusion_now: Share
     sentence: str

@@ -27,7 +27,6 @@ class AxisDifferentiation(Record):
     resolution: Size
     quantisation_sd: Size
     measurement_noise_sd: Size
-    spectrum_floor_hz: Size = Field(description="Where the spectrum meets the noise of the encoder")
     log_likelihood: dict[str, float] = Field(description="By order of the motion model")
     position_sd: Size
     velocity_sd: Size

@@ -58,7 +58,6 @@ class AxisStiffness(Record):
     calibration_sd: Size = Field(
         description="Part from the stated uncertainties of sensors, and the zeros of encoders"
     )
-    cycle_scatter: Size = Field(description="Standard deviation over the cycles")
     unit: str = Field(description="Of the stiffness: N.m/rad or N/m")
     n_cycles: int = Field(ge=1)
     bandwidth_rad_s: Positive = Field(description="sqrt(stiffness / inertia) at bandwidth_pose")

@@ -76,7 +76,8 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
             lost = lost or watch.fault()
             time.sleep(0.0 if lost or not tasks else 0.05)
     finally:
-        _close(client)
+        with contextlib.suppress(Exception):
+            _within(PATIENCE_S / 5.0, client.close)
     if lost and not outcomes:
         raise InputError(lost, where=scheduler, remedy="finished steps are kept: run it again")
     for number, request in enumerate(requests):
@@ -155,11 +156,6 @@ def _outcome(task: Future[Outcome], root: Path) -> Outcome:
         return replace(found, root=root)
     except Exception as error:
         return Outcome(root, "crashed", error=f"its worker failed: {type(error).__name__}: {error}")
-
-
-def _close(client: Client) -> None:
-    with contextlib.suppress(Exception):
-        _within(PATIENCE_S / 5.0, client.close)
 
 
 def _placed(request: Request) -> Request:

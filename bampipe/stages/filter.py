@@ -446,7 +446,6 @@ def _choose(
         "quantisation_sd": resolution / float(np.sqrt(12.0)),
         "resolution": resolution,
         "log_likelihood": {str(k): f.log_likelihood for k, f in fits.items()},
-        "spectrum_floor_hz": floor,
     }
     if kalman:
         report["order"] = order

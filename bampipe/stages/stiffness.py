@@ -277,7 +277,6 @@ def _axis(
     number = system.coordinates.index(axis)
     unit = f"{system.torque_units[number]}/{system.coordinate_units[number]}"
     cycles = [(trial, cycle) for trial in trials for cycle in trial.found.cycles]
-    values = np.array([cycle.stiffness for _, cycle in cycles])
     weights = np.array([len(trial.found.cycles) for trial in trials]) / len(cycles)
     stiffness = float(weights @ [trial.found.stiffness for trial in trials])
     error = float(np.linalg.norm(weights * [trial.found.standard_error for trial in trials]))
@@ -288,7 +287,6 @@ def _axis(
         for name, share in trial.calibration.items():
             shares[name] += weight * share
     calibration = stiffness * float(np.linalg.norm(list(shares.values())))
-    scatter = float(np.std(values, ddof=1)) if len(values) > 1 else trials[0].found.scatter
     for trial in trials:
         if not trial.found.yielded:
             notes.append(
@@ -315,7 +313,6 @@ def _axis(
         standard_error=error,
         systematic=systematic,
         calibration_sd=calibration,
-        cycle_scatter=scatter,
         unit=unit,
         n_cycles=len(cycles),
         bandwidth_rad_s=bandwidths[stated].rad_s,

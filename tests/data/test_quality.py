@@ -48,9 +48,9 @@ def columns(n=N, seed=0):
     }
 
 
-def cleaned(table, kind=0, limits=None):
+def cleaned(table, kind=0, limits=None, session=SESSION):
     raw = RawTrial({name: np.array(values, dtype=float) for name, values in table.items()}, 2)
-    return clean(raw, SESSION, SESSION.trials[kind], limits or CleaningLimits())
+    return clean(raw, session, session.trials[kind], limits or CleaningLimits())
 
 
 def test_a_sound_trial_comes_through_untouched():
@@ -73,9 +73,7 @@ def test_a_force_of_several_columns_is_their_weighted_sum():
     table = columns()
     table["volts"] = table.pop("force_x")
     table["pulse"] = np.where(np.arange(N) % 200 < 100, 40.0, 0.0)
-    raw = RawTrial({name: np.array(values, dtype=float) for name, values in table.items()}, 2)
-    session = session_from({**TABLE, "force": force}, Path())
-    trial = clean(raw, session, session.trials[0], CleaningLimits())
+    trial = cleaned(table, session=session_from({**TABLE, "force": force}, Path()))
     wanted = 35.0 * (table["volts"] - 0.1) + table["pulse"]
     np.testing.assert_allclose(trial.columns["force_motor"], wanted)
 
@@ -140,14 +138,13 @@ def test_a_trial_is_a_stretch_of_a_record():
     table = {**TABLE, "trials": [{"file": "a.csv", "kind": "free", "start_s": 0.5, "end_s": 2.0}]}
     session = session_from(table, Path())
     whole = columns()
-    trial = clean(RawTrial(columns(), 2), session, session.trials[0], CleaningLimits())
+    trial = cleaned(columns(), session=session)
     assert len(trial.t) == 750 and trial.t[0] == 0.0 and trial.repairs == []
     np.testing.assert_allclose(trial.columns["q_turn"], whole["turn"][250:1000])
     assert trial.notes == ["from 0.5 to 2 s of the record"]
     table["trials"][0] = {"file": "a.csv", "kind": "free", "start_s": 3.0}
-    session = session_from(table, Path())
     with pytest.raises(InputError, match=r"after the last sample, at 2\.998 s"):
-        clean(RawTrial(columns(), 2), session, session.trials[0], CleaningLimits())
+        cleaned(columns(), session=session_from(table, Path()))
 
 
 def test_an_unsigned_register_is_read_as_signed():
@@ -156,11 +153,10 @@ def test_an_unsigned_register_is_read_as_signed():
     signed = np.rint(300 * np.sin(np.arange(N) / 40.0))
     raw = columns() | {"pwm": np.where(signed < 0, signed + 65536, signed)}
     raw["pwm"][np.flatnonzero(np.diff(np.sign(signed)))[3]] = np.nan
-    trial = clean(RawTrial(raw, 2), session, session.trials[0], CleaningLimits())
+    trial = cleaned(raw, session=session)
     np.testing.assert_allclose(trial.columns["duty"], 0.5 * signed, atol=3.0)
-    below = columns() | {"pwm": signed}
     with pytest.raises(InputError, match="expected 0 to 65535"):
-        clean(RawTrial(below, 2), session, session.trials[0], CleaningLimits())
+        cleaned(columns() | {"pwm": signed}, session=session)
 
 
 def test_limits_are_heeded():

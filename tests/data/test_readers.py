@@ -55,7 +55,16 @@ def as_mat73(table, userblock=512):
         for name, values in table.items():
             file[name] = values[None, :]
     content = stream.getvalue()
-    return b"MATLAB 7.3 MAT-file".ljust(userblock) + content[userblock:]
+    return b"MATLAB 7.3 MAT-file"[:userblock].ljust(userblock) + content[userblock:]
+
+
+WHOLE = {
+    "a.csv": as_csv(TABLE),
+    "b.parquet": as_parquet(TABLE),
+    "c.mat": as_mat(TABLE),
+    "d.mat": as_mat(TABLE, do_compression=True),
+    "e.mat": as_mat73(TABLE),
+}
 
 
 @pytest.mark.parametrize(
@@ -68,6 +77,7 @@ def as_mat73(table, userblock=512):
         ("a.mat", as_mat(TABLE, oned_as="row")),
         ("a.mat", as_mat(TABLE, oned_as="column", do_compression=True)),
         ("a.mat", as_mat73(TABLE)),
+        ("a.mat", as_mat73(TABLE, userblock=0)),
     ],
 )
 def test_all_kinds_of_file_give_the_same_numbers(tmp_path, name, content):
@@ -131,26 +141,10 @@ def test_a_last_line_that_may_be_cut_off_is_dropped_and_said(tmp_path, content, 
     assert trial.notes == (("last line is cut off: 1 row dropped",) if said else ())
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("a.csv", as_csv(TABLE)),
-        ("a.parquet", as_parquet(TABLE)),
-        ("a.mat", as_mat(TABLE)),
-        ("a.mat", as_mat73(TABLE)),
-    ],
-)
-def test_a_trial_that_is_too_large_is_refused(tmp_path, name, content):
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_trial_that_is_too_large_is_refused(tmp_path, name):
     with pytest.raises(InputError, match="are more than the 0 MB allowed"):
-        read(tmp_path / name, content, largest_bytes=100)
-
-
-def test_a_mat_file_without_a_user_block(tmp_path):
-    stream = io.BytesIO()
-    with h5py.File(stream, "w") as file:
-        for name, values in TABLE.items():
-            file[name] = values
-    assert len(read(tmp_path / "a.mat", stream.getvalue()).columns["enc"]) == 20
+        read(tmp_path / name, WHOLE[name], largest_bytes=100)
 
 
 CELLS = st.one_of(
@@ -171,15 +165,6 @@ def test_any_table_of_text_reads_or_is_refused_in_one_line(rows, delimiter):
 @given(st.binary(max_size=300), st.sampled_from([".csv", ".parquet", ".mat"]))
 def test_any_bytes_are_refused_in_one_line(content, ending):
     check_reads_or_refuses(f"a{ending}", content, ("a", "b"))
-
-
-WHOLE = {
-    "a.csv": as_csv(TABLE),
-    "b.parquet": as_parquet(TABLE),
-    "c.mat": as_mat(TABLE),
-    "d.mat": as_mat(TABLE, do_compression=True),
-    "e.mat": as_mat73(TABLE),
-}
 
 
 @settings(QUICK, max_examples=300)

@@ -104,9 +104,7 @@ def test_the_page_names_no_address_but_the_report(page_file: Path) -> None:
     text = page_file.read_text()
     assert 'href="report.html"' in text
     assert "default-src 'none'" in text
-    assert "src=" not in text.replace("img-src", "").replace("script-src", "").replace(
-        "style-src", ""
-    ).replace("default-src", "")
+    assert "src=" not in text
     assert "Copyright (c) 2022 Leon Sorokin" in text
 
 

@@ -113,7 +113,9 @@ def vector_columns(path: Path, schema: pa.Schema) -> dict[str, tuple[str, int]]:
             continue
         named = _names(features.get(field.name, {}))
         size = kind.list_size if pa.types.is_fixed_size_list(kind) else len(named)
-        size = size or _first_length(path, field.name)
+        if not size and (first := pq.ParquetFile(path)).metadata.num_rows:
+            batch = next(first.iter_batches(1, columns=[field.name]))
+            size = len(batch.column(0)[0].as_py() or ())
         names = [f".{name}" for name in named] if len({*named}) == len(named) == size else []
         for place in range(size):
             found[field.name + (names[place] if names else f"[{place}]")] = (field.name, place)
@@ -165,9 +167,3 @@ def _names(feature: Mapping[str, Any]) -> list[str]:
     if isinstance(names, dict):
         names = [name for group in names.values() if isinstance(group, list) for name in group]
     return [str(name) for name in names]
-
-
-def _first_length(path: Path, column: str) -> int:
-    for batch in pq.ParquetFile(path).iter_batches(1, columns=[column]):
-        return len(batch.column(0)[0].as_py() or ())
-    return 0
