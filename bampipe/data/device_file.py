@@ -27,7 +27,6 @@ _ACCELERATING_S = 0.02
 """Time in which a drive without load reaches full speed at full effort: how large a rotor may be.
 A joint whose drawn body has no inertia, as of many last links, moves by that of its drive."""
 
-
 _MOST_JOINTS = 32
 """Of a chain: its equations grow with their square, and no drive of more is logged as one."""
 

@@ -22,7 +22,6 @@ _MARK = re.compile(
     r"|\[(?P<words>[^\]]+)\]\((?P<page>[\w./%+-]+\.html)\)"
 )
 
-
 _COLUMN = re.compile(r"(?P<right>>?)(?P<title>.*?)(?: ~(?P<width>[\d.]+))?", re.DOTALL)
 
 

@@ -42,7 +42,6 @@ InputDigest = Annotated[
     str, Field(pattern="^([0-9a-f]{64}|absent)$", description="SHA-256, or that it was absent")
 ]
 
-
 GateState = Literal["passed", "failed", "warned", "absent"]
 
 

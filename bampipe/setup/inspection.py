@@ -290,15 +290,11 @@ def describe_lack(system: System, before: Plausibility, after: Plausibility) -> 
 
 
 def _fall(axis: int, before: Plausibility, after: Plausibility) -> str:
-    fallen = percent(before.error[axis]), percent(after.error[axis])
-    return f"{fallen[0]} to {fallen[1]} of the applied force"
-
-
-def percent(share: float) -> str:
-    """A share in per cent, two digits, no more than a reader wants of a very large one."""
-    if share >= 10.0:
-        return "over 1000 %"
-    return f"{100.0 * share:.0f} %" if share >= 0.1 else f"{100.0 * share:.2g} %"
+    shares = before.error[axis], after.error[axis]
+    said = [f"{100.0 * x:.0f} %" if x >= 0.1 else f"{100.0 * x:.2g} %" for x in shares]
+    # No more than a reader wants of a very large one.
+    said = ["over 1000 %" if x >= 10.0 else text for x, text in zip(shares, said, strict=True)]
+    return f"{' to '.join(said)} of the applied force"
 
 
 def number(value: float) -> str:

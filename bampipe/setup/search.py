@@ -39,7 +39,6 @@ ALIKE = 1.5
 """Difference of scores within which two mistakes cannot be distinguished."""
 MOST_MISTAKES = 4
 
-
 Judge = Callable[[tuple[Correction, ...]], Plausibility | None]
 SUSPICIOUS_PRIORS = 5.0
 """Sum of objections from which other set-ups are tried: two parameters beyond

@@ -11,7 +11,6 @@ from bampipe.lists import count_noun
 FASTEST = {"rad": 20.0, "m": 4.0}
 """Speed below which a step is never taken for a wild reading, rad/s and m/s."""
 
-
 VELOCITY_RATIO = 1.5
 """A recorded velocity further than this factor from the change of position is in another unit."""
 _WINDOW_S = 0.1
