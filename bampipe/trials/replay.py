@@ -393,6 +393,7 @@ def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
     try:
         for count, motion in enumerate(motions, start=1):
             with temporary_space():
+                # A copy has no columns and states computed before.
                 stored = pickle.dumps(replace(motion), pickle.HIGHEST_PROTOCOL)
                 (folder / str(count - 1)).write_bytes(stored)
     except BaseException:
