@@ -16,7 +16,7 @@ from bampipe.physics.system import System
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import Samples, take_samples
 from bampipe.trials.residuals import ModelOnTrial
-from bampipe.trials.scale import NO_SLOPE, find_spectra, gain_of_filter, slopes_by_force
+from bampipe.trials.scale import NO_SLOPE, Spectra, find_spectra, gain_of_filter, slopes_by_force
 
 _ALONE, _SEVERAL = 7, 5
 """Values of a shape on the grid: of an effect with one, and of each of an effect with several."""
@@ -172,20 +172,16 @@ class Dictionary:
         """
         if slopes or item.linear_indices or not item.system.force_fed:
             return np.ones(len(self.samples))
-        before, after = self._applied_by_model, self._applied(item.system, p)
-        return gain_of_filter(before, self._spectra, after, self.evidence.band)
+        return gain_of_filter(self._spectra, self._spectra_of(item.system, p), self.evidence.band)
 
     @cached_property
-    def _applied_by_model(self) -> list[Array]:
-        """The applied force by the model, low-passed, by trial, each (K, n_q)."""
-        return self.evidence.thin(lambda at: at.applied)
+    def _spectra(self) -> Spectra:
+        """Of the applied force by the model."""
+        return find_spectra(self.evidence.thin(lambda at: at.applied))
 
-    @cached_property
-    def _spectra(self) -> list[Array]:
-        return find_spectra(self._applied_by_model)
-
-    def _applied(self, system: System, p: Array) -> list[Array]:
-        return self.evidence.thin(lambda at: ModelOnTrial(system, p, [at.motion]).applied)
+    def _spectra_of(self, system: System, p: Array) -> Spectra:
+        e = self.evidence
+        return find_spectra(e.thin(lambda at: ModelOnTrial(system, p, [at.motion]).applied))
 
     def scale_without(
         self, name: str, absence: Mapping[int, float]
@@ -206,8 +202,7 @@ class Dictionary:
         )
         if slopes or all(e.system.linear[i] for i in moved):
             return slopes, unchanged
-        before, after = self._applied(e.system, p), self._applied_by_model
-        return slopes, 1.0 / gain_of_filter(before, find_spectra(before), after, e.band)
+        return slopes, 1.0 / gain_of_filter(self._spectra_of(e.system, p), self._spectra, e.band)
 
 
 _MULTIPLE = (0.5, 2.0)

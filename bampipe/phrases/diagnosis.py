@@ -53,11 +53,14 @@ def list_effects(entry: AxisVerdict, effects: Iterable[str], mark: str = "") -> 
 def split_sets(
     found: DiagnoseResult, axis: str
 ) -> tuple[list[str], list[tuple[tuple[str, ...], float]]]:
-    """Return the effects common to all probable sets of an axis, and the sets to be named."""
-    sets = found.sets_on(axis)[:_MOST_ALTERNATIVES]
+    """Return the effects common to all probable sets of an axis, and the sets to be named.
+
+    Of a single set, those that are certain: beside something unknown, others are in doubt.
+    """
+    sets, known = found.sets_on(axis)[:_MOST_ALTERNATIVES], found.axes[axis].probabilities
     sets = [one for one in sets if probability(one[1]) != "< 0.01"] or sets[:1]
     if len(sets) < 2:
-        return [], sets
+        return [name for names, _ in sets for name in names if known[name] >= _SURE], sets
     return [name for name in sets[0][0] if all(name in names for names, _ in sets[1:])], sets
 
 
@@ -81,12 +84,17 @@ def split_alternatives(
         ``a:yaw (0.99)``, or "" where there is none; ``b:yaw (0.60)``, ``nothing more (0.40)``.
     """
     common, sets = split_sets(found, axis)
-    parts: list[str] = []
-    for names, chance in sets:
+    entry, parts = found.axes[axis], list[str]()
+    for names, chance in sets if len(sets) > 1 else ():
         rest = [f"{mark}{name}{mark}" for name in names if name not in common]
         shown = " with ".join(rest) or ("nothing more" if common else "nothing")
-        parts.append(f"{shown} ({'' if parts else first}{probability(chance)})")
-    known = list_effects(found.axes[axis], common, mark).replace(" (", f" ({first}", 1)
+        parts.append(f"{shown} ({probability(chance)})")
+    if not parts:
+        doubtful = [name for names, _ in sets for name in names if name not in common]
+        parts = [list_effects(entry, [name], mark) for name in doubtful]
+    parts = parts or [f"something unknown ({probability(entry.unknown)})"]
+    parts[0] = parts[0].replace(" (", f" ({first}", 1)
+    known = list_effects(entry, common, mark).replace(" (", f" ({first}", 1)
     return known, parts
 
 

@@ -5,15 +5,19 @@ where log |d residual / d force| is added to it: nothing is explained by making 
 """
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.signal import csd
+from scipy.signal import get_window
 
 from bampipe.arrays import Array, Flags, Indices
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.trials.motion import Motion
+
+Spectra = NDArray[np.complex128]
 
 NO_SLOPE = 1e-3
 """Slope by a constant force up to which effects pass it as it is."""
@@ -137,31 +141,34 @@ def log_scale(
     return here, slopes
 
 
-def find_spectra(applied: Sequence[Array]) -> list[Array]:
-    """Power spectrum of the applied force of each axis, low-passed, by trial, each (K, n_q)."""
-    axes = range(applied[0].shape[1])
-    return [np.abs(sum(_spectrum(x[:, a], x[:, a]) for x in applied)) for a in axes]
+def find_spectra(applied: Sequence[Array]) -> Spectra:
+    """Spectra of half-overlapping segments of all trials, (segments, n_q, _SEGMENT // 2).
+
+    Of a force by trial, each (K, n_q), low-passed.
+    """
+    found = []
+    for x in applied:
+        n = min(_SEGMENT, len(x))
+        segments = sliding_window_view(x, n, axis=0)[:: max(n // 2, 1)]
+        found.append(segments @ _to_spectrum(n).T)
+    return np.concatenate(found)
 
 
-def gain_of_filter(
-    before: Sequence[Array], spectra: Sequence[Array], after: Sequence[Array], band: Band
-) -> Array:
+def gain_of_filter(before: Spectra, after: Spectra, band: Band) -> Array:
     """Share of the variance of white noise of a force that a filter leaves in the band, (n_q,).
 
-    Of the applied force ``before`` it, with ``spectra``, and ``after`` it, as in `find_spectra`.
+    Of the applied force before and after it, as in `find_spectra`.
     """
-    passed = band.passed_power(_SEGMENT // 2)
-    found = np.ones(before[0].shape[1])
-    for axis, power in enumerate(spectra):
-        pairs = [(x[:, axis], y[:, axis]) for x, y in zip(before, after, strict=True)]
-        if any(not np.array_equal(x, y) for x, y in pairs):
-            gain = np.abs(sum(_spectrum(x, y) for x, y in pairs)) / np.maximum(power, 1e-300)
-            found[axis] = np.average(np.clip(gain, 1e-2, 1.0) ** 2, weights=passed[:, axis])
-    return found
+    cross = np.abs(np.sum(before.conj() * after, axis=0))
+    gain = cross / np.maximum(np.sum(np.abs(before) ** 2, axis=0), 1e-300)
+    left = np.clip(gain, 1e-2, 1.0) ** 2
+    left[(before == after).all(axis=(0, 2))] = 1.0
+    return np.average(left, axis=1, weights=band.passed_power(_SEGMENT // 2).T)
 
 
-def _spectrum(x: Array, y: Array) -> NDArray[np.complex128]:
-    """Cross spectral density of two series, (_SEGMENT // 2,)."""
-    n = min(_SEGMENT, len(x))
-    found = csd(x, y, nperseg=n, nfft=_SEGMENT, detrend="linear")[1]
-    return np.asarray(found[: _SEGMENT // 2])
+@cache
+def _to_spectrum(n: int) -> Spectra:
+    """What takes the linear trend off ``n`` samples and transforms them in a window of Hann."""
+    line = np.column_stack([np.ones(n), np.arange(n)])
+    windowed = get_window("hann", n)[:, None] * (np.eye(n) - line @ np.linalg.pinv(line))
+    return np.asarray(np.fft.rfft(windowed, _SEGMENT, axis=0)[: _SEGMENT // 2])
