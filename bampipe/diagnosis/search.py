@@ -150,7 +150,9 @@ class Search(SetCosts):
         normal[:m, :m] = np.tensordot(weight, xx, 1)
         right[:m] = -weight @ (xy + xx @ b)
         normal[:nb, :nb] += p.precision
+        normal[nb:m, nb:m] += (expected := self._expected(keys))
         right[:nb] += p.moment - p.precision @ known.base
+        right[nb:m] -= expected @ b[nb:]
         normal[m:, m:] = np.eye(extra) / _FARTHEST**2
         for axis, slopes in more.items():
             w = weight[axis]

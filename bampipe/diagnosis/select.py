@@ -248,11 +248,11 @@ def _leave_out(
     """The model without the effects that came out improbable; None where there are none.
 
     With what the most probable set has in their place. What an unknown function could replace
-    stays: it describes the machine until its effect has a name.
+    stays: it describes the machine until its effect has a name. It must predict, though.
     """
     least = 1.0 - session.criteria.probability
     own = [e for e in fit.recipe.effects if e not in given]
-    out = {e for e in own if weighed.by_name.get(e, 0.0) < least}
+    out = {e for e in own if weighed.by_name.get(e, 0.0) < least} or _misleading(fit, weighed, own)
     if not out:
         return None
     best = next(one.keys for one in weighed.sets if one.unknown is None)
@@ -263,6 +263,21 @@ def _leave_out(
         return session.try_fit(less, start_of(search, keys, less))
     known = {q.name: v for q, v in zip(fit.evidence.system.parameters, fit.evidence.p, strict=True)}
     return session.try_fit(less, np.array([known[q.name] for q in system_of(less).parameters]))
+
+
+def _misleading(fit: Fit, weighed: Weighed, own: Sequence[str]) -> set[str]:
+    """Effects that are rather not there, and make the error on trials not seen larger."""
+
+    def error(out: Collection[str]) -> float:
+        return float(np.sum(np.log(np.maximum(fit.held_out_without(out), 1e-300))))
+
+    out, least = set[str](), error(())
+    while doubtful := [e for e in own if e not in out and weighed.effects.get(e, 0.0) < 0.5]:
+        worst = min(doubtful, key=lambda e: error({*out, e}))
+        if (left := error({*out, worst})) >= least:
+            break
+        out, least = {*out, worst}, left
+    return out
 
 
 def gain_when_fitted(before: Fit, after: Fit, search: Search, keys: Sequence[Key]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -413,6 +413,11 @@ class Fit:
 
         With one group of trials only, that of the fit.
         """
+        return self.held_out_without()
+
+    def held_out_without(self, effects: Iterable[str] = ()) -> Array:
+        """`held_out_rmse` where some of the model's effects are taken away."""
+        absent = {k: v for name in effects for k, v in self.problem.absence[name].items()}
         e, p, samples = self.evidence, self.problem, self.likelihood.samples
         group_of = np.array(e.folds.groups)
         groups = [group_of[here.trial] for here in samples]
@@ -423,18 +428,17 @@ class Fit:
         squares = np.zeros(len(samples))
         for group in np.unique(group_of):
             inside = [g == group for g in groups]
-            if len(np.unique(group_of)) == 1:
-                change = np.zeros(slopes[0].shape[1])
-            else:
-                rows = [(b[i], y[i]) for b, y, i in zip(p.base, p.y, inside, strict=True)]
-                others = solve_bounded(
-                    p,
-                    xx - np.array([b.T @ b for b, _ in rows]),
-                    xy - np.array([b.T @ y for b, y in rows]),
-                    np.maximum(yy - np.array([float(y @ y) for _, y in rows]), 1e-300),
-                    weight=self.solved.weight,
-                )
-                change = (p.to_parameters @ others.base)[: slopes[0].shape[1]]
+            unseen = [i & (group_of != group).any() for i in inside]
+            rows = [(b[i], y[i]) for b, y, i in zip(p.base, p.y, unseen, strict=True)]
+            others = solve_bounded(
+                p,
+                xx - np.array([b.T @ b for b, _ in rows]),
+                xy - np.array([b.T @ y for b, y in rows]),
+                np.maximum(yy - np.array([float(y @ y) for _, y in rows]), 1e-300),
+                absent=absent,
+                weight=self.solved.weight,
+            )
+            change = (p.to_parameters @ others.base)[: slopes[0].shape[1]]
             for axis, i in enumerate(inside):
                 squares[axis] += float(np.sum((plain[axis][i] + slopes[axis][i] @ change) ** 2))
         return np.asarray(np.sqrt(squares / p.count))

@@ -15,6 +15,7 @@ from itertools import pairwise
 from typing import Self
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.criteria import Criteria
@@ -24,6 +25,7 @@ from bampipe.trials.likelihood import (
     NOTHING,
     Problem,
     Samples,
+    expect_strengths,
     solve_bounded,
     solve_scaled,
 )
@@ -195,7 +197,10 @@ class SetCosts:
         spread = np.array([s for key in keys for s in self.dictionary.spreads(key[0])])
         # What a strength of any size leaves as it is has none.
         bounds[np.einsum("a,akk->k", self._weight, xx[:, nb:, nb:]) * spread**2 < NOTHING**2] = 0.0
-        solved = solve_bounded(p, xx, xy, self.yy, bounds[:, 0], bounds[:, 1], absent, self._weight)
+        expected = self._expected(keys)
+        solved = solve_bounded(
+            p, xx, xy, self.yy, bounds[:, 0], bounds[:, 1], absent, self._weight, expected
+        )
         b, weight, n = solved.unknowns, solved.weight, xx.shape[1]
         held = [slice(i.start - nb, i.stop - nb) for i in places]
         if any(solved.held[h].all() for h in held):
@@ -211,11 +216,12 @@ class SetCosts:
         volume = volume - p.independent * (first - 0.5 * first**2)
         sizes: tuple[float, ...] = ()
         # What an effect of the model costs is not in the cost of the model as it is.
-        penalty = self.penalty_of(all_keys)
+        penalty = self.penalty_of(all_keys) + 0.5 * float(b[nb:] @ expected @ b[nb:])
         if keys:
             products = np.tensordot(weight, xx, 1)
             normal = products.copy()
             normal[:nb, :nb] += p.precision
+            normal[nb:, nb:] += expected
             used = np.flatnonzero(~solved.held)
             # What a set takes away does not move along: its place can be taken by a twin of it.
             if absent:
@@ -312,12 +318,23 @@ class SetCosts:
 
     def _size(self, key: Key, strength: Array) -> float:
         """What an effect adds over the applied force of an axis, root mean square, the largest."""
-        if key not in self._squares:
-            self._squares[key] = {a: c.T @ c for a, c in self._atom(key).columns.items()}
         return max(
             float(np.sqrt(max(float(strength @ square @ strength), 0.0) / self.applied[axis]))
-            for axis, square in self._squares[key].items()
+            for axis, square in self._squares_of(key).items()
         )
+
+    def _squares_of(self, key: Key) -> dict[int, Array]:
+        """Products of the columns of a candidate with each other, by axis, (m, m), unweighted."""
+        if key not in self._squares:
+            self._squares[key] = {a: c.T @ c for a, c in self._atom(key).columns.items()}
+        return self._squares[key]
+
+    def _expected(self, keys: Sequence[Key]) -> Array:
+        """What is known of the strengths of a set beforehand, see `expect_strengths`, (m, m)."""
+        applied = self.p.likelihood.applied
+        parts = [self._squares_of(key) for key in keys]
+        blocks = [expect_strengths([*x.values()], [applied[a] for a in x]) for x in parts]
+        return np.asarray(block_diag(*blocks)) if blocks else np.zeros((0, 0))
 
     def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
         """`Solution.volume` of a set with the parameters of a model that was fitted with it."""

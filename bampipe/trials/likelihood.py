@@ -320,7 +320,16 @@ class Likelihood:
             s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)
         ]
         products = (w * (x.T @ x) for w, x in zip(weight, weighted_columns(), strict=True))
-        normal = sum(products) + np.diag(precision)
+        known_precision, moment = np.diag(precision), precision * known
+        cost_of_known = 0.5 * float(precision @ known**2)
+        effects, p = evidence.system.model.effects, evidence.p[list(evidence.free)]
+        for at in [_places(evidence, item, strengths=True) for item in effects]:
+            own = [take_samples(slopes, here, axis)[:, at] for axis, here in enumerate(samples)]
+            expected = expect_strengths([x.T @ x for x in own], self.applied)
+            known_precision[np.ix_(at, at)] += expected
+            moment[at] -= expected @ p[at]
+            cost_of_known += 0.5 * float(p[at] @ expected @ p[at])
+        normal = sum(products) + known_precision
         # What changes nothing over its range stays, as a shape does whose strength is zero.
         size, parameters = np.sqrt(np.diag(normal)), evidence.system.parameters
         reach = np.ones(size.size)
@@ -330,11 +339,11 @@ class Likelihood:
         kept = values > _DETERMINED * values[-1]
         to = vectors[:, kept] / np.sqrt(values[kept]) * per_unit[:, None]
         loose = vectors[:, ~kept] * per_unit[:, None]
-        effects, (log_scale, by_parameters) = evidence.system.model.effects, evidence.log_scale
+        log_scale, by_parameters = evidence.log_scale
         by_parameters = np.pad(by_parameters, ((0, 0), (0, 2 * n_q)))
         return Problem(
             self, tuple(y), tuple(x @ to for x in weighted_columns()),
-            to.T @ (precision[:, None] * to), to.T @ (precision * known), log_scale,
+            to.T @ known_precision @ to, to.T @ moment, log_scale,
             by_parameters @ to, to, lower, upper,
             {item.name: _absence(evidence, item) for item in effects},
             {
@@ -342,7 +351,7 @@ class Likelihood:
                 for item in effects
             },
             {item.name: tuple(_places(evidence, item, strengths=False)) for item in effects},
-            0.5 * float(precision @ known**2), loose,
+            cost_of_known, loose,
         )  # fmt: skip
 
 
@@ -467,6 +476,19 @@ class Problem:
         return solve_bounded(self, *self.sums(), absent=dict.fromkeys(range(count), 0.0))
 
 
+def expect_strengths(squares: Sequence[Array], applied: Sequence[Array]) -> Array:
+    """What is known beforehand of the strengths of an effect: their precision about zero, (m, m).
+
+    What it adds has the root mean square of the applied force as its standard deviation, so that
+    no two effects cancel each other with forces that the machine does not have.
+
+    Args:
+        squares: by axis, products of what unit strengths add, (m, m); applied: by axis, (n,).
+    """
+    pairs = zip(squares, applied, strict=True)
+    return np.asarray(sum(square / max(float(f @ f), 1e-300) for square, f in pairs))
+
+
 def _correlate(values: Array, samples: Samples, lags: int) -> Array:
     """Autocorrelation of values (n,) within trials, (lags + 1,); one and zeros of nothing."""
     total = np.zeros(lags + 1)
@@ -556,6 +578,7 @@ def solve_bounded(
     high: Array | None = None,
     absent: Mapping[int, float] | None = None,
     weight: Array | None = None,
+    expected: Array | None = None,
 ) -> Solved:
     """Minimise the negative log likelihood: weights of the axes and bounds found in turn.
 
@@ -567,6 +590,7 @@ def solve_bounded(
         low, high: bounds of the unknowns beyond the model's own, (n - P,).
         absent: given changes of the model's parameters, by number.
         weight: of the squares of each axis to start from, (n_q,).
+        expected: precision of the unknowns beyond the model's own about zero, (n - P, n - P).
     """
     p, n = problem, xx.shape[1]
     nb, independent = p.to_parameters.shape[1], p.independent
@@ -574,6 +598,7 @@ def solve_bounded(
     high = np.zeros(0) if high is None else high
     precision, moment = np.zeros((n, n)), np.zeros(n)
     precision[:nb, :nb], moment[:nb] = p.precision, p.moment
+    precision[nb:, nb:] = 0.0 if expected is None else expected
     fixed_at = dict(absent or {})
     held, bound = np.zeros(n - nb, dtype=bool), np.zeros(n - nb)
     weight = independent / np.maximum(yy, 1e-300) if weight is None else weight

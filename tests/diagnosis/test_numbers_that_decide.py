@@ -23,6 +23,7 @@ NUMERICAL = {
         "_NEAR": "what is less probable by a factor of a million changes no probability",
     },
     "select": {
+        "0.5": "more probable than not",
         "2": "tasks from which on processes share them",
         "_MOST_ROUNDS": "work, not a judgement",
         "_TRIED": "work, not a judgement",
