@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 from bampipe.lists import join_names
 from bampipe.phrases.results import STANDINGS
-from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, NullDistribution
+from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, NullDistribution, WeighedSet
 from bampipe.results.floor import FLOOR_WRONG
 from bampipe.results.rounding import significant
 
@@ -62,6 +62,13 @@ def split_sets(
     if len(sets) < 2:
         return [name for names, _ in sets for name in names if known[name] >= _SURE], sets
     return [name for name in sets[0][0] if all(name in names for names, _ in sets[1:])], sets
+
+
+def name_set(one: WeighedSet, mark: str = "") -> str:
+    """Return the effects of a set and what is unknown beside them; ``mark`` on either side."""
+    names = [f"{mark}{name}{mark}" for name in one.effects]
+    beside = [f"something unknown on {one.unknown}"] if one.unknown else []
+    return join_names(names + beside) or "none"
 
 
 def find_open_effects(found: DiagnoseResult) -> frozenset[str]:
@@ -182,6 +189,10 @@ def describe_axes(result: DiagnoseResult, shapes: Mapping[str, str] = _NO_SHAPES
 
 def _describe_verdict(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> str:
     """Return the missing effects, the error with them, and the explained share of the force."""
+    if not result.selected and entry.rmse_after > 0.0:  # the model stays as it is
+        left = (1.0 - entry.explained) * (entry.rmse_before / entry.rmse_after) ** 2
+        kept = {"rmse_after": entry.rmse_before, "explained": max(0.0, 1.0 - left)}
+        entry = entry.model_copy(update=kept)
     before, error = significant(entry.rmse_before), significant(entry.rmse_after)
     after = f"{error} {entry.unit}, {times_floor(entry.rmse_after, entry.noise_floor)}"
     share = f"explains {share_of_force(entry)}"
@@ -197,7 +208,8 @@ def _describe_verdict(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> 
         return f"something is missing that {_describe_unknown(entry, result)}{doubt}; {errors}"
     if entry.verdict == "missing":
         verb = "is" if len(entry.effects) == 1 else "are"
-        values = join_names(probability(entry.probabilities[name]) for name in entry.effects)
+        each = [probability(entry.probabilities[name]) for name in entry.effects]
+        values = f"{each[0]} each" if each[1:] and len({*each}) == 1 else join_names(each)
         return f"{join_names(entry.effects)} {verb} missing ({_PROBABILITY}{values}); {errors}"
     known, parts = split_alternatives(result, axis, first=_PROBABILITY)
     verb = "are" if " and " in known else "is"
@@ -210,7 +222,9 @@ def _describe_verdict(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> 
 def _describe_addition(entry: AxisVerdict, result: DiagnoseResult) -> str:
     """Return which effects give the errors of an axis: its own, or those of several axes."""
     if set(entry.effects) != set(result.selected):
-        return f"adding all selected effects ({join_names(result.selected)})"
+        names, count = join_names(result.selected), len(result.selected)
+        few = count <= _MOST_ALTERNATIVES
+        return f"adding all {f'selected effects ({names})' if few else f'{count} selected effects'}"
     if entry.verdict == "missing":
         return "adding it" if len(entry.effects) == 1 else "adding them"
     return f"adding {join_names(entry.effects)}"

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -29,6 +30,7 @@ _NORMAL_SIZE, _SMALL_SIZE = 9.0, 8.0
 _MANY_COLUMNS = 7
 _MANY_ROWS, _MANY_LETTERS = 8, 1500
 """Size beyond which a table may continue on the next page."""
+_BEFORE_UNIT = re.compile(r" (?=%)|(?<=\d) (?=[kmµ]?(?:N|m|rad|s|g|Hz)\b)")
 _VERBATIM = ("name", "tone", "lines", "columns")
 """Fields of blocks without inline marks."""
 
@@ -71,11 +73,12 @@ def _print(document: Document, recorded: int) -> tuple[bytes, int]:
         {"title": section.title, "blocks": [_describe_block(*pair) for pair in blocks]}
         for section, blocks in number_blocks(document)
     ]
-    described = {
+    described: dict[str, Any] = {
         "title": document.title,
         "subtitle": document.subtitle,
         "scale": document.scale,
         "sections": sections,
+        "floating": [],
     }
     with temporary_space(), tempfile.TemporaryDirectory(prefix="bampipe-report-") as folder:
         root = Path(folder)
@@ -86,11 +89,30 @@ def _print(document: Document, recorded: int) -> tuple[bytes, int]:
                     (root / f"figures/{block.name}.svg").write_text(block.svg, encoding="utf-8")
         source = root / _TEMPLATE.name
         shutil.copyfile(_TEMPLATE, source)
-        (root / "document.json").write_text(json.dumps(described), encoding="utf-8")
         compiler = typst.Compiler(source, root=root, ignore_system_fonts=True)
+        while True:
+            (root / "document.json").write_text(json.dumps(described), encoding="utf-8")
+            layout = json.loads(compiler.query("<layout>", field="value"))[0]
+            late = _find_late_figure(layout["figures"], described["floating"])
+            if late is None:
+                break
+            described["floating"].append(late)
         printed = compiler.compile(format="pdf", timestamp=int(stamp))
         assert isinstance(printed, bytes)  # other formats return a list of pages
-        return printed, json.loads(compiler.query("<pages>", field="value"))[0]
+        return printed, layout["pages"]
+
+
+def _find_late_figure(pages: Sequence[tuple[str, int, int]], floating: Sequence[str]) -> str | None:
+    """Return the first figure that leaves the foot of a page empty or overtakes another one.
+
+    ``pages``: each figure with the page of its place in the text, and its own.
+    """
+    latest = 0
+    for name, place, drawn in pages:
+        if name not in floating and (drawn > place or drawn < latest):
+            return name
+        latest = max(latest, drawn)
+    return None
 
 
 def _describe_block(block: Block, number: str) -> dict[str, Any]:
@@ -124,6 +146,6 @@ def _split_spans(text: str | Sequence[Any]) -> list[Any]:
     for kind, body in split_spans(text):
         if kind == "link":
             shown.append(("plain", body.partition("\n")[0]))
-        else:  # no line starts with a per cent sign
-            shown.append((kind, body if kind == "code" else body.replace(" %", "\u00a0%")))
+        else:  # a unit stays on the line of its number
+            shown.append((kind, body if kind == "code" else _BEFORE_UNIT.sub("\u00a0", body)))
     return shown or [("plain", "")]

@@ -10,6 +10,7 @@ import pandas as pd
 from bampipe.errors import InputError
 from bampipe.files import read_toml
 from bampipe.lists import join_names
+from bampipe.phrases import diagnosis as phrases
 from bampipe.report.document import strip_marks
 from bampipe.report.explorer.packing import Packer
 from bampipe.report.run_results import R, Results
@@ -302,7 +303,7 @@ def _list_verdicts(versions: Sequence[_Version]) -> list[Content]:
     """Return, by model and axis, the probability of each effect and what it rests on."""
     found = []
     for number, diagnosis in reversed(_read_all(versions, DiagnoseResult)):
-        for axis, verdict in diagnosis.axes.items():
+        for axis, verdict in versions[number].session.results.order_axes(diagnosis.axes).items():
             names = {name: share for name, share in verdict.probabilities.items() if share > 0.0}
             effects = [
                 _describe_effect(diagnosis, axis, name, share)
@@ -321,7 +322,7 @@ def _describe_effect(diagnosis: DiagnoseResult, axis: str, name: str, share: flo
     ]
     said = diagnosis.descriptions.get(name.partition(":")[0])
     sets = [
-        {"effects": " + ".join(one.effects) or "none", "probability": one.probability}
+        {"effects": phrases.name_set(one), "probability": one.probability}
         for one in diagnosis.sets
         if name in one.effects
     ]

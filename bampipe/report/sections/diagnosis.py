@@ -145,9 +145,9 @@ def _tabulate_sets(found: DiagnoseResult) -> list[Block]:
         return [null]
     rows = [
         (
-            join_names(f"`{name}`" for name in one.effects) or "none",
+            phrases.name_set(one, "`"),
             phrases.probability(one.probability),
-            format_digits(one.log_evidence),
+            format_digits(one.log_evidence - shown[0].log_evidence),
         )
         for one in shown[:_MOST_RANKED]
     ]

@@ -29,8 +29,8 @@ _MOST_OTHERS = 12
 _FRICTION = ("viscous.", "coulomb.")
 _TERMS = (
     "RMSE: root mean square of measured minus predicted force. Noise floor: the error that sensor "
-    "noise, quantisation and filtering alone would leave. Fit: share of the measured force that is "
-    "explained."
+    "noise, quantisation and filtering alone would leave. Fit: 100 (1 − RMSE / standard deviation "
+    "of the measured force)."
 )
 
 

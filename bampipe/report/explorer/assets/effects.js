@@ -1,6 +1,6 @@
 // Probabilities of effects by axis, and the evidence of each behind its bar.
 
-const percentOf = (share) => (share > 0 && share < 0.01 ? "< 1 %" : `${Math.round(100 * share)} %`);
+const percentOf = (share) => (share > 0 && share < 0.01 ? "< 1 %" : share > 0.99 ? "> 99 %" : `${Math.round(100 * share)} %`);
 
 function buildEffects() {
   const host = document.getElementById("effect-list");
