@@ -94,20 +94,16 @@ def page(path: Path) -> None:
 def print_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Print a table: text to the left, broken where it is long, numbers to the right, no rules."""
     raw = [list(row) for row in rows]
-    cells = [[format_cell(cell) for cell in row] for row in raw]
     last = len(head) - 1  # nothing follows it, so it may be of any length
     # Names of models, and of several effects, are long.
     lines = [
         [
             [cell] if column == last else break_lines(cell, WIDEST_CELL, "+ ").split("\n")
-            for column, cell in enumerate(row)
+            for column, cell in enumerate(map(format_cell, row))
         ]
-        for row in cells
+        for row in (head, *raw)
     ]
-    widths = [
-        max(len(text) for text in (name, *(part for row in lines for part in row[column])))
-        for column, name in enumerate(head)
-    ]
+    widths = [max(len(part) for row in lines for part in row[column]) for column in range(last + 1)]
     right = [
         bool(raw) and all(isinstance(row[column], int | float | None) for row in raw)
         for column in range(len(head))
@@ -120,7 +116,6 @@ def print_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
         ]
         return "  " + "  ".join(parts).rstrip()
 
-    say(join(head))
     for row in lines:
         for parts in zip_longest(*row, fillvalue=""):
             say(join(parts))
@@ -209,8 +204,9 @@ def _print_ladder(rungs: Sequence[Rung]) -> None:
     """Print one row a model version: its held-out error over the noise floor, axis by axis."""
     axes = list(dict.fromkeys(axis for rung in rungs for axis in rung.held_out_rmse))
     rows = []
-    for rung in rungs:
-        cells = [rung.model, rung.added or ""]
+    for number, rung in enumerate(rungs):
+        version = f"version {number}: " if number else ""  # as the tables below name it
+        cells = [version + rung.model, rung.added or ""]
         for axis in axes:
             error, floor = rung.held_out_rmse.get(axis), rung.noise_floor.get(axis)
             cells += [format_cell(error), format_cell(error / floor) if error and floor else ""]
@@ -229,8 +225,11 @@ def _print_ladder(rungs: Sequence[Rung]) -> None:
 
 def print_block(table: Table) -> None:
     """Print a table of a report, with its caption above and its note below."""
+    from bampipe.report.document import strip_marks
+
     say(f"\n{table.caption}")
-    print_table([column.title for column in table.read_columns()], table.rows)
+    rows = [list(map(strip_marks, row)) for row in table.rows]
+    print_table([column.title for column in table.read_columns()], rows)
     if table.note:
         say(table.note)
 

@@ -22,9 +22,8 @@ def tabulate_pair(pair: PairResult) -> list[Table]:
         )
         for name, one in pair.parameters.items()
     ]  # fmt: skip
-    verdicts = [
-        (axis, *(side.verdicts.get(axis, "not diagnosed") for side in sides)) for axis in axes
-    ]
+    verdicts = [("model", *(f"`{side.model}`" for side in sides))]
+    verdicts += [(x, *(side.verdicts.get(x, "not diagnosed") for side in sides)) for x in axes]
     travels = [
         (
             one.model_of, one.trials_of, axis,
@@ -44,23 +43,22 @@ def tabulate_pair(pair: PairResult) -> list[Table]:
         if refit is not None and (refit is not one.together or len(refit.changes) > 1)
     ]  # fmt: skip
     a, b = (side.session for side in sides)
-    heads = " | ".join(f"{side.session} ({side.model})" for side in sides)
     columns = f"Parameter | >{a} | >sd | >{b} | >sd | Unit | >Change/se | >p (Holm) | Changed"
     found = [
         Table("Parameters", columns, parameters, "Change/se: difference over its standard error."),
-        Table("Verdicts", f"Axis | {heads}", verdicts),
+        Table("Verdicts", f"Axis | {a} ~1 | {b} ~1", verdicts),
         Table(
             "Prediction of the other session's trials, RMSE",
             "Model of | Trials of | Axis | >Error | >Own model | >Floor | >Limit | Unit | Travels",
             travels,
-            "Own model: held-out error of that session's own. Travels: error within the limit.",
+            "Own model: its held-out error at home. Travels: error within the limit.",
         ),
         Table(
             "Some parameters refitted to the other session",
             f"Model of | Refitted, others held ~1 | {''.join(f'>Error {x} | ' for x in axes)}"
             "Travels on",
             refits,
-        ),
+        ).drop_empty_columns(),
     ]
     return [table for table in found if table.rows]
 
