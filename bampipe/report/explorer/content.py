@@ -413,7 +413,7 @@ def _make_candidates(diagnosis: DiagnoseResult, label: str) -> Content:
     head = ["Effect", "Axis", "Without", "With", "Unit", "Probability", "p"]
     head.append("Indistinguishable from")
     note = (
-        "Held-out error without and with each effect; p: probability that replicates give any "
-        "candidate as large a gain."
+        "Held-out error without and with each effect; the one that was not fitted is scaled by the "
+        "weighted misfit. p: probability that replicates give any candidate as large a gain."
     )
     return {"title": f"Candidate effects, {label}", "note": note, "head": head, "rows": rows}

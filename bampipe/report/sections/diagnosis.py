@@ -133,7 +133,8 @@ def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -
         "held-out trials. Beyond bias: with the set, without the bias that filters leave where "
         "friction changes its sign. Floor: of replicates of the model with the set. Explainable: "
         "share of the present residual that a smooth function of motion and load predicts on "
-        "unseen trials.",
+        "unseen trials. Errors and floors come from fits and replicates of the diagnosis, and may "
+        "differ from those under Validation.",
     )
 
 
@@ -179,8 +180,9 @@ def tabulate_candidates(
             )
             for one, more in rows
         ],
-        f"{note} Without and with: RMSE on held-out trials. p: probability that replicates give "
-        "any candidate as large a gain.".lstrip(),
+        f"{note} Without and with: RMSE on held-out trials; the one that was not fitted is scaled "
+        "by the weighted misfit. p: probability that replicates give any candidate as large a "
+        "gain.".lstrip(),
     )
 
 

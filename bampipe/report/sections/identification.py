@@ -102,7 +102,7 @@ def _tabulate_parameters(results: Results, identified: IdentifyResult) -> Table:
     if others:
         note += f" For comparison, {join_names(METHODS[method] for method in others)}."
     if any(one.at_bound for one in parameters.values()):
-        note += " * At the limit of its range: the data ask for a value beyond it."
+        note += " * At the limit of its range: the data may ask for a value beyond it."
     heads = (f" | >{METHODS[m].removeprefix('the ').capitalize()}" for m in others)
     return Table(
         f"Parameters of model `{identified.model}`, {METHODS[identified.method]}"
