@@ -149,11 +149,7 @@ def _is_effect(argument: str) -> bool:
     return name.endswith(".toml") or name in effect_names()
 
 
-def demo(
-    runs: RunsOption = RUNS,
-    force: ForceOption = False,
-    quiet: QuietOption = False,
-) -> None:
+def demo(runs: RunsOption = RUNS, force: ForceOption = False, quiet: QuietOption = False) -> None:
     """Run the loop on a shipped session with a hidden effect, in minutes.
 
     Example: bampipe demo

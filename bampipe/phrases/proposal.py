@@ -156,10 +156,7 @@ def _explain_decision(found: NextResult, unlimited: Sequence[str]) -> tuple[str,
         f" {before}."
     )
     if pair.after < pair.before / AS_FORECAST:
-        return (
-            why,
-            f"The chance of confusing them is expected to fall from {before} to {after}.",
-        )
+        return (why, f"The chance of confusing them is expected to fall from {before} to {after}.")
     remedy = (
         f", as may a wider motion: none was tried, because the device file states no [limits] of"
         f" {join_names(unlimited, _MOST_NAMED)}."

@@ -10,14 +10,8 @@ from bampipe.results.rounding import round_with_sd
 from bampipe.results.setup import SetupResult
 from bampipe.results.validate import JudgedError
 
-METHODS: Mapping[Method, str] = {
-    "ukf": "the unscented filter",
-    "least-squares": "least squares",
-}
-FILTERS = {
-    "kalman": "a Kalman smoother",
-    "butterworth": "a zero-phase Butterworth filter",
-}
+METHODS: Mapping[Method, str] = {"ukf": "the unscented filter", "least-squares": "least squares"}
+FILTERS = {"kalman": "a Kalman smoother", "butterworth": "a zero-phase Butterworth filter"}
 STANDINGS: Mapping[FloorStatus, str] = {
     "at_floor": "at the noise floor",
     "above_floor": "above the noise floor",

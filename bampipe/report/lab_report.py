@@ -161,10 +161,7 @@ def _draw_chart(panel: Axes, chart: ControlChart) -> None:
         panel.fill_between(edges, low, high, color=style.SKY, alpha=0.22, lw=0)
         shown += [low, high]
     outside = np.array([point.outside_limits for point in points])
-    for chosen, colour, mark in (
-        (~outside, style.BLUE, "o"),
-        (outside, style.VERMILLION, "D"),
-    ):
+    for chosen, colour, mark in ((~outside, style.BLUE, "o"), (outside, style.VERMILLION, "D")):
         panel.errorbar(
             x[chosen], y[chosen], error[chosen], fmt=mark, ms=3.2, color=colour, elinewidth=0.8
         )

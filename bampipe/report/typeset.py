@@ -93,26 +93,12 @@ def _print(document: Document, recorded: int) -> tuple[bytes, int]:
         while True:
             (root / "document.json").write_text(json.dumps(described), encoding="utf-8")
             layout = json.loads(compiler.query("<layout>", field="value"))[0]
-            late = _find_late_figure(layout["figures"], described["floating"])
-            if late is None:
+            if layout["late"] is None:
                 break
-            described["floating"].append(late)
+            described["floating"].append(layout["late"])
         printed = compiler.compile(format="pdf", timestamp=int(stamp))
         assert isinstance(printed, bytes)  # other formats return a list of pages
         return printed, layout["pages"]
-
-
-def _find_late_figure(pages: Sequence[tuple[str, int, int]], floating: Sequence[str]) -> str | None:
-    """Return the first figure that leaves the foot of a page empty or overtakes another one.
-
-    ``pages``: each figure with the page of its place in the text, and its own.
-    """
-    latest = 0
-    for name, place, drawn in pages:
-        if name not in floating and (drawn > place or drawn < latest):
-            return name
-        latest = max(latest, drawn)
-    return None
 
 
 def _describe_block(block: Block, number: str) -> dict[str, Any]:

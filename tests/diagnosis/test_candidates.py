@@ -7,11 +7,7 @@ import numpy as np
 import pytest
 from independent_runs import record_trials
 
-from bampipe.diagnosis.candidates import (
-    build_candidate_model,
-    compile_candidate,
-    list_candidates,
-)
+from bampipe.diagnosis.candidates import build_candidate_model, compile_candidate, list_candidates
 from bampipe.diagnosis.columns import added_residual
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.select import open_search, start_of

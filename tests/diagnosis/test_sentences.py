@@ -59,8 +59,8 @@ def test_every_number_in_a_sentence_is_one_of_the_record(verdict, sets, before, 
     said = phrases.describe_axes(found)["joint"]
     error = after if found.selected else before  # without effects to add, the model stays
     share = 1 - min(1.0, (1 - entry.explained) * (error / after) ** 2)
-    known = [before, error, floor, error / floor, entry.rmse_beyond_bias, entry.unknown]
-    known += [100 * share, 0.99, 0.01, *entry.probabilities.values(), *sets.values()]
+    known = [before, error, floor, error / floor, entry.rmse_beyond_bias, entry.unknown, 0.99, 0.01]
+    known += [100 * share, *entry.probabilities.values(), *sets.values()]
     for text in re.findall(r"(?<![\w.])\d+(?:\.\d+)?", said):
         assert any(float(text) == pytest.approx(x, rel=0.006, abs=0.006) for x in known), said
     assert f"{phrases.percent_of_force(share)} of the mean square of the applied force" in said

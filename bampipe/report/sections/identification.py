@@ -22,12 +22,7 @@ from bampipe.report.wording import (
     format_with_sd,
     name_parameter,
 )
-from bampipe.results.identify import (
-    BaseEstimate,
-    IdentifyResult,
-    ParameterEstimate,
-    StateBound,
-)
+from bampipe.results.identify import BaseEstimate, IdentifyResult, ParameterEstimate, StateBound
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.validate import ValidateResult
 

@@ -8,13 +8,7 @@ from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits, format_percent, format_unit
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
-from bampipe.results.next import (
-    Detectable,
-    ExpectedSd,
-    NextResult,
-    PlannedConfusion,
-    PlannedSd,
-)
+from bampipe.results.next import Detectable, ExpectedSd, NextResult, PlannedConfusion, PlannedSd
 
 TITLE = "What to record next"
 

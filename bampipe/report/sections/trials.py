@@ -143,18 +143,17 @@ def _describe_filter(results: Results, filtered: FilterResult) -> list[Block]:
     if stretches:
         title = "Stretches that no estimate and no error uses"
         blocks.append(Table(title, "Trial ~1 | Time (s) ~1 | Why ~6", stretches))
-    rows = []
-    for axis, one in results.order_axes(filtered.axes).items():
-        rows.append(
-            (
-                axis,
-                format_scaled(one.resolution, one.unit),
-                format_digits(one.bandwidth_hz),
-                format_scaled(one.position_sd, one.unit),
-                format_scaled(one.velocity_sd, f"{one.unit}/s"),
-                format_scaled(one.acceleration_sd, f"{one.unit}/s2"),
-            )
+    rows = [
+        (
+            axis,
+            format_scaled(one.resolution, one.unit),
+            format_digits(one.bandwidth_hz),
+            format_scaled(one.position_sd, one.unit),
+            format_scaled(one.velocity_sd, f"{one.unit}/s"),
+            format_scaled(one.acceleration_sd, f"{one.unit}/s2"),
         )
+        for axis, one in results.order_axes(filtered.axes).items()
+    ]
     if rows:
         title = "Encoders and the motion derived from them: typical standard deviations of error"
         columns = (
