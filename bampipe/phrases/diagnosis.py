@@ -221,13 +221,13 @@ def _describe_verdict(axis: str, entry: AxisVerdict, result: DiagnoseResult) -> 
 
 def _describe_addition(entry: AxisVerdict, result: DiagnoseResult) -> str:
     """Return which effects give the errors of an axis: its own, or those of several axes."""
-    if set(entry.effects) != set(result.selected):
-        names, count = join_names(result.selected), len(result.selected)
-        few = count <= _MOST_ALTERNATIVES
-        return f"adding all {f'selected effects ({names})' if few else f'{count} selected effects'}"
-    if entry.verdict == "missing":
-        return "adding it" if len(entry.effects) == 1 else "adding them"
-    return f"adding {join_names(entry.effects)}"
+    is_own, count = set(entry.effects) == set(result.selected), len(result.selected)
+    if is_own and entry.verdict == "missing":
+        return "adding it" if count == 1 else "adding them"
+    if count > _MOST_ALTERNATIVES:
+        return f"adding all {count} selected effects"
+    names = join_names(result.selected)
+    return f"adding {names}" if is_own else f"adding all selected effects ({names})"
 
 
 def _describe_unknown(entry: AxisVerdict, result: DiagnoseResult) -> str:

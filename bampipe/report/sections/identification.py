@@ -148,7 +148,7 @@ def _tabulate_combinations(bases: Sequence[BaseEstimate]) -> Table:
         "Combinations of inertial numbers that motion determines",
         "Combination ~3 | >Estimate | >SD | >Drawing | Shown | Unit",
         rows,
-        "Shown: whether the trials determine it better than the drawing does.",
+        "Shown: whether its SD is less than half of that of the drawing.",
     )
 
 

@@ -132,7 +132,7 @@ def _tabulate_numbers(results: Results) -> Table | None:
             else NONE,
         }
         columns.append(cells)
-    rows = [(title, *(cells[title] for cells in columns)) for title in columns[0]]
+    rows = [_share_unit(title, [cells[title] for cells in columns]) for title in columns[0]]
     rows = [row for row in rows if any(cell != NONE for cell in row[1:])]
     if not rows:
         return None
@@ -144,6 +144,14 @@ def _tabulate_numbers(results: Results) -> Table | None:
         rows,
         " ".join(filter(None, notes)),
     )
+
+
+def _share_unit(title: str, cells: list[str]) -> tuple[str, ...]:
+    """Return a row; a unit that all of its cells have stands behind its title."""
+    units = {cell.rpartition(" ")[2] for cell in cells if cell != NONE}
+    if len(cells) < 2 or len(units) != 1:
+        return (title, *cells)
+    return (f"{title} ({units.pop()})", *(cell.rpartition(" ")[0] or NONE for cell in cells))
 
 
 def _format_estimate(entry: ParameterEstimate | None) -> str:
