@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 from bampipe.errors import InputError, printable
 from bampipe.progress import Progress
+from bampipe.report.document import Table, strip_marks
 from bampipe.report.wording import break_lines
 from bampipe.run.events import Event
 from bampipe.run.request import Outcome
 
 if TYPE_CHECKING:
-    from bampipe.report.document import Table
     from bampipe.results.compare import Rung
     from bampipe.results.identify import EffectEstimate
 
@@ -225,8 +225,6 @@ def _print_ladder(rungs: Sequence[Rung]) -> None:
 
 def print_block(table: Table) -> None:
     """Print a table of a report, with its caption above and its note below."""
-    from bampipe.report.document import strip_marks
-
     say(f"\n{table.caption}")
     rows = [list(map(strip_marks, row)) for row in table.rows]
     print_table([column.title for column in table.read_columns()], rows)

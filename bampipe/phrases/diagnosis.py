@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 
 from bampipe.lists import join_names
 from bampipe.phrases.results import STANDINGS
@@ -12,7 +11,7 @@ from bampipe.results.rounding import significant
 
 _MOST_ALTERNATIVES = 3
 """Most sets of effects that a phrase names."""
-_NO_SHAPES: Mapping[str, str] = MappingProxyType({})
+_NO_SHAPES: Mapping[str, str] = {}
 _PROBABILITY = "probability "
 _SURE = 0.9  # as the diagnosis's own default
 

@@ -133,8 +133,7 @@ def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -
         "held-out trials. Beyond bias: with the set, without the bias that filters leave where "
         "friction changes its sign. Floor: of replicates of the model with the set. Explainable: "
         "share of the present residual that a smooth function of motion and load predicts on "
-        "unseen trials. Errors and floors come from fits and replicates of the diagnosis, and may "
-        "differ from those under Validation.",
+        "unseen trials. Errors and floors are of fits of the diagnosis, not those of Validation.",
     )
 
 

@@ -66,10 +66,10 @@ def _choose_scales(
     sizes: Mapping[str, Sequence[float]], units: Mapping[str, str]
 ) -> dict[str, tuple[float, str]]:
     """Return, by axis, a scale that suits most of its errors: they differ by powers of ten."""
-    middle = {
-        axis: sorted(found)[len(found) // 2 : len(found) // 2 + 1] for axis, found in sizes.items()
+    return {
+        axis: choose_scale(sorted(found)[len(found) // 2 :][:1], units.get(axis, ""))
+        for axis, found in sizes.items()
     }
-    return {axis: choose_scale(one, units.get(axis, "")) for axis, one in middle.items()}
 
 
 def _tabulate_free_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
