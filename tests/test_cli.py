@@ -401,7 +401,7 @@ def test_summary_prints_the_ladder(capsys: pytest.CaptureFixture[str]) -> None:
     ladder = [{"model": "base", **rung}, {"model": "base+x", "added": "x", **rung, **free}]
     show.print_summary(filled(CompareResult, {"ladder": ladder}))
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert ["base", "0.5", "2"] in lines and ["base+x", "x", "0.5", "2"] in lines
+    assert ["base", "0.5", "2"] in lines and ["version", "1:", "base+x", "x", "0.5", "2"] in lines
     assert ["version", "1", "open", "loop", "0.100", "3.00"] in lines
 
 
