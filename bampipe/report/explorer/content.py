@@ -14,7 +14,7 @@ from bampipe.phrases import diagnosis as phrases
 from bampipe.report.document import strip_marks
 from bampipe.report.explorer.packing import Packer
 from bampipe.report.run_results import R, Results
-from bampipe.report.wording import format_unit, name_trial_state, split_name
+from bampipe.report.wording import format_prose, format_unit, name_trial_state, split_name
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
@@ -293,6 +293,7 @@ def _list_windows(versions: Sequence[_Version]) -> list[Content]:
             "model": number,
             "trial_id": versions[number].session.prefix + window.trial_id,
             "unit": format_unit(window.unit),
+            "doing": format_prose(window.doing),
         }
         for number, diagnosis in reversed(_read_all(versions, DiagnoseResult))
         for window in diagnosis.worst_windows
