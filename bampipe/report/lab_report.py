@@ -254,7 +254,7 @@ def _show_errors(folder: Path, trends: TrendsResult) -> list[Section]:
     caption = "Error on unseen trials over the noise floor, session by session."
     text = (
         "The noise floor is the error that sensors and filters leave if the model is exactly "
-        f"right. In the green band, below {AT_FLOOR:g}, the session shows no further effect."
+        f"right. In the green band, below {AT_FLOOR:g}, only a diagnosis can find a further effect."
     )
     picture = style.finish(figure, "errors", caption, panels[:1])
     return [Section("Prediction", (Paragraph(text), picture))]

@@ -82,7 +82,8 @@ def _judge_model(results: Results, validated: ValidateResult | None) -> Callout:
             "good",
             "The model explains this session down to its noise floor",
             "On trials that the parameters never saw, the error is what sensor noise, quantisation "
-            f"and filtering alone would leave ({parts} the noise floor).",
+            f"and filtering alone would leave ({parts} the noise floor). "
+            f"`{results.diagnose_command}` tests whether a smaller effect hides below it.",
         )
     return Callout(
         "attention",

@@ -179,9 +179,8 @@ def tabulate_candidates(
             )
             for one, more in rows
         ],
-        f"{note} Without and with: RMSE on held-out trials; the one that was not fitted is scaled "
-        "by the weighted misfit. p: probability that replicates give any candidate as large a "
-        "gain.".lstrip(),
+        f"{note} Without and with: RMSE on held-out trials, one of them scaled by the weighted "
+        "misfit. p: probability that replicates give any candidate such a gain.".lstrip(),
     )
 
 
