@@ -16,7 +16,7 @@ from bampipe.arrays import Array, Flags
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Pool
-from bampipe.diagnosis.session import Fit
+from bampipe.diagnosis.session import Fit, acting_axes, without_members
 from bampipe.diagnosis.set_cost import SetCosts, added, gone
 from bampipe.diagnosis.unknown import Splines, Unknown, lay_splines, weigh_unknown
 
@@ -88,6 +88,7 @@ def weigh_sets(
     pool = {n: (costs.cost(k) + short[k], k) for n, (_, k) in pool.items()}
     none = costs.cost(())
     own = [e for e in costs.p.absence if e not in given]
+    bare = without_members(fit.recipe, own)
     near = sorted((c, k) for c, k in pool.values() if c < none + _NEAR and k)[:_MOST]
     absent = [((f"-{e}", ()),) for e in own]
     named = [
@@ -116,23 +117,23 @@ def weigh_sets(
         more = by_noise.cost(()) - by_all.cost - (none - here.cost) + costs.log_prior
         if none - here.cost + more < costs.log_prior - _NEAR:
             continue
+        acting = [e for e in own if axis in acting_axes(bare, e)]
         more_by_block = _by_block(by_noise, (), by_all) - _by_block(costs, (), here)
         beside = [
             _Listed(
                 keys, axis, none - found.cost + more,
                 _by_block(costs, keys, found) + more_by_block,
             )
-            for keys, found in _beside_unknown(costs, splines, here, own)
+            for keys, found in _beside_unknown(costs, splines, here, acting)
         ]  # fmt: skip
         # What one axis lacks is independent of what another one does.
         with_unknown = _share(costs, [*named, *beside], given, seed)
         here_too = _by_effect(with_unknown)
         unknown[axis] = sum(s.probability for s in with_unknown if s.unknown is not None)
-        for effect in own:
-            if axis in touched_axes(costs, effect):
-                effects[effect] = min(effects[effect], here_too.get(effect, 0.0))
-                if unknown[axis] >= criteria.probability:
-                    drops[effect] = _losses(with_unknown).get(effect, 0.0)
+        for effect in acting:
+            effects[effect] = min(effects[effect], here_too.get(effect, 0.0))
+            if unknown[axis] >= criteria.probability:
+                drops[effect] = _losses(with_unknown).get(effect, 0.0)
         if unknown[axis] == unknown.max():
             sets = with_unknown
     far = np.sqrt(_squares(costs, ()) / np.maximum(costs.p.count, 1)) > criteria.doubt
@@ -214,7 +215,7 @@ def _by_effect(sets: Sequence[WeighedSet]) -> dict[str, float]:
 
 
 def _beside_unknown(
-    costs: SetCosts, splines: Splines, here: Unknown, own: Sequence[str]
+    costs: SetCosts, splines: Splines, here: Unknown, acting: Sequence[str]
 ) -> list[tuple[tuple[Key, ...], Unknown]]:
     """Sets beside an unknown function: the whole one, and less each effect whose place it takes.
 
@@ -223,22 +224,14 @@ def _beside_unknown(
     keys: tuple[Key, ...] = ()
     found = [(keys, here)]
     while True:
-        beside = [e for e in own if splines.axis in touched_axes(costs, e) if e not in gone(keys)]
-        fewer = [tuple(sorted((*keys, (f"-{e}", ())))) for e in beside]
+        away = gone(keys)
+        fewer = [tuple(sorted((*keys, (f"-{e}", ())))) for e in acting if e not in away]
         tried = [(less, weigh_unknown(costs, splines, less)) for less in fewer]
         best = min(tried, key=lambda one: one[1].cost, default=None)
         found += tried
         if best is None or best[1].cost > min(one.cost for _, one in found):
             return found
         keys = best[0]
-
-
-def touched_axes(costs: SetCosts, effect: str) -> tuple[int, ...]:
-    """Axes whose equation an effect of the model changes."""
-    system = costs.dictionary.evidence.system
-    item = next(i for i in system.model.effects if i.name == effect)
-    axes = [system.coordinates.index(a) for a in item.axes]
-    return tuple(axes) or tuple(range(len(system.coordinates)))
 
 
 def _effects(costs: SetCosts, keys: Sequence[Key], given: Sequence[str]) -> tuple[str, ...]:

@@ -82,6 +82,15 @@ def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:
     return out
 
 
+def acting_axes(recipe: Recipe, effect: str) -> tuple[int, ...]:
+    """Numbers of the axes whose equation an effect changes, beside a model that may have it."""
+    system = candidates_of(without_members(recipe, (effect,)), (effect,))[0].system
+    touched = range(len(system.coordinates)) if system.moves_sensors else system.touched
+    item = next(item for item in system.model.effects if item.name == effect)
+    named = [system.coordinates.index(axis) for axis in item.axes]
+    return tuple(axis for axis in named if axis in touched) or tuple(touched)
+
+
 _shared: Any = None
 """In a worker process: what its tasks are about, inherited from the process that started it."""
 

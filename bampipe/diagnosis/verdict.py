@@ -1,14 +1,14 @@
 """The rule: what is said of each axis, from the probabilities, the sizes and the noise floor."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from bampipe.diagnosis.criteria import most_probable
 from bampipe.diagnosis.probability import chance_of
 from bampipe.diagnosis.select import Selection
-from bampipe.diagnosis.session import Fit, Session, candidates_of, rms
+from bampipe.diagnosis.session import Session, acting_axes, rms
 from bampipe.results.diagnose import (
     AxisVerdict,
     NullDistribution,
@@ -45,7 +45,7 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
     probability = {
         e: min(share, most_probable(p_values.get(e, 0.0))) for e, share in weighed.effects.items()
     }
-    where = {e: effect_axes(initial, final, e) for e in probability}
+    where = {e: acting_axes(initial.recipe, e) for e in probability}
     selected = tuple(e for e in selection.effects if probability.get(e, 0.0) >= 1.0 - c.probability)
     axes = []
     for axis, name in enumerate(final.evidence.system.coordinates):
@@ -123,17 +123,6 @@ def _judge(
     )
 
 
-def effect_axes(initial: Fit, final: Fit, effect: str) -> tuple[int, ...]:
-    """Axes on which an effect changes the equation."""
-    rest = tuple(e for e in initial.recipe.effects if e != effect)
-    alone = candidates_of(replace(initial.recipe, effects=rest), (effect,))[0].system
-    system = final.evidence.system if effect in final.recipe.effects else alone
-    item = next(i for i in system.model.effects if i.name == effect)
-    if item.axes:
-        return tuple(system.coordinates.index(a) for a in item.axes)
-    return tuple(range(len(system.coordinates))) if alone.moves_sensors else tuple(alone.touched)
-
-
 def rank_effects(
     selection: Selection,
     probability: Mapping[str, float],
@@ -144,8 +133,8 @@ def rank_effects(
 
     Sets that are ``mentioned`` have at least that probability.
 
-    The error without an effect of the set, beside the others, is that of the linear problem; that
-    with another one alone follows from the log evidence by the independent samples of the axis.
+    The error with another effect alone follows from the log evidence by the independent samples of
+    the axis.
     """
     initial, final = selection.initial, selection.final
     values = final.effect_parameters
@@ -158,21 +147,19 @@ def rank_effects(
         is_chosen = effect in selection.effects
         fit = final if is_chosen else initial
         gain = selection.weighed.drops.get(effect, 0.0) if is_chosen else selection.gains[effect]
-        axes = effect_axes(initial, final, effect)
-        axis = max(axes, key=lambda a: float(left[a]))
+        axis = max(acting_axes(initial.recipe, effect), key=lambda a: float(left[a]))
+        before = after = float(fit.held_out_rmse[axis])
         if is_chosen:
-            without = final.problem.solve_without(effect).left[axis]
-            ratio = float(np.sqrt(final.solved.left[axis] / max(without, 1e-300)))
+            before = float(final.held_out_without([effect])[axis])
         else:
-            ratio = float(np.exp(-gain / max(initial.problem.independent[axis], 1.0)))
-        here = float(fit.held_out_rmse[axis])
+            after *= float(np.exp(-gain / max(initial.problem.independent[axis], 1.0)))
         system = fit.evidence.system
         rows.append(
             RankedEffect(
                 effect=effect,
                 axis=system.coordinates[axis],
-                held_out_rmse_before=here / ratio if is_chosen else here,
-                held_out_rmse_after=here if is_chosen else here * ratio,
+                held_out_rmse_before=before,
+                held_out_rmse_after=after,
                 unit=system.torque_units[axis],
                 probability=min(probability.get(effect, 0.0), 1.0),
                 p_value=p_values.get(effect, chance_of(gain, selection.chance)),

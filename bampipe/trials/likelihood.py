@@ -465,10 +465,6 @@ class Problem:
         roots = [float(np.mean(np.log(r))) if r.size else 0.0 for r in self.likelihood.root]
         return float(self.independent @ roots) - self.solve().cost
 
-    def solve_without(self, effect: str) -> Solved:
-        """The same where one of the model's effects is taken away."""
-        return solve_bounded(self, *self.sums(), absent=self.absence[effect])
-
     def solve_nuisance(self, count: int) -> Solved:
         """The nuisance parameters that are most likely where the first ``count``, the model's own,
         stay as they are.
