@@ -27,9 +27,7 @@ from bampipe.run import pipeline as pipelines
 
 @stage_command("diagnose")
 def diagnose(
-    run: RunArgument = None,
-    model: BestModelOption = "",
-    options: StageOptions = DEFAULTS,
+    run: RunArgument = None, model: BestModelOption = "", options: StageOptions = DEFAULTS
 ) -> None:
     """Find the effects that a model lacks, axis by axis, with their probabilities.
 
@@ -149,11 +147,7 @@ def _is_effect(argument: str) -> bool:
     return name.endswith(".toml") or name in effect_names()
 
 
-def demo(
-    runs: RunsOption = RUNS,
-    force: ForceOption = False,
-    quiet: QuietOption = False,
-) -> None:
+def demo(runs: RunsOption = RUNS, force: ForceOption = False, quiet: QuietOption = False) -> None:
     """Run the loop on a shipped session with a hidden effect, in minutes.
 
     Example: bampipe demo

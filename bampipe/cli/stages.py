@@ -63,10 +63,7 @@ def identify(
     run: RunArgument = None,
     model: ModelOption = "",
     method: Annotated[str, typer.Option(help="auto, ukf or least-squares.")] = "",
-    engine: Annotated[
-        str,
-        typer.Option(help="compiled; or filterpy: slow, to compare with."),
-    ] = "",
+    engine: Annotated[str, typer.Option(help="compiled; or filterpy: slow, to compare with.")] = "",
     options: StageOptions = DEFAULTS,
 ) -> None:
     """Estimate a model's parameters, with units and uncertainty.
