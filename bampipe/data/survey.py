@@ -560,7 +560,8 @@ def _by_looks(
     for name, role in roles.items():
         named.setdefault("what drives the motion" if role == "force" else role, []).append(name)
     said = "; ".join(f"{role}: {join_names(names, 4)}" for role, names in named.items())
-    guessed = f"columns without names (--names gives some) by what they look like: {said}"
+    way = " (--names gives some)" * (columns[0].name == "column_1")
+    guessed = f"columns without names{way} by what they look like: {said}"
     return tuple(
         replace(c, role=roles[c.name], by_looks=True) if c.name in roles else c for c in columns
     ), [guessed]
