@@ -16,8 +16,7 @@ def init(
         typer.Option(help="A built-in device, or a device file in the folder; guessed if omitted."),
     ] = "",
     names: Annotated[
-        str,
-        typer.Option(help="Names of the columns of texts without a header, as t,q,tau_nm."),
+        str, typer.Option(help="Names of the columns of texts without a header, as t,q,tau_nm.")
     ] = "",
     episodes: Annotated[
         str, typer.Option(help="Of a data set of LeRobot: those that become trials, as 0:20 or 7.")

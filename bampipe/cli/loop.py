@@ -27,9 +27,7 @@ from bampipe.run import pipeline as pipelines
 
 @stage_command("diagnose")
 def diagnose(
-    run: RunArgument = None,
-    model: BestModelOption = "",
-    options: StageOptions = DEFAULTS,
+    run: RunArgument = None, model: BestModelOption = "", options: StageOptions = DEFAULTS
 ) -> None:
     """Find the effects that a model lacks, axis by axis, with their probabilities.
 

@@ -50,7 +50,11 @@ def stage_command(stage: str) -> Callable[[Callable[..., None]], Callable[..., N
         def expanded(**given: Any) -> None:
             options = StageOptions(**{name: given.pop(name) for name in names})
             if options.list_settings:
-                _print_settings(stage)
+                module = base.load_stage(stage)
+                show.say(f"{stage}: {module.SUMMARY}\n")
+                for kind in module.Config.__mro__[:-1]:
+                    show.say((inspect.getdoc(kind) or "").partition("Attributes:\n")[2].rstrip())
+                show.say(f"\ndefaults: {module.Config()}")
             else:
                 command(**given, options=options)
 
@@ -64,14 +68,6 @@ def stage_command(stage: str) -> Callable[[Callable[..., None]], Callable[..., N
 def parse_settings(given: Sequence[str] | None) -> dict[str, object]:
     """Return the settings ``NAME=VALUE`` by name."""
     return dict(parse_assignment(text) for text in given or ())
-
-
-def _print_settings(stage: str) -> None:
-    module = base.load_stage(stage)
-    show.say(f"{stage}: {module.SUMMARY}\n")
-    for kind in module.Config.__mro__[:-1]:
-        show.say((inspect.getdoc(kind) or "").partition("Attributes:\n")[2].rstrip())
-    show.say(f"\ndefaults: {module.Config()}")
 
 
 def run_stage(

@@ -213,7 +213,10 @@ def _filled(
     parameters: dict[str, dict[str, Any]] = {}
     kinetic = []
     for name, motor in motors.items():
-        ratios = {joint: _ratio(ratio, joint in slides) for joint, ratio in motor["turns"].items()}
+        ratios = {
+            joint: f"({float(ratio)!r}{'/metre' if joint in slides else ''})"
+            for joint, ratio in motor["turns"].items()
+        }
         speed = " + ".join(f"{ratio}*qd_{joint}" for joint, ratio in ratios.items())
         torque = channel[name]
         last = list(motor["turns"])[-1]
@@ -266,10 +269,6 @@ def _filled(
             "metre": {"value": 1.0, "unit": "m", "source": "a joint that slides feels a force"}
         }
     return found
-
-
-def _ratio(ratio: object, slides: bool) -> str:
-    return f"({float(ratio)!r}/metre)" if slides else f"({float(ratio)!r})"  # type: ignore[arg-type]
 
 
 def _constant(motor: Mapping[str, Any]) -> dict[str, Any]:

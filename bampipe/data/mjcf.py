@@ -29,7 +29,7 @@ _KINDS = {"revolute": "hinge", "prismatic": "slide"}
 _READ = {name: kind for kind, name in _KINDS.items()}
 _COUPLES = ("equality", "tendon")
 _BUILDS = ("include", "replicate", "composite", "flexcomp", "attach", "frame")
-_FLAT = 'write it out flat: mj_saveLastXML, with saveinertial="true" in <compiler>'
+_FLAT = 'write it out flat (mj_saveLastXML, saveinertial="true"), or take it out of the folder'
 
 
 @dataclass

@@ -112,10 +112,11 @@ def join_parts(
     return trials, reasons
 
 
-def are_axes(names: Sequence[str]) -> bool:
-    """Whether the names of files differ by an axis, as ``joint1.csv`` and ``joint2.csv`` do."""
+def axes_of(names: Sequence[str]) -> dict[str, str]:
+    """The axis in each name of a file, such as ``joint1.csv``; none unless they differ by it."""
     bare = {_AXIS.sub("", name) for name in names}
-    return len(bare) < len(names) and all(_AXIS.search(name) for name in names)
+    found = {name: match[0] for name in names if (match := _AXIS.search(name))}
+    return found if len(bare) < len(names) == len(found) else {}
 
 
 def _kind(name: str, columns: Columns, role: Callable[[str, str], str]) -> _Kind:

@@ -305,7 +305,7 @@ def find_copies(session: Session) -> list[str]:
             entry = session.trials[number]
             other = next(e for e in entries if e is not entry)
             what = "file" if other.file == entry.file else "content"
-            reasons[number] = f"the same {what} as trial {other.trial_id}" + (
+            reasons[number] = f"the same {what} as trial {other.name}" + (
                 ": used once" if alike else f", which is declared {other.kind}"
             )
     return reasons

@@ -63,7 +63,7 @@ class StreamLayout:
                 where=f"{where}: time",
                 remedy="write seconds, or microseconds as time_us",
             )
-        rates = [encoder.axis for encoder in session.encoders if encoder.integrate]
+        rates = [encoder.name for encoder in session.encoders if encoder.integrate]
         if rates:
             raise InputError(
                 f"axis {rates[0]} has a velocity and no position, which a stream cannot do without",
@@ -79,7 +79,7 @@ class StreamLayout:
                 remedy="log it as a signed number",
             )
         known = [(clock.column, "t", session.tick, 0.0)]
-        known += [(e.column, f"q_{e.axis}", e.scale, -e.zero * e.scale) for e in session.encoders]
+        known += [(e.column, f"q_{e.name}", e.scale, -e.zero * e.scale) for e in session.encoders]
         known += [(b.column, f"brake_{b.axis}", 1.0, 0.0) for b in session.brakes]
         known += [(c.column, c.name, c.scale, c.offset) for c in session.channels]
         columns, names, scales, offset = map(list, zip(*known, strict=True))

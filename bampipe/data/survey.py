@@ -1,7 +1,8 @@
 """What a folder of logs holds, before anyone has said what its columns mean."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
@@ -10,7 +11,7 @@ from unicodedata import combining, normalize
 import numpy as np
 
 from bampipe.data.guesses import describe, find_roles, is_time
-from bampipe.data.parts import are_axes, join_parts
+from bampipe.data.parts import axes_of, join_parts
 from bampipe.data.readers import EXTENSIONS, SHEETS, TEXTS, columns_of, lerobot, objects, read_trial
 from bampipe.data.readers.trial import Dialect, RawTrial
 from bampipe.data.recording import read_recording, starts_of
@@ -79,6 +80,11 @@ _ENDS = sorted((word for word in _ALL_WORDS if len(word) > 4 or word in ("time",
 _RUN_TOGETHER = re.compile(r"(q|dq|tau|trq|pos|vel)(des|ref|cmd|meas|msr|act)")
 REFERENCE_WORDS = frozenset(_WORDS["reference"].split())
 """Words for what a controller asks for rather than what was measured."""
+_ASKED = frozenset(
+    ["desired", "des", "reference", "ref", "setpoint", "target", "planned", "sim", "simulated"]
+)
+_TWINS = _ASKED | {"measured", "meas", "actual", "act", "real", "feedback"}
+"""Words in the name of a file of what was asked for, and in that of the measurement beside it."""
 DRIVERS = ("force", "current", "voltage")
 """Roles of what may drive an axis."""
 _BY_UNIT = {
@@ -300,7 +306,7 @@ class _Logs:
     def fault(self) -> InputError:
         """That no log can be read, with the reason of the first."""
         # What is no log anyway says least.
-        idle = ("*", "no column of numbers", "one row", "has other columns")
+        idle = ("*", "no column of numbers", "one row", "other columns")
         name, why = min(
             self.passed,
             key=lambda p: next((k for k, x in enumerate(idle) if p[1].startswith(x)), -1),
@@ -317,9 +323,11 @@ class _Logs:
         are parts of one recording; of several, those with the most bytes.
         """
         common = max(map(frozenset, self.found.values()), key=self._worth)
-        names = [name for name, columns in self.found.items() if common <= set(columns)]
         whole = self._worth(common)[0] == _WHOLE
-        axes = len(names) > 1 and are_axes(names)
+        if whole:
+            self._leave_out(self._asked(self._with(common)), "asked for or simulated, by name")
+        names = self._with(common)
+        axes = axes_of(names)
         if not whole or axes:
             pool = {n: self.found[n] for n in names} if axes and whole else self.found
             trials, reasons = join_parts(self.folder, pool, _role, self.dialect)
@@ -329,27 +337,52 @@ class _Logs:
             )
             trials = [trial for trial, has in zip(trials, shared, strict=True) if best <= has]
             if trials and (axes or self._completeness(self._labels(trials[0])) == _WHOLE):
-                self._leave_out([p for t in trials for p in (t.file, *(x.file for x in t.parts))])
+                used = {p for t in trials for p in (t.file, *(x.file for x in t.parts))}
+                self._leave_out(self.found.keys() - used)
                 ways = join_names(dict.fromkeys(_JOINED[part.join] for part in trials[0].parts))
                 files = join_names([trials[0].file, *(part.file for part in trials[0].parts)])
                 self.remarks += [f"{files} are taken as one recording, joined {ways}"]
                 return trials, [c for c in self._labels(trials[0]) if c in best]
             if not whole:
                 self._refuse_parted(names[0], reasons)
-        self._leave_out(names)
         stated = self.found[names[0]]
+        if axes and [_role(column, stated[column]) for column in common].count("position") < 2:
+            # No joint has the inertia and friction of the next.
+            axis = Counter(axes.values()).most_common(1)[0][0]
+            others = [name for name in names if axes[name] != axis]
+            self._leave_out(others, f"not of {axis}, by name: for another session")
+            names = [name for name in names if name not in others]
+        self._leave_out(self.found.keys() - set(names))
         return [TrialEntry(file=n, kind="free") for n in names], [c for c in stated if c in common]
 
-    def _leave_out(self, names: Sequence[str]) -> None:
-        why = "has other columns: it needs a session of its own"
-        self.passed += [(name, why) for name in self.found if name not in names]
+    def _leave_out(
+        self, names: Collection[str], why: str = "other columns, for another session"
+    ) -> None:
+        self.passed += [(name, why) for name in self.found if name in names]
+        self.found = {name: own for name, own in self.found.items() if name not in names}
+
+    def _with(self, columns: frozenset[str]) -> list[str]:
+        """Files that have these columns; of columns without names, as many and no more."""
+        named = not all(column.startswith("column_") for column in columns)
+        having = {name: own for name, own in self.found.items() if columns <= set(own)}
+        return [name for name, own in having.items() if named or len(own) == len(columns)]
+
+    @staticmethod
+    def _asked(names: Sequence[str]) -> list[str]:
+        """Files of what was asked for, or simulated, in one with the same name but for that."""
+        said = {name: set(words(name)) for name in names}
+        bare = {name: (re.findall(r"\d+", name), said[name] - _TWINS) for name in names}
+        sound = [bare[name] for name in names if not said[name] & _ASKED]
+        return [name for name in names if said[name] & _ASKED and bare[name] in sound]
 
     def _worth(self, columns: frozenset[str]) -> tuple[int, int, int]:
         """How well files with these columns would do as logs: what they hold, and how much."""
-        names = [name for name, other in self.found.items() if columns <= set(other)]
+        names = self._with(columns)
         stated = {column: self.found[names[0]][column] for column in columns}
         sizes = sum((self.folder / name).stat().st_size for name in names)
-        return self._completeness(stated), sizes, len(columns)
+        # Without its time a log is worth half.
+        timed = any(_role(*column) == "time" for column in stated.items())
+        return self._completeness(stated), (1 + timed) * sizes, len(columns)
 
     @staticmethod
     def _completeness(stated: Mapping[str, str]) -> int:
@@ -527,7 +560,8 @@ def _by_looks(
     for name, role in roles.items():
         named.setdefault("what drives the motion" if role == "force" else role, []).append(name)
     said = "; ".join(f"{role}: {join_names(names, 4)}" for role, names in named.items())
-    guessed = f"columns without names by what they look like: {said}"
+    way = " (--names gives some)" * (columns[0].name == "column_1")
+    guessed = f"columns without names{way} by what they look like: {said}"
     return tuple(
         replace(c, role=roles[c.name], by_looks=True) if c.name in roles else c for c in columns
     ), [guessed]
@@ -597,7 +631,7 @@ def _role(name: str, stated: str) -> str:
     if name.strip().rpartition(".")[2] == "ts":  # Ts is rather an interval
         return "time"
     said = set(words(name))
-    said |= {word.removesuffix("s") for word in said if len(word) > 3}
+    said |= {word.removesuffix(end) for word in said for end in ("s", "ed") if len(word) > 3}
     if {"load", "cell"} <= said:
         return "force"
     first = [role for role in ("reference", "brake") if said & set(_WORDS[role].split())]
@@ -632,7 +666,8 @@ def _role_by_suffix(suffix: str) -> str:
 def _unit(name: str, stated: str, role: str) -> str:
     """Unit by the file, or by a last word of the name such as ``_us``, before an index if any."""
     if stated:
-        return stated
+        known = unit(stated)
+        return "rev/s" if role == "velocity" and known == unit("Hz") else stated
     bare = re.sub(r"(\[\d+\]|_\d+)$", "", name)
     rate = re.search(r"_(rad|deg|rev|mm|cm|m)_(per_)?s$", bare)
     if role == "velocity" and rate is not None:

@@ -48,7 +48,7 @@ def _device(session: Session) -> Device:
 
 def _mismatches(session: Session, device: Device) -> Iterator[InputError]:
     where = f"{session.root / 'session.toml'}"
-    encoders = {encoder.axis: encoder for encoder in session.encoders}
+    encoders = {encoder.name: encoder for encoder in session.encoders}
     axes = {coordinate.name: coordinate.unit for coordinate in device.coordinates}
     for axis in encoders:
         if axis not in axes:

@@ -118,7 +118,7 @@ def _ingest_trials(
     encoders = {each.name for each in session.channels if each.second_encoder_of}
     total, measured = len(session.trials), 0
     for number, entry in enumerate(session.trials):
-        progress(number / total, entry.trial_id)
+        progress(number / total, entry.name)
         try:
             if copies[number]:
                 raise InputError(copies[number], where=entry.file)
@@ -134,7 +134,7 @@ def _ingest_trials(
             channels.measure_noise(trial)
         rows.append(_row(entry, trial, ""))
         ids = pa.DictionaryArray.from_arrays(
-            np.zeros(len(trial.t), dtype=np.int32), pa.array([entry.trial_id])
+            np.zeros(len(trial.t), dtype=np.int32), pa.array([entry.name])
         )
         samples.append({"trial_id": ids, "t": trial.t, **trial.columns})
     if all(row["status"] == "set_aside" for row in rows):
@@ -181,7 +181,7 @@ def _row(entry: TrialEntry, trial: CleanTrial | None, reason: str) -> dict[str, 
     if trial is not None:
         status = "repaired" if trial.repairs else "ok"
     return {
-        "trial_id": entry.trial_id,
+        "trial_id": entry.name,
         "file": entry.file,
         "kind": entry.kind,
         "locked_axis": entry.locked_axis,
@@ -226,11 +226,11 @@ def _description(
         announced_rate_hz=session.sample_rate,
         kept_every=every,
         axes={
-            encoder.axis: EncoderChannel.of(
-                encoders[encoder.axis],
+            encoder.name: EncoderChannel.of(
+                encoders[encoder.name],
                 encoder,
-                resolution_stated=encoders[encoder.axis].stated,
-                resolution_measured=encoders[encoder.axis].measured,
+                resolution_stated=encoders[encoder.name].stated,
+                resolution_measured=encoders[encoder.name].measured,
                 raw_unit=encoder.stated_unit,
             )
             for encoder in session.encoders

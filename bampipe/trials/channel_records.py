@@ -64,7 +64,7 @@ class ChannelRecords:
     def encoders(self) -> dict[str, ChannelNoise]:
         """Resolution and noise of the encoders, by axis."""
         return {
-            e.axis: settle_encoder(e.axis, e.unit, e.resolution, self._noise.get(f"q_{e.axis}", []))
+            e.name: settle_encoder(e.name, e.unit, e.resolution, self._noise.get(f"q_{e.name}", []))
             for e in self._session.encoders
         }
 

@@ -84,13 +84,9 @@ def test_encodings_that_show_themselves(tmp_path, encoding):
 
 @pytest.mark.parametrize("name", WRITTEN)
 def test_columns_are_found_without_being_asked_for(tmp_path, name):
-    (tmp_path / "a.csv").write_text(WRITTEN[name], newline="")
-    assert list(columns_of(tmp_path / "a.csv"))[:3] == ["t", "x", "n"]
-
-
-@pytest.mark.parametrize("ending", [".txt", ".dat", ".tsv", ".asc", ".log"])
-def test_endings_of_text(tmp_path, ending):
-    check(read(tmp_path, table("\t"), ending=ending))
+    for ending in ("csv", "txt", "dat", "tsv", "asc", "log"):
+        (tmp_path / f"a.{ending}").write_text(WRITTEN[name], newline="")
+        assert list(columns_of(tmp_path / f"a.{ending}"))[:3] == ["t", "x", "n"]
 
 
 def test_units_are_taken_from_names_and_from_the_line_below(tmp_path):
@@ -126,6 +122,7 @@ def test_what_was_found_is_said(tmp_path):
         ("0;1;2\n1;2;3\n", "no header: the first line holds numbers"),
         (table(";", ",") + "0,41;1.5;3\n0,42;1,5;3\n", "'1.5' in row 42 a point"),
         (table(";") + "0.41;1,5;3\n0.42;1.5;3\n", "'1,5' in row 42 has a decimal comma"),
+        (table(" ") + "  0.4  x1  9\n" * 2, "row 42, column 'x': found 'x1', expected a number"),
     ],
 )  # fmt: skip
 def test_what_can_be_read_in_two_ways_is_refused(tmp_path, text, said):
@@ -156,13 +153,9 @@ def test_the_session_decides_what_the_file_leaves_open(tmp_path):
     text = "gr\xf6\xdfe,t,x,n\n1,2,3,4\n"
     trial = read(tmp_path, text, encoding="latin-1", dialect=Dialect(encoding="latin-1"))
     np.testing.assert_array_equal(trial.columns["n"], [4.0])
-
-
-def test_a_fault_in_a_table_of_blanks_is_found_at_its_line(tmp_path):
-    lines = table(" ", row="  ".join).split("\n")
-    lines[30] = "  0.290  x1  9"
-    with pytest.raises(InputError, match="row 31, column 'x': found 'x1', expected a number"):
-        read(tmp_path, "\n".join(lines))
+    text = table().replace("0.010,0.0300", "0.010,ovf").replace("0.020,0.0600", "0.020,n/a")
+    trial = read(tmp_path, text, dialect=Dialect(missing=("ovf",)))
+    assert np.isnan(trial.columns["x"][1:3]).all() and np.isfinite(trial.columns["x"][3:]).all()
 
 
 def test_a_cut_last_line_of_any_dialect_is_dropped_and_said(tmp_path):
@@ -189,10 +182,8 @@ def test_dates_and_times_become_seconds(tmp_path, stamps, form):
 
 def test_a_date_that_could_be_two_is_refused(tmp_path):
     text = "when,x\n03/10/2026 10:12,1\n04/10/2026 10:12,1\n"
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match=r"row 2: found '03/10/2026 10:12'.*give its form"):
         read(tmp_path, text, ("when", "x"), datetimes={"when": ""})
-    assert "row 2: found '03/10/2026 10:12'" in str(caught.value)
-    assert "give its form" in str(caught.value)
 
 
 def test_dates_and_times_are_told_from_numbers_and_text(tmp_path: Path) -> None:
@@ -211,20 +202,10 @@ def test_times_of_day_need_no_form_and_pass_midnight(tmp_path):
     assert columns_of(tmp_path / "a.csv", name="a.csv") == {"when": "datetime", "q": ""}
 
 
-def test_what_means_no_reading_can_be_said(tmp_path):
-    text = table().replace("0.010,0.0300", "0.010,ovf").replace("0.020,0.0600", "0.020,n/a")
-    trial = read(tmp_path, text, dialect=Dialect(missing=("ovf",)))
-    assert np.isnan(trial.columns["x"][1:3]).all() and np.isfinite(trial.columns["x"][3:]).all()
-
-
 def test_the_first_rows_may_lack_cells(tmp_path):
     """What is logged before all sensors have answered is no header."""
     rows = "2026-05-04T09:30:00.{:03}Z,{},{}"
-    lines = [
-        "timestamp,pos (1),pos (2)",
-        "2026-05-04T09:29:59.990Z,,",
-        "2026-05-04T09:29:59.995Z,,",
-    ]
+    lines = ["timestamp,pos (1),pos (2)", *(f"2026-05-04T09:29:59.99{k}Z,," for k in (0, 5))]
     lines += [rows.format(10 * k, k, 2 * k) for k in range(30)]
     path = tmp_path / "a.csv"
     path.write_text("\n".join(lines) + "\n")

@@ -17,9 +17,15 @@ from bampipe.data.units import unit
 from bampipe.errors import InputError
 from bampipe.setup.proposal import propose
 
+TURN = 2 * np.pi
 T = np.arange(60) / 100.0
 Q = np.round(np.sin(3 * T), 4)
 U = np.round(np.cos(3 * T), 4)
+
+
+def write(path: Path, head: str, *columns: np.ndarray) -> None:
+    path.parent.mkdir(exist_ok=True)
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=head, comments="")
 
 
 def lines(form: str, head: str = "") -> str:
@@ -248,6 +254,11 @@ def test_counters_wrap_at_any_width_and_go_on():
         np.testing.assert_allclose(np.diff(found), 37.0 * 2 ** (bits - 12))
         assert len(rows) == 4 and said == f"at {bits} bits"
     assert not len(unwrapped(np.where(np.arange(500) < 250, 0.0, 3000.0), 0.0, True)[1])
+    for half, ending in ((12.5, "25 rad"), (4 * np.pi, "four turns")):
+        sent = (0.1 * angle / 37.0 + half) % (2 * half) - half
+        found, rows, said = unwrapped(sent, TURN, False)
+        np.testing.assert_allclose(np.diff(found), 0.1)
+        assert len(rows) == 2 and said == f"at {ending}"
 
 
 @pytest.mark.parametrize(
@@ -263,14 +274,13 @@ def test_a_unit_that_is_not_known_is_asked_for(tmp_path: Path, header: str, aske
     t = np.arange(2000) / 200.0
     q = 57.3 * (np.sin(2 * t) + 0.3 * np.sin(5 * t))
     u = 0.3 * np.gradient(np.gradient(q, t), t) + 40.0 * np.sin(q / 57.3)
-    np.savetxt(tmp_path / "a.csv", np.c_[t, q, u], delimiter=",", header=header, comments="")
+    write(tmp_path / "a.csv", header, t, q, u)
     assert any(asked in line for line in propose(tmp_path).fill_in)
 
 
 def test_a_log_that_is_written_backwards_is_refused(tmp_path: Path):
     t = np.arange(2000)[::-1] / 200.0
-    table = np.c_[t, np.sin(3 * t), np.cos(3 * t)]
-    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="time_s,q,torque", comments="")
+    write(tmp_path / "a.csv", "time_s,q,torque", t, np.sin(3 * t), np.cos(3 * t))
     with pytest.raises(
         InputError, match=r"time_s falls from row to row.*turn the order of its rows"
     ):
@@ -300,6 +310,7 @@ def test_data_of_other_kinds_are_named_with_what_to_do(tmp_path: Path):
     np.savez(tmp_path / "c.npz", trials=np.zeros((3, 60, 2)))
     for text, said in (
         ("(1.5) can0 141#A1250064\n" * 9, "frames of a CAN bus.*; decode them"),
+        ("  can0  141   [4]  A1 25 00 64\n" * 9, "frames of a CAN bus.*; decode them"),
         ("t,variable,value\n" + "0.1,q,0.2\n" * 9, "one signal below the other; make it"),
         ("# name: t\n# rows: 9\n" + "0.5\n" * 9, "as Octave writes them; save them with"),
     ):
@@ -336,11 +347,11 @@ def test_trials_in_one_file_are_told_apart(tmp_path: Path):
     number = np.repeat([1, 2, 3], 400)
     table = np.c_[np.arange(1200) / 100.0, np.tile(np.sin(3 * t), 3), np.tile(u, 3), number]
     head = "time_s,angle_rad,torque_Nm,trial"
-    np.savetxt(tmp_path / "b.csv", table, delimiter=",", header=head, comments="")
+    write(tmp_path / "b.csv", head, table)
     session = propose(tmp_path).session
     assert "end_s = 3.995" in session and "start_s = 7.995" in session
     table = np.r_[table, np.zeros((50, 4))]
-    np.savetxt(tmp_path / "b.csv", table, delimiter=",", header=head, comments="")
+    write(tmp_path / "b.csv", head, table)
     clock, entry = Clock(column="time_s", unit="s"), TrialEntry(file="b.csv", kind="free")
     raw = read_recording(tmp_path, entry, ("time_s", "angle_rad"), clock)
     assert len(raw) == 1200 and "50 rows from row 1202 on were never filled" in raw.notes[0]
@@ -350,8 +361,7 @@ def test_a_drive_with_the_sign_of_the_reaction_is_turned(tmp_path: Path):
     t = np.arange(2000) / 200.0
     q, v = np.sin(2 * t) + 0.3 * np.sin(5 * t), 2 * np.cos(2 * t) + 1.5 * np.cos(5 * t)
     u = 0.3 * np.gradient(v, t) + 0.5 * np.tanh(v / 1e-2) + 0.4 * v
-    head = "time_s,angle_rad,torque_Nm"
-    np.savetxt(tmp_path / "a.csv", np.c_[t, q, -u], delimiter=",", header=head, comments="")
+    write(tmp_path / "a.csv", "time_s,angle_rad,torque_Nm", t, q, -u)
     assert "reaction = true  # guess" in propose(tmp_path).session
 
 
@@ -400,14 +410,10 @@ def test_a_second_table_in_a_file_and_a_segment_of_labview(tmp_path):
 
 
 def test_codes_for_no_reading_are_taken_for_none_and_hours_pass(tmp_path):
-    rows = [
-        (n, q, -9999.0 if n in (7, 30, 31) else u)
-        for n, (q, u) in enumerate(zip(Q, U, strict=True))
-    ]
     text = ""
-    for n, q, u in rows:
-        second = 3599.7 + 0.01 * n
-        text += f"{int(second // 60) % 60:02d}:{second % 60:06.3f},{q},{u}\n"
+    for n, (q, u) in enumerate(zip(Q, U, strict=True)):
+        second, reading = 3599.7 + 0.01 * n, -9999.0 if n in (7, 30, 31) else u
+        text += f"{int(second // 60) % 60:02d}:{second % 60:06.3f},{q},{reading}\n"
     (tmp_path / "a.csv").write_text("Time,q,u\n" + text)
     raw = read_recording(
         tmp_path, TrialEntry(file="a.csv", kind="free"), ["Time", "q", "u"],
@@ -416,3 +422,43 @@ def test_codes_for_no_reading_are_taken_for_none_and_hours_pass(tmp_path):
     assert np.flatnonzero(np.isnan(raw.columns["u"])).tolist() == [7, 30, 31]
     assert "column 'u': 3 readings of -9999 are taken for none" in raw.notes
     np.testing.assert_allclose(np.diff(raw.columns["Time"]), 0.01, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("files", "kept", "said"),
+    [
+        (("1_measured", "1_desired", "2_desired"), ("1_measured", "2_desired"), "asked for"),
+        (("a", "a_sim"), ("a",), "simulated"),
+        (("motor_1/a", "motor_2/a", "motor_2/b"), ("motor_2/a", "motor_2/b"), "not of motor_2"),
+    ],
+)
+def test_a_folder_may_hold_more_than_one_mechanism(tmp_path, files, kept, said):
+    for name in files:
+        write(tmp_path / f"{name}.csv", "t_s,q_rad,tau_Nm", T, Q, U)
+    found = survey(tmp_path)
+    assert [trial.file for trial in found.trials] == [f"{name}.csv" for name in kept]
+    assert len(found.passed) == len(files) - len(kept)
+    assert all(said in why for _, why in found.passed)
+
+
+def test_logs_with_their_time_come_first_and_unnamed_columns_are_alike_in_number(tmp_path):
+    write(tmp_path / "a/a.csv", "t_s,q_rad,tau_Nm", T, Q, U)
+    write(tmp_path / "a/b.csv", "q_rad,tau_Nm", Q[:40], U[:40])
+    assert "t_s" in [column.name for column in survey(tmp_path / "a").columns]
+    write(tmp_path / "b/a.csv", "", T, Q, 3.0 * U)
+    write(tmp_path / "b/b.csv", "", Q[:20], U[:20])
+    found = survey(tmp_path / "b")
+    assert [trial.file for trial in found.trials] == ["a.csv"] and len(found.columns) == 3
+    assert found.passed == (("b.csv", "other columns, for another session"),)
+
+
+def test_speeds_in_hertz_commands_and_one_reading_in_two_units(tmp_path):
+    names = "time [s],velocity [Hz],force [Nm],motor current [A]"
+    write(tmp_path / "a/a.csv", names, T, U, np.cos(9 * T), U)
+    proposal = propose(tmp_path / "a")
+    assert 'unit = "rev/s"' in proposal.session and "coil_current" not in proposal.device
+    names = "time [s],commanded angle [rad],a1 position [rad],c1 position [rev],a1 torque [Nm]"
+    write(tmp_path / "b/b.csv", names, T, np.roll(Q, -3), Q, Q / TURN, U)
+    assert 'column = "a1 position [rad]"' in propose(tmp_path / "b").session
+    (tmp_path / "c.json").write_text(json.dumps({"data": [{"t": [*T, *T], "q": [*Q, *Q]}]}))
+    assert set(columns_of(tmp_path / "c.json")) == {"data[0].t", "data[0].q"}

@@ -94,9 +94,6 @@ def test_empty_cells_and_words_for_missing_are_nan(tmp_path):
     columns = read(tmp_path / "a.csv", content, ("a", "b")).columns
     np.testing.assert_array_equal(columns["a"], [1, np.nan, np.nan, np.nan, 5])
     np.testing.assert_array_equal(columns["b"], [np.nan, 2, np.nan, np.inf, 6])
-
-
-def test_missing_parquet_values_are_nan(tmp_path):
     table = pd.DataFrame({"a": pa.array([1, None, 3]).to_pandas(), "b": [1, 2, 3]})
     columns = read(tmp_path / "a.parquet", as_parquet(table), ("a", "b")).columns
     np.testing.assert_array_equal(columns["a"], [1, np.nan, 3])
@@ -207,9 +204,6 @@ def test_samples_that_are_json_objects(tmp_path, text, name):
     trial = read_json(tmp_path, text, name=name)
     np.testing.assert_array_equal(trial.columns["t"], [0.0, 1.0])
     np.testing.assert_array_equal(trial.columns["x"], [1.5, np.nan])
-
-
-def test_numbers_beside_the_samples_are_columns(tmp_path):
     text = '{"gain": 2, "who": "a", "log": [{"on": true}, {"on": false}]}'
     trial = read_json(tmp_path, text, ("on", "gain"))
     np.testing.assert_array_equal(trial.columns["on"], [1.0, 0.0])

@@ -80,7 +80,7 @@ def test_what_is_read():
     assert session.force.noise_sd is None
     assert [brake.axis for brake in session.brakes] == ["slide", "yaw"]
     assert session.channels[0].name == "current" and session.channels[0].offset == 0.0
-    assert [trial.trial_id for trial in session.trials] == ["t1", "t2", "t3"]
+    assert [trial.name for trial in session.trials] == ["t1", "t2", "t3"]
     assert session.trials[2].viscous == 40.0
     assert session.columns == (
         "time_us", "enc_yaw", "x", "brake_slide", "brake_yaw", "amps", "force_x_v", "push_n",
@@ -119,7 +119,7 @@ def record_in(*stretches):
 
 def test_one_record_gives_several_trials():
     session = record_in({"end_s": 4}, {"start_s": 4, "end_s": 9.5}, {"start_s": 9.5})
-    assert [trial.trial_id for trial in session.trials] == ["r", "r_2", "r_3"]
+    assert [trial.name for trial in session.trials] == ["r", "r_2", "r_3"]
     assert [trial.start_s for trial in session.trials] == [0.0, 4.0, 9.5]
     assert session.trials[2].end_s == float("inf")
     record_in({}, {})  # the same file twice is for ingest to judge

@@ -322,8 +322,8 @@ def test_an_encoder_that_reads_two_joints_gives_the_position_of_its_own() -> Non
     from bampipe.data.quality.channels import part_readings
 
     encoders = [
-        SimpleNamespace(axis="one", also_reads={}),
-        SimpleNamespace(axis="two", also_reads={"one": 1.0}),
+        SimpleNamespace(name="one", also_reads={}),
+        SimpleNamespace(name="two", also_reads={"one": 1.0}),
     ]
     si = {"q_one": np.array([0.1, 0.2]), "q_two": np.array([0.4, 0.7])}
     part_readings(SimpleNamespace(encoders=encoders), si)  # type: ignore[arg-type]

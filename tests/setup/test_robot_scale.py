@@ -52,11 +52,7 @@ def arm(gravity: Drawn = DOWN, is_shared: bool = False) -> System:
 
 
 def motions(
-    factor: float,
-    viscous: float,
-    gravity: Drawn = DOWN,
-    tool: float = 1.0,
-    is_shared: bool = False,
+    factor: float, viscous: float, gravity: Drawn = DOWN, tool: float = 1.0, is_shared: bool = False
 ) -> list[Motion]:
     """Two trials whose torques read ``factor`` times too much.
 
@@ -198,8 +194,7 @@ def test_two_joints_of_a_makers_zero_posture_are_found_together() -> None:
 
 
 @pytest.mark.parametrize(
-    "gravity",
-    [pytest.param((9.81, 0.0, 0.0), marks=pytest.mark.long), (0.0, 6.937, -6.937)],
+    "gravity", [pytest.param((9.81, 0.0, 0.0), marks=pytest.mark.long), (0.0, 6.937, -6.937)]
 )
 def test_a_base_that_does_not_stand_is_found_with_the_joint_that_is_reversed(
     gravity: tuple[float, float, float],

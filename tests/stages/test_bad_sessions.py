@@ -357,9 +357,7 @@ ASIDE: dict[str, tuple[Damage, str]] = {
     ),
     "viscous trial whose brakes were not recorded": (
         both(
-            put("trials.0.kind", "viscous"),
-            put("trials.0.viscous_n_s_per_m", 40),
-            drop("brakes"),
+            put("trials.0.kind", "viscous"), put("trials.0.viscous_n_s_per_m", 40), drop("brakes")
         ),
         "declared viscous, but no brake command is recorded",
     ),

@@ -115,10 +115,7 @@ def test_degrees_milliamperes_and_decimal_commas(tmp_path):
         (1.79e9 + T, 'column = "t"\nunit = "s"'),
         (np.rint(T * 1e9), 'column = "t"\nunit = "ns"'),
         (1_790_000_000_000_000 + np.rint(T * 1e6), 'column = "t"\nunit = "us"'),
-        (
-            [f"2026-10-03T10:12:{t:09.6f}" for t in T],
-            'column = "t"\nunit = "datetime"',
-        ),
+        ([f"2026-10-03T10:12:{t:09.6f}" for t in T], 'column = "t"\nunit = "datetime"'),
         (
             [f"03.10.2026 10:12:{t:09.6f}" for t in T],
             'column = "t"\nunit = "datetime"\nformat = "%d.%m.%Y %H:%M:%S.%f"',
@@ -147,19 +144,20 @@ def test_seconds_and_nanoseconds_in_two_columns(tmp_path):
 def test_a_velocity_for_want_of_a_position_is_integrated(tmp_path):
     text = log({"t": T, "w": QD * 60 / (2 * np.pi), "i": I}, form="{:.9f}")
     encoder = 'column = "w", unit = "rev/min"'
-    samples, trial, about = ingested(
-        tmp_path, text, time='column = "t"\nunit = "s"', **{**PLAIN, "encoder": encoder}
-    )
+    clock, turning = 'column = "t"\nunit = "s"', PLAIN | {"encoder": encoder}
+    samples, trial, about = ingested(tmp_path, text, time=clock, **turning)
     np.testing.assert_allclose(samples["q_joint"], Q - Q[0], atol=3e-4)
     assert "position is the integral of the velocity 'w'" in trial["repairs"]
+    in_hertz = log({"t": T, "w [Hz]": QD / (2.0 * np.pi), "i": I})
+    turning = PLAIN | {"encoder": 'column = "w [Hz]", unit = "rev/s"'}
+    found = ingested(tmp_path / "b", in_hertz, time=clock, **turning)[0]
+    np.testing.assert_allclose(found["q_joint"], Q - Q[0], atol=3e-4)
     joint = about["axes"]["joint"]
     assert joint["unit"] == "rad" and joint["resolution_stated"] is None
     assert 0.0 < joint["resolution"] < 1e-6
     with pytest.raises(InputError, match="makes the column a velocity; leave it out"):
-        ingested(
-            tmp_path, text, time='column = "t"\nunit = "s"',
-            **{**PLAIN, "encoder": f"{encoder}, counts_per_unit = 3"},
-        )  # fmt: skip
+        turning = PLAIN | {"encoder": f"{encoder}, counts_per_unit = 3"}
+        ingested(tmp_path, text, time=clock, **turning)
 
 
 def test_samples_that_are_counted(tmp_path):

@@ -124,13 +124,10 @@ def test_where_only_the_command_was_logged_it_is_the_input(tmp_path, column: str
     assert "drive = true" in proposal.device
     inputs = session.get("channels") or {"force": {"column": session["force"]["columns"][0]}}
     assert [given["column"] for given in inputs.values()] == [column]
-
-
-def test_a_measured_current_comes_before_the_one_commanded(tmp_path):
-    log = joint_log(1)
-    log["target_current"] = np.roll(log["motor_current"], -1)
-    write_table(tmp_path / "a.csv", log, "%.6f")
-    session, _ = proposed(tmp_path)
+    log["target_current"] = np.roll(log["motor_current"], -1)  # what was measured comes first
+    (tmp_path / "b").mkdir()
+    write_table(tmp_path / "b/a.csv", log, "%.6f")
+    session, _ = proposed(tmp_path / "b")
     assert session["channels"]["motor_current"]["column"] == "motor_current"
 
 
@@ -201,7 +198,7 @@ def test_duty_cycle_and_supply_make_a_motor(tmp_path):
     assert check_device(device) == [] and device.force_unit == ""
 
 
-def test_a_damper_whose_velocity_alone_was_kept(tmp_path):
+def test_a_damper_whose_velocity_alone_was_kept_and_a_log_too_short_to_look_into(tmp_path):
     log = damper_log(1)
     table = {"V": log["Velocity"] / 10, "F": log["Force"], "Ts": np.full_like(log["Force"], 1e-3)}
     write_table(tmp_path / "a.csv", table)
@@ -210,6 +207,9 @@ def test_a_damper_whose_velocity_alone_was_kept(tmp_path):
     (axis,) = session["encoders"].values()
     assert axis["column"] == "V" and any("integral of V" in line for line in proposal.check)
     assert session["force"]["columns"] == ["F"]
+    (tmp_path / "b").mkdir()
+    write_table(tmp_path / "b/a.csv", {n: v[:6] for n, v in labelled("t,angle_deg,w,u_nm").items()})
+    assert "[encoders]" in propose(tmp_path / "b").session
 
 
 def test_the_measured_axis_is_understood_from_its_motion(tmp_path):
@@ -293,12 +293,6 @@ def test_folders_that_cannot_be_proposed_for(tmp_path, command: Command, files, 
     assert not (folder / "session.toml").exists()
 
 
-def test_a_log_too_short_to_look_into_is_proposed_all_the_same(tmp_path):
-    rows = "\n".join(f"{k / 100},{0.1 * k},{0.01 * k}" for k in range(6))
-    (tmp_path / "a.csv").write_text(f"t,angle_deg,torque_nm\n{rows}\n")
-    assert "[encoders]" in propose(tmp_path).session
-
-
 def test_a_clock_of_no_likely_unit_is_left_open_and_costs_no_time(tmp_path):
     t = np.arange(1000) * 1e-9
     wave = np.arange(1000) / 50
@@ -353,11 +347,9 @@ def test_a_rate_that_nobody_knows_is_refused_until_it_is_given(tmp_path):
     assert ask.startswith("sample_rate_hz, rows a second. To find it: ")
     with pytest.raises(InputError, match=r'sample_rate_hz: found "\?"'):
         read_session(tmp_path / "a")
-
-
-def test_the_position_of_another_joint_is_no_force(tmp_path):
-    write_stage_log(tmp_path / "a", "ms", "pos_mm", "Joint 2 (rad)", "load_cell_N")
-    session, _ = proposed(tmp_path / "a")
+    # The position of another joint is no force.
+    write_stage_log(tmp_path / "b", "ms", "pos_mm", "Joint 2 (rad)", "load_cell_N")
+    session, _ = proposed(tmp_path / "b")
     assert session["encoders"]["carriage"]["column"] == "pos_mm"
     assert session["force"]["columns"] == ["load_cell_N"]
 
@@ -498,7 +490,7 @@ def labelled(names: str, **scales: float) -> dict[str, np.ndarray]:
     return {n: v * f for n, v, f in zip(names.split(","), values, factors, strict=True)}
 
 
-def test_units_at_the_end_of_names(tmp_path):
+def test_units_at_the_end_of_names_and_what_slides(tmp_path):
     table = labelled("t_ms,pos_deg,vel_deg_s,cur_mA", t=1e3, q=57.29578, qd=57.29578, u=1e3)
     write_table(tmp_path / "a.csv", table)
     session, proposal = proposed(tmp_path)
@@ -507,11 +499,9 @@ def test_units_at_the_end_of_names(tmp_path):
     assert session["encoders"]["joint"] == {"column": "pos_deg", "unit": "deg"} | velocity
     assert session["channels"]["motor_current"] == {"column": "cur_mA", "unit": "mA"}
     assert "driven by a current" in proposal.device
-
-
-def test_a_distance_slides_under_a_force(tmp_path):
-    write_table(tmp_path / "a.csv", labelled("t,dist,w,forc"))
-    session, proposal = proposed(tmp_path)
+    (tmp_path / "b").mkdir()
+    write_table(tmp_path / "b/a.csv", labelled("t,dist,w,forc"))
+    session, proposal = proposed(tmp_path / "b")
     assert session["force"]["unit"] == "N" and "linear axis" in " ".join(proposal.check)
 
 
@@ -625,17 +615,15 @@ def test_a_current_that_goes_with_the_torque_is_no_coil(tmp_path):
     assert any("current goes with torque_nm" in line for line in proposal.check)
 
 
-def test_the_gear_of_a_motor_is_what_the_weight_says(tmp_path):
+def test_the_gear_of_a_motor_is_what_the_weight_says_and_missed_in_its_torque(tmp_path):
     write_table(tmp_path / "a.csv", pendulum("t,motor_angle_deg,torque_nm", 70.0 * 57.29578, 1.0))
     session, proposal = proposed(tmp_path)
     assert session["encoders"]["joint"]["gear_ratio"] == pytest.approx(70.0, rel=0.02)
     assert any("times for one turn of it, by its weight" in line for line in proposal.check)
     assert "moment" in proposal.device
-
-
-def test_the_torque_of_a_motor_is_said_to_lack_the_gear(tmp_path):
-    write_table(tmp_path / "a.csv", pendulum("t,motor_deg,motor_torque_mNm", 4000.0, 14.0))
-    session, proposal = proposed(tmp_path)
+    (tmp_path / "b").mkdir()
+    write_table(tmp_path / "b/a.csv", pendulum("t,motor_deg,motor_torque_mNm", 4000.0, 14.0))
+    session, proposal = proposed(tmp_path / "b")
     assert any("motor_torque_mNm is the torque of a motor" in line for line in proposal.check)
     assert session["force"]["unit"] == "mN.m"
 

@@ -77,7 +77,7 @@ def test_joints_are_paired_with_columns_in_their_order(tmp_path: Path) -> None:
     write_log(tmp_path)
     proposal = proposed(tmp_path)
     session = read_session(tmp_path)
-    assert {e.axis: e.column for e in session.encoders} == {"shoulder": "q1", "elbow": "q2"}
+    assert {e.name: e.column for e in session.encoders} == {"shoulder": "q1", "elbow": "q2"}
     assert {c.name: c.column for c in session.channels} == {
         "torque_shoulder": "tau1",
         "torque_elbow": "tau2",
@@ -143,7 +143,7 @@ def paired(folder: Path) -> tuple[dict[str, str], dict[str, str], ProposedSessio
     proposal = proposed(folder)
     session = read_session(folder)
     drives = {c.name.partition("_")[2]: c.column for c in session.channels}
-    return {e.axis: e.column for e in session.encoders}, drives, proposal
+    return {e.name: e.column for e in session.encoders}, drives, proposal
 
 
 def test_columns_with_the_names_of_joints_go_to_these_joints(tmp_path: Path) -> None:
@@ -394,10 +394,10 @@ def test_joints_counted_otherwise_than_drawn(
     _, _, proposal = paired(tmp_path / "log")
     session = read_session(tmp_path / "log")
     for encoder in session.encoders:
-        direction, zero = counted.get(encoder.axis, (1.0, 0.0))
+        direction, zero = counted.get(encoder.name, (1.0, 0.0))
         assert encoder.gear_ratio == direction
         off = np.remainder(encoder.zero - zero + 0.1, 2.0 * np.pi)
-        assert off < 0.2, (encoder.axis, encoder.zero)
+        assert off < 0.2, (encoder.name, encoder.zero)
     drives = {c.name.partition("_")[2] for c in session.channels if c.scale < 0.0}
     assert drives == set(turned)
     said = [line for line in proposal.check if "by weight and inertia as drawn: look it up" in line]
@@ -429,7 +429,7 @@ def test_gravity_of_a_base_that_does_not_stand(
     device = read_device_file(tmp_path / "log/device.toml")
     assert device["robot"]["gravity"] == pytest.approx(list(gravity), abs=0.01)
     session = read_session(tmp_path / "log")
-    assert [e.axis for e in session.encoders if e.gear_ratio < 0.0] == ["elbow"]
+    assert [e.name for e in session.encoders if e.gear_ratio < 0.0] == ["elbow"]
     assert [c.name for c in session.channels if c.scale < 0.0] == ["torque_shoulder"]
 
 
@@ -473,7 +473,7 @@ def test_a_robot_of_which_the_urdf_shows_more_ends_with_the_last_joint_logged(
     table.to_csv(tmp_path / "log.csv", index=False)
     proposal = proposed(tmp_path)
     assert 'tip = "lower"' in proposal.device
-    assert {e.axis: e.column for e in read_session(tmp_path).encoders} == {
+    assert {e.name: e.column for e in read_session(tmp_path).encoders} == {
         "shoulder": "shoulder_q", "elbow": "elbow_q"
     }  # fmt: skip
 
@@ -504,7 +504,7 @@ def test_joint_states_in_a_bag_go_to_the_joints_that_they_name(tmp_path: Path) -
     session = read_session(tmp_path)
     assert 'column = "/joint_states:header.stamp"' in proposal.session
     joints = ("shoulder", "elbow")
-    assert {e.axis: e.column for e in session.encoders} == {
+    assert {e.name: e.column for e in session.encoders} == {
         name: f"/joint_states:position[{name}]" for name in joints
     }
     assert {c.name: c.column for c in session.channels} == {
@@ -529,7 +529,7 @@ def test_zeros_of_a_log_from_the_motors_side(tmp_path: Path) -> None:
     table.to_csv(tmp_path / "log/log_01.csv", index=False)
     paired(tmp_path / "log")
     for encoder, turns in zip(read_session(tmp_path / "log").encoders, truth["ratio"], strict=True):
-        direction, zero = counted.get(encoder.axis, (1.0, 0.0))
+        direction, zero = counted.get(encoder.name, (1.0, 0.0))
         assert encoder.gear_ratio == pytest.approx(direction * turns, rel=0.05)
         assert encoder.zero == pytest.approx(np.rad2deg(zero) * turns, rel=0.05, abs=1e-9)
     turned = {c.name for c in read_session(tmp_path / "log").channels if c.scale < 0.0}

@@ -30,6 +30,8 @@ def refuse_other_units(table: TrialTable, stated: Mapping[str, str]) -> None:
             continue
         if found.si == "kg":  # the weight of a mass
             found = unit(f"{text.strip('[]() ')}f") or found
+        if found == unit("Hz") and expected.si == "rad/s":  # turns a second
+            found = unit("rev/s") or found
         if (found.si, found.scale) != (expected.si, expected.scale):
             raise table.fault(
                 f"the file gives the unit {text}, session.toml {declared[column]}",
@@ -134,8 +136,8 @@ def to_si(table: TrialTable) -> dict[str, np.ndarray]:
         values = raw.pop(encoder.column)
         values -= encoder.zero
         values *= encoder.scale
-        si[f"q_{encoder.axis}"] = values
-        source[f"q_{encoder.axis}"] = encoder.column
+        si[f"q_{encoder.name}"] = values
+        source[f"q_{encoder.name}"] = encoder.column
     part_readings(session, si)
     if session.force is not None:
         force = session.force
@@ -170,11 +172,11 @@ def part_readings(session: Session, si: dict[str, np.ndarray]) -> None:
     """Take the positions of joints out of the readings of motors that several of them turn."""
     if not any(encoder.also_reads for encoder in session.encoders):
         return
-    place = {encoder.axis: i for i, encoder in enumerate(session.encoders)}
+    place = {encoder.name: i for i, encoder in enumerate(session.encoders)}
     reads = np.eye(len(place))
     for encoder in session.encoders:
         for other, share in encoder.also_reads.items():
-            reads[place[encoder.axis], place[other]] = share
+            reads[place[encoder.name], place[other]] = share
     if not np.linalg.cond(reads) < LARGEST_CONDITION:
         raise InputError(
             "the readings do not give the positions: some motion shows in none of them",

@@ -64,7 +64,9 @@ def unwrap(table: TrialTable, encoder: Encoder) -> None:
 
 
 def unwrapped(values: Array, turn: float, counts: bool) -> tuple[Array, Indices, str]:
-    """Readings that go on where they start anew: at a full turn, or at the bits of a counter.
+    """Readings that go on where they start anew: after full turns, or at the bits of a counter.
+
+    So do motors whose protocol has room for +-12.5 rad, as that of the Mini Cheetah.
 
     Args:
         values: (T,) raw readings, NaN where missing.
@@ -77,14 +79,15 @@ def unwrapped(values: Array, turn: float, counts: bool) -> tuple[Array, Indices,
     known = np.flatnonzero(np.isfinite(values))
     steps = np.diff(values[known])
     periods = [(2.0**bits, f"at {bits} bits") for bits in range(10, 33)] if counts else []
-    periods += [(turn, "at a full turn")] if turn else []
+    ranges = {"a full turn": 1.0, "two turns": 2.0, "25 rad": 12.5 / np.pi, "four turns": 4.0}
+    periods += [(turn * number, f"at {words}") for words, number in ranges.items() if turn]
     for period, words in periods:
         wraps = np.abs(steps) > period / 2
         near = np.abs(np.abs(steps) - period) < period / 16
         if wraps.any() and near[wraps].all() and np.ptp(values[known]) <= period:
-            turns, found = np.zeros(len(known)), values.copy()
-            turns[1:][wraps] = -np.sign(steps[wraps]) * period
-            found[known] += np.cumsum(turns)
+            passed, found = np.zeros(len(known)), values.copy()
+            passed[1:][wraps] = -np.sign(steps[wraps]) * period
+            found[known] += np.cumsum(passed)
             return found, (known[np.flatnonzero(wraps) + 1]).astype(np.int64), words
     return values, np.empty(0, dtype=np.int64), ""
 
@@ -158,7 +161,7 @@ def check_velocity(table: TrialTable, encoder: Encoder) -> None:
     column = encoder.velocity.column
     if abs(correlation) < 0.9:
         table.notes.append(
-            f"column '{column}' is not the velocity of {encoder.axis} by its position"
+            f"column '{column}' is not the velocity of {encoder.name} by its position"
             f" (correlation {correlation:.2f}); it is not used"
         )
         return
@@ -177,17 +180,17 @@ def check_velocity(table: TrialTable, encoder: Encoder) -> None:
 def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> None:
     """A free trial moves; a locked axis winds up, but stays."""
     session, limits, entry = table.session, table.limits, table.entry
-    travel = {e.axis: float(np.ptp(columns[f"q_{e.axis}"])) for e in session.encoders}
+    travel = {e.name: float(np.ptp(columns[f"q_{e.name}"])) for e in session.encoders}
     still = {"rad": limits.still_rad, "m": limits.still_m}
     if entry.kind != "locked":
-        if all(travel[e.axis] < still[e.unit] for e in session.encoders):
-            shown = ", ".join(f"{e.axis} {travel[e.axis]:.2g} {e.unit}" for e in session.encoders)
+        if all(travel[e.name] < still[e.unit] for e in session.encoders):
+            shown = ", ".join(f"{e.name} {travel[e.name]:.2g} {e.unit}" for e in session.encoders)
             raise table.fault(
                 f"declared {entry.kind}, but never moves ({shown})",
                 remedy="were the encoders on, and is their unit right? or is it a locked trial?",
             )
         for encoder in session.encoders:
-            if travel[encoder.axis] == 0.0:
+            if travel[encoder.name] == 0.0:
                 raise table.fault(
                     "never changes while other axes move: frozen",
                     column=encoder.column,
@@ -195,12 +198,12 @@ def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> No
                     " device: make a robot's joint fixed in its file",
                 )
         return
-    encoder = next(e for e in session.encoders if e.axis == entry.locked_axis)
+    encoder = next(e for e in session.encoders if e.name == entry.locked_axis)
     most = {"rad": limits.locked_rad, "m": limits.locked_m}[encoder.unit]
-    moved = travel[encoder.axis]
+    moved = travel[encoder.name]
     if moved > most:
         raise table.fault(
-            f"{encoder.axis} is declared locked, but moves by {moved:.3g} {encoder.unit},"
+            f"{encoder.name} is declared locked, but moves by {moved:.3g} {encoder.unit},"
             f" more than {most:g} {encoder.unit}",
             column=encoder.column,
             remedy="did the brake slip? or is it a free trial?",
@@ -208,7 +211,7 @@ def refuse_wrong_motion(table: TrialTable, columns: dict[str, np.ndarray]) -> No
     if encoder.resolution is not None and moved < (limits.locked_steps - 0.5) * encoder.resolution:
         steps = count_noun(round(moved / encoder.resolution), "encoder step")
         raise table.fault(
-            f"locked {encoder.axis} deflects by {steps} only, too little for a stiffness",
+            f"locked {encoder.name} deflects by {steps} only, too little for a stiffness",
             column=encoder.column,
             remedy="was another axis loaded? are the columns right?",
         )

@@ -179,15 +179,13 @@ def thin(trial: CleanTrial, every: int, sampled: Collection[str]) -> CleanTrial:
     low_pass = firwin(length, _HALF_POWER / every, window=("kaiser", _KAISER))
     columns = {
         name: values[::every].copy()
-        if name.startswith(("q_", "brake_")) or name in sampled or _is_held(values)
+        if name.startswith(("q_", "brake_"))
+        or name in sampled
+        or not np.isfinite(values).all()
+        or np.mean(np.diff(values) == 0.0) > _HELD
         else resample_poly(values, 1, every, window=low_pass, padtype="edge")
         for name, values in trial.columns.items()
     }
     return replace(
         trial, t=trial.t[::every].copy(), columns=columns, sample_rate=trial.sample_rate / every
     )
-
-
-def _is_held(values: np.ndarray) -> bool:
-    """Whether readings (T,) are no signal that a low-pass may take: held, or with gaps."""
-    return not np.isfinite(values).all() or float(np.mean(np.diff(values) == 0.0)) > _HELD

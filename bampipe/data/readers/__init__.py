@@ -23,34 +23,28 @@ TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
 """File extensions of tables as text."""
 SHEETS = (".xlsx", ".xlsm")
 """Of workbooks, whose first sheet with rows is read as a text."""
-_READERS: dict[str, ModuleType] = {
-    **dict.fromkeys((*TEXTS, *SHEETS), text),
-    ".parquet": parquet,
-    ".mat": mat,
-    **dict.fromkeys((".h5", ".hdf5", ".hdf"), hdf5),
-    **dict.fromkeys((".json", ".jsonl", ".ndjson"), objects),
-    ".tdms": tdms,
-    **dict.fromkeys((".bag", ".mcap", ".db3"), bag),
-    **dict.fromkeys((".npy", ".npz"), arrays),
-}
+_AGAIN = "copy it again from the logger"
+_FORMATS: tuple[tuple[tuple[str, ...], ModuleType, str, str], ...] = (
+    (TEXTS, text, "", ""),
+    (SHEETS, text, "workbook of Excel", "save it again, or export the sheet as CSV"),
+    ((".parquet",), parquet, "Parquet file", _AGAIN),
+    ((".mat",), mat, "MATLAB file", "save it again from MATLAB"),
+    ((".h5", ".hdf5", ".hdf"), hdf5, "HDF5 file", _AGAIN),
+    ((".json", ".jsonl", ".ndjson"), objects, "", ""),
+    ((".tdms",), tdms, "TDMS file", _AGAIN),
+    ((".bag", ".db3"), bag, "bag", f"{_AGAIN}, with the message definitions in it"),
+    ((".mcap",), bag, "MCAP file", f"{_AGAIN}, with the message definitions in it"),
+    ((".npy", ".npz"), arrays, "file of NumPy", "save it again with np.savez"),
+)
+"""File extensions and their reader; of what libraries read, what to do where they cannot."""
+_READERS = {extension: module for own, module, _, _ in _FORMATS for extension in own}
+_FOREIGN = {extension: (kind, remedy) for own, _, kind, remedy in _FORMATS for extension in own}
 EXTENSIONS = tuple(_READERS)
 """File extensions that can be read."""
 
 _HEAD = 1 << 10
 _MOST_UNPACKED, _LEAST_ROOM = 100, 2 << 30
 """Of the size of a file, and bytes, which it may take in memory while it is read, if it is free."""
-_AGAIN = "copy it again from the logger"
-_FOREIGN = {
-    ".parquet": ("Parquet file", _AGAIN),
-    ".mat": ("MATLAB file", "save it again from MATLAB"),
-    **dict.fromkeys((".h5", ".hdf5", ".hdf"), ("HDF5 file", _AGAIN)),
-    ".tdms": ("TDMS file", _AGAIN),
-    **dict.fromkeys(SHEETS, ("workbook of Excel", "save it again, or export the sheet as CSV")),
-    **dict.fromkeys((".npy", ".npz"), ("file of NumPy", "save it again with np.savez")),
-    **dict.fromkeys((".bag", ".db3"), ("bag", f"{_AGAIN}, with the message definitions in it")),
-    ".mcap": ("MCAP file", f"{_AGAIN}, with the message definitions in it"),
-}
-"""What libraries read, and what to do where they cannot: they have no one error for damage."""
 _KINDS = (
     (b"PAR1", (".parquet",), "a Parquet file"),
     (b"TDSm", (".tdms",), "a TDMS file"),
@@ -146,9 +140,9 @@ def _safely(path: Path, name: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        if path.suffix.lower() not in _FOREIGN:
-            raise
         kind, remedy = _FOREIGN[path.suffix.lower()]
+        if not kind:
+            raise
         raise InputError(f"not a sound {kind}", where=name, remedy=remedy) from error
     finally:
         if resource is not None:

@@ -83,9 +83,9 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
     """Arrays (T,) or (T, k) of numbers, or (T,) of moments, in a parsed text, by their paths."""
     if isinstance(value, dict):
         for key, item in value.items():
-            names = [
-                other for other in value.values() if isinstance(other, list) and _are_names(other)
-            ]
+            lists = [other for other in value.values() if isinstance(other, list)]
+            texts = [own for own in lists if all(isinstance(x, str) and x for x in own)]
+            names = [own for own in texts if len(set(own)) == len(own)]
             inner = f"{path}.{key}" if path else str(key)
             for label, array in _arrays(item, inner):
                 width = array.shape[-1] if array.ndim == 2 else 0
@@ -94,7 +94,7 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
                     yield from zip(called, array.T, strict=True)
                 else:
                     yield label, array
-    elif isinstance(value, list) and len(value) > 1:
+    elif isinstance(value, list) and value:
         if isinstance(value[0], dict):
             own = [next((str(x[key]) for key in _CALLED if key in x), "") for x in value]
             places = own if all(own) and len(set(own)) == len(own) else range(len(value))
@@ -109,7 +109,7 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
             array = np.array(value, dtype=np.float64)
         except (TypeError, ValueError):  # ragged, or with other things in it
             return
-        if array.ndim <= 2 and array.size:
+        if array.ndim <= 2 and array.size and len(array) > 1:
             yield path or "data", array
 
 
@@ -124,11 +124,6 @@ def _with_lists(content: object, depth: int = 2) -> object:
     if len(content) > 1 and all(key == str(n) for n, key in enumerate(content)):
         return list(content.values())
     return {key: _with_lists(item, depth - 1) for key, item in content.items()}
-
-
-def _are_names(values: list[object]) -> bool:
-    texts = [value for value in values if isinstance(value, str) and value]
-    return bool(texts) and len(set(texts)) == len(values)
 
 
 def _samples(

@@ -43,6 +43,7 @@ _PIVOT = (
 )
 _FOREIGN = (
     (re.compile(r"\s*\(\d+\.\d+\)\s+\w+\s+[0-9A-F]+#"), _CAN, _DECODE),
+    (re.compile(r"\s*(\(\S+\)\s+)?\w+\s+[0-9A-F]{3,8}\s+\[\d+\]\s"), _CAN, _DECODE),
     (re.compile(r"\s*\d+\.\d+\s+\d+\s+[0-9A-Fa-f]+x?\s+[RT]x\s+d "), _CAN, _DECODE),
     (
         re.compile(r"# name: \w+"),

@@ -189,11 +189,6 @@ class Encoder(NamedDeclaration):
     )
 
     @property
-    def axis(self) -> str:
-        """Name of the axis."""
-        return self.name
-
-    @property
     def unit(self) -> Literal["rad", "m"]:
         """Unit of the position."""
         return "rad" if _unit(self.stated_unit).si.startswith("rad") else "m"
@@ -435,7 +430,7 @@ class BrakeTable(Declaration):
         Raises:
             InputError: a column that names no axis, or a unit that does not fit one.
         """
-        axes = {encoder.axis: encoder for encoder in encoders}
+        axes = {encoder.name: encoder for encoder in encoders}
         named = [column.removeprefix("brake_") for column in self.columns]
         if not set(named) <= set(axes):
             unknown = next(name for name in named if name not in axes)
@@ -514,13 +509,8 @@ class Channel(NamedDeclaration):
     @property
     def raw_unit(self) -> str:
         """Unit of the column, "" where the session file rescales it."""
-        rescaled = {
-            "stated_scale",
-            "stated_offset",
-            "wrap_bits",
-            "sign_bit",
-        } & self.model_fields_set
-        return "" if rescaled else self.stated_unit
+        changing = {"stated_scale", "stated_offset", "wrap_bits", "sign_bit"}
+        return "" if changing & self.model_fields_set else self.stated_unit
 
     def cross_faults(self) -> Iterator[InputError]:
         if self.stated_scale == 0.0:

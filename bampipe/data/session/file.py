@@ -187,11 +187,6 @@ class TrialEntry(NamedDeclaration):
     hold_out: bool = Field(default=False, description="Never fitted, only for judging models")
     notes: str = Field(default="", description="Free text")
 
-    @property
-    def trial_id(self) -> str:
-        """The file's name without its extension, with its folders where that is not unique."""
-        return self.name
-
     def overlaps(self, other: TrialEntry) -> bool:
         """Whether the stretches of two trials of one file have samples in common."""
         apart = self.recording != other.recording and None not in (self.recording, other.recording)
@@ -355,12 +350,12 @@ class Session(Declaration):
         except InputError as error:
             yield error
             columns = ()
-        axes = [encoder.axis for encoder in self.encoders]
+        axes = [encoder.name for encoder in self.encoders]
         for encoder in self.encoders:
             for other in encoder.also_reads:
-                if other not in axes or other == encoder.axis:
-                    yield _no_axis(other, axes, f"encoders.{encoder.axis}.also_reads", "other ")
-        units = {encoder.axis: encoder.unit for encoder in self.encoders}
+                if other not in axes or other == encoder.name:
+                    yield _no_axis(other, axes, f"encoders.{encoder.name}.also_reads", "other ")
+        units = {encoder.name: encoder.unit for encoder in self.encoders}
         for channel in self.channels:
             axis = channel.second_encoder_of
             if axis and axis not in axes:
@@ -380,7 +375,7 @@ class Session(Declaration):
         yield from self._faults_of_trials()
 
     def _faults_of_trials(self) -> Iterator[InputError]:
-        axes = [encoder.axis for encoder in self.encoders]
+        axes = [encoder.name for encoder in self.encoders]
         for number, trial in enumerate(self.trials):
             place = f"trials[{number}]"
             if trial.locked_axis is not None and trial.locked_axis not in axes:
@@ -391,7 +386,7 @@ class Session(Declaration):
                 twice = stretches == {(0.0, math.inf)}
                 if other.file == trial.file and other.overlaps(trial) and not twice:
                     yield InputError(
-                        f"overlaps trial {other.trial_id} of the same file",
+                        f"overlaps trial {other.name} of the same file",
                         where=place,
                         remedy="give each stretch its own start_s and end_s: held-out samples"
                         " must not be in another trial",

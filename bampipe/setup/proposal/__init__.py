@@ -109,6 +109,9 @@ def propose(
             " [[trials]]"
         )
     left = [column.name for column in found.columns if column.name not in match.used]
+    passed: dict[str, list[str]] = {}
+    for name, reason in found.passed:
+        passed.setdefault(reason.removeprefix(name).lstrip(":, "), []).append(name)
     lines = [
         *_head(folder, chosen.name, clock.rate),
         *(["[csv]", f"names = [{', '.join(map(quoted, names))}]", ""] if names else []),
@@ -123,9 +126,7 @@ def propose(
         device=chosen.text,
         fill_in=notes.questions,
         check=notes.check,
-        passed=[
-            f"{name}: {reason.removeprefix(name).lstrip(':, ')}" for name, reason in found.passed
-        ],
+        passed=[f"{join_names(own, 4)}: {reason}" for reason, own in passed.items()],
     )
 
 
@@ -228,11 +229,7 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
 
 
 def _trials_tables(
-    device: Device,
-    axes: Mapping[str, SurveyedColumn],
-    match: Matcher,
-    notes: Notes,
-    timed: bool,
+    device: Device, axes: Mapping[str, SurveyedColumn], match: Matcher, notes: Notes, timed: bool
 ) -> list[str]:
     """Propose the trials and their kinds; a long single record is cut at rests of its axis.
 

@@ -271,7 +271,8 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
 
 def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bool:
     """Whether a current beside a force is that of a coil or a brake, rather than of the drive."""
-    currents = [c for c in match.found.of("current") if not c.is_constant]
+    found = (c for c in match.found.of("current") if not c.is_constant)
+    currents = [c for c in found if "motor" not in words(c.name)]
     if driver is None:
         return bool(currents)
     alike = [c for c in currents if _go_together(c.values, driver.values)]

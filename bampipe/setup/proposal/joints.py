@@ -62,11 +62,10 @@ def pair_joints(
 def chain_logged(chains: Mapping[str, Sequence[tuple[str, str]]], found: Survey) -> str:
     """The link at which the chain ends whose joints the columns name most; "" if they name none."""
     said = [_tokens(column.name) for column in found.of("position")]
-
-    def is_logged(joint: str) -> bool:
-        return any(_without(tokens, _tokens(joint)) is not None for tokens in said)
-
-    logged = [[(j, link) for j, link in chain if is_logged(j)] for chain in chains.values()]
+    logged = [
+        [end for end in chain if any(_without(own, _tokens(end[0])) is not None for own in said)]
+        for chain in chains.values()
+    ]
     longest = max(logged, key=len, default=[])
     return longest[-1][1] if longest else ""
 

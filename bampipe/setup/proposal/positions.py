@@ -103,8 +103,9 @@ def signed_readings(found: Survey) -> tuple[Survey, dict[str, guesses.Register]]
     columns = []
     for c in found.columns:
         values = registers[c.name].signed(c.values) if c.name in registers else c.values
-        if c.role == "position" and c.name not in registers and (in_counts(c) or c.si == "rad"):
-            values = unwrapped(values, 2.0 * np.pi / c.scale if c.si else 0.0, in_counts(c))[0]
+        if c.role == "position" and c.name not in registers and c.si != "m":
+            turn = 0.0 if in_counts(c) else 2.0 * np.pi / c.scale
+            values = unwrapped(values, turn, in_counts(c))[0]
         if c.role in ("position", *DRIVERS):
             known = np.isfinite(values)
             known[known] = ~find_spikes(values[known], POSITION if c.role == "position" else INPUT)

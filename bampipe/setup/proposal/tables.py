@@ -309,7 +309,8 @@ def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
         return entry(column.name, UNKNOWN) + note
     said = spelled(column.unit, _SPEED_UNITS) if column.si == si else ""
     return entry(column.name, said or si) + notes.guess(
-        f"no position was recorded: that of {axis.name} is the integral of {column.name}"
+        f"no position was recorded: that of {axis.name} is the integral of {column.name}, in"
+        f" {said or si}"
     )
 
 
