@@ -14,7 +14,7 @@ regression (Fuller 1987, eq. 1.2.3), else it would make the axis look stiff.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,14 +134,10 @@ def reversals(smooth: Array) -> NDArray[np.intp]:
     valleys = find_peaks(-smooth, prominence=least)[0]
     turns = np.sort(np.concatenate((peaks, valleys)))
     # Two peaks in a row can only be shoulders of one: the higher is the turn.
-    turning: list[int] = []
-    for turn in turns:
-        top = turn in peaks
-        if turning and (turning[-1] in peaks) == top:
-            if (smooth[turn] > smooth[turning[-1]]) == top:
-                turning[-1] = int(turn)
-        else:
-            turning.append(int(turn))
+    turning = []
+    for top, run in groupby(turns, key=lambda turn: turn in peaks):
+        same = np.array([*run])
+        turning.append(same[np.argmax(smooth[same] if top else -smooth[same])])
     return np.array(turning, dtype=np.intp)
 
 

@@ -12,6 +12,7 @@ Clifford 1959): up to a quarter of the sessions may be off without hiding one an
 """
 
 from collections.abc import Sequence
+from itertools import groupby
 
 import numpy as np
 
@@ -94,16 +95,10 @@ def make_chart(
 
 def _find_run(x: Array) -> tuple[int, int] | None:
     """Return the places of the longest run of RUN_LENGTH or more on one side of the median."""
-    side = np.sign(x - np.median(x))
-    best: tuple[int, int] | None = None
-    start = 0
-    for i in range(1, len(x) + 1):
-        if i == len(x) or side[i] != side[start]:
-            longest = 0 if best is None else best[1] - best[0] + 1
-            if side[start] != 0 and i - start >= max(RUN_LENGTH, longest + 1):
-                best = (start, i - 1)
-            start = i
-    return best
+    side = np.sign(x - np.median(x)).tolist()
+    runs = [[*run] for one, run in groupby(range(len(x)), key=side.__getitem__) if one]
+    longest = max(runs, key=len, default=[])
+    return (longest[0], longest[-1]) if len(longest) >= RUN_LENGTH else None
 
 
 def _find_trend(x: Array) -> tuple[float, float]:

@@ -20,21 +20,15 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from bampipe.report import document
 from bampipe.report.wording import break_lines, choose_scale, format_unit
 
-INK = "#1c2024"
-FAINT = "#b4b8bd"
-BLUE = "#0072b2"
-VERMILLION = "#d55e00"
-GREEN = "#009e73"
-ORANGE = "#e69f00"
-SKY = "#56b4e9"
-PURPLE = "#cc79a7"
+COLOURS = {
+    "ink": "#1c2024", "faint": "#b4b8bd", "blue": "#0072b2", "vermillion": "#d55e00",
+    "green": "#009e73", "orange": "#e69f00", "sky": "#56b4e9", "purple": "#cc79a7",
+}  # fmt: skip
+"""All colours in use, by the name that the page's style sheet gives them."""
+INK, FAINT, BLUE, VERMILLION, GREEN, ORANGE, SKY, PURPLE = COLOURS.values()
 
 SERIES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 """Colours of axes, components or models, in their order."""
-
-_NAMES = ("INK", "FAINT", "BLUE", "VERMILLION", "GREEN", "ORANGE", "SKY", "PURPLE")
-COLOURS: dict[str, str] = {name.lower(): globals()[name] for name in _NAMES}
-"""All colours in use, by the name that the page's style sheet gives them."""
 
 _LABEL = 30
 """Letters in a line of an axis label: longer lines are clipped if three panels share a row."""
@@ -173,9 +167,9 @@ def draw_series(
     axes.plot(x[keep], y[keep], color=colour, label=name, **more)  # type: ignore[arg-type]
 
 
-def mark_trials(axes: Axes, trace: pd.DataFrame, clock: str) -> None:
-    """Mark the start of each trial but the first in a trace, by its column of times."""
-    starts = trace.loc[trace["trial_id"].ne(trace["trial_id"].shift()), clock].to_numpy()
+def mark_trials(axes: Axes, trace: pd.DataFrame) -> None:
+    """Mark the start of each trial but the first in a trace."""
+    starts = trace.loc[trace["trial_id"].ne(trace["trial_id"].shift()), "t_total"].to_numpy()
     for start in starts[1:]:
         axes.axvline(start, color=FAINT, lw=0.6, ls=(0, (1, 2)), zorder=0)
 

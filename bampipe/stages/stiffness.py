@@ -140,8 +140,7 @@ def _gears(
     rotors = robot.rotors_at_joints if robot is not None else {}
     apart: dict[str, list[tuple[Array, Array, Array]]] = {axis: [] for axis in second}
     for trial_id in free["trial_id"]:
-        frame = read_parquet(samples, trial=str(trial_id))
-        frame = frame[frame.drop(columns="trial_id").notna().all(axis=1)]
+        frame = read_parquet(samples, trial=str(trial_id)).dropna()
         if len(frame) < _FEWEST:
             continue
         q = frame[[f"q_{name}" for name in system.coordinates]].to_numpy(dtype=np.float64)
@@ -203,8 +202,7 @@ def _loops_of(
 ) -> _Loops | str:
     """Return the loops of one trial, or why there are none."""
     rate = session.sample_rate_hz
-    frame = read_parquet(samples, trial=trial_id)
-    frame = frame[frame.drop(columns="trial_id").notna().all(axis=1)]
+    frame = read_parquet(samples, trial=trial_id).dropna()
     t = frame["t"].to_numpy(dtype=np.float64)
     if len(t) < 2:
         return "no sound samples"

@@ -210,12 +210,11 @@ def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.Da
     few = [n for n in _PANEL_COLUMNS if len(groups) <= n * _MOST_PANEL_ROWS] or _PANEL_COLUMNS[-1:]
     columns = min(few, key=lambda columns: (-len(groups) % columns, columns))
     figure, panels = style.make_grid(len(groups), columns, 1.35)
-    clock = "t_total" if "t_total" in trace else "t"
     shown = trace.iloc[style.thin(len(trace), 1500)]
-    again = trace.loc[trace["run"] > 0, clock].to_numpy() if "run" in trace else np.array([])
+    again = trace.loc[trace["run"] > 0, "t_total"].to_numpy() if "run" in trace else np.array([])
     for number, (panel, (kind, unit, names)) in enumerate(zip(panels, groups, strict=True)):
-        _draw_traces(results, panel, shown, clock, names)
-        style.mark_trials(panel, trace, clock)
+        _draw_traces(results, panel, shown, names)
+        style.mark_trials(panel, trace)
         if again.size:
             panel.axvline(again[0], color=style.INK, lw=0.6, zorder=0)
         _limit_panel(panel, trace, names)
@@ -236,11 +235,9 @@ def _draw_convergence(results: Results, identified: IdentifyResult, trace: pd.Da
     return style.finish(figure, "convergence", caption)
 
 
-def _draw_traces(
-    results: Results, panel: Any, shown: pd.DataFrame, clock: str, names: Sequence[str]
-) -> None:
+def _draw_traces(results: Results, panel: Any, shown: pd.DataFrame, names: Sequence[str]) -> None:
     """Draw the estimates of one panel with their bounds and design values."""
-    t = shown[clock].to_numpy()
+    t = shown["t_total"].to_numpy()
     for number, name in enumerate(names):
         axis = name.split(".")[-1]
         place = results.axes.index(axis) if axis in results.axes else number
@@ -248,9 +245,8 @@ def _draw_traces(
         value = shown[name].to_numpy()
         title = axis if axis in results.axes else "estimate"
         panel.plot(t, value, color=colour, ls=_DASHES[place % len(_DASHES)], label=title)
-        if f"{name}_sd" in shown:
-            half = NORMAL_95 * shown[f"{name}_sd"].to_numpy()
-            panel.fill_between(t, value - half, value + half, color=colour, alpha=0.18, lw=0)
+        half = NORMAL_95 * shown[f"{name}_sd"].to_numpy()
+        panel.fill_between(t, value - half, value + half, color=colour, alpha=0.18, lw=0)
     design = (results.paper or {}).get("design", {})
     for one in (design[name] for name in names if name in design):
         panel.axhline(one["value"], color=style.INK, lw=0.8, ls="--", label=one["label"])
@@ -264,7 +260,7 @@ def _limit_panel(panel: Any, trace: pd.DataFrame, names: Sequence[str]) -> None:
     values = []
     for name in names:
         centre = tail[name].to_numpy()
-        half = 2.5 * tail[f"{name}_sd"].to_numpy() if f"{name}_sd" in tail else 0.0
+        half = 2.5 * tail[f"{name}_sd"].to_numpy()
         values += [centre - half, centre + half, trace[name].to_numpy()]
     style.set_limits(panel, values)
 

@@ -118,9 +118,8 @@ def _draw_loop(
     deflection = deflection - 0.5 * (deflection.min() + deflection.max())
     factor, unit = choose_scale([float(np.max(np.abs(deflection)))], results.unit(axis))
     panel.plot(factor * deflection, torque, color=style.FAINT, lw=0.6, label="around a reversal")
-    if "post_yield" in rows:
-        away = np.where(rows["post_yield"].to_numpy(dtype=bool), torque, np.nan)
-        panel.plot(factor * deflection, away, color=style.BLUE, lw=0.8, label="away from reversals")
+    away = np.where(rows["post_yield"].to_numpy(dtype=bool), torque, np.nan)
+    panel.plot(factor * deflection, away, color=style.BLUE, lw=0.8, label="away from reversals")
     middle, reach = 0.5 * (torque.max() + torque.min()), 0.5 * (torque.max() - torque.min())
     line = np.array([-reach, reach])
     panel.plot(

@@ -129,19 +129,16 @@ def _tabulate_drift(
 def _read_trial(results: Results) -> pd.DataFrame | None:
     """Return the residuals of the first held-out trial, else of the first."""
     path = results.model_file("residuals.parquet")
-    ids = results.table(path, [n for n in ("trial_id", "held_out") if n in results.columns(path)])
+    ids = results.table(path, ["trial_id", "held_out"])
     if ids is None or ids.empty:
         return None
-    held = ids[ids["held_out"].astype(bool)] if "held_out" in ids else ids
+    held = ids[ids["held_out"]]
     return results.table(path, trial=str((held if len(held) else ids)["trial_id"].iloc[0]))
 
 
 def _draw_forces(results: Results, frame: pd.DataFrame) -> Figure:
-    """Draw Fig. 9: forces at the handle if both kinds of prediction are stored, else at joints."""
-    start = "force_predicted_without_friction_"
-    components = [str(n).removeprefix(start) for n in frame.columns if str(n).startswith(start)]
-    names = components or [a for a in results.axes if f"torque_measured_{a}" in frame]
-    kind = "force" if components else "torque"
+    """Draw Fig. 9, at the joints."""
+    names = [axis for axis in results.axes if f"torque_measured_{axis}" in frame]
     figure, panels = style.make_panels(len(names), 1, 0.45 + 1.2 * len(names), sharex=True)
     t = frame["t"].to_numpy()
     window = (t >= t[0] + _SETTLE_S) & (t <= t[0] + _SETTLE_S + _SHOWN_S)
@@ -149,22 +146,20 @@ def _draw_forces(results: Results, frame: pd.DataFrame) -> Figure:
     t = part["t"].to_numpy()
     for panel, name in zip(panels[:, 0], names, strict=True):
         for column, title, colour, look in (
-            (f"{kind}_predicted_without_friction_{name}", "predicted without friction",
+            (f"torque_predicted_without_friction_{name}", "predicted without friction",
              style.ORANGE, {"ls": (0, (4, 1.5)), "lw": 0.9}),
-            (f"{kind}_measured_{name}", "measured", style.FAINT, {"lw": 2.6}),
-            (f"{kind}_predicted_{name}", "predicted", style.BLUE, {"lw": 0.9}),
+            (f"torque_measured_{name}", "measured", style.FAINT, {"lw": 2.6}),
+            (f"torque_predicted_{name}", "predicted", style.BLUE, {"lw": 0.9}),
         ):  # fmt: skip
             if column in part:
                 style.draw_series(panel, t, part[column].to_numpy(), colour, title, **look)
-        quantity = f"force {name}" if components else f"{name}, {results.name_force(name)}"
-        unit = "N" if components else results.force_unit(name)
-        panel.set_ylabel(style.label_axis(quantity, unit, 20))
+        quantity = f"{name}, {results.name_force(name)}"
+        panel.set_ylabel(style.label_axis(quantity, results.force_unit(name), 20))
     panels[-1, 0].set_xlabel("time (s)")
-    place = "force" if components else "generalised force at each joint"
     caption = (
         f"Trial {frame['trial_id'].iloc[0]}{results.cite_paper('Fig. 9')}: the {results.pusher}'s "
-        f"{place}, measured and predicted by the inverse dynamics, with and without its friction "
-        "terms."
+        "generalised force at each joint, measured and predicted by the inverse dynamics, with and "
+        "without its friction terms."
     )
     return style.finish(figure, "force-prediction", caption, [panels[0, 0]])
 

@@ -89,7 +89,7 @@ def _draw(results: Results, directions: Mapping[str, Damping], trace: pd.DataFra
         if (command := directions[name].commanded) is not None:
             panel.axhline(command, color=style.INK, lw=0.8, ls="--", label="commanded")
             extent.append(np.array([command]))
-        style.mark_trials(panel, trace, "t_total")
+        style.mark_trials(panel, trace)
         style.set_limits(panel, extent)
         panel.set_title(name)
         panel.set_xlabel("time in the filter (s)")
