@@ -10,10 +10,9 @@ import pytest
 from bampipe.data import store
 from bampipe.errors import InputError
 from bampipe.identification.filter_run import choose_stride
-from bampipe.trials.cache import TrialCache
 from bampipe.trials.folds import Folds
-from bampipe.trials.motion import Motion
-from bampipe.trials.replay import store_motions
+from bampipe.trials.kept import KeptItems
+from bampipe.trials.motion import Motion, trial_names
 
 
 def test_trials_are_held_out_one_by_one_up_to_ten_then_in_ten_groups() -> None:
@@ -24,30 +23,7 @@ def test_trials_are_held_out_one_by_one_up_to_ten_then_in_ten_groups() -> None:
     assert max(many.count(k) for k in range(10)) - min(many.count(k) for k in range(10)) <= 1
 
 
-def test_a_cache_holds_all_or_a_tenth_and_fetches_the_rest_again() -> None:
-    fetched: list[int] = []
-
-    def fetch(place: int) -> list[int]:
-        fetched.append(place)
-        return [place] * 10
-
-    whole = TrialCache(fetch, 5, len, most=50)
-    assert [item[0] for item in [*whole, *whole]] == 2 * [0, 1, 2, 3, 4]
-    assert fetched == [0, 1, 2, 3, 4]
-    fetched.clear()
-    cache = TrialCache(fetch, 50, len, most=200)
-    assert [item[0] for item in cache] == list(range(50))
-    assert cache[-1][0] == 49 and cache[48][0] == 48 and len(fetched) == 50
-    assert cache[0][0] == 0 and len(fetched) == 51
-    assert [item[0] for item in cache[1:3]] == [1, 2]
-    assert cache.size(40) == 10 and len(fetched) == 53
-    with pytest.raises(IndexError):
-        cache[50]
-    one = TrialCache(fetch, 1, len, most=1)
-    assert one[0] is one[0]
-
-
-def test_stored_trials_come_back_bit_by_bit_and_leave_nothing(
+def test_items_beyond_the_memory_come_back_bit_by_bit_and_leave_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -62,14 +38,20 @@ def test_stored_trials_come_back_bit_by_bit_and_leave_nothing(
         )
         for k in range(3)
     ]
-    cache = store_motions(iter(given))
-    for motion, back in zip(given, cache, strict=True):
+    assert all(a is b for a, b in zip(given, KeptItems(given), strict=True))
+    kept = KeptItems(iter(given), most=1000)
+    for motion, back in zip(given, kept, strict=True):
         assert back.trial_id == motion.trial_id
         assert all(np.array_equal(getattr(motion, name), getattr(back, name)) for name in names)
         assert np.array_equal(motion.channels["force_x"], back.channels["force_x"])
-    assert len(list(tmp_path.iterdir())) == 1
-    del cache
-    assert list(tmp_path.iterdir()) == []
+        assert back is not motion
+    assert kept[-1] is kept[2] and [m.trial_id for m in kept[:2]] == trial_names(kept)[:2]
+    with pytest.raises(IndexError):
+        kept[3]
+    descriptors = Path("/dev/fd")
+    held = len([*descriptors.iterdir()])
+    del kept
+    assert len([*descriptors.iterdir()]) == held - 1 and [*tmp_path.iterdir()] == []
 
 
 def test_the_trials_of_a_table_with_and_without_a_row_group_each(tmp_path: Path) -> None:

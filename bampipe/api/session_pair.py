@@ -309,7 +309,7 @@ def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
 def _refit_together(e: Evidence, limits: Array) -> Refit | None:
     """Refit parameters, added one at a time while each brings some axis nearer to its limit."""
     chosen: list[int] = []
-    error = np.sqrt(e.sums.yy.sum(axis=0) / np.maximum(e.sums.count.sum(axis=0), 1.0))
+    error = e.rmse()
     while len(chosen) < len(e.free) and np.any(error > limits):
         left = [k for k in range(len(e.free)) if k not in chosen]
         tried = {k: _solve(e, [*chosen, k], limits)[1] for k in left}

@@ -4,7 +4,7 @@ They have fixed options and no metadata that varies. A file that cannot be read 
 :class:`bampipe.errors.InputError` naming it.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import lru_cache
 from itertools import pairwise
@@ -140,17 +140,6 @@ def trial_ids(path: Path) -> frozenset[str]:
     if "trial_id" not in metadata.schema.names:
         raise InputError("no column 'trial_id'", where=str(path))
     return frozenset(by_trial)
-
-
-def row_count(path: Path, trials: Collection[str]) -> int:
-    """Rows of the row groups that hold these trials.
-
-    Raises:
-        InputError: no such file, or not a sound Parquet file.
-    """
-    metadata, by_trial = _footer(Path(path))
-    groups = {group for name in trials for group in by_trial.get(name, ())}
-    return sum(metadata.row_group(group).num_rows for group in groups)
 
 
 def _table(frame: Frame) -> pa.Table:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +23,9 @@ from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
 from bampipe.results.floor import compare_with_floor
-from bampipe.trials.cache import MOST_SAMPLES
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import HELD_OUT
+from bampipe.trials.kept import KeptItems
 from bampipe.trials.likelihood import (
     Likelihood,
     Noise,
@@ -39,14 +39,13 @@ from bampipe.trials.likelihood import (
     take_samples,
 )
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.noise_floor import NoiseFloor
-from bampipe.trials.replay import StandIn, keep_motion, replay_motion, replay_motions
+from bampipe.trials.replay import StandIn, keep_motion, replay_motion
 from bampipe.trials.residuals import ModelOnTrial
+from bampipe.trials.sensors import Sensors
 from bampipe.workers import process_pool
 
-Task = TypeVar("Task")
-Returned = TypeVar("Returned")
+Seed = tuple[int, ...]
 
 _STEPS = 8
 _SHARES = (1.0, 0.3, 0.1, 0.03)
@@ -164,8 +163,8 @@ class Session:
         both = choosing, self.trials.folds.judged
         return [self.trials.subset(np.flatnonzero(counts).tolist()) for counts in both]
 
-    def replay(self, evidence: Evidence, p: Array, count: int, first: int = 0) -> list[list[Array]]:
-        """Residuals of a model on replays of itself, by trial, each (K, n_q).
+    def replay(self, evidence: Evidence, p: Array, count: int, first: int = 0) -> Sequence[Array]:
+        """Residuals of a model on replays of itself, by trial, each (K, n_q, count).
 
         Args:
             evidence: the model on the measured trials; p: parameters that are replayed, (n_p,).
@@ -174,19 +173,21 @@ class Session:
         Raises:
             Runaway: the simulated motion grows without bounds.
         """
-        stand_in = StandIn(evidence.system, p, evidence.motions, self.trials.sensors.rate_hz)
         seeds = [(self.seed, _SEED, k) for k in range(first, first + count)]
-        # A course is followed once: in a session too long to keep all, by the worker that reads it.
-        parts, trials = [seeds], range(len(evidence.motions))
-        if self.jobs > 1 and sum(trial_sizes(evidence.motions)) <= MOST_SAMPLES:
-            parts = [[seed] for seed in seeds]
-            for trial in trials:
-                stand_in.courses[trial]  # before the workers inherit it
+        return self._replay(evidence, evidence.system, p, self.trials.sensors, seeds)
+
+    def _replay(
+        self, e: Evidence, system: System, p: Array, sensors: Sensors, seeds: Sequence[Seed]
+    ) -> Sequence[Array]:
+        stand_in = StandIn(system, p, e.motions, sensors.rate_hz)
+        parts = [[seed] for seed in seeds] if self.jobs > 1 else [seeds]
+        # Workers inherit what the machine does, which is the same in all replays.
+        trials = range(min(len(stand_in.courses), len(stand_in.rests)))
         tasks = [(trial, part) for trial in trials for part in parts]
-        with workers((self.trials, evidence, stand_in), min(self.jobs, len(tasks))) as spread:
+        state = e, stand_in, sensors, self.trials.kinematics
+        with workers(state, min(self.jobs, len(tasks))) as spread:
             found = spread(_residuals_of_replays, tasks)
-            by_trial = [[one for _ in parts for one in next(found)] for _ in trials]
-        return [list(replay) for replay in zip(*by_trial, strict=True)]
+            return KeptItems(np.concatenate([next(found) for _ in parts], axis=2) for _ in trials)
 
     def replay_stopping(self, recipe: Recipe, evidence: Evidence) -> list[Array]:
         """Residual of a model on a replay without noise whose friction truly stops it, by trial.
@@ -206,11 +207,10 @@ class Session:
         )
         narrow = system_of(recipe.with_sign_widths(_STOPPING_WIDTH))
         try:
-            stand_in = StandIn(narrow, evidence.p, evidence.motions, t.sensors.rate_hz)
-            replays = replay_motions(stand_in, exact, t.kinematics, (self.seed,))
+            found = self._replay(evidence, narrow, evidence.p, exact, [(self.seed,)])
         except Runaway:
             return nothing
-        return residuals_of(evidence, replays)
+        return [values[:, :, 0] for values in found]
 
     def weight_samples(
         self, recipe: Recipe, evidence: Evidence, noise: Noise | None = None, count: int = 0
@@ -305,7 +305,8 @@ class Session:
         evidence = self.linearise(recipe, start)
         samples = lay_out_samples(evidence, self.criteria.block_s)
         nothing = [np.zeros_like(r) for r in evidence.residual]
-        noise = describe_noise([nothing, nothing], nothing, evidence, samples)
+        silent = [np.zeros((*r.shape, 2)) for r in evidence.residual]
+        noise = describe_noise(silent, nothing, evidence, samples)
         flat = Likelihood.of(evidence, samples, noise, 0.0, 0.0, self.trials.sensors.force_sd)
         evidence, problem = self._descend(recipe, evidence, flat)
         return Fit(recipe, evidence, flat, problem)
@@ -428,28 +429,19 @@ class Fit:
         """`held_out_rmse` where some of the model's effects are taken away."""
         absent = {k: v for name in effects for k, v in self.problem.absence[name].items()}
         e, p, samples = self.evidence, self.problem, self.likelihood.samples
-        group_of = np.array(e.folds.groups)
-        groups = [group_of[here.trial] for here in samples]
+        groups, group_of = np.unique(e.folds.groups, return_inverse=True)
+        parts = [group_of[here.trial] for here in samples]
         plain = [take_samples(e.residual, here, axis) for axis, here in enumerate(samples)]
-        joined = e.slopes
-        slopes = [take_samples(joined, here, axis) for axis, here in enumerate(samples)]
-        xx, xy, yy = p.sums()
-        squares = np.zeros(len(samples))
-        for group in np.unique(group_of):
-            inside = [g == group for g in groups]
-            unseen = [i & (group_of != group).any() for i in inside]
-            rows = [(b[i], y[i]) for b, y, i in zip(p.base, p.y, unseen, strict=True)]
-            others = solve_bounded(
-                p,
-                xx - np.array([b.T @ b for b, _ in rows]),
-                xy - np.array([b.T @ y for b, y in rows]),
-                np.maximum(yy - np.array([float(y @ y) for _, y in rows]), 1e-300),
-                absent=absent,
-                weight=self.solved.weight,
-            )
+        slopes = [take_samples(e.slopes, here, axis) for axis, here in enumerate(samples)]
+        sums, squares, is_unseen = p.sums(), np.zeros(len(samples)), len(groups) > 1
+        for k, own in enumerate(zip(*p.sums_of(parts, len(groups)), strict=True)):
+            xx, xy, yy = (whole - is_unseen * part for whole, part in zip(sums, own, strict=True))
+            yy = np.maximum(yy, 1e-300)
+            others = solve_bounded(p, xx, xy, yy, absent=absent, weight=self.solved.weight)
             change = (p.to_parameters @ others.base)[: slopes[0].shape[1]]
-            for axis, i in enumerate(inside):
-                squares[axis] += float(np.sum((plain[axis][i] + slopes[axis][i] @ change) ** 2))
+            for axis, part in enumerate(parts):
+                left = plain[axis][part == k] + slopes[axis][part == k] @ change
+                squares[axis] += float(np.sum(left**2))
         return np.asarray(np.sqrt(squares / p.count))
 
 
@@ -458,16 +450,16 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
-def _residuals_of_replays(task: tuple[int, Sequence[tuple[int, ...]]]) -> list[Array]:
-    """The residuals (K, n_q) of one trial on replays of it, by seed."""
-    (trials, e, stand_in), (trial, seeds) = shared(), task
+def _residuals_of_replays(task: tuple[int, Sequence[Seed]]) -> Array:
+    """The residuals of one trial on replays of it, by seed, (K, n_q, seeds)."""
+    (e, stand_in, sensors, kinematics), (trial, seeds) = shared(), task
     rows = []
     for seed in seeds:
         rng = np.random.default_rng([*seed, trial])
-        motion = replay_motion(stand_in, trial, trials.sensors, trials.kinematics, rng)
+        motion = replay_motion(stand_in, trial, sensors, kinematics, rng)
         rows.append(ModelOnTrial(e.system, e.p, [motion]).residual)
     thin = e.band.thin_trials(rows, range(len(e.system.coordinates)))
-    return [values * e.used[trial] for values in thin]
+    return np.stack([values * e.used[trial] for values in thin], axis=2)
 
 
 def _narrower_friction(evidence: Evidence) -> list[Array]:
@@ -479,14 +471,6 @@ def _narrower_friction(evidence: Evidence) -> list[Array]:
         for dry, m in zip(dry_friction(e), e.motions, strict=True)
     )
     thin = e.band.thin_trials(rows, range(len(width)))
-    return [values * used for values, used in zip(thin, e.used, strict=True)]
-
-
-def residuals_of(evidence: Evidence, replays: Sequence[Motion]) -> list[Array]:
-    """The residual of a model on replays of its trials, by trial, each (K, n_q)."""
-    e = evidence
-    rows = (ModelOnTrial(e.system, e.p, replays, k).residual for k in range(len(replays)))
-    thin = e.band.thin_trials(rows, range(len(e.system.coordinates)))
     return [values * used for values, used in zip(thin, e.used, strict=True)]
 
 

@@ -1,6 +1,6 @@
 """How far each stretch of time moves the parameters of a least-squares fit."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +29,7 @@ class RemovedStretch:
 
 
 def find_worst_stretch(
-    rows: Sequence[tuple[Array, Array]],
+    rows: Iterable[tuple[Array, Array]],
     stretches: Sequence[Indices],
     places: Mapping[int, tuple[int, float]],
     sd: Array,

@@ -131,11 +131,21 @@ def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
     count, n = y.shape[0], x.shape[0]
     states, covariances, gains = np.empty((count, n)), np.empty((count, n, n)), np.zeros((count, n))
     innovations, spreads, work = np.zeros(count), np.ones(count), np.empty((n, n))
+    settled = False
     for t in range(count):
-        if t > 0:
-            _predict(x, p, step, noise, work)
-        if present[t]:
-            innovations[t], spreads[t] = _update(x, p, y[t], gains[t])
+        if settled and present[t]:
+            # Bit by bit as after the last sample: nothing that follows differs, either.
+            _advance(x, step)
+            innovations[t], spreads[t] = y[t] - x[0], spreads[t - 1]
+            for i in range(n):
+                gains[t, i] = gains[t - 1, i]
+                x[i] += gains[t, i] * innovations[t]
+        else:
+            if t > 0:
+                _predict(x, p, step, noise, work)
+            if present[t]:
+                innovations[t], spreads[t] = _update(x, p, y[t], gains[t])
+            settled = t > 0 and present[t] and present[t - 1] and (p == covariances[t - 1]).all()
         for i in range(n):
             states[t, i] = x[i]
             for j in range(n):

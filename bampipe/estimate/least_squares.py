@@ -10,7 +10,7 @@ Everything here sees arrays and callables only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -54,11 +54,12 @@ class KnownSlopes:
     """Slopes of the residual that have been taken before, and hold for another fit, too.
 
     Attributes:
-        by_trial: low-passed and thinned, each (K, n_q, n_free); the columns that hold count.
+        take: gives those of a trial, low-passed and thinned, (K, n_q, n_free); the columns that
+            hold count.
         holds: (n_free,) which columns those are.
     """
 
-    by_trial: Sequence[Array] | Mapping[int, Array]
+    take: Callable[[int], Array]
     holds: Flags
 
 
@@ -80,6 +81,7 @@ class Problem:
         precision: (n_free,) of what is known of the parameters beforehand, one over its variance,
             zero where nothing is; known: (n_free,) that.
         slopes: those by some of the parameters, where they are known; see `Slopes`.
+        keep: holds trials that are linearised, of which a long session has more than memory.
         multiplied: (n_free,) axis whose measured force a parameter multiplies, as a current by a
             torque constant, an axis for one parameter only; -1 of others, and of all by default.
             Small, such a factor leaves a small residual and explains nothing: the likelihood is
@@ -102,6 +104,7 @@ class Problem:
     slopes: Slopes | None = None
     multiplied: Indices | None = None
     parts: Callable[[int], Sequence[slice]] = lambda trial: (slice(None),)
+    keep: Callable[[Iterable[Stacked]], Sequence[Stacked]] = list
 
 
 def residual_and_slopes(
@@ -165,7 +168,7 @@ def stacked_residual(
     if known is None:
         slope = np.zeros((len(thin), n_q, n_free))
     else:
-        slope = known.by_trial[trial].copy()
+        slope = known.take(trial).copy()
         slope[:, :, fresh] = 0.0
     slope[:, axes, fresh[numbers]] = thin[:, n_q:] * used[:, axes]
     return Stacked(thin[:, :n_q] * used, slope, used)
@@ -200,7 +203,7 @@ def minimise(
     chosen = list(range(problem.n_trials)) if trials is None else list(trials)
     p = np.array(start, dtype=float)
     p[problem.free] = np.clip(p[problem.free], problem.lower, problem.upper)
-    stacked = [stacked_residual(problem, trial, p, known) for trial in chosen]
+    stacked = problem.keep(stacked_residual(problem, k, p, known) for k in chosen)
     for trial, s in zip(chosen, stacked, strict=True):
         _require_finite(problem, trial, s, p)
     if most_iterations and sum(int(s.used.sum()) for s in stacked) <= problem.free.size:
@@ -257,11 +260,16 @@ class Linearised:
         p[self.problem.free] = value
         if self.problem.linear:
             step = value - self.value
-            stacked = [Stacked(s.residual + s.slope @ step, s.slope, s.used) for s in self.stacked]
+            stacked = self.problem.keep(
+                Stacked(s.residual + s.slope @ step, s.slope, s.used) for s in self.stacked
+            )
         else:
-            slopes = {k: here.slope for k, here in zip(self.trials, self.stacked, strict=True)}
-            known = KnownSlopes(slopes, self.problem.constant)
-            stacked = [stacked_residual(self.problem, k, p, known) for k in self.trials]
+            known = KnownSlopes(
+                lambda trial: self.stacked[self.trials.index(trial)].slope, self.problem.constant
+            )
+            stacked = self.problem.keep(
+                stacked_residual(self.problem, k, p, known) for k in self.trials
+            )
         return replace(self, p=p, stacked=stacked)
 
 
@@ -272,7 +280,7 @@ def _factors(problem: Problem) -> list[tuple[int, int]]:
     return [(k, int(axis)) for k, axis in enumerate(problem.multiplied) if axis >= 0]
 
 
-def as_measured(problem: Problem, p: Array, stacked: Sequence[Stacked]) -> Sequence[Stacked]:
+def as_measured(problem: Problem, p: Array, stacked: Iterable[Stacked]) -> Iterator[Stacked]:
     """Trials with the slopes that the residual over the factors of its axes has, times these.
 
     Along a change of all parameters of an axis in proportion that is zero: nothing tells its scale.
@@ -282,16 +290,12 @@ def as_measured(problem: Problem, p: Array, stacked: Sequence[Stacked]) -> Seque
         stacked: the trials, linearised there.
     """
     factors = _factors(problem)
-    if not factors:
-        return stacked
-    found = []
     for s in stacked:
-        slope = s.slope.copy()
+        slope = s.slope.copy() if factors else s.slope
         for k, axis in factors:
             value = p[problem.free[k]]
             slope[:, axis, k] -= s.residual[:, axis] / (value if value != 0.0 else 1e-300)
-        found.append(replace(s, slope=slope))
-    return found
+        yield replace(s, slope=slope)
 
 
 def _require_finite(problem: Problem, trial: int, stacked: Stacked, p: Array) -> None:
@@ -318,7 +322,7 @@ def _scatter(stacked: Sequence[Stacked]) -> Array:
 
 
 def covariance_by_blocks(
-    rows: Sequence[tuple[Array, Array]],
+    rows: Iterable[tuple[Array, Array]],
     precision: Array,
     blocks: Sequence[Indices],
     independent: Sequence[float],
@@ -335,16 +339,17 @@ def covariance_by_blocks(
         blocks: by axis, (n,) numbers of the blocks, which are independent of each other.
         independent: by axis, how many samples are independent.
     """
-    normal = precision + sum(x.T @ x for x, _ in rows)
-    inverse = invert_scaled(normal)
-    fitted = float(np.trace(inverse @ (normal - precision)))
     count = 1 + max((int(number.max()) for number in blocks if number.size), default=0)
-    scores, size = np.zeros((count, len(normal))), np.zeros((count, 1))
-    white = np.array(precision)
+    scores, size = np.zeros((count, len(precision))), np.zeros((count, 1))
+    products, white = np.zeros_like(precision), np.array(precision)
     for (x, left), number, alone in zip(rows, blocks, independent, strict=True):
         np.add.at(scores, number, x * left[:, None])
         np.add.at(size, number, 1.0)
-        white = white + alone / max(len(x), 1) * (x.T @ x)
+        square = x.T @ x
+        products, white = products + square, white + alone / max(len(x), 1) * square
+    normal = precision + products
+    inverse = invert_scaled(normal)
+    fitted = float(np.trace(inverse @ (normal - precision)))
     # Priors and bounds pull at the fit: what all blocks have in common is no scatter.
     scores -= scores.sum(axis=0) * size / size.sum()
     filled = int(np.count_nonzero(size))

@@ -40,7 +40,7 @@ def propagate_calibration(
     held = [int(k) for k in np.flatnonzero(squares.at_bound)]
     found = {}
     for name, theirs, change in _sources(system, recipe, session):
-        changed = [_residual(theirs, change(motion), squares) for motion in motions]
+        changed = (_residual(theirs, change(motion), squares) for motion in motions)
         found[name] = squares.respond(squares.residual_change(changed), held)[:count]
     return found
 

@@ -52,8 +52,8 @@ from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
 from bampipe.results.rounding import significant
-from bampipe.trials.cache import TrialCache
 from bampipe.trials.disturbances import part_trials
+from bampipe.trials.kept import KeptItems
 from bampipe.trials.motion import Motion, trial_names, trial_sizes
 
 _RESTARTS = 3
@@ -121,13 +121,9 @@ class _Filtering:
         stride, squares, choice = choose_stride(self.motions), task.squares, task.choice
         self.count = task.known.size
         near = squares.p[:-1]
-        self.trials: Sequence[Trial] = TrialCache(
-            lambda k: load_filter_trial(
-                task.run, self.motions[k], task.system, near, task.noise, stride, choice
-            ),
-            len(self.motions),
-            lambda trial: int(trial.t.size),
-            in_all=sum(self.sizes),
+        self.trials: Sequence[Trial] = KeptItems(
+            load_filter_trial(task.run, motion, task.system, near, task.noise, stride, choice)
+            for motion in self.motions
         )
         timing = squares.free.size > self.count
         self.model = build_filter_model(task.system, self.trials, task.start, timing, squares.p[-1])

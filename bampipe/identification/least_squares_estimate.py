@@ -4,7 +4,7 @@ Weights of samples, the bias of filters and of friction that stops, and the timi
 are those of `bampipe.trials.likelihood`: what is a nuisance there is one here.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,6 +31,7 @@ from bampipe.identification.filter_tables import as_filtered
 from bampipe.physics import System
 from bampipe.physics.recipe import Recipe
 from bampipe.results.identify import Convergence, StateBound
+from bampipe.trials.kept import KeptItems
 from bampipe.trials.likelihood import lay_out_samples, solve_bounded, take_samples
 from bampipe.trials.measured import MeasuredTrials, cut_blocks
 from bampipe.trials.motion import Motion
@@ -88,29 +89,23 @@ class SquaresFit:
         return np.asarray((value <= low) | (value >= high))
 
     @cached_property
-    def _left(self) -> tuple[tuple[Array, float], ...]:
+    def _left(self) -> Sequence[tuple[Array, float]]:
         """By axis: what is left, (n,), and its root mean square."""
         pairs = zip(self.fit.problem.y, self.fit.problem.base, strict=True)
         every = (y + x @ self.fit.solved.base for y, x in pairs)
-        return tuple(
+        return KeptItems(
             (left, max(float(np.sqrt(np.mean(left**2))), 1e-300) if left.size else 1.0)
             for left in every
         )
 
     @property
-    def rows(self) -> tuple[tuple[Array, Array], ...]:
+    def rows(self) -> Iterator[tuple[Array, Array]]:
         """By axis: slopes (n, P) by the determined unknowns, what is left (n,); both weighted.
 
         Made anew each time: kept, they would double the memory of the problem.
         """
         pairs = zip(self.fit.problem.base, self._left, strict=True)
-        return tuple((x / scale, left / scale) for x, (left, scale) in pairs)
-
-    @cached_property
-    def weights(self) -> tuple[Array, ...]:
-        """By axis: what a residual in N.m or N is multiplied by in `rows`, (n,)."""
-        pairs = zip(self.fit.likelihood.root, self._left, strict=True)
-        return tuple(root / scale for root, (_, scale) in pairs)
+        return ((x / scale, left / scale) for x, (left, scale) in pairs)
 
     @cached_property
     def normal(self) -> Array:
@@ -131,15 +126,14 @@ class SquaresFit:
             changes: of the residual, by axis, each (n,), N.m or N.
             held: places of parameters that stay, nuisance parameters behind the others.
         """
-        score = sum(
-            x.T @ (w * c) for (x, _), w, c in zip(self.rows, self.weights, changes, strict=True)
-        )
+        parts = zip(self.rows, self._left, self.fit.likelihood.root, changes, strict=True)
+        score = sum(x.T @ (root / scale * c) for (x, _), (_, scale), root, c in parts)
         to, count = self.fit.problem.to_parameters, self.free.size
         _, chosen = self.fit.problem.hold(dict.fromkeys(held, 0.0))
         step = chosen @ invert_scaled(chosen.T @ self.normal @ chosen) @ (chosen.T @ score)
         return np.asarray(-(to @ step)[:count])
 
-    def residual_change(self, residual: Sequence[Array]) -> list[Array]:
+    def residual_change(self, residual: Iterable[Array]) -> list[Array]:
         """What unfiltered residuals (T, n_q) of the trials add to its own, by axis, each (n,)."""
         evidence, samples = self.fit.evidence, self.fit.likelihood.samples
         thin = evidence.band.thin_trials(residual, range(len(samples)))
@@ -159,7 +153,7 @@ class SquaresFit:
         )
         samples = lay_out_samples(self.fit.evidence, min(self.block_s, most))
         tailed = [_TAILED if np.ptp(root) > 0.0 else 1.0 for root in self.fit.likelihood.root]
-        rows = [(x, left / by) for (x, left), by in zip(self.rows, tailed, strict=True)]
+        rows = ((x, left / by) for (x, left), by in zip(self.rows, tailed, strict=True))
         independent = [s.independent * by**2 for s, by in zip(samples, tailed, strict=True)]
         found = covariance_by_blocks(rows, pose.precision, [s.block for s in samples], independent)
         to = pose.to_parameters[: self.free.size]
@@ -170,8 +164,14 @@ class SquaresFit:
         """(n,) standard deviations."""
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
 
-    def refit(self, kept: Sequence[Flags]) -> Array:
-        """Parameters (n_p + 1,) by the samples ``kept``, (n,) by axis, to first order in bounds."""
+    @cached_property
+    def by_trial(self) -> tuple[Array, Array, Array]:
+        """Sums of products by trial; see `sums_of`."""
+        trials = [here.trial for here in self.fit.likelihood.samples]
+        return self.fit.problem.sums_of(trials, len(self.trials.motions))
+
+    def refit(self, xx: Array, xy: Array, yy: Array) -> Array:
+        """Parameters (n_p + 1,) by sums of some samples, to first order in bounds."""
         pose, count = self.fit.problem, self.free.size
         lower, upper = pose.lower.copy(), pose.upper.copy()
         if not self.problem.linear:
@@ -179,14 +179,9 @@ class SquaresFit:
             reach = _FARTHEST * np.maximum(self.sd, 1e-300)
             lower[:count] = np.maximum(lower[:count], step - reach)
             upper[:count] = np.minimum(upper[:count], step + reach)
-        rows = [(b[k], y[k]) for b, y, k in zip(pose.base, pose.y, kept, strict=True)]
-        found = solve_bounded(
-            replace(pose, lower=lower, upper=upper),
-            np.array([b.T @ b for b, _ in rows]),
-            np.array([b.T @ y for b, y in rows]),
-            np.array([max(float(y @ y), 1e-300) for _, y in rows]),
-            weight=self.fit.solved.weight,
-        )
+        bounded = replace(pose, lower=lower, upper=upper)
+        yy = np.maximum(yy, 1e-300)
+        found = solve_bounded(bounded, xx, xy, yy, weight=self.fit.solved.weight)
         moved = pose.to_parameters @ (found.base - self.fit.solved.base)
         p = self.p.copy()
         p[self.free] = np.clip(p[self.free] + moved[:count], self.problem.lower, self.problem.upper)
@@ -208,19 +203,23 @@ class SquaresFit:
         if len(self.parts) == 1:
             return [np.zeros(self.free.size)]
         if len(groups) > 1:
-            of_sample = np.repeat(groups, [len(r) for r in self.fit.evidence.residual])
-            found = {group: self._move_without(of_sample == group) for group in set(groups)}
+            others = {group: np.array(groups) != group for group in groups}
+            found = {
+                group: self._move_to([s[kept].sum(axis=0) for s in self.by_trial])
+                for group, kept in others.items()
+            }
             return [found[group] for group in groups]
         t, *blocks = (m.t[band.thinned_rows(len(m.t))] for m in (*self.trials.motions, *self.parts))
         gap_s = 1.0 / min(band.cutoff_hz)
-        return [
-            self._move_without((t >= block[0] - gap_s) & (t <= block[-1] + gap_s))
-            for block in blocks
-        ]
+        samples, moves = self.fit.likelihood.samples, []
+        for block in blocks:
+            gone = (t >= block[0] - gap_s) & (t <= block[-1] + gap_s)
+            parts = self.fit.problem.sums_of([gone[here.rows] for here in samples], 2)
+            moves.append(self._move_to([s[0] for s in parts]))
+        return moves
 
-    def _move_without(self, gone: Flags) -> Array:
-        found = self.refit([~gone[here.rows] for here in self.fit.likelihood.samples])
-        return np.asarray((found - self.p)[self.free])
+    def _move_to(self, sums: Sequence[Array]) -> Array:
+        return np.asarray((self.refit(*sums) - self.p)[self.free])
 
     def held_out_rmse(self, p: Array) -> Array:
         """Error of an estimate on each part that it is left without, by axis, (n_q,), N.m or N.
@@ -243,17 +242,16 @@ class SquaresFit:
         evidence = self.fit.evidence
         samples = lay_out_samples(evidence, _STRETCH_S)
         to = self.fit.problem.to_parameters[: self.free.size] @ invert_scaled(self.normal)
-        steps = [(x @ to.T, left) for x, left in self.rows]
-        band, sizes = evidence.band, [len(r) for r in evidence.residual]
-        first = np.concatenate([[0], np.cumsum(sizes)])
-        places: dict[int, tuple[int, float]] = {}
+        steps = ((x @ to.T, left) for x, left in self.rows)
+        band, places = evidence.band, dict[int, tuple[int, float]]()
+        first = np.cumsum([0, *map(len, evidence.residual)])
         for here in samples:
-            for block, trial in set(zip(here.block.tolist(), here.trial.tolist(), strict=True)):
-                row = int(here.rows[np.argmax(here.block == block)]) - int(first[trial])
-                second = np.floor(row * band.step / band.rate_hz / _STRETCH_S) * _STRETCH_S
-                places[block] = min(
-                    places.get(block, (trial, np.inf)), (trial, float(band.margin_s + second))
-                )
+            block, at = np.unique(here.block, return_index=True)
+            trial = here.trial[at]
+            t = (here.rows[at] - first[trial]) * band.step / band.rate_hz
+            start = band.margin_s + np.floor(t / _STRETCH_S) * _STRETCH_S
+            starts = zip(trial.tolist(), start.tolist(), strict=True)
+            places.update(zip(block.tolist(), starts, strict=True))
         return find_worst_stretch(steps, [here.block for here in samples], places, self.sd)
 
     @property
@@ -327,11 +325,13 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
     def trace() -> list[Mapping[str, object]]:
         rows: list[Mapping[str, object]] = []
         clock = 0.0
+        so_far = [np.cumsum(s, axis=0) for s in squares.by_trial]
+        trial_of = np.concatenate([here.trial for here in squares.fit.likelihood.samples])
+        counts = np.cumsum(np.bincount(trial_of, minlength=len(motions)))
         for number, motion in enumerate(motions):
             clock += float(motion.t[-1])
-            kept = [here.trial <= number for here in squares.fit.likelihood.samples]
-            p = squares.refit(kept)
-            share = sum(int(k.sum()) for k in kept) / max(sum(k.size for k in kept), 1)
+            p = squares.refit(*(s[number] for s in so_far))
+            share = float(counts[number] / max(counts[-1], 1))
             row: dict[str, object] = {"t_total": clock, "trial_id": motion.trial_id}
             for k, place in enumerate(squares.free[:count]):
                 name = system.parameters[place].name

@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import FILTERED, INGESTED, MOVING, RunFolder
-from bampipe.data.store import ParquetAppender, read_parquet, row_count
+from bampipe.data.store import ParquetAppender, read_parquet
 from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate import butterworth, kalman_smoother
@@ -38,12 +38,12 @@ from bampipe.schema import STRICT, NotNegative
 from bampipe.setup.inspection import inspect_setup
 from bampipe.setup.search import HIGHEST_HZ, MOST_TRIALS, shorten
 from bampipe.trials.band import LEAST_HZ, find_band
-from bampipe.trials.cache import TrialCache
 from bampipe.trials.disturbances import find_disturbances
 from bampipe.trials.folds import Folds
 from bampipe.trials.force_offsets import find_force_offsets
+from bampipe.trials.kept import MOST_OF_TRIALS, KeptItems
 from bampipe.trials.kinematics import AxisFilter, Kinematics
-from bampipe.trials.motion import Motion, input_derivatives, n_samples
+from bampipe.trials.motion import Motion, input_derivatives
 from bampipe.trials.reading import held_out_trials, read_motion
 from bampipe.trials.sensors import Sensors
 
@@ -65,6 +65,7 @@ _SHORTEST = 32
 _INSPECTED, _TUNING_PART = 12_000, 2000
 """Samples of all trials on which the set-up is judged; and least length of the parts that the
 bandwidth is chosen from, where trials are many."""
+_TRIALS_OF_BAND = 5
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -164,11 +165,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.9, "the band of motion and force")
     system = compile_model(Model(load_device(run, session.device)))
     names = [k for k in ids if k in written.interpolated]
-    # Where residuals are compared, from the trials just written.
+    # Where residuals are compared, from some of the trials just written, spread over the session.
     sensors = Sensors.from_result(session, system.coordinates, system.model.device.forces)
-    bands = find_band(
-        system, _motions(path, names, system, {}), sensors, kinematics, config.band_hz
-    )
+    some = np.unique(np.linspace(0, len(names) - 1, min(len(names), _TRIALS_OF_BAND)).round())
+    motions = _motions(path, [names[int(k)] for k in some], system, {})
+    bands = find_band(system, motions, sensors, kinematics, config.band_hz)
     widest = max(band.cutoff_hz for band in bands.values())
     needed = min(_CUTOFF_OVER_BAND * widest, _HIGHEST_CUTOFF * rate)
     if not config.force_cutoff_hz and widest > LEAST_HZ and needed > kinematics.input_cutoff_hz:
@@ -300,13 +301,10 @@ def _write_motions(
 
 def _motions(
     path: Path, names: Sequence[str], system: System, left_out: Mapping[str, Sequence[Disturbance]]
-) -> TrialCache[Motion]:
+) -> Sequence[Motion]:
     """The trials just written."""
-
-    def read(number: int) -> Motion:
-        return read_motion(path, names[number], system, left_out.get(names[number], ()))
-
-    return TrialCache(read, len(names), n_samples, names=names, in_all=row_count(path, names))
+    read = (read_motion(path, name, system, left_out.get(name, ())) for name in names)
+    return KeptItems(read, MOST_OF_TRIALS)
 
 
 def _describe_offsets(
@@ -340,13 +338,11 @@ def _inspect(
     """Hold the set-up against the trials ``ids``, those in ``free`` fitted."""
     most = _INSPECTED // min(len(ids), MOST_TRIALS)
 
-    def read(number: int) -> Motion:
-        name = ids[number]
+    def read(name: str) -> Motion:
         motion = read_motion(path, name, system, disturbances.get(name, ()), every_input=True)
         return deepcopy(shorten([motion], most)[0])  # a view would keep the whole trial
 
-    in_all = min(row_count(path, ids), most * len(ids))
-    motions = TrialCache(read, len(ids), n_samples, names=ids, in_all=in_all)
+    motions = KeptItems(map(read, ids), MOST_OF_TRIALS)
     # What brakes do is no part of the bare device: it is judged by braked trials, not fitted.
     folds = Folds.of_trials(ids, (), [name for name in ids if name in free])
     cutoffs = tuple(min(bands[axis].cutoff_hz, HIGHEST_HZ) for axis in system.coordinates)
@@ -356,9 +352,7 @@ def _inspect(
 
 def _load(samples: Path, trial_id: str, rate: float) -> _Trial | str:
     """Return the trial on its grid, or why it cannot be differentiated."""
-    frame = read_parquet(samples, trial=trial_id)
-    sound = frame.drop(columns="trial_id").notna().all(axis=1).to_numpy()
-    frame = frame[sound]
+    frame = read_parquet(samples, trial=trial_id).dropna()
     if len(frame) < _SHORTEST:
         return f"{len(frame)} sound samples, of which {_SHORTEST} are needed"
     return _Trial(trial_id, uniform_grid(frame["t"].to_numpy(dtype=np.float64), rate), frame)

@@ -194,7 +194,6 @@ def _read_case(
         )
     progress(0.0, "what the trials at hand say")
     trials = read_measured_trials(run, system, every_input=True, timing=found.input_timing)
-    trials = replace(trials, motions=tuple(trials.motions))
     session = Session(trials, config, config.jobs or os.cpu_count() or 1, config.seed)
     seen = Envelope.of_trials(trials.motions, system, p)
     if not seen.moved_axes:

@@ -38,6 +38,7 @@ from bampipe.trials.comparison import (
     axis_errors,
     compare_trial,
 )
+from bampipe.trials.kept import KeptItems
 from bampipe.trials.measured import (
     MeasuredTrials,
     read_measured_trials,
@@ -90,10 +91,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.1, "residuals")
     # Parameters found with the inputs late are those of inputs that late.
     published = np.append(p, estimates.input_timing.estimate - trials.late_s)
-    unseen = [
-        _leave_out(system, published, estimates, name) for name in trial_names(trials.motions)
-    ]
-    compared = [compare_trial(system, trials, k, published, q) for k, q in enumerate(unseen)]
+    names = trial_names(trials.motions)
+    unseen = [_leave_out(system, published, estimates, name) for name in names]
+    compared = KeptItems(
+        compare_trial(system, trials, k, published, p) for k, p in enumerate(unseen)
+    )
     notes = []
     if trials.blocks == len(trials.motions):
         notes.append(
@@ -196,7 +198,7 @@ def _silent_joints(
     for i, (axis, entry) in enumerate(axis_errors(system, compared).items()):
         if entry.fit_percent is None or entry.fit_percent >= SILENT_PERCENT:
             continue
-        size = rms([c.measured for c in compared], [c.used for c in compared])[i]
+        size = rms((c.measured for c in compared), (c.used for c in compared))[i]
         buried = floor is not None and entry.held_out_rmse < 2.0 * floor.level[i]
         why = "noise and friction bury it" if buried else "the model lacks what drives it"
         share = max(entry.fit_percent, 0.0)

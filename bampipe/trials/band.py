@@ -18,8 +18,6 @@ LEAST_HZ = 8.0
 _COVERED = 0.95
 """Share of the power of the applied force, above its noise, that the band covers."""
 _SEGMENT_S = 4.0
-_LONGEST = 5
-"""Trials from which the band is found, spread over the session."""
 
 
 def find_band(
@@ -38,9 +36,7 @@ def find_band(
     axes, Hz; 0 takes it from the data.
     """
     rate = sensors.rate_hz
-    numbers = np.unique(np.linspace(0, len(motions) - 1, min(len(motions), _LONGEST)).round())
-    some = [motions[int(k)] for k in numbers]
-    covered = np.median([_covered_hz(system, motion, sensors) for motion in some], axis=0)
+    covered = np.median([_covered_hz(system, motion, sensors) for motion in motions], axis=0)
     found = {}
     for i, axis in enumerate(system.coordinates):
         motion_hz = float(kinematics.axes[axis].bandwidth_hz)

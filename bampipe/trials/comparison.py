@@ -1,6 +1,6 @@
 """What a model requires against what was measured, by trial: residuals, and errors by axis."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,17 +81,22 @@ def _percent(error: float, size: float) -> float:
 
 def axis_errors(system: System, compared: Sequence[ComparedTrial]) -> dict[str, AxisError]:
     """Return the errors of each axis over some trials."""
-    used = [c.used for c in compared]
-    rmse = rms([c.residual for c in compared], used)
-    without = rms([c.residual_without_friction for c in compared], used)
-    size = rms([c.measured for c in compared], used)
-    unseen = [c for c in compared if c.judged] or compared
-    where = [c.used for c in unseen]
-    held_out = rms([c.residual_held_out for c in unseen], where)
-    count = np.maximum(sum(keep.sum(axis=0) for keep in where), 1)
-    mean = sum(np.sum(c.measured * c.used, axis=0) for c in unseen) / count
-    spread = rms([c.measured - mean for c in unseen], where)
-    unseen_size = rms([c.measured for c in unseen], where)
+    every = range(len(compared))
+    unseen = [k for k, c in enumerate(compared) if c.judged] or every
+
+    def rms_of(which: Sequence[int], part: Callable[[ComparedTrial], Array]) -> Array:
+        # One trial in memory at a time: of a long session, the others are on disk.
+        return rms((part(compared[k]) for k in which), (compared[k].used for k in which))
+
+    rmse = rms_of(every, lambda c: c.residual)
+    without = rms_of(every, lambda c: c.residual_without_friction)
+    size = rms_of(every, lambda c: c.measured)
+    held_out = rms_of(unseen, lambda c: c.residual_held_out)
+    count = np.maximum(sum(compared[k].used.sum(axis=0) for k in unseen), 1)
+    measured = (np.sum(compared[k].measured * compared[k].used, axis=0) for k in unseen)
+    mean = sum(measured) / count
+    spread = rms_of(unseen, lambda c: c.measured - mean)
+    unseen_size = rms_of(unseen, lambda c: c.measured)
     # Of an axis that nothing drives, such as a pole on a cart, no force is there to explain.
     return {
         axis: AxisError(

@@ -18,8 +18,8 @@ from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_runs
 from bampipe.physics import System
 from bampipe.results.filter import Disturbance
-from bampipe.trials.cache import TrialCache
-from bampipe.trials.motion import Motion, n_samples, trial_names, trial_sizes
+from bampipe.trials.kept import MOST_OF_TRIALS, KeptItems
+from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.residuals import applied_rms, fit_device
 
 _BLOCK_S = 0.2
@@ -165,7 +165,7 @@ def _gather(
     if found is None:
         return None
     problem, p, by_trial = found
-    measured = as_measured(problem, p, by_trial)
+    measured = [*as_measured(problem, p, by_trial)]
     stacked = Stacked(
         np.concatenate([trial.residual for trial in measured]),
         np.concatenate([trial.slope for trial in measured]),
@@ -252,12 +252,8 @@ def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Mot
                 of_trial.append(number)
     if [part.stop - part.start for part in rows] == trial_sizes(motions):
         return motions, of_trial
-    known = trial_names(motions)
-    names = [known[number] for number in of_trial]
-    parts = TrialCache(
-        lambda k: motions[of_trial[k]].rows(rows[k]), len(rows), n_samples, names=names
-    )
-    return parts, of_trial
+    parts = (motions[k].rows(part) for k, part in zip(of_trial, rows, strict=True))
+    return KeptItems(parts, MOST_OF_TRIALS), of_trial
 
 
 def _cut(times: Sequence[Array], ends_s: Sequence[float], band: Band) -> _Blocks:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -21,8 +20,9 @@ from bampipe.estimate.low_pass import Band
 from bampipe.estimate.normal_equations import NormalEquations
 from bampipe.physics import System
 from bampipe.trials.folds import Folds
+from bampipe.trials.kept import KeptItems
 from bampipe.trials.motion import Motion, join_short, trial_sizes
-from bampipe.trials.residuals import ModelOnTrial, problem_of
+from bampipe.trials.residuals import ModelOnTrial, problem_of, rms
 from bampipe.trials.scale import log_scale, slopes_by_force
 
 _CONVERGED = 1e-8
@@ -59,9 +59,9 @@ class Evidence:
     joined: Sequence[Motion]
     band: Band
     folds: Folds
-    residual: tuple[Array, ...]
-    jacobian: tuple[Array, ...]
-    used: tuple[Flags, ...]
+    residual: Sequence[Array]
+    jacobian: Sequence[Array]
+    used: Sequence[Flags]
     free: tuple[int, ...]
     lower: Array
     upper: Array
@@ -71,15 +71,15 @@ class Evidence:
     factors: tuple[float, ...] = ()
 
     @property
-    def slopes(self) -> list[Array]:
+    def slopes(self) -> Iterable[Array]:
         """By trial, `jacobian` and, where the timing is open, `by_timing` behind it, (K, n_q, n).
 
         Joined anew each time: kept, it would double the memory that an evidence takes.
         """
         if not self.by_timing:
-            return list(self.jacobian)
+            return self.jacobian
         pairs = zip(self.jacobian, self.by_timing, strict=True)
-        return [np.append(x, by[:, :, None], axis=2) for x, by in pairs]
+        return (np.append(x, by[:, :, None], axis=2) for x, by in pairs)
 
     @cached_property
     def fitted(self) -> tuple[ModelOnTrial, ...]:
@@ -129,8 +129,9 @@ class Evidence:
         See `scale.log_scale`, (n_q,) and (n_q, n), by the same parameters as `slopes`.
         """
         value, slopes = log_scale(
-            self.system, self.joined, self.band, self.used, self.p, self.free, self.slopes_by_force
-        )
+            self.system, self.joined, self.band, self.used, self.p, self.free,
+            self.slopes_by_force if self.system.parameters_by_force else (),
+        )  # fmt: skip
         return value, np.pad(slopes, ((0, 0), (0, 1 if self.by_timing else 0)))
 
     @property
@@ -154,8 +155,7 @@ class Evidence:
 
     def rmse(self) -> Array:
         """Root mean square of the residual by axis over all trials, (n_q,), N.m or N."""
-        count = np.maximum(self.sums.count.sum(axis=0), 1.0)
-        return np.asarray(np.sqrt(self.sums.yy.sum(axis=0) / count))
+        return rms(self.residual, self.used)
 
 
 def gather_evidence(
@@ -190,20 +190,24 @@ def gather_evidence(
     found = minimise(
         problem, np.append(start, 0.0), fitted, most_iterations, known=known, tolerance=_CONVERGED
     )
-    by_trial = dict(zip(fitted, found.stacked, strict=True))
-    stacked = [
-        by_trial.get(k) or stacked_residual(problem, k, found.p, known) for k in range(len(taken))
-    ]
-    value, slopes = found.p[problem.free], as_measured(problem, found.p, stacked)
+    place = {trial: number for number, trial in enumerate(fitted)}
+    stacked = (
+        found.stacked[place[k]] if k in place else stacked_residual(problem, k, found.p, known)
+        for k in range(len(taken))
+    )
+    value, residual, used = found.p[problem.free], list[Array](), list[Flags]()
     ends = np.cumsum([len(band.thinned_rows(n)) for n in trial_sizes(motions)])[:-1]
 
-    def split(values: Sequence[Any]) -> tuple[Any, ...]:
-        return tuple(values if len(values) == len(motions) else np.split(values[0], ends))
+    def slopes() -> Iterator[Array]:
+        for s in as_measured(problem, found.p, stacked):
+            parts = ends if len(taken) < len(motions) else ends[:0]
+            residual.extend(np.split(s.residual, parts))
+            used.extend(np.split(s.used, parts))
+            yield from np.split(s.slope, parts)
 
     return Evidence(
-        system, found.p[:-1], motions, joined, band, folds,
-        split([s.residual for s in stacked]), split([s.slope for s in slopes]),
-        split([s.used for s in stacked]), tuple(int(i) for i in problem.free),
+        system, found.p[:-1], motions, joined, band, folds, residual, KeptItems(slopes()), used,
+        tuple(int(i) for i in problem.free),
         problem.lower - value, problem.upper - value, problem.precision, problem.known - value,
         timing, _factors(problem, found.p, len(system.coordinates)),
     )  # fmt: skip
@@ -243,10 +247,12 @@ def _common_slopes(like: Evidence, system: System, problem: Problem) -> KnownSlo
     ]
     places = np.flatnonzero(holds)
     taken = [source[k] for k in places]
-    slopes = []
     joined = problem.n_trials < len(like.jacobian)
-    for jacobian in [np.concatenate(like.jacobian)] if joined else like.jacobian:
+
+    def take_columns(trial: int) -> Array:
+        jacobian = np.concatenate(like.jacobian) if joined else like.jacobian[trial]
         columns = np.zeros((*jacobian.shape[:2], problem.free.size))
         columns[:, :, places] = jacobian[:, :, taken]
-        slopes.append(columns)
-    return KnownSlopes(slopes, np.array(holds))
+        return columns
+
+    return KnownSlopes(take_columns, np.array(holds))

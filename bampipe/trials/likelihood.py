@@ -17,15 +17,17 @@ beta and gamma of each axis, and the time by which inputs were sampled late.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
 from bampipe.arrays import Array, Flags, Indices
 from bampipe.physics.effect import BoundEffect
 from bampipe.trials.evidence import Evidence
+from bampipe.trials.kept import KeptItems
 from bampipe.trials.scale import bare_slopes
 
 _SPEEDS = 12
@@ -70,10 +72,10 @@ class Samples:
 def lay_out_samples(evidence: Evidence, block_s: float) -> tuple[Samples, ...]:
     """Return the samples of each axis that count; blocks of ``block_s`` seconds are numbered."""
     band, sizes = evidence.band, [len(r) for r in evidence.residual]
-    trial = np.repeat(np.arange(len(sizes)), sizes)
+    trial = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
     seconds = np.concatenate([np.arange(n) * band.step / band.rate_hz for n in sizes])
     within = np.floor(seconds / block_s).astype(np.int64)
-    block = np.unique(trial * (within.max() + 1) + within, return_inverse=True)[1]
+    block = np.unique(trial * (within.max() + 1) + within, return_inverse=True)[1].astype(np.int32)
     used = np.concatenate(evidence.used)
     found = []
     for axis, share in enumerate(band.independent_share):
@@ -82,9 +84,14 @@ def lay_out_samples(evidence: Evidence, block_s: float) -> tuple[Samples, ...]:
     return tuple(found)
 
 
-def take_samples(values: Sequence[Array], samples: Samples, axis: int) -> Array:
+def take_samples(values: Iterable[Array], samples: Samples, axis: int) -> Array:
     """Return the rows of one axis, (n,) or (n, m), of values by trial, each (K, n_q[, m])."""
-    return np.concatenate([v[:, axis] for v in values])[samples.rows]
+    end, found = 0, []
+    for each in values:
+        first, end = end, end + len(each)
+        rows = samples.rows[slice(*np.searchsorted(samples.rows, (first, end)))]
+        found.append(each[rows - first, axis])
+    return np.concatenate(found)
 
 
 @dataclass(frozen=True)
@@ -99,11 +106,11 @@ class Noise:
         speed: class of speed of each sample, by axis, each (n,).
     """
 
-    bias: tuple[Array, ...]
-    variance: tuple[Array, ...]
-    stopping: tuple[Array, ...]
-    residuals: tuple[Array, ...]
-    speed: tuple[Indices, ...]
+    bias: Sequence[Array]
+    variance: Sequence[Array]
+    stopping: Sequence[Array]
+    residuals: Sequence[Array]
+    speed: Sequence[Indices]
 
     def variance_of_bias(self, axis: int, y: Array) -> Array:
         """How far the bias of a residual ``y``, (n,), may be off, for a relative error of one.
@@ -128,7 +135,7 @@ class Noise:
 
 
 def describe_noise(
-    residuals: Sequence[Sequence[Array]],
+    residuals: Sequence[Array],
     stopping: Sequence[Array],
     evidence: Evidence,
     samples: Sequence[Samples],
@@ -136,15 +143,18 @@ def describe_noise(
     """Return the noise that replays show.
 
     Args:
-        residuals: of each replay, by trial, each (K, n_q).
-        stopping: the same of a replay whose friction truly stops it.
+        residuals: of replays, by trial, each (K, n_q, replays).
+        stopping: of one whose friction truly stops it, by trial, each (K, n_q).
         evidence: the model on the measured trials; samples: of it that count.
     """
     thinned = evidence.band.thinned_rows
     speeds = [np.abs(m.qd[thinned(len(m.t))]) for m in evidence.motions]
-    biases, variances, by_axis, classes = [], [], [], []
-    for axis, here in enumerate(samples):
-        left = np.array([take_samples(r, here, axis) for r in residuals])
+    by_axis = KeptItems(
+        np.ascontiguousarray(take_samples(residuals, here, axis).T)
+        for axis, here in enumerate(samples)
+    )
+    biases, variances, classes = [], [], []
+    for axis, (here, left) in enumerate(zip(samples, by_axis, strict=True)):
         around = left.var(axis=0, ddof=1)
         speed = take_samples(speeds, here, axis)
         shares = np.linspace(0.0, 1.0, _SPEEDS + 1)[1:-1] ** 2
@@ -152,10 +162,9 @@ def describe_noise(
         count = np.maximum(np.bincount(at, minlength=_SPEEDS), 1)
         biases.append(left.mean(axis=0))
         variances.append((np.bincount(at, around, minlength=_SPEEDS) / count)[at])
-        by_axis.append(left)
-        classes.append(at)
-    stops = tuple(take_samples(stopping, here, axis) for axis, here in enumerate(samples))
-    return Noise(tuple(biases), tuple(variances), stops, tuple(by_axis), tuple(classes))
+        classes.append(at.astype(np.int8))
+    stops = [take_samples(stopping, here, axis) for axis, here in enumerate(samples)]
+    return Noise(KeptItems(biases), KeptItems(variances), KeptItems(stops), by_axis, classes)
 
 
 @dataclass(frozen=True)
@@ -167,19 +176,20 @@ class Likelihood:
         root: one over the standard deviation of each sample, by axis, each (n,).
         bias_variance: how far the bias may be off where the machine turns, by axis, each (n,).
         applied: the applied force, by axis, each (n,), N.m or N.
-        slopes: its derivative by each measured force, effects included, by axis, (n, n_forces).
-        force_share: share of the noise of each sample that is that of the measured forces, by axis,
-            each (n,).
+        model: that was weighted, without its residual and slopes.
+        force_sd: noise of each measured force, (n_forces,), in its unit.
+        discrepancy: of any model, relative.
         factors: of what is measured where the weights are those of the residual; see `Evidence`.
     """
 
     samples: tuple[Samples, ...]
     noise: Noise
-    root: tuple[Array, ...]
-    bias_variance: tuple[Array, ...]
-    applied: tuple[Array, ...]
-    slopes: tuple[Array, ...]
-    force_share: tuple[Array, ...]
+    root: Sequence[Array]
+    bias_variance: Sequence[Array]
+    applied: Sequence[Array]
+    model: Evidence
+    force_sd: Array
+    discrepancy: float
     factors: tuple[float, ...] = ()
 
     @classmethod
@@ -200,13 +210,10 @@ class Likelihood:
         e = evidence
         axes = range(len(samples))
         applied = e.thin(lambda at: at.applied)
-        bare = bare_slopes(e.system, e.joined, e.band, e.p)
-        total = [a + b for a, b in zip(bare, e.slopes_by_force, strict=True)]
         turning = [np.zeros_like(r) for r in e.residual]
         if bias_error:
             turning = e.band.thin_trials(_error_of_turning(e), axes)
-        white = e.band.passed_power(_FREQUENCIES).mean(axis=0) / e.band.step
-        root, force, bias_variance, force_share = [], [], [], []
+        root, force, bias_variance = [], [], []
         for axis, here in enumerate(samples):
             f, y = take_samples(applied, here, axis), take_samples(e.residual, here, axis)
             of_bias = bias_error**2 * noise.variance_of_bias(axis, y)
@@ -217,14 +224,33 @@ class Likelihood:
             root.append(1.0 / np.sqrt(np.maximum(variance, least)) if least else np.ones(len(f)))
             force.append(f)
             bias_variance.append(of_bias)
-            slope = take_samples(total, here, axis)
-            of_force = np.sum((slope * force_sd) ** 2, axis=1) * white[axis]
-            force_share.append(np.minimum(of_force / np.maximum(variance, 1e-300), 1.0))
+        model = replace(e, residual=(), jacobian=(), used=())  # their memory
         return cls(
-            samples, noise, tuple(root), tuple(bias_variance), tuple(force),
-            tuple(take_samples(total, here, axis) for axis, here in enumerate(samples)),
-            tuple(force_share), e.factors,
+            samples, noise, KeptItems(root), KeptItems(bias_variance), KeptItems(force), model,
+            force_sd, discrepancy, e.factors,
         )  # fmt: skip
+
+    @cached_property
+    def slopes(self) -> tuple[Array, ...]:
+        """Derivative of ``applied`` by each measured force, effects included, (n, n_forces)."""
+        e = self.model
+        bare = bare_slopes(e.system, e.joined, e.band, e.p)
+        total = [a + b for a, b in zip(bare, e.slopes_by_force, strict=True)]
+        return tuple(take_samples(total, here, axis) for axis, here in enumerate(self.samples))
+
+    @cached_property
+    def force_share(self) -> tuple[Array, ...]:
+        """Share of the noise of each sample that is that of the measured forces, by axis, (n,)."""
+        band, found = self.model.band, list[Array]()
+        white = band.passed_power(_FREQUENCIES).mean(axis=0) / band.step
+        parts = zip(
+            self.slopes, self.noise.variance, self.bias_variance, self.applied, white, strict=True
+        )
+        for slope, noise, of_bias, f, passed in parts:
+            variance = noise + of_bias + (self.discrepancy * f) ** 2
+            of_force = np.sum((slope * self.force_sd) ** 2, axis=1) * passed
+            found.append(np.minimum(of_force / np.maximum(variance, 1e-300), 1.0))
+        return tuple(found)
 
     def with_equal_weights(self, problem: Problem, lacking: float) -> Likelihood:
         """The same where all samples of an axis weigh alike on which the model lacks much.
@@ -237,11 +263,11 @@ class Likelihood:
         """
         scale = np.sqrt(problem.solve().left / problem.count)
         root, samples = list(self.root), list(self.samples)
-        for axis in np.flatnonzero(scale > lacking):
+        for axis in np.flatnonzero(scale > lacking).tolist():
             rows = samples[axis].rows.size
             root[axis] = np.full(rows, np.sqrt(np.mean(self.root[axis] ** 2)))
             samples[axis] = replace(samples[axis], independent=float(rows))
-        return replace(self, root=tuple(root), samples=tuple(samples))
+        return replace(self, root=KeptItems(root), samples=tuple(samples))
 
     def with_heavy_tails(self, problem: Problem, tails: float) -> Likelihood:
         """Weights of samples as under Student's t distribution, at a fit of the model.
@@ -257,7 +283,7 @@ class Likelihood:
             square = (y + base @ solved.base) ** 2
             mean = max(float(solved.left[axis]) / problem.count[axis], 1e-300)
             root.append(self.root[axis] * np.sqrt((tails + 1.0) / (tails + square / mean)))
-        return replace(self, root=tuple(root))
+        return replace(self, root=KeptItems(root))
 
     def count_independent(self, problem: Problem, lags: int) -> tuple[Samples, ...]:
         """Count the samples of each axis that are independent in what a fit of the model leaves.
@@ -286,22 +312,20 @@ class Likelihood:
 
     def pose(self, evidence: Evidence) -> Problem:
         """Weight the residual of a linearised model; join what is known of its parameters."""
-        samples, n_q = self.samples, len(self.samples)
-        weights = self.root
+        samples, noise, n_q, weights = self.samples, self.noise, len(self.samples), self.root
         if evidence.factors:  # in units of what is measured: small factors explain nothing
             ratio = np.array(self.factors) / np.array(evidence.factors)
-            weights = tuple(root * by for root, by in zip(weights, ratio, strict=True))
+            weights = [root * by for root, by in zip(weights, ratio, strict=True)]
         timing = evidence.timing if evidence.by_timing else ()
-        slopes = evidence.slopes
-        n = slopes[0].shape[2]
+        n = len(evidence.free) + len(timing[:1])
 
         def weighted_columns() -> Iterator[Array]:
             """By all unknowns, (n, n_all) each; one axis after the other, for they are large."""
             for axis, here in enumerate(samples):
                 columns = np.zeros((len(here.rows), n + 2 * n_q))
-                columns[:, :n] = take_samples(slopes, here, axis)
-                columns[:, n + axis] = -self.noise.bias[axis]
-                columns[:, n + n_q + axis] = -self.noise.stopping[axis]
+                columns[:, :n] = take_samples(evidence.slopes, here, axis)
+                columns[:, n + axis] = -noise.bias[axis]
+                columns[:, n + n_q + axis] = -noise.stopping[axis]
                 columns *= weights[axis][:, None]
                 yield columns
 
@@ -324,7 +348,10 @@ class Likelihood:
         cost_of_known = 0.5 * float(precision @ known**2)
         effects, p = evidence.system.model.effects, evidence.p[list(evidence.free)]
         for at in [_places(evidence, item, strengths=True) for item in effects]:
-            own = [take_samples(slopes, here, axis)[:, at] for axis, here in enumerate(samples)]
+            own = (
+                take_samples(evidence.slopes, here, axis)[:, at]
+                for axis, here in enumerate(samples)
+            )
             expected = expect_strengths([x.T @ x for x in own], self.applied)
             known_precision[np.ix_(at, at)] += expected
             moment[at] -= expected @ p[at]
@@ -342,7 +369,7 @@ class Likelihood:
         log_scale, by_parameters = evidence.log_scale
         by_parameters = np.pad(by_parameters, ((0, 0), (0, 2 * n_q)))
         return Problem(
-            self, tuple(y), tuple(x @ to for x in weighted_columns()),
+            self, KeptItems(y), KeptItems(x @ to for x in weighted_columns()),
             to.T @ known_precision @ to, to.T @ moment, log_scale,
             by_parameters @ to, to, lower, upper,
             {item.name: _absence(evidence, item) for item in effects},
@@ -376,8 +403,8 @@ class Problem:
     """
 
     likelihood: Likelihood
-    y: tuple[Array, ...]
-    base: tuple[Array, ...]
+    y: Sequence[Array]
+    base: Sequence[Array]
     known_precision: Array
     known_moment: Array
     log_scale: Array
@@ -424,6 +451,18 @@ class Problem:
             np.array([b.T @ y for b, y in zip(self.base, self.y, strict=True)]),
             np.array([float(y @ y) for y in self.y]),
         )
+
+    def sums_of(self, parts: Sequence[Indices], count: int) -> tuple[Array, Array, Array]:
+        """`sums` of each of ``count`` parts; ``parts``: of each sample, by axis, each (n,)."""
+        n_q, n = len(self.y), self.to_parameters.shape[1]
+        xx, xy, yy = (np.zeros((count, n_q, *shape)) for shape in ((n, n), (n,), ()))
+        for axis, part in enumerate(parts):
+            y, base, order = self.y[axis], self.base[axis], np.argsort(part, kind="stable")
+            ends = np.searchsorted(part[order], np.arange(count + 1))
+            for k, (first, last) in enumerate(pairwise(ends)):
+                b, v = base[order[first:last]], y[order[first:last]]
+                xx[k, axis], xy[k, axis], yy[k, axis] = b.T @ b, b.T @ v, v @ v
+        return xx, xy, yy
 
     def hold(self, values: Mapping[int, float], n: int | None = None) -> tuple[Array, Array]:
         """Unknowns (n,) at which parameters have given values, and (n, m) directions still free.

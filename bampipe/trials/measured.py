@@ -14,6 +14,7 @@ from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.results.identify import InputTiming
 from bampipe.trials.folds import HELD_OUT, Folds
+from bampipe.trials.kept import MOST_OF_TRIALS, KeptItems
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
 from bampipe.trials.reading import (
@@ -68,14 +69,14 @@ class MeasuredTrials:
         """The same with ``late_s`` taken off, instead of `late_s`."""
         if late_s == self.late_s:
             return self
-        moved = tuple(m.with_input_timing(late_s - self.late_s) for m in self.motions)
-        return replace(self, motions=moved, late_s=late_s)
+        moved = (m.with_input_timing(late_s - self.late_s) for m in self.motions)
+        return replace(self, motions=KeptItems(moved, MOST_OF_TRIALS), late_s=late_s)
 
     def subset(self, chosen: Sequence[int]) -> MeasuredTrials:
         """The same with some of the trials, given by number."""
         if len(chosen) == len(self.motions):
             return self
-        motions = [self.motions[k] for k in chosen]
+        motions = KeptItems((self.motions[k] for k in chosen), MOST_OF_TRIALS)
         return replace(self, motions=motions, folds=self.folds.subset(chosen))
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product, takewhile
+from operator import attrgetter
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,7 +14,7 @@ from bampipe.arrays import Array, Flags, Indices
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.physics.device import INPUT_ORDERS, derivative
-from bampipe.trials.cache import TrialCache
+from bampipe.trials.kept import KeptItems
 
 TIMING_ORDERS = 3
 """Time derivatives by which inputs are moved in time: half a sample, at the highest frequency of a
@@ -73,6 +74,9 @@ class Motion:
     parts: Sequence[slice] = (slice(None),)
     _states: dict[Any, Array] = field(default_factory=dict, init=False, repr=False, compare=False)
     _kept: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**vars(self), "_states": {}, "_kept": {}}
 
     def inputs(self, names: Sequence[str]) -> Array:
         """The channels called ``names`` as columns, (T, len(names)); do not write to them.
@@ -201,20 +205,14 @@ def force_columns(system: System) -> list[int]:
     return [system.inputs.index(name) for name in system.model.device.forces]
 
 
-def n_samples(motion: Motion) -> int:
-    """Return the number of samples of a trial."""
-    return int(motion.t.size)
-
-
 def trial_sizes(motions: Sequence[Motion]) -> list[int]:
-    """Return the number of samples of each trial; none is fetched a second time for that."""
-    if isinstance(motions, TrialCache):
-        return [motions.size(place) for place in range(len(motions))]
-    return [n_samples(motion) for motion in motions]
+    """Return the number of samples of each trial."""
+    return motions.each(_size) if isinstance(motions, KeptItems) else [*map(_size, motions)]
 
 
 def trial_names(motions: Sequence[Motion]) -> list[str]:
-    """Return the names of trials; where they are known, none is fetched for that."""
-    if isinstance(motions, TrialCache) and motions.names:
-        return list(motions.names)
-    return [motion.trial_id for motion in motions]
+    """Return the names of trials."""
+    return motions.each(_name) if isinstance(motions, KeptItems) else [*map(_name, motions)]
+
+
+_size, _name = (lambda motion: len(motion.t)), attrgetter("trial_id")

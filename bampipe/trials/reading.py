@@ -8,16 +8,16 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.data.run_folder import MOVING, RunFolder
-from bampipe.data.store import column_names, read_arrays, read_parquet, row_count, trial_ids
+from bampipe.data.store import column_names, read_arrays, read_parquet, trial_ids
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.physics.soundness import require_sound
 from bampipe.results.filter import Disturbance, FilterResult
 from bampipe.results.ingest import IngestResult
-from bampipe.trials.cache import TrialCache
+from bampipe.trials.kept import MOST_OF_TRIALS, KeptItems
 from bampipe.trials.kinematics import Kinematics
-from bampipe.trials.motion import TIMING_ORDERS, Motion, input_derivatives, n_samples
+from bampipe.trials.motion import TIMING_ORDERS, Motion, input_derivatives
 from bampipe.trials.sensors import Sensors
 
 KINEMATICS = "filter/kinematics.parquet"
@@ -145,27 +145,24 @@ def read_motions(
     every_input: bool = False,
     late_s: float = 0.0,
 ) -> Sequence[Motion]:
-    """Return the free trials, each read from ``filter/kinematics.parquet`` when it is wanted.
+    """Return the free trials of ``filter/kinematics.parquet``.
 
     Args:
         fitted, braked: as in :func:`free_trials`; every_input: as in :func:`read_motion`.
         late_s: time by which inputs were sampled after positions, taken off.
 
     Raises:
-        InputError: there is none; on reading one, as :func:`read_motion`.
+        InputError: there is none, and as :func:`read_motion`.
     """
     names = free_trials(run, fitted=fitted, braked=braked)
     path = run.require(KINEMATICS, "filter")
     disturbances, filters = run.read(FilterResult).disturbances, read_kinematics(run, system)
 
-    def fetch(number: int) -> Motion:
-        name = names[number]
-        motion = read_motion(
-            path, name, system, disturbances.get(name, ()), filters, every_input=every_input
-        )
-        return motion.with_input_timing(late_s)
-
-    return TrialCache(fetch, len(names), n_samples, names=names, in_all=row_count(path, names))
+    read = (
+        read_motion(path, k, system, disturbances.get(k, ()), filters, every_input=every_input)
+        for k in names
+    )
+    return KeptItems((motion.with_input_timing(late_s) for motion in read), MOST_OF_TRIALS)
 
 
 def require_sound_motions(system: System, motions: Sequence[Motion]) -> None:

@@ -9,15 +9,10 @@ would carry away. What it does is read by the same sensors and goes through
 the same filters.
 """
 
-import pickle
-import shutil
-import tempfile
-import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -26,18 +21,15 @@ from scipy.interpolate import CubicSpline
 from bampipe.arrays import Array, Flags
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.simulation import Runaway, count_steps, simulate_tracking
-from bampipe.files import temporary_space
 from bampipe.physics import System
 from bampipe.physics.device import derivative
-from bampipe.trials.cache import MOST_SAMPLES, TrialCache
+from bampipe.trials.kept import KeptItems
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import (
     Motion,
     Recording,
     force_columns,
     input_derivatives,
-    n_samples,
-    trial_sizes,
 )
 from bampipe.trials.residuals import ModelOnTrial, standstill_of
 from bampipe.trials.sensors import Sensors
@@ -94,22 +86,14 @@ class StandIn:
     rate_hz: float
 
     @cached_property
-    def courses(self) -> TrialCache[Course]:
+    def courses(self) -> Sequence[Course]:
         """What it does in each trial: the same in all replays, which differ by noise alone."""
-        return TrialCache(
-            lambda trial: follow_motion(self.system, self.p, self.motions[trial], self.rate_hz),
-            len(self.motions),
-            lambda course: len(course.q),
-        )
+        return KeptItems(follow_motion(self.system, self.p, m, self.rate_hz) for m in self.motions)
 
     @cached_property
-    def rests(self) -> TrialCache[Flags]:
+    def rests(self) -> Sequence[Flags]:
         """Where the axes of each trial stand still, (T, n_q)."""
-        return TrialCache(
-            lambda trial: standstill_of(self.motions[trial], self.system, self.rate_hz),
-            len(self.motions),
-            len,
-        )
+        return KeptItems(standstill_of(m, self.system, self.rate_hz) for m in self.motions)
 
 
 def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> Course:
@@ -356,57 +340,6 @@ def replay_motion(
     recording = read_by_sensors(system, stand_in.motions[trial], *course, sensors, rng)
     motion = kinematics.observe(recording, system.model.device.forces, system.inputs)
     return replace(motion, left_out=stand_in.rests[trial])
-
-
-def replay_motions(
-    stand_in: StandIn,
-    sensors: Sensors,
-    kinematics: Kinematics,
-    seed: Sequence[int],
-) -> Sequence[Motion]:
-    """Replay every trial; long sessions are stored on disk, so that few trials are in memory.
-
-    ``seed`` is that of the sensor noise; the trial's number is added.
-
-    Raises:
-        Runaway: a simulated motion grows without bounds.
-    """
-
-    def replays() -> Iterator[Motion]:
-        for trial in range(len(stand_in.motions)):
-            rng = np.random.default_rng([*seed, trial])
-            yield replay_motion(stand_in, trial, sensors, kinematics, rng)
-
-    if sum(trial_sizes(stand_in.motions)) <= MOST_SAMPLES:
-        return list(replays())
-    return store_motions(replays())
-
-
-def store_motions(motions: Iterator[Motion]) -> Sequence[Motion]:
-    """Return trials that cannot be read again, from a folder that lasts as long as they do.
-
-    What comes back is bit by bit the same, and takes the memory of a few trials only.
-    """
-    with temporary_space():
-        folder = Path(tempfile.mkdtemp(prefix="bampipe-trials-"))
-    count = 0
-    try:
-        for count, motion in enumerate(motions, start=1):
-            with temporary_space():
-                # A copy has no columns and states computed before.
-                stored = pickle.dumps(replace(motion), pickle.HIGHEST_PROTOCOL)
-                (folder / str(count - 1)).write_bytes(stored)
-    except BaseException:
-        shutil.rmtree(folder)
-        raise
-
-    def fetch(number: int) -> Motion:
-        motion: Motion = pickle.loads((folder / str(number)).read_bytes())
-        return motion
-
-    trials = TrialCache(fetch, count, n_samples)
-    weakref.finalize(trials, shutil.rmtree, folder)
-    return trials
 
 
 def _reference(

@@ -18,7 +18,7 @@ from bampipe.estimate.least_squares import Problem, Stacked, minimise, stacked_r
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_standstill, find_turns
 from bampipe.physics import System
-from bampipe.trials.cache import TrialCache
+from bampipe.trials.kept import KeptItems
 from bampipe.trials.motion import Motion
 
 
@@ -118,12 +118,13 @@ def problem_of(
         linear=linear,
         constant=np.array(same),
         band=band,
-        standstill=TrialCache(left_out, len(motions), len),
+        standstill=KeptItems(map(left_out, range(len(motions)))),
         precision=np.array(precision),
         known=np.array(known),
         slopes=slopes,
         multiplied=multiplied,
         parts=lambda trial: motions[trial].parts,
+        keep=KeptItems,
     )
 
 

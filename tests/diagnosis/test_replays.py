@@ -12,6 +12,7 @@ from bampipe.diagnosis.session import system_of
 from bampipe.physics import Model, compile_model
 from bampipe.trials import replay
 from bampipe.trials.evidence import Evidence, gather_evidence
+from bampipe.trials.kept import KeptItems
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.replay import StandIn, replay_motion
 from bampipe.trials.residuals import ModelOnTrial, problem_of
@@ -64,7 +65,9 @@ def test_replays_differ_by_noise_alone_and_share_what_was_simulated(
     rate_hz, motions = trials.sensors.rate_hz, trials.motions
 
     def replayed(stand_in: StandIn, number: int) -> Any:
-        return replay.replay_motions(stand_in, trials.sensors, trials.kinematics, (7, number))
+        rngs = (np.random.default_rng([7, number, k]) for k in range(len(motions)))
+        filters = trials.sensors, trials.kinematics
+        return [replay_motion(stand_in, k, *filters, rng) for k, rng in enumerate(rngs)]
 
     one = StandIn(evidence.system, evidence.p, motions, rate_hz)
     shared = [replayed(one, number) for number in range(2)]
@@ -92,7 +95,7 @@ def test_a_replay_leaves_out_the_moments_at_which_the_machine_stands_still(fitte
     )
     still = problem_of(evidence.system, [replayed], trials.band).standstill[0]
     assert still[rest].all() and 0.0 < still.mean() < 0.5
-    (stored,) = replay.store_motions(iter([replayed]))
+    stored, _ = KeptItems([replayed, motion], most=1)
     np.testing.assert_array_equal(stored.left_out, replayed.left_out)
 
 

@@ -72,7 +72,7 @@ def rows_of(
 
 def sd_of(found: Linearised, inner: Problem, block_s: float = 2.0) -> np.ndarray:
     """Standard deviations by blocks of time."""
-    rows, blocks = rows_of(as_measured(inner, found.p, found.stacked), block_s)
+    rows, blocks = rows_of([*as_measured(inner, found.p, found.stacked)], block_s)
     alone = float(inner.band.independent_share[0]) * len(blocks)
     return np.sqrt(
         np.diag(covariance_by_blocks([rows], np.diag(inner.precision), [blocks], [alone]))
@@ -134,7 +134,7 @@ def test_a_scale_that_is_free_does_not_collapse(start: float) -> None:
     assert minimise(problem(**scaled), np.append(TRUTH, start)).p[3] < 0.1
     # What is made of the fit afterwards sees a minimum there, and no way down to no scale at all.
     sd = sd_of(found, free)
-    assert largest_step(found, as_measured(free, found.p, found.stacked), free, sd) < 1e-3
+    assert largest_step(found, [*as_measured(free, found.p, found.stacked)], free, sd) < 1e-3
     assert largest_step(found, found.stacked, free, sd) > 1.0
 
 

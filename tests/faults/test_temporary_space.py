@@ -12,8 +12,8 @@ import pytest
 from bampipe.errors import InputError
 from bampipe.report import typeset
 from bampipe.report.document import Document
+from bampipe.trials.kept import KeptItems
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import store_motions
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def motion(size: int = 20000) -> Motion:
 
 def test_stored_trials(full: Path) -> None:
     with pytest.raises(InputError, match="written: the disk is full") as caught:
-        store_motions(iter([motion()]))
+        KeptItems([motion()], most=1)
     assert caught.value.where == str(full) and "TMPDIR" in caught.value.remedy
     assert [path.name for path in full.iterdir()] == ["filler"]
 
@@ -57,4 +57,4 @@ def test_no_folder_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(tempfile, "gettempdir", nowhere)
     with pytest.raises(InputError, match="no folder for temporary files"):
-        store_motions(iter([motion(10)]))
+        KeptItems([motion(10)], most=1)
