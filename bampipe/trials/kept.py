@@ -4,7 +4,7 @@ import os
 import pickle
 import tempfile
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
@@ -21,7 +21,7 @@ _MOST = 10_000_000
 
 
 class KeptItems(Sequence[Item], Generic[Item]):
-    """A sequence that lies on disk, all but the item used last, where it takes much memory.
+    """A sequence that lies on disk, all but the item asked for last, where it takes much memory.
 
     What comes back is bit by bit the same. The file has no name: it goes with the last process that
     holds it, however that ends.
@@ -38,6 +38,7 @@ class KeptItems(Sequence[Item], Generic[Item]):
         self._items: list[Item] = []
         self._places: list[tuple[int, list[int]]] = []
         self._known: dict[Callable[[Item], Any], list[Any]] = {}
+        self._last: tuple[int, Any] = (-1, None)
         size = 0
         for item in items:
             self._items.append(item)
@@ -45,7 +46,7 @@ class KeptItems(Sequence[Item], Generic[Item]):
             if size > most:
                 for each in self._items:
                     self._write(each)
-                self._items, self._last = [], (len(self._places) - 1, item)
+                self._items = []
 
     def _write(self, item: Item) -> None:
         with temporary_space():
@@ -76,7 +77,12 @@ class KeptItems(Sequence[Item], Generic[Item]):
         place = range(len(self))[place]
         if self._last[0] != place:
             self._last = place, self._read(place)
-        return self._last[1]
+        item: Item = self._last[1]
+        return item
+
+    def __iter__(self) -> Iterator[Item]:
+        # Whoever goes through all holds one at a time: none stays behind.
+        return map(self._read, range(len(self))) if self._places else iter(self._items)
 
     def _read(self, place: int) -> Any:
         at, sizes = self._places[place]

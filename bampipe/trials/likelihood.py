@@ -45,6 +45,8 @@ _SLOW = 3.0
 """Sign widths: slow motion, in which dry friction is as large as it gets."""
 _MOST_STOPPING = 1.5
 """Largest factor of the residual of a replay that truly stops."""
+_TOGETHER = 100_000
+"""Rows of columns that are weighted at once."""
 _FREQUENCIES = 256
 """At which the share of white noise that a low-pass leaves is summed."""
 _RIDGE = 1e-10
@@ -68,6 +70,14 @@ class Samples:
     block: Indices
     independent: float
 
+    def take(self, values: Iterable[Array], axis: int) -> Iterator[Array]:
+        """By trial, the rows of one axis, (k,) or (k, m), of values, each (K, n_q[, m])."""
+        end = 0
+        for each in values:
+            first, end = end, end + len(each)
+            rows = self.rows[slice(*np.searchsorted(self.rows, (first, end)))]
+            yield each[rows - first, axis]
+
 
 def lay_out_samples(evidence: Evidence, block_s: float) -> tuple[Samples, ...]:
     """Return the samples of each axis that count; blocks of ``block_s`` seconds are numbered."""
@@ -86,12 +96,19 @@ def lay_out_samples(evidence: Evidence, block_s: float) -> tuple[Samples, ...]:
 
 def take_samples(values: Iterable[Array], samples: Samples, axis: int) -> Array:
     """Return the rows of one axis, (n,) or (n, m), of values by trial, each (K, n_q[, m])."""
-    end, found = 0, []
-    for each in values:
-        first, end = end, end + len(each)
-        rows = samples.rows[slice(*np.searchsorted(samples.rows, (first, end)))]
-        found.append(each[rows - first, axis])
-    return np.concatenate(found)
+    return np.concatenate([*samples.take(values, axis)])
+
+
+def _join(parts: Iterable[Array]) -> Iterator[tuple[slice, Array]]:
+    """Arrays one below the other, `_TOGETHER` rows or a few more at a time, and which rows."""
+    few, end, size = list[Array](), 0, 0
+    for part in parts:
+        few, size = [*few, part], size + len(part)
+        if size >= _TOGETHER:
+            yield slice(end, end + size), np.concatenate(few)
+            few, end, size = [], end + size, 0
+    if few:
+        yield slice(end, end + size), np.concatenate(few)
 
 
 @dataclass(frozen=True)
@@ -319,15 +336,22 @@ class Likelihood:
         timing = evidence.timing if evidence.by_timing else ()
         n = len(evidence.free) + len(timing[:1])
 
-        def weighted_columns() -> Iterator[Array]:
-            """By all unknowns, (n, n_all) each; one axis after the other, for they are large."""
-            for axis, here in enumerate(samples):
-                columns = np.zeros((len(here.rows), n + 2 * n_q))
-                columns[:, :n] = take_samples(evidence.slopes, here, axis)
-                columns[:, n + axis] = -noise.bias[axis]
-                columns[:, n + n_q + axis] = -noise.stopping[axis]
-                columns *= weights[axis][:, None]
-                yield columns
+        def weighted_columns(axis: int) -> Iterator[tuple[slice, Array]]:
+            """By all unknowns, (k, n_all), a part of the rows after the other: all are large."""
+            bias, stopping, weight = noise.bias[axis], noise.stopping[axis], weights[axis]
+            for part, slopes in _join(samples[axis].take(evidence.slopes, axis)):
+                columns = np.zeros((len(slopes), n + 2 * n_q))
+                columns[:, :n] = slopes
+                columns[:, n + axis] = -bias[part]
+                columns[:, n + n_q + axis] = -stopping[part]
+                columns *= weight[part, None]
+                yield part, columns
+
+        def combined_columns(axis: int) -> Array:
+            out = np.empty((len(samples[axis].rows), to.shape[1]))
+            for part, x in weighted_columns(axis):
+                out[part] = x @ to
+            return out
 
         # What lies evenly between two bounds has a standard deviation of 0.29 of their distance.
         of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
@@ -343,7 +367,9 @@ class Likelihood:
         weight = [
             s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)
         ]
-        products = (w * (x.T @ x) for w, x in zip(weight, weighted_columns(), strict=True))
+        products = (
+            w * (x.T @ x) for axis, w in enumerate(weight) for _, x in weighted_columns(axis)
+        )
         known_precision, moment = np.diag(precision), precision * known
         cost_of_known = 0.5 * float(precision @ known**2)
         effects, p = evidence.system.model.effects, evidence.p[list(evidence.free)]
@@ -369,7 +395,7 @@ class Likelihood:
         log_scale, by_parameters = evidence.log_scale
         by_parameters = np.pad(by_parameters, ((0, 0), (0, 2 * n_q)))
         return Problem(
-            self, KeptItems(y), KeptItems(x @ to for x in weighted_columns()),
+            self, KeptItems(y), KeptItems(map(combined_columns, range(n_q))),
             to.T @ known_precision @ to, to.T @ moment, log_scale,
             by_parameters @ to, to, lower, upper,
             {item.name: _absence(evidence, item) for item in effects},
@@ -456,8 +482,8 @@ class Problem:
         """`sums` of each of ``count`` parts; ``parts``: of each sample, by axis, each (n,)."""
         n_q, n = len(self.y), self.to_parameters.shape[1]
         xx, xy, yy = (np.zeros((count, n_q, *shape)) for shape in ((n, n), (n,), ()))
-        for axis, part in enumerate(parts):
-            y, base, order = self.y[axis], self.base[axis], np.argsort(part, kind="stable")
+        for axis, (y, base, part) in enumerate(zip(self.y, self.base, parts, strict=True)):
+            order = np.argsort(part, kind="stable")
             ends = np.searchsorted(part[order], np.arange(count + 1))
             for k, (first, last) in enumerate(pairwise(ends)):
                 b, v = base[order[first:last]], y[order[first:last]]
