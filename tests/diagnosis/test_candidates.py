@@ -1,7 +1,6 @@
 """Candidates: on what effects of the model leave, and among rivals on data of other simulators."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,9 +10,8 @@ from bampipe.diagnosis.candidates import build_candidate_model, compile_candidat
 from bampipe.diagnosis.columns import added_residual
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.select import open_search, start_of
-from bampipe.diagnosis.session import Session, candidates_of, system_of
+from bampipe.diagnosis.session import Session, acting_axes, candidates_of, system_of
 from bampipe.diagnosis.start import search_start
-from bampipe.diagnosis.verdict import effect_axes
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.residuals import ModelOnTrial
@@ -32,13 +30,18 @@ def test_gears_and_cables_are_weighed_wherever_a_motor_drives(effect):
     assert not weighed("bam") and not weighed("magnetic_damper")
 
 
-def test_an_effect_that_the_most_probable_set_takes_away_has_its_axes():
-    def fit(*effects: str) -> SimpleNamespace:
+@pytest.mark.parametrize(
+    ("effect", "axes"),
+    [
+        ("stribeck:pitch", (1,)),
+        ("force_delay", (0, 1, 2)),
+        ("friction_by_pose:yaw-extension", (0,)),
+    ],
+)
+def test_an_effect_has_the_axes_whose_equation_it_changes(effect, axes):
+    for effects in ((), (effect,)):
         recipe = Recipe(registry.device("bam").declaration, effects, ())
-        return SimpleNamespace(recipe=recipe, evidence=SimpleNamespace(system=system_of(recipe)))
-
-    assert effect_axes(fit("stribeck:pitch"), fit(), "stribeck:pitch") == (1,)
-    assert effect_axes(fit("force_delay"), fit(), "force_delay") == (0, 1, 2)
+        assert acting_axes(recipe, effect) == axes
 
 
 def test_beside_a_gear_that_loses_of_its_load_a_spring_is_scored_as_part_of_that_load():
