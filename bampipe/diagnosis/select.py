@@ -35,8 +35,8 @@ _MINOR = 0.05
 linearised far from the truth, a model leaves more than that."""
 _WORTH = 0.5
 """Fall of the cost, nats, that makes another set worth fitting."""
-_TRIED = 4
-"""Most sets that are fitted in a round until one is better."""
+_TRIED = 2
+"""Sets fitted in a round before only smaller ones are: these keep more of what they promise."""
 _DEEP = 3
 """Effects added at once beside a set that has been fitted."""
 
@@ -210,8 +210,8 @@ def _fit_better(
     broken: list[set[Key]] = []
     kept: dict[tuple[str, ...], float] = {}
     for keys in better:
-        if len(broken) == _TRIED:
-            break
+        if added(keys) and len(broken) >= _TRIED and len(keys) >= min(map(len, broken)):
+            continue
         # A larger set promises no more than the one in it whose fit fell short.
         if any(one <= {*keys} for one in broken):
             continue
