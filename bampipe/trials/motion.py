@@ -109,11 +109,16 @@ class Motion:
         """The motion of the mechanism, which is `System.offset` from what its encoders read.
 
         The offset goes through the filters of the encoders. Where play is crossed it jumps as the
-        readings do, and only what was filtered alike leaves nothing of the two.
+        readings do, and only what was filtered alike leaves nothing of the two. The last one is
+        kept, with the internal states along it.
         """
         if not system.moves_sensors:
             return self
         offset = system.offset(self.q, u, p)
+        mechanism: Motion
+        last, mechanism = self._kept.get("mechanism", (None, self))
+        if np.array_equal(last, offset):
+            return mechanism
         moved = [values.copy() for values in self.kinematics]
         for axis, part in product(np.flatnonzero(offset.any(axis=0)), self.parts):
             added, t = offset[part, axis], self.t[part]
@@ -124,7 +129,9 @@ class Motion:
                 orders = self.filters.derivatives_of(int(axis), added)
             for total, order in zip(moved, orders, strict=True):
                 total[part, axis] += order
-        return replace(self, q=moved[0], qd=moved[1], qdd=moved[2])
+        mechanism = replace(self, q=moved[0], qd=moved[1], qdd=moved[2])
+        self._kept["mechanism"] = offset, mechanism
+        return mechanism
 
     def rows(self, which: slice) -> Motion:
         """Some of its samples, at the same times."""
