@@ -1,6 +1,6 @@
 """The selection of effects: search, fit what was found, and search again from there."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -15,6 +15,7 @@ from bampipe.diagnosis.search import Pool, Search
 from bampipe.diagnosis.session import (
     Fit,
     Session,
+    bounds_of,
     candidates_of,
     shared,
     system_of,
@@ -28,7 +29,7 @@ Progress = Callable[[float, str], None]
 """Called with a fraction of the work done and what is being done."""
 
 _MOST_ROUNDS = 6
-_PARTS = 8
+PARTS = 8
 """Tasks a process into which columns are divided: one candidate may take as long as ten others."""
 _MINOR = 0.05
 """Share of the gain of a set that the next effect must bring to be added before the set is fitted:
@@ -93,16 +94,17 @@ def open_search(
     with workers(dictionary, session.jobs) as spread:
 
         def make(keys: Sequence[Key]) -> Iterable[tuple[Key, Atom | None]]:
-            parts = min(len(keys), _PARTS * session.jobs)
+            parts = min(len(keys), PARTS * session.jobs)
             if session.jobs <= 1 or parts < 2:
                 return dictionary.make_all(keys)
-            made = spread(_make_columns, [keys[k::parts] for k in range(parts)])
+            made = spread(make_columns, [keys[k::parts] for k in range(parts)])
             return [pair for part in made for pair in part]
 
         yield Search(fit.problem, dictionary, make, session.criteria, _reusable(known, dictionary))
 
 
-def _make_columns(keys: Sequence[Key]) -> list[tuple[Key, Atom | None]]:
+def make_columns(keys: Sequence[Key]) -> list[tuple[Key, Atom | None]]:
+    """Make columns by the dictionary that a worker process shares."""
     dictionary: Dictionary = shared()
     return dictionary.make_all(keys)
 
@@ -339,11 +341,7 @@ def change_set(recipe: Recipe, keys: Sequence[Key]) -> Recipe:
 
 def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
     """Parameters of a changed model from the solution of its linear problem, (n_p,)."""
-    evidence, solution = search.dictionary.evidence, search.solve(keys)
-    known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
-    change = search.p.to_parameters @ solution.base
-    for place, number in enumerate(evidence.free):
-        known[evidence.system.parameters[number].name] += change[place]
+    solution, known = search.solve(keys), dict[str, float]()
     for key, strength in zip(added(tuple(sorted(keys))), solution.strengths, strict=True):
         item = search.dictionary.candidates[key[0]]
         values = search.dictionary.values(key)
@@ -356,7 +354,20 @@ def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
         known |= {
             item.parameters[i].name: v for i, v in zip(item.linear_indices, strength, strict=False)
         }
+    return start_at(search, solution.base, known, wider)
+
+
+def start_at(search: Search, base: Array, known: Mapping[str, float], wider: Recipe) -> Array:
+    """Parameters of a changed model, within bounds, (n_p,).
+
+    Those of the model moved by ``base``, a solution of its linear problem, with ``known`` ones.
+    """
+    evidence = search.dictionary.evidence
+    found = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
+    change = search.p.to_parameters @ base
+    for place, number in enumerate(evidence.free):
+        found[evidence.system.parameters[number].name] += change[place]
+    found |= known
     system = system_of(wider)
-    start = np.array([known.get(q.name, q.prior) for q in system.parameters])
-    bounds = [q.lower for q in system.parameters], [q.upper for q in system.parameters]
-    return np.asarray(np.clip(start, *bounds))
+    start = np.array([found.get(q.name, q.prior) for q in system.parameters])
+    return np.asarray(np.clip(start, *bounds_of(system)))

@@ -280,7 +280,7 @@ class Session:
             for share in _SHARES:
                 p = evidence.p.copy()
                 p[list(evidence.free)] += share * step[:count]
-                moved = self.linearise(recipe, np.clip(p, *_bounds(evidence.system)), evidence)
+                moved = self.linearise(recipe, np.clip(p, *bounds_of(evidence.system)), evidence)
                 tried = likelihood.pose(moved)
                 there = tried.solve_nuisance(count).cost
                 if there < here:
@@ -319,11 +319,10 @@ class Session:
             return None
 
 
-def _bounds(system: System) -> tuple[Array, Array]:
-    return (
-        np.array([q.lower for q in system.parameters]),
-        np.array([q.upper for q in system.parameters]),
-    )
+def bounds_of(system: System) -> tuple[Array, Array]:
+    """Lower and upper bounds of the parameters, (n_p,) each."""
+    parameters = system.parameters
+    return np.array([q.lower for q in parameters]), np.array([q.upper for q in parameters])
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ def steps_to_follow(
     """Steps of integration that a model takes along a motion, from sample to sample on average."""
     u = motion.inputs(system.inputs)
     true = motion.of_mechanism(system, u, p)
-    memory = system.memory(*true.kinematics, u, p, true.t)
+    memory = true.memory(system, p)
     rows = slice(None, None, -(-len(u) // probed))
     return count_steps(
         system.derivative, np.hstack([true.q, true.qd, memory])[rows], u[rows],

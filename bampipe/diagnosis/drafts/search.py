@@ -7,31 +7,27 @@ refined, and the best of these fitted with all parameters of the model.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from scipy.optimize import minimize
 
 from bampipe.arrays import Array
-from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
+from bampipe.diagnosis.dictionary import Dictionary, Key
 from bampipe.diagnosis.drafts import symbolic
 from bampipe.diagnosis.drafts.columns import FormDictionary
 from bampipe.diagnosis.drafts.forms import Form
 from bampipe.diagnosis.probability import chance_of
 from bampipe.diagnosis.search import Search
-from bampipe.diagnosis.session import Fit, Session, shared, system_of, workers
+from bampipe.diagnosis.select import PARTS, Progress, make_columns, start_at
+from bampipe.diagnosis.session import Fit, Session, shared, workers
 from bampipe.physics.recipe import Recipe
 from bampipe.results.draft import ChanceOfDraft
 
-Progress = Callable[[float, str], None]
-"""Called with a fraction of the work done and what is being done."""
-
 MOST_TERMS = 2
 """What is left beside two formulas is for a diagnosis of the model with them."""
-_PARTS = 8
-"""Tasks a process into which columns are divided."""
 _REFINED, _FITTED = 12, 4
 """Forms whose shapes are refined, and of those the ones that are fitted with the model."""
 _TRIES = 90
@@ -130,9 +126,9 @@ class FormSearch(Search):
         self.forms, self.fit = forms, fit
         known = cast(Dictionary, forms)  # to a search they are alike
         keys = [key for name in forms.candidates for key in forms.grid(name)]
-        parts = _PARTS * session.jobs
+        parts = PARTS * session.jobs
         with workers(forms, session.jobs) as spread:
-            made = spread(_make_columns, [keys[k::parts] for k in range(parts)])
+            made = spread(make_columns, [keys[k::parts] for k in range(parts)])
             atoms = {key: atom for part in made for key, atom in part}
         super().__init__(fit.problem, known, forms.make_all, session.criteria, atoms)
 
@@ -162,11 +158,6 @@ class FormSearch(Search):
         options = {"maxfev": _TRIES, "initial_simplex": simplex, "xatol": 1e-7, "fatol": 1e-3}
         found = minimize(cost, start, method="Nelder-Mead", options=options).x
         return name, tuple(map(float, np.clip(found, 0.0, 1.0)))
-
-
-def _make_columns(keys: Sequence[Key]) -> list[tuple[Key, Atom | None]]:
-    forms: FormDictionary = shared()
-    return forms.make_all(keys)
 
 
 def _refine(key: Key) -> Key:
@@ -288,7 +279,7 @@ class _AxisSearch:
             strengths = dict(zip(form.shape.strengths, solution.strengths[0], strict=True))
             values = search.forms.values(key) | strengths
             known = {form.parameters[name]: value for name, value in values.items()}
-            start = _start(search, wider, known, solution.base)
+            start = start_at(search, solution.base, known, wider)
             terms.append((*current.terms, form))
             tasks.append((wider, start))
         jobs = min(self.session.jobs, len(tasks))
@@ -316,20 +307,6 @@ def weigh_chance(search: FormSearch) -> ChanceOfDraft:
     gains = tuple(search.of_replay(k).largest_gain()[0] for k in replays)
     gain, _ = search.largest_gain()
     return ChanceOfDraft(gain=gain, gains=gains, p_value=chance_of(gain, gains))
-
-
-def _start(search: FormSearch, wider: Recipe, values: dict[str, float], base: Array) -> Array:
-    """Parameters of a model with a form from the solution of its linear problem, (n_p,)."""
-    e = search.fit.evidence
-    known = {q.name: float(v) for q, v in zip(e.system.parameters, e.p, strict=True)}
-    change = search.p.to_parameters @ base
-    for place, number in enumerate(e.free):
-        known[e.system.parameters[number].name] += float(change[place])
-    known |= values
-    parameters: Sequence[Any] = system_of(wider).parameters
-    start = np.array([known.get(q.name, q.prior) for q in parameters])
-    bounds = [q.lower for q in parameters], [q.upper for q in parameters]
-    return np.asarray(np.clip(start, *bounds))
 
 
 def _terms(fit: Fit, option: Option) -> tuple[Term, ...]:
