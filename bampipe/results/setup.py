@@ -7,6 +7,8 @@ from pydantic import Field
 from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
+AxisState = Literal["sound", "mistaken", "hardly_moves", "unexplained"]
+"""Unexplained where the bare device hardly follows how the applied force varies."""
 Kind = Literal["sign", "scale", "exchange", "zero", "clock", "gravity"]
 
 
@@ -45,7 +47,7 @@ class SetupMistake(PossibleMistake):
 class AxisSetup(Record):
     """The state of the set-up of one axis."""
 
-    state: Literal["sound", "mistaken", "hardly_moves"]
+    state: AxisState
     error_percent: Size | None = Field(
         description="Error of the bare device fitted by least squares, per cent of the "
         "applied force; null where none is applied, or the axis hardly moves"

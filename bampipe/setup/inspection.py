@@ -3,7 +3,7 @@
 import ast
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -12,11 +12,11 @@ from bampipe.estimate.low_pass import Band
 from bampipe.lists import join_names
 from bampipe.physics import System
 from bampipe.results.ingest import IngestResult
-from bampipe.results.setup import AxisSetup, PossibleMistake, SetupMistake, SetupResult
+from bampipe.results.setup import AxisSetup, AxisState, PossibleMistake, SetupMistake, SetupResult
 from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility, distance_from_prior
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, drawn_robot, is_drawn
-from bampipe.setup.search import MOST_AXES, Finding, Search, shorten, spoilt_axes, spread
+from bampipe.setup.search import EXPLAINED, Finding, Search, shorten, spoilt_axes, spread
 from bampipe.setup.turned_trials import TurnedTrial, find_turned_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -61,13 +61,8 @@ def inspect_setup(
         return search, held
 
     search, held = search_in(motions)
-    odd, many = list[TurnedTrial](), len(system.coordinates) > MOST_AXES
-    if many:
-        odd = find_turned_trials(system, motions, band, folds, signals)
-    findings = () if odd else search.find_mistakes(ones)
-    if not (many or findings) and search.over_position is None:
-        # What is wrong in all trials is likelier than what is in some.
-        odd = find_turned_trials(system, motions, band, folds, signals)
+    # First: what is turned in some trials looks like another mistake in all.
+    odd = find_turned_trials(system, motions, band, folds, signals)
     if odd:
         changes = {one.place: one.corrections[0].change for one in odd}
         motions = [
@@ -75,9 +70,9 @@ def inspect_setup(
             for k, motion in enumerate(motions)
         ]
         search, _ = search_in(motions)
-        findings = search.find_mistakes(ones)
+    findings = search.find_mistakes(ones)
     mistakes = (
-        *(_record_turned(system, session, one, names[one.place]) for one in odd),
+        *_record_turned(system, session, odd, names),
         *(_record(system, session, found, placeholders) for found in findings),
     )
     axes = {
@@ -89,6 +84,14 @@ def inspect_setup(
         for axis, entry in axes.items()
         if entry.state == "hardly_moves"
     ]
+    if held is not None and not mistakes and search.over_position is None:
+        warnings += [
+            f"{axis}: of how the applied force varies, the bare device explains"
+            f" {100.0 * max(1.0 - left, 0.0):.0f} %, too little to tell whether the signals mean"
+            " what is stated: does what is logged drive this axis, and does it vary?"
+            for (axis, entry), left in zip(axes.items(), held.left, strict=True)
+            if entry.state == "unexplained"
+        ]
     warnings += _describe_travel(system, session, motions)
     if search.heavier is not None:
         robot = drawn_robot(system)
@@ -129,9 +132,17 @@ def _axis(
 ) -> AxisSetup:
     moving = held.moving[place] if held is not None else 1.0
     still = moving < LEAST_MOVING
-    spoilt = any(axis in mistake.axes or held is None for mistake in mistakes)
+    state: AxisState = (
+        "mistaken"
+        if any(axis in mistake.axes or held is None for mistake in mistakes)
+        else "hardly_moves"
+        if still
+        else "unexplained"
+        if held is None or held.left[place] > EXPLAINED
+        else "sound"
+    )
     return AxisSetup(
-        state="mistaken" if spoilt else "hardly_moves" if still else "sound",
+        state=state,
         error_percent=None if held is None or still else 100.0 * held.error[place],
         moving_share=moving,
     )
@@ -171,19 +182,24 @@ def _record(
 
 
 def _record_turned(
-    system: System, session: IngestResult, found: TurnedTrial, name: str
-) -> SetupMistake:
-    """One trial with a sign of its own."""
-    either = " or ".join(join_names(one.signals) for one in found.corrections)
-    names = found.corrections[0].signals
-    sentence = (
-        f"{name}: {either} {'have' if len(names) > 1 else 'has'} another sign than in the other"
-        f" trials: put negated = {json.dumps(names)} into its [[trials]] entry, or leave the trial"
-        " out"
-    )
-    one = Finding(found.corrections[0], (), found.before, found.after, 0.0)
-    record = _record(system, session, one, {})
-    return record.model_copy(update={"sentence": sentence})
+    system: System, session: IngestResult, odd: Sequence[TurnedTrial], names: Sequence[str]
+) -> Iterator[SetupMistake]:
+    """Trials with a sign of their own, those with the same one as one mistake."""
+    alike: dict[tuple[tuple[str, ...], ...], list[TurnedTrial]] = {}
+    for each in odd:
+        alike.setdefault(tuple(one.signals for one in each.corrections), []).append(each)
+    for any_of, trials in alike.items():
+        first, many = trials[0], len(trials) > 1
+        said = f"{' or '.join(map(join_names, any_of))} {'have' if len(any_of[0]) > 1 else 'has'}"
+        sentence = (
+            f"{join_names(names[one.place] for one in trials)}: {said} another sign than in the"
+            f" other trials: put negated = {json.dumps(any_of[0])} into"
+            f" {'their' if many else 'its'} [[trials]] {'entries' if many else 'entry'}, or leave"
+            f" {'them' if many else 'the trial'} out"
+        )
+        found = Finding(first.corrections[0], (), first.before, first.after, 0.0)
+        record = _record(system, session, found, {})
+        yield record.model_copy(update={"sentence": sentence})
 
 
 def _require_scale(system: System, motions: Sequence[Motion]) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from bampipe.arrays import Array
+from bampipe.arrays import Array, Flags
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
@@ -17,7 +17,7 @@ from bampipe.physics.parameter import Parameter
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
-from bampipe.trials.residuals import applied_rms
+from bampipe.trials.residuals import ModelOnTrial, rms
 
 WEIGHT = 8.0
 """Of the logarithm of an axis' error: its third counts as much as a parameter that comes back from
@@ -31,6 +31,8 @@ VAGUE = 100.0
 """Deviations of its prior within which a parameter is even where the trials say nothing of it."""
 LEAST_MOVING = 0.05
 """Share of the samples in which an axis must move for its equation to be judged."""
+_EVEN = 1e-6
+"""Deviation of a force over its root mean square below which there is none to explain."""
 
 
 @dataclass(frozen=True)
@@ -44,17 +46,25 @@ class Plausibility:
         moving: share of the samples in which each axis moves, (n_q,).
         p: parameters, (n_p,).
         objections: half the squared distance of each from its prior, in its deviations, (n_p,).
+        unexplained: the error as a share of the applied force's deviation from its mean, (n_q,);
+            None where it is that of bodies as drawn.
     """
 
     error: Array
     moving: Array
     p: Array
     objections: Array
+    unexplained: Array | None = None
 
     @property
     def worst_error(self) -> float:
         """Of the axes that move."""
         return float(self.error[self.moving >= LEAST_MOVING].max(initial=0.0))
+
+    @property
+    def left(self) -> Array:
+        """Share (n_q,) of the applied force, or of how it varies where that is more."""
+        return self.error if self.unexplained is None else np.maximum(self.error, self.unexplained)
 
     def score(self, least: float) -> float:
         """The lower, the better; errors below ``least`` are as good as each other."""
@@ -87,12 +97,15 @@ def judge_setup(
                 system, motions, band, system.prior, folds, most_iterations=steps
             )
             error = _errors_with_pose(evidence, posed) if posed else evidence.rmse()
-            size = applied_rms(system, motions, band, evidence.p, evidence.used)
+            on_trials = (ModelOnTrial(system, evidence.p, [motion]) for motion in motions)
+            applied = [band.thin(on_trial.applied) for on_trial in on_trials]
+            size, varied = rms(applied, evidence.used), _deviation(applied, evidence.used)
         except (InputError, ValueError, np.linalg.LinAlgError):
             return None
         moving = np.mean(np.concatenate(evidence.used), axis=0)
         share = np.where(size > 0.0, error / size, 0.0)
         share = np.where(moving >= LEAST_MOVING, share, 1.0)
+        unexplained = np.where(varied > _EVEN * size, error / varied, 0.0)
     if not np.isfinite(share).all():
         return None
     spread = CERTAIN * _standard_errors(evidence)
@@ -100,7 +113,14 @@ def judge_setup(
     nearest = np.clip(priors, evidence.p - spread, evidence.p + spread)
     distance = np.array(list(map(distance_from_prior, system.parameters, nearest)))
     objections = 0.5 * np.minimum(distance**2, FARTHEST**2)
-    return Plausibility(share, moving, evidence.p, objections)
+    return Plausibility(share, moving, evidence.p, objections, unexplained)
+
+
+def _deviation(values: Sequence[Array], used: Sequence[Flags]) -> Array:
+    """Standard deviation by axis, (n_q,), of values (K, n_q) by trial over samples that count."""
+    count = np.maximum(np.concatenate(used).sum(axis=0), 1)
+    mean = sum(np.sum(each * keep, axis=0) for each, keep in zip(values, used, strict=True)) / count
+    return rms([each - mean for each in values], used)
 
 
 def axes_without_pose(system: System, motions: Sequence[Motion]) -> list[int]:

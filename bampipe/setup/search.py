@@ -28,7 +28,8 @@ sessions no other set-up gains more than 5.0, of mistaken ones the right one at 
 LEAST_GAIN_PLACEHOLDER = 4.0
 """The same for a scale that stands at exactly 1, as nobody has filled it in."""
 EXPLAINED = 0.6
-"""Error that must be left of a spoilt axis at most, as a share of the applied force."""
+"""Error that may be left of an axis that is set right or sound, as a share of the applied force and
+of its deviation from its mean: a constant explains an even one, whatever the signals mean."""
 JUDGED_ERROR, RANKED_ERROR = 0.1, 0.01
 """Errors below these are alike: when a mistake is named, and when mistakes are ranked."""
 SPOILS = 2.0
@@ -130,7 +131,7 @@ def conclude(
                 rivals.setdefault(key, other)
         found[place] = replace(finding, rivals=tuple(rivals.values()))
     found.sort(key=lambda finding: -finding.gain)
-    explained = all((f.after.error[spoilt_axes(f)] < EXPLAINED).all() for f in found)
+    explained = all((f.after.left[spoilt_axes(f)] < EXPLAINED).all() for f in found)
     return tuple(found) if explained else ()
 
 

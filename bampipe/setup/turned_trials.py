@@ -4,6 +4,8 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
 from bampipe.setup.hypotheses import Correction, turned
@@ -13,7 +15,6 @@ from bampipe.setup.search import (
     ALIKE,
     LEAST_GAIN,
     MOST_AXES,
-    RANKED_ERROR,
     SUSPICIOUS_ERROR,
     gain_of,
     shorten,
@@ -22,11 +23,7 @@ from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
 
-_TOGETHER = 6
-"""Trials that are held against each other at once, the most."""
 _STEPS, _SAMPLES = 4, 4000
-_ONE_AXIS = 3
-"""Signals of a machine so small that signs wrong throughout are tried beside those of a trial."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class TurnedTrial:
 
     Attributes:
         place: of the trial; corrections: any sets it right; of one signal, or a robot's drives.
-        before, after: what its group shows as stated, and with all that was found in it.
+        before, after: what it shows alone, as the others are stated and set right.
     """
 
     place: int
@@ -49,7 +46,7 @@ def find_turned_trials(
 ) -> list[TurnedTrial]:
     """Find them among the trials that are fitted; of many joints, drawn bodies must tell the signs.
 
-    Where as many count one way as the other, those found are as right as the rest.
+    The fewer are found: where all others are wrong, that is a mistake of the whole session.
     """
     fitted = folds.fitted_trials
     if len(fitted) < 2:
@@ -57,9 +54,63 @@ def find_turned_trials(
     if len(system.coordinates) > MOST_AXES:
         drawn = is_drawn(system)
         return _by_drawn_bodies(system, motions, fitted, band, folds, signals) if drawn else []
-    groups = -(-len(fitted) // _TOGETHER)
-    parts = (fitted[start::groups] for start in range(groups))
-    return [one for part in parts for one in _search(system, motions, part, band, folds, signals)]
+    return _by_own_fits(system, motions, fitted, band, folds, signals)
+
+
+def _by_own_fits(
+    system: System,
+    motions: Sequence[Motion],
+    fitted: Sequence[int],
+    band: Band,
+    folds: Folds,
+    signals: Signals,
+) -> list[TurnedTrial]:
+    """The fewer of trials whose own fits show opposite signs: inertia and friction only resist.
+
+    However many they are, and also where trials have other parameters, as of another damper.
+    """
+
+    def is_doubtful(one: Plausibility) -> bool:
+        return bool(one.error.max() >= SUSPICIOUS_ERROR)
+
+    def fit(k: int, one: Correction | None = None) -> Plausibility | None:
+        (motion,) = shorten([motions[k]], _SAMPLES)
+        way = one.change.of_motion(motion, signals) if one else motion
+        return judge_setup(system, [way], band, folds.subset([k]), _STEPS)
+
+    stated = {k: own for k in fitted if (own := fit(k)) is not None}
+    if not any(map(is_doubtful, stated.values())):
+        return []
+    drives = [name for name in signals.inputs if name not in signals.brakes]
+    options = [turned(signals, [name]) for name in (*signals.axes, *drives)]
+    fits = {
+        k: [fit(k, one) or own.with_nothing_explained() for one in options]
+        for k, own in stated.items()
+    }
+    gains = {k: np.array([gain_of(stated[k], one, 0.0) for one in of]) for k, of in fits.items()}
+    found: dict[int, list[tuple[float, int]]] = {}
+    for place in range(len(options)):
+        # Of signs that explain a trial, the one that does so best, or those that do alike.
+        against = [
+            k
+            for k, of in gains.items()
+            if of[place] > max(LEAST_GAIN, of.max() - ALIKE) and is_doubtful(stated[k])
+        ]
+        along = [
+            k for k, of in gains.items() if of[place] < -LEAST_GAIN and is_doubtful(fits[k][place])
+        ]
+        for k in min(against, along, key=len) if against and along else ():
+            strength = float(np.mean([gains[j][place] for j in against]))
+            found.setdefault(k, []).append((strength, place))
+    result = []
+    for k, ways in sorted(found.items()):
+        most, place = max(ways, key=lambda way: way[0])
+        before, after = stated[k], fits[k][place]
+        if gains[k][place] < 0.0:  # The others are turned, and it is not.
+            before, after = after, before
+        alike = [options[at] for strength, at in ways if strength > most - ALIKE and at != place]
+        result.append(TurnedTrial(k, (options[place], *alike), before, after))
+    return result
 
 
 def _by_drawn_bodies(
@@ -87,43 +138,3 @@ def _by_drawn_bodies(
             if before and after and gain_of(before, after, 0.0) > LEAST_GAIN:
                 found.append(TurnedTrial(k, (one,), before, after))
     return found
-
-
-def _search(
-    system: System,
-    motions: Sequence[Motion],
-    places: Sequence[int],
-    band: Band,
-    folds: Folds,
-    signals: Signals,
-) -> list[TurnedTrial]:
-    """Of one group; where nothing is found as stated, under a sign that is wrong in all of it."""
-    part, short = folds.subset(places), shorten([motions[k] for k in places], _SAMPLES)
-    stated = judge_setup(system, short, band, part, _STEPS)
-    if stated is None or stated.error.max() < SUSPICIOUS_ERROR:
-        return []
-    drives = [name for name in signals.inputs if name not in signals.brakes]
-    options = [turned(signals, [name]) for name in (*signals.axes, *drives)]
-    for start in (None, *options) if len(options) <= _ONE_AXIS else (None,):
-        now = [start.change.of_motion(one, signals) for one in short] if start else list(short)
-        best = judge_setup(system, now, band, part, _STEPS)
-        found: dict[int, tuple[Correction, ...]] = {}
-        while best is not None and len(found) < len(places) // 2:
-            tried = []
-            for at in (at for at in range(len(places)) if at not in found):
-                for one in options:
-                    changed = [*now[:at], one.change.of_motion(now[at], signals), *now[at + 1 :]]
-                    after = judge_setup(system, changed, band, part, _STEPS)
-                    if after is not None:
-                        tried.append((after.score(RANKED_ERROR), at, one, after))
-            if not tried:
-                break
-            least, at, one, after = min(tried, key=lambda each: each[0])
-            if gain_of(best, after, 0.0) <= ALIKE:
-                break
-            alike = [c for score, k, c, _ in tried if k == at and score < least + ALIKE]
-            found[at], best = (one, *(c for c in alike if c is not one)), after
-            now[at] = one.change.of_motion(now[at], signals)
-        if best is not None and found and gain_of(stated, best, 0.0) > LEAST_GAIN:
-            return [TurnedTrial(places[at], any_of, stated, best) for at, any_of in found.items()]
-    return []

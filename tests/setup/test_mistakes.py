@@ -1,6 +1,8 @@
 """Mistakes in session files of independent simulators are named; sound ones are left alone."""
 
-from collections.abc import Callable
+import json
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import independent
@@ -84,9 +86,9 @@ def test_what_a_slow_trial_alone_does_not_determine_is_no_mistake(tmp_path: Path
     assert found.axes["joint"].error_percent < 10.0
 
 
-def inspected(root: Path, *changes: Callable[[Path], None]) -> SetupResult:
-    """The set-up of a joint's session, changed by ``changes`` before it is read."""
-    independent.record("joint", root / "session", 31, {}, mistakes.SHORT["joint"])
+def inspected(root: Path, *changes: Callable[[Path], None], machine: str = "joint") -> SetupResult:
+    """The set-up of a machine's session, changed by ``changes`` before it is read."""
+    independent.record(machine, root / "session", 31, {}, mistakes.SHORT[machine])
     for change in changes:
         change(root / "session")
     return inspect_session(root)
@@ -183,17 +185,56 @@ def test_the_report_says_it_first(reversed_joint: bampipe.Run) -> None:
     assert "leaves something unexplained" not in page
 
 
-def test_a_trial_with_a_sign_of_its_own_is_named_and_taken_in(tmp_path: Path) -> None:
-    def turn(folder: Path) -> None:
-        path = sorted(folder.glob("trials/*.csv"))[1]
-        frame = pd.read_csv(path)
-        frame["q"] *= -1.0
-        frame.to_csv(path, index=False)
+def scale_trials(column: str, factors: Sequence[float]) -> Callable[[Path], None]:
+    """A column times a factor of its own in each trial."""
 
-    (mistake,) = inspected(tmp_path, turn).mistakes
-    assert mistake.sentence.startswith("t02: joint")
-    negated = set_text(r'(file = "trials/t02.csv")', r'\1\nnegated = ["joint"]')
-    assert inspected(tmp_path / "taken", turn, negated).mistakes == ()
+    def change(folder: Path) -> None:
+        for path, factor in zip(sorted(folder.glob("trials/*.csv")), factors, strict=True):
+            frame = pd.read_csv(path)
+            frame[column] *= factor
+            frame.to_csv(path, index=False)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("machine", "column", "factors", "named"),
+    [
+        ("joint", "q", (1, -1, 1, 1), "t02: joint"),
+        ("axis", "u", (1, -1, -1, 1), "t02 and t03: carriage or force_motor"),
+        # Each of another damper.
+        ("damper", "f", (1, -2, -3, 4), "t02 and t03: piston or force_load_cell"),
+        ("bam", "enc_pitch", (1, -1, 1, -1, 1), "t02_free and t04_free: pitch has"),
+    ],
+)
+def test_trials_with_a_sign_of_their_own_are_named_and_taken_in(
+    machine: str, column: str, factors: Sequence[float], named: str, tmp_path: Path
+) -> None:
+    turn = scale_trials(column, factors)
+    (mistake,) = inspected(tmp_path, turn, machine=machine).mistakes
+    assert mistake.sentence.startswith(named)
+    signals = json.loads(re.findall(r"negated = (\[.*?\])", mistake.sentence)[0])
+    entries = [
+        set_text(f'(file = "trials/t0{n}\\w*.csv")', rf"\1\nnegated = {json.dumps(signals)}")
+        for n, factor in enumerate(factors, 1)
+        if factor < 0
+    ]
+    assert inspected(tmp_path / "taken", turn, *entries, machine=machine).mistakes == ()
+
+
+def test_what_hardly_follows_the_force_is_not_called_sound(tmp_path: Path) -> None:
+    """A force that is held even, but for noise: a constant explains it, the motion does not."""
+
+    def hold(folder: Path) -> None:
+        for path in folder.glob("trials/*.csv"):
+            frame = pd.read_csv(path)
+            frame["u"] = 1.0 + 0.02 * np.random.default_rng(31).standard_normal(len(frame))
+            frame.to_csv(path, index=False)
+
+    found = inspected(tmp_path, hold, machine="axis")
+    assert found.axes["carriage"].state == "unexplained"
+    (line,) = list_setup_faults(found)
+    assert line.startswith("carriage: of how the applied force varies, the bare device explains")
 
 
 def test_gravity_that_the_device_lacks_is_no_exchanged_column(tmp_path: Path) -> None:
