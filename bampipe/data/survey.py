@@ -581,13 +581,14 @@ def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:
     """The columns, with commanded forces, currents or voltages for inputs if none was measured.
 
     Many controllers log what they ask of the drive and nothing of what it gives. Beside a measured
-    one, the command is a reference like that of a position.
+    one, the command is a reference like that of a position; but beside one force, the current that
+    is asked of the coil of a brake or damper is all that tells of it.
     """
-    if any(column.role in DRIVERS for column in columns):
-        return tuple(columns)
+    measured = [column.role for column in columns if column.role in DRIVERS]
+    wanted = ("current",) if measured == ["force"] else () if measured else DRIVERS
     return tuple(
         replace(column, role=role)
-        if column.role == "reference" and (role := _role_apart(column)) in DRIVERS
+        if column.role == "reference" and (role := _role_apart(column)) in wanted
         else column
         for column in columns
     )

@@ -10,7 +10,7 @@ import numpy as np
 from bampipe.data import guesses
 from bampipe.data.chain import Branches
 from bampipe.data.device_file import complete_device, read_device_file
-from bampipe.data.survey import Survey, SurveyedColumn, words
+from bampipe.data.survey import REFERENCE_WORDS, Survey, SurveyedColumn, words
 from bampipe.data.urdf import unexpanded
 from bampipe.errors import InputError
 from bampipe.estimate.white_noise import counting_step, white_noise_sd
@@ -282,7 +282,14 @@ def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bo
             f"{current.name} goes with {driver.name}: both are of the drive, and {driver.name} is"
             " taken; either would do"
         )
-    return len(alike) < len(currents)
+    coils = [c.name for c in currents if c.name not in match.used]
+    notes.check += [
+        f"{name} is taken for the current of a coil that changes the friction, as of a brake or"
+        " damper; it was asked for, and none was measured"
+        for name in coils
+        if REFERENCE_WORDS & set(words(name))
+    ]
+    return bool(coils)
 
 
 def _go_together(one: np.ndarray, other: np.ndarray) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bampipe.data import guesses
-from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
+from bampipe.data.survey import DRIVERS, REFERENCE_WORDS, Survey, SurveyedColumn, words
 from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import travelled
 from bampipe.setup.proposal.robot import RobotColumns
@@ -143,8 +143,11 @@ class Matcher:
     def driving(self, position: SurveyedColumn) -> SurveyedColumn | None:
         """The column that acceleration, velocity and friction of the motion explain best."""
         share = {}
+        # What is asked of a coil brakes the motion, and follows it where a force is controlled.
+        asked = REFERENCE_WORDS if self.found.of("force") else frozenset[str]()
         for column in self.found.columns:
             free = column.name not in self.used and column.role not in _NEVER_DRIVES
+            free = free and asked.isdisjoint(words(column.name))
             of_axis = column is position or column.si in ("rad", "m")
             if not free or column.is_constant or of_axis:
                 continue

@@ -264,7 +264,8 @@ def _least_inertia(linear: bool, coil: bool, found: Driven) -> float:
     # nearly all friction the guess of the mass is not worth much: friction has the last word.
     least = 0.02 * found.inertia if found.inertia > 0.0 else 0.1 if linear else 1e-5
     least = min(least, _FASTEST_S * found.viscous) if found.viscous > 0.0 else least
-    return _rounded(max(least, 0.3) if coil and linear else least)
+    heavy = 0.3 * min(found.inertia, 1.0) if found.inertia > 0.0 else 0.3
+    return _rounded(max(least, heavy) if coil and linear else least)
 
 
 def _parameter(
