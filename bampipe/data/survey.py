@@ -10,9 +10,10 @@ from unicodedata import combining, normalize
 
 import numpy as np
 
+from bampipe.data import readers
 from bampipe.data.guesses import describe, find_roles, is_time
 from bampipe.data.parts import axes_of, join_parts
-from bampipe.data.readers import EXTENSIONS, SHEETS, TEXTS, columns_of, lerobot, objects, read_trial
+from bampipe.data.readers import columns_of, is_log, is_text, lerobot, objects, read_trial
 from bampipe.data.readers.trial import Dialect, RawTrial
 from bampipe.data.recording import read_recording, starts_of
 from bampipe.data.session import Clock, TrialEntry
@@ -251,7 +252,7 @@ class _Logs:
             if path.is_file()
             and not any(part.startswith(".") for part in path.relative_to(folder).parts)
         )
-        paths = [path for path in files if path.suffix.lower() in EXTENSIONS]
+        paths = [p for p in files if p.suffix.lower() not in _OTHER_DATA and is_log(p)]
         for path in files:
             if path.suffix.lower() in _OTHER_DATA:
                 why = f"*{path.suffix} is not read: {_OTHER_DATA[path.suffix.lower()]}"
@@ -264,7 +265,7 @@ class _Logs:
                 where=str(folder),
                 remedy=self.passed[0][1]
                 if self.passed
-                else f"supported file extensions are {', '.join(EXTENSIONS)}"
+                else f"supported file extensions are {', '.join(readers.EXTENSIONS)}"
                 + "; of XML, name it *.txt" * any(name.endswith(".xml") for name in others),
             )
         if len(paths) > MOST_FILES:
@@ -279,9 +280,8 @@ class _Logs:
                 lexically_inside(name, where="")
                 columns = columns_of(path, name=name, dialect=self.dialect)
                 if not columns:
-                    raise InputError(f"no column of numbers in it{_like(path)}")
-                text = path.suffix.lower() in (*TEXTS, *SHEETS)
-                small = path.stat().st_size < _SMALL and text
+                    raise InputError(f"no table: no column of numbers in it{_like(path)}")
+                small = path.stat().st_size < _SMALL and is_text(name)
                 wide, first = len(columns) > _MOST_COLUMNS, next(iter(columns))
                 rows = len(self._read_one(name, columns, first)) if small or wide else 2
                 if wide and 0 < 10 * rows < len(columns):
@@ -306,7 +306,7 @@ class _Logs:
     def fault(self) -> InputError:
         """That no log can be read, with the reason of the first."""
         # What is no log anyway says least.
-        idle = ("*", "no column of numbers", "one row", "other columns")
+        idle = ("*", "no table", "one row", "other columns")
         name, why = min(
             self.passed,
             key=lambda p: next((k for k, x in enumerate(idle) if p[1].startswith(x)), -1),
@@ -438,7 +438,7 @@ class _Logs:
         raw = read_recording(self.folder, trial, first, clock, self.dialect)
         sound = _complete_rows(raw.columns, clock.column)
         self.first = trial.file
-        if not (trial.parts or trial.recording or trial.file.lower().endswith(TEXTS)):
+        if not (trial.parts or trial.recording or is_text(trial.file)):
             self.remarks += raw.remarks
         # Times of one name, beside the readings that each is of.
         times = [c for c in times if c in raw.columns]
@@ -487,9 +487,7 @@ class _Logs:
         path = self.folder / trial.file
         self.scanned += path.stat().st_size
         columns = self.found[trial.file]
-        several = path.suffix.lower() in (*TEXTS, *SHEETS) or any(
-            "[:]." in column for column in columns
-        )
+        several = is_text(trial.file) or any("[:]." in column for column in columns)
         if trial.parts or not several or self.scanned > _MOST_SCANNED:
             return [trial]
         times = [c for c, u in columns.items() if _role(c, u) == "time"]
@@ -510,7 +508,7 @@ class _Logs:
 
 def _like(path: Path) -> str:
     """What the lines of a text that is no table look like, in a few words."""
-    if path.suffix.lower() not in TEXTS:
+    if not is_text(path.name):
         return ""
     with path.open("rb") as stream:
         head = stream.read(1 << 12).decode("utf-8", "replace")

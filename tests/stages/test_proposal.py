@@ -32,7 +32,7 @@ from bampipe.physics import registry
 from bampipe.physics.units import check_device
 from bampipe.progress import silent
 from bampipe.setup.proposal import propose, write_proposal
-from bampipe.setup.proposal.notes import COLUMNS
+from bampipe.setup.proposal.notes import COLUMNS, Notes
 from bampipe.setup.proposal.starter import Drive, starter_device
 from bampipe.stages import ingest
 
@@ -146,6 +146,41 @@ def test_a_damper_with_a_coil(tmp_path):
     truth = damper_log(2)
     np.testing.assert_allclose(found["q_carriage"], 1e-3 * truth["Displacement"], atol=1e-8)
     np.testing.assert_allclose(found["force_drive"], truth["Force"], atol=1e-5)
+
+
+def test_what_is_asked_of_a_coil_beside_a_measured_force_is_its_current(tmp_path):
+    """Of a small brake, whose mass is below what is the least of a damper's."""
+    table = damper_log(1)
+    table["i_cmd"], table["Force"] = table.pop("Current"), 1e-3 * table["Force"]
+    write_table(tmp_path / "a.csv", table)
+    session, proposal = proposed(tmp_path)
+    assert session["force"]["columns"] == ["Force"]
+    assert session["channels"]["coil_current"]["column"] == "i_cmd"
+    assert any(line.startswith("i_cmd is taken for the current") for line in proposal.check)
+
+
+def test_tables_of_any_extension_are_read_and_prose_beside_them_is_no_table(tmp_path):
+    for size, name in enumerate(("a.t", "b.res", "c"), 1):
+        write_table(tmp_path / name, labelled("t,angle_rad,w,torque_nm", q=0.3 * size))
+    (tmp_path / "README.txt").write_text("The rig, 24 V.\nRuns 1, 2 and 3: 10 to 40 rpm.\n")
+    (tmp_path / "notes.txt").write_text("Run 1 is good. Run 2 is bad after 5 s.\nRun 3 1 2 3\n")
+    (tmp_path / "LICENSE").write_text("Copyright 2019\nAll rights are kept.\n")
+    session, proposal = proposed(tmp_path)
+    assert [trial["file"] for trial in session["trials"]] == ["a.t", "b.res", "c"]
+    left = dict(line.split(": ", 1) for line in proposal.passed)
+    assert set(left) == {"README.txt", "notes.txt"}
+    assert all(why.startswith("no table: ") for why in left.values())
+    found = samples(tmp_path, tmp_path / "out", "b")
+    whole = labelled("t,angle_rad,w,torque_nm", q=0.6)["angle_rad"][: len(found)]
+    np.testing.assert_allclose(found["q_joint"], whole, atol=1e-5)
+
+
+def test_the_unit_of_joints_without_names_is_asked_once() -> None:
+    notes = Notes()
+    comments = [notes.ask_unit(f"column_{n}", f"joint_{n}") for n in (1, 2)]
+    assert comments[1].endswith("column_2, which looks like the position of joint_2")
+    (question,) = notes.questions
+    assert question.startswith("the unit of column_1 and column_2, which look like the positions")
 
 
 def arm_log(turned: float = 0.0) -> dict[str, np.ndarray]:

@@ -84,13 +84,23 @@ def read_trial(
             cell that is not a number, or a library that is not installed.
     """
     path, name = Path(path), name or str(path)
-    reader = _READERS[_checked_extension(path, name)]
+    reader = _READERS.get(_checked_extension(path, name), text)
     wanted = Wanted(tuple(columns), datetimes or {}, dialect or Dialect(), largest_bytes)
     with _safely(path, name):
         trial: RawTrial = reader.read(path, wanted, name)
     if columns and len(trial) == 0:
         raise InputError("a header but no samples", where=name)
     return trial
+
+
+def is_log(path: Path) -> bool:
+    """Whether a file may be a log: by its extension, or as text with rows of numbers."""
+    return path.suffix.lower() in _READERS or text.is_table(path)
+
+
+def is_text(name: str) -> bool:
+    """Whether a log is read as text, as those are whose extension is not known."""
+    return _READERS.get(Path(name).suffix.lower(), text) is text
 
 
 def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) -> dict[str, str]:
@@ -103,7 +113,7 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
         InputError: as :func:`read_trial`.
     """
     path, name = Path(path), name or str(path)
-    reader = _READERS[_checked_extension(path, name)]
+    reader = _READERS.get(_checked_extension(path, name), text)
     more = (dialect,) if reader is text else ()
     with _safely(path, name):
         columns: dict[str, str] = reader.columns(path, name, *more)
@@ -140,7 +150,7 @@ def _safely(path: Path, name: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        kind, remedy = _FOREIGN[path.suffix.lower()]
+        kind, remedy = _FOREIGN.get(path.suffix.lower(), ("", ""))
         if not kind:
             raise
         raise InputError(f"not a sound {kind}", where=name, remedy=remedy) from error
@@ -165,11 +175,11 @@ def _checked_extension(path: Path, name: str) -> str:
         raise InputError(
             f"cannot be read: {(error.strerror or 'error').lower()}", where=name
         ) from error
-    if extension not in _READERS:
+    if not is_log(path):
         raise InputError(
             f"unsupported file extension '{extension}'",
             where=name,
-            remedy=f"supported are {', '.join(EXTENSIONS)}",
+            remedy=f"supported are {', '.join(EXTENSIONS)}, and text with rows of numbers",
         )
     if state.st_size == 0:
         raise InputError("the file is empty", where=name)

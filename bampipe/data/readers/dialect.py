@@ -190,6 +190,18 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
     }
 
 
+def share_of_rows(head: bytes) -> float:
+    """Share of the first lines that are rows of numbers, of more than one; prose has hardly any."""
+    lines = [line.text for line in _lines(head, "") if line.text.strip()][:_SEARCHED]
+
+    def is_row(row: list[str], mark: str) -> bool:
+        numbers = sum(_is_number(cell, ",") or is_moment(cell) for cell in row)
+        return numbers >= max(min(2, len(row)), (0.5 if mark == " " else 0.25) * len(row), 1)
+
+    rows = max(sum(is_row(cells(text, mark), mark) for text in lines) for mark in DELIMITERS)
+    return rows / len(lines) if rows > 1 else 0.0
+
+
 def _is_number(cell: str, decimal: str) -> bool:
     return bool(_POINT.match(cell) or (decimal == "," and _COMMA.match(cell)))
 

@@ -26,6 +26,8 @@ from bampipe.errors import InputError
 BLOCK = 1 << 20
 _MOST_CHATTER = 50
 """Lines of text among the samples, messages of a logger, that are left out."""
+_LEAST_ROWS, _MANY_ROWS = 0.05, 0.5
+"""Share of rows of numbers in a table's first lines, and where its extension tells nothing."""
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _WESTERN = "cp1252"
 _TAKEN_AS = {
@@ -68,11 +70,22 @@ def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, 
     """Names and units of the columns of numbers, or of moments (unit "datetime")."""
     with _opened(path, dialect or Dialect(), name) as (stream, dialect, _):
         head = _head(stream, name)
+    if dialects.share_of_rows(head) < _LEAST_ROWS:
+        return {}
     layout = dialects.find_layout(head, (), dialect, name)
     return {
         column: "datetime" if is_moment else layout.units.get(column, "")
         for column, is_moment in dialects.readable_columns(head, layout).items()
     }
+
+
+def is_table(path: Path) -> bool:
+    """Whether a file of an unknown extension is text with rows of numbers."""
+    try:
+        with path.open("rb") as stream:
+            return dialects.share_of_rows(_head(stream, "")) > _MANY_ROWS
+    except (OSError, InputError):
+        return False
 
 
 @contextmanager

@@ -146,10 +146,9 @@ class Matcher:
         # What is asked of a coil brakes the motion, and follows it where a force is controlled.
         asked = REFERENCE_WORDS if self.found.of("force") else frozenset[str]()
         for column in self.found.columns:
-            free = column.name not in self.used and column.role not in _NEVER_DRIVES
-            free = free and asked.isdisjoint(words(column.name))
+            known = column.name in self.used or column.role in _NEVER_DRIVES
             of_axis = column is position or column.si in ("rad", "m")
-            if not free or column.is_constant or of_axis:
+            if known or column.is_constant or of_axis or asked & set(words(column.name)):
                 continue
             values = np.nan_to_num(column.values)
             if abs(float(np.corrcoef(position.values, values)[0, 1])) > 0.98:

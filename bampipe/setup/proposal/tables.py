@@ -16,7 +16,7 @@ from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.setup.proposal.device import ChosenDevice
 from bampipe.setup.proposal.matching import Match, Matcher
-from bampipe.setup.proposal.notes import UNKNOWN, Notes, entry, quoted, say_unit
+from bampipe.setup.proposal.notes import UNITS, UNKNOWN, Notes, entry, quoted, say_unit
 from bampipe.setup.proposal.positions import in_counts, is_force, is_velocity, needs_gain
 
 _RECORDED = ":@time"
@@ -257,12 +257,9 @@ def _encoder(
         )
     right, geared = column.si == axis.unit, axis.name in match.robot.gears
     if (column.by_looks or column.is_foreign) and not right:
-        stated = f"stated as '{column.stated}'" if column.is_foreign else ""
-        note = notes.ask(
-            f"the unit of {column.name}, "
-            + (stated or f"which looks like the position of {axis.name}"),
-            "ask who wrote the logger, or see how far it moves; rad, deg, m and mm are usual",
-        )
+        said = f"the unit of {column.name}, stated as '{column.stated}'"
+        foreign = column.is_foreign
+        note = notes.ask(said, UNITS) if foreign else notes.ask_unit(column.name, axis.name)
         return entry(column.name, UNKNOWN, _velocity_beside(axis, alone, match, notes)) + note
     by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
     said = (spelled(column.unit, _POSITION_UNITS) if right else by_size) or axis.unit
