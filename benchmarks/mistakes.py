@@ -22,6 +22,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from independent import MACHINES, arm, record
 from independent.sensors import Conditions
@@ -78,6 +79,26 @@ def scale_number(pattern: str, factor: float) -> Callable[[Path], None]:
         return f"{match[1]}{float(match[2]) * factor!r}"
 
     return lambda folder: _rewrite(folder / "session.toml", f"({pattern})([-0-9.e+]+)", scaled)
+
+
+def scale_trials(column: str, factors: Sequence[float]) -> Callable[[Path], None]:
+    """A column times a factor of its own in each trial."""
+
+    def change(folder: Path) -> None:
+        for path, factor in zip(sorted(folder.glob("trials/*.csv")), factors, strict=True):
+            frame = pd.read_csv(path)
+            frame[column] *= factor
+            frame.to_csv(path, index=False)
+
+    return change
+
+
+def hold_even(folder: Path) -> None:
+    """The force of an axis held even, but for noise."""
+    for path in folder.glob("trials/*.csv"):
+        frame = pd.read_csv(path)
+        frame["u"] = 1.0 + 0.02 * np.random.default_rng(31).standard_normal(len(frame))
+        frame.to_csv(path, index=False)
 
 
 def scale_column(column: str, factor: float, offset: float = 0.0) -> Callable[[Path], None]:

@@ -94,10 +94,7 @@ def test_a_run_is_found_by_its_name(run, monkeypatch, tmp_path):
         (lambda run: bampipe.run_session("nowhere"), "nowhere: no such session folder"),
         (lambda run: bampipe.identify(run, methd="ukf"), "methd"),
         (lambda run: bampipe.extend(run, "stribek:carriage"), "did you mean 'stribeck'"),
-        (
-            lambda run: bampipe.diagnose(run, replicates=1),
-            "replicates: found 1, expected 4",
-        ),
+        (lambda run: bampipe.diagnose(run, replicates=1), "replicates: found 1, expected 4"),
     ],
 )
 def test_mistakes_are_one_line(run, ask, said):

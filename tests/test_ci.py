@@ -290,10 +290,7 @@ def test_the_shell_script_runs(tmp_path: Path) -> None:
 
     def run() -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            ["sh", str(script), str(lab)],
-            env=os.environ | settings,
-            capture_output=True,
-            text=True,
+            ["sh", str(script), str(lab)], env=os.environ | settings, capture_output=True, text=True
         )
 
     done = run()

@@ -512,9 +512,7 @@ def test_what_a_diagnosis_found_comes_before_a_trial_for_the_parameters(ingested
     assert after_proposal(ingested, "base").startswith(recorded)
 
 
-def test_a_diagnosis_is_asked_for_where_none_is_or_none_knows_the_new_trial(
-    ingested: Path,
-) -> None:
+def test_a_diagnosis_is_asked_for_where_none_is_or_none_knows_the_new_trial(ingested: Path) -> None:
     diagnose = "bampipe diagnose RUN"
     write_result(ingested, NextResult, purpose="precision")
     write_result(ingested, ValidateResult, axes={"yaw": {"standing": "above_floor"}})

@@ -42,10 +42,7 @@ def prepare(folder: str, pause: str) -> None:
 @pytest.fixture
 def cluster() -> Iterator[Any]:
     settings = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
-    with (
-        distributed.LocalCluster(**settings) as cluster,
-        distributed.Client(cluster) as client,
-    ):
+    with distributed.LocalCluster(**settings) as cluster, distributed.Client(cluster) as client:
         client.register_worker_callbacks(lambda: prepare(str(TOYS), "0.3"))
         yield cluster
 

@@ -96,10 +96,7 @@ class _Side:
 
 
 def compare_runs(
-    first: str | Path,
-    second: str | Path,
-    model: str = "",
-    progress: Progress = silent,
+    first: str | Path, second: str | Path, model: str = "", progress: Progress = silent
 ) -> PairResult:
     """Compare two identified sessions of one device.
 

@@ -130,10 +130,7 @@ class Search(SetCosts):
         return (*(key for key in all_keys if key[0][0] == "-"), *moved)
 
     def _solve_with_shapes(
-        self,
-        all_keys: tuple[Key, ...],
-        more: Mapping[int, Array],
-        known: Solution,
+        self, all_keys: tuple[Key, ...], more: Mapping[int, Array], known: Solution
     ) -> Array:
         """Steps of the shapes, (d,), strengths and the model's own parameters moving along.
 

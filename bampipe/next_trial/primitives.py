@@ -253,11 +253,7 @@ class Series:
         size = u**4 * (35.0 - 84.0 * u + 70.0 * u**2 - 20.0 * u**3)
         rate = 140.0 * (u * (1.0 - u)) ** 3 * slope
         bend = 420.0 * (u * (1.0 - u)) ** 2 * (1.0 - 2.0 * u) / self.ramp_s**2
-        return (
-            self.middle + size * x,
-            size * v + rate * x,
-            size * a + 2.0 * rate * v + bend * x,
-        )
+        return (self.middle + size * x, size * v + rate * x, size * a + 2.0 * rate * v + bend * x)
 
     def scale_by(self, share: Array | float) -> Series:
         """Return the series with all amplitudes times ``share``, a number or one for each axis."""

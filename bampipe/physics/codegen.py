@@ -266,9 +266,7 @@ def array_source(e: Equations, added: Sequence[Any]) -> str:
 
 
 def _print_over_columns(
-    e: Equations,
-    results: Mapping[str, tuple[str, Sequence[Any]]],
-    steps: Sequence[tuple[Any, Any]],
+    e: Equations, results: Mapping[str, tuple[str, Sequence[Any]]], steps: Sequence[tuple[Any, Any]]
 ) -> str:
     """Module of functions over columns: by name, their groups and what they return."""
     return ARRAY_HEADER + "".join(

@@ -80,14 +80,10 @@ class Energy(Declaration):
     """The energies of a device, J; beside those of its rigid bodies where it is a robot."""
 
     kinetic: Expression = Field(
-        default="0",
-        validate_default=True,
-        description="Kinetic energy, J: quadratic in the rates",
+        default="0", validate_default=True, description="Kinetic energy, J: quadratic in the rates"
     )
     potential: Expression = Field(
-        default="0",
-        validate_default=True,
-        description="Potential energy, J; 0 where left out",
+        default="0", validate_default=True, description="Potential energy, J; 0 where left out"
     )
 
 

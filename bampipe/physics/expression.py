@@ -99,8 +99,7 @@ def _check_node(node: ast.AST, where: str, power: float = 1.0, rates: int = 0) -
                 )
             if len(args) != FUNCTIONS[name]:
                 raise InputError(
-                    f"{name}() takes {FUNCTIONS[name]} argument(s), found {len(args)}",
-                    where=where,
+                    f"{name}() takes {FUNCTIONS[name]} argument(s), found {len(args)}", where=where
                 )
             rates += name == "ddt"
             if rates > 2:
@@ -240,8 +239,7 @@ def build(
         value = sp.sympify(combine(node), strict=True)
         if value.is_number and not _is_bounded(value):
             raise InputError(
-                f"{ast.unparse(node)[:60]!r} is not a real number below {MAX_NUMBER:g}",
-                where=where,
+                f"{ast.unparse(node)[:60]!r} is not a real number below {MAX_NUMBER:g}", where=where
             )
         # sympy's 0.0 is not equal to 0, and everything here and later asks whether terms are 0.
         return sp.Integer(0) if value.is_number and value.is_zero else value
@@ -253,8 +251,7 @@ def build(
             case ast.Name(id=name):
                 if name not in symbols:
                     raise InputError(
-                        f"unknown symbol {name!r:.60}{did_you_mean(name, symbols)}",
-                        where=where,
+                        f"unknown symbol {name!r:.60}{did_you_mean(name, symbols)}", where=where
                     )
                 return symbols[name]
             case ast.UnaryOp(op=op, operand=operand):

@@ -28,10 +28,7 @@ class Model:
     effects: tuple[BoundEffect, ...]
 
     def __init__(
-        self,
-        device: Device,
-        effects: Iterable[str] = (),
-        extra_effects: Iterable[Effect] = (),
+        self, device: Device, effects: Iterable[str] = (), extra_effects: Iterable[Effect] = ()
     ) -> None:
         """Bind ``effects`` (``"stribeck:yaw"``) to ``device``.
 

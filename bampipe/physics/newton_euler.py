@@ -264,10 +264,7 @@ def potential_energy(
 
 
 def mass_matrix(
-    algebra: Algebra,
-    links: Sequence[Link],
-    inertial: Sequence[Sequence[Any]],
-    q: Sequence[Any],
+    algebra: Algebra, links: Sequence[Link], inertial: Sequence[Sequence[Any]], q: Sequence[Any]
 ) -> list[list[Any]]:
     """Return the mass matrix: column by column, the forces of a unit acceleration at rest."""
     n = len(q)

@@ -45,8 +45,7 @@ class Parameter(NamedDeclaration):
     )
     fixed: bool = Field(default=False, description="Held at its prior, never estimated")
     needs_pull: bool = Field(
-        default=False,
-        description="Held at its prior on an axis that nothing pulls by its position",
+        default=False, description="Held at its prior on an axis that nothing pulls by its position"
     )
     weighed: bool = Field(
         default=False,

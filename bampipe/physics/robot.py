@@ -14,14 +14,7 @@ from pydantic import Field
 from bampipe.arrays import Array, Flags
 from bampipe.errors import InputError, did_you_mean
 from bampipe.physics.expression import Name
-from bampipe.physics.newton_euler import (
-    INERTIAL,
-    Algebra,
-    Link,
-    Vector,
-    columns,
-    joint_forces,
-)
+from bampipe.physics.newton_euler import INERTIAL, Algebra, Link, Vector, columns, joint_forces
 from bampipe.physics.parameter import Parameter
 from bampipe.schema import (
     ByName,
@@ -76,8 +69,7 @@ class Joint(NamedDeclaration):
     mass: Number = Field(default=0.0, description="Of the body behind it, kg, as drawn")
     center: Triple = Field(default=(0.0, 0.0, 0.0), description="Its centre of mass, m")
     inertia: Sextuple = Field(
-        default=(0.0,) * 6,
-        description="xx, xy, xz, yy, yz, zz about the centre of mass, kg.m2",
+        default=(0.0,) * 6, description="xx, xy, xz, yy, yz, zz about the centre of mass, kg.m2"
     )
     effort: NotNegative = Field(default=0.0, description="Largest, N.m or N; 0: not known")
     velocity: NotNegative = Field(default=0.0, description="Largest, rad/s or m/s; 0: not known")

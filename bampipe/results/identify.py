@@ -19,8 +19,7 @@ class ParameterEstimate(Record):
     unit: str
     at_bound: bool = Field(description="Within one sd of its physical bound")
     filter_sd: Size | None = Field(
-        default=None,
-        description="Of the filter alone, valid for white noise only",
+        default=None, description="Of the filter alone, valid for white noise only"
     )
     smoothing_sd: Size | None = Field(
         default=None,

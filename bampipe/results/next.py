@@ -177,8 +177,7 @@ class NextResult(Result):
     proposals: tuple[Proposal, ...] = Field(description="Best first")
     sensitivity: dict[str, Detectable] = Field(default={}, description="By effect of the library")
     unpromised: Names = Field(
-        default=(),
-        description="Effects that change the motion too much for such a number",
+        default=(), description="Effects that change the motion too much for such a number"
     )
     shows: Names = Field(
         default=(),

@@ -35,8 +35,7 @@ class ViscousResult(Result):
     headline: str
     trials: Names
     blocks: Annotated[int, Field(ge=1)] | None = Field(
-        default=None,
-        description="Stretches of time whose scatter gave the standard deviations",
+        default=None, description="Stretches of time whose scatter gave the standard deviations"
     )
     process_noise_factor: Annotated[float, Field(ge=1)] | None = Field(
         default=None,

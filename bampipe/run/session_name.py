@@ -36,9 +36,7 @@ def session_id(session: Path) -> str:
                 remedy=f"give them one by one, or as '{session}/*'",
             )
         raise InputError(
-            "no session.toml here",
-            where=str(session),
-            remedy="give the folder of a session",
+            "no session.toml here", where=str(session), remedy="give the folder of a session"
         )
     content = read_toml(path)
     if "session_id" not in content:

@@ -191,11 +191,11 @@ def _record_turned(
     for any_of, trials in alike.items():
         first, many = trials[0], len(trials) > 1
         said = f"{' or '.join(map(join_names, any_of))} {'have' if len(any_of[0]) > 1 else 'has'}"
+        its, entry, them = ("their", "entries", "them") if many else ("its", "entry", "the trial")
         sentence = (
             f"{join_names(names[one.place] for one in trials)}: {said} another sign than in the"
-            f" other trials: put negated = {json.dumps(any_of[0])} into"
-            f" {'their' if many else 'its'} [[trials]] {'entries' if many else 'entry'}, or leave"
-            f" {'them' if many else 'the trial'} out"
+            f" other trials: put negated = {json.dumps(any_of[0])} into {its} [[trials]] {entry},"
+            f" or leave {them} out"
         )
         found = Finding(first.corrections[0], (), first.before, first.after, 0.0)
         record = _record(system, session, found, {})

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from bampipe.arrays import Array, Flags
+from bampipe.arrays import Array
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
@@ -99,10 +99,11 @@ def judge_setup(
             error = _errors_with_pose(evidence, posed) if posed else evidence.rmse()
             on_trials = (ModelOnTrial(system, evidence.p, [motion]) for motion in motions)
             applied = [band.thin(on_trial.applied) for on_trial in on_trials]
-            size, varied = rms(applied, evidence.used), _deviation(applied, evidence.used)
+            size, used = rms(applied, evidence.used), np.concatenate(evidence.used)
+            varied = np.std(np.concatenate(applied), axis=0, where=used)
         except (InputError, ValueError, np.linalg.LinAlgError):
             return None
-        moving = np.mean(np.concatenate(evidence.used), axis=0)
+        moving = np.mean(used, axis=0)
         share = np.where(size > 0.0, error / size, 0.0)
         share = np.where(moving >= LEAST_MOVING, share, 1.0)
         unexplained = np.where(varied > _EVEN * size, error / varied, 0.0)
@@ -114,13 +115,6 @@ def judge_setup(
     distance = np.array(list(map(distance_from_prior, system.parameters, nearest)))
     objections = 0.5 * np.minimum(distance**2, FARTHEST**2)
     return Plausibility(share, moving, evidence.p, objections, unexplained)
-
-
-def _deviation(values: Sequence[Array], used: Sequence[Flags]) -> Array:
-    """Standard deviation by axis, (n_q,), of values (K, n_q) by trial over samples that count."""
-    count = np.maximum(np.concatenate(used).sum(axis=0), 1)
-    mean = sum(np.sum(each * keep, axis=0) for each, keep in zip(values, used, strict=True)) / count
-    return rms([each - mean for each in values], used)
 
 
 def axes_without_pose(system: System, motions: Sequence[Motion]) -> list[int]:

@@ -11,14 +11,7 @@ from bampipe.physics import System
 from bampipe.setup.hypotheses import Correction, turned
 from bampipe.setup.plausibility import Plausibility, judge_setup
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, is_drawn
-from bampipe.setup.search import (
-    ALIKE,
-    LEAST_GAIN,
-    MOST_AXES,
-    SUSPICIOUS_ERROR,
-    gain_of,
-    shorten,
-)
+from bampipe.setup.search import ALIKE, LEAST_GAIN, MOST_AXES, SUSPICIOUS_ERROR, gain_of, shorten
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
@@ -44,9 +37,10 @@ class TurnedTrial:
 def find_turned_trials(
     system: System, motions: Sequence[Motion], band: Band, folds: Folds, signals: Signals
 ) -> list[TurnedTrial]:
-    """Find them among the trials that are fitted; of many joints, drawn bodies must tell the signs.
+    """The fewer of trials whose own fits show opposite signs: inertia and friction only resist.
 
-    The fewer are found: where all others are wrong, that is a mistake of the whole session.
+    However many they are, and also where trials have other parameters, as of another damper. Of
+    many joints, drawn bodies must tell the signs.
     """
     fitted = folds.fitted_trials
     if len(fitted) < 2:
@@ -54,24 +48,11 @@ def find_turned_trials(
     if len(system.coordinates) > MOST_AXES:
         drawn = is_drawn(system)
         return _by_drawn_bodies(system, motions, fitted, band, folds, signals) if drawn else []
-    return _by_own_fits(system, motions, fitted, band, folds, signals)
 
-
-def _by_own_fits(
-    system: System,
-    motions: Sequence[Motion],
-    fitted: Sequence[int],
-    band: Band,
-    folds: Folds,
-    signals: Signals,
-) -> list[TurnedTrial]:
-    """The fewer of trials whose own fits show opposite signs: inertia and friction only resist.
-
-    However many they are, and also where trials have other parameters, as of another damper.
-    """
-
-    def is_doubtful(one: Plausibility) -> bool:
-        return bool(one.error.max() >= SUSPICIOUS_ERROR)
+    def gain(own: Plausibility, other: Plausibility) -> float:
+        found = gain_of(own, other, 0.0)
+        worse = own if found > 0.0 else other
+        return found if worse.error.max() >= SUSPICIOUS_ERROR else 0.0
 
     def fit(k: int, one: Correction | None = None) -> Plausibility | None:
         (motion,) = shorten([motions[k]], _SAMPLES)
@@ -79,7 +60,7 @@ def _by_own_fits(
         return judge_setup(system, [way], band, folds.subset([k]), _STEPS)
 
     stated = {k: own for k in fitted if (own := fit(k)) is not None}
-    if not any(map(is_doubtful, stated.values())):
+    if all(own.error.max() < SUSPICIOUS_ERROR for own in stated.values()):
         return []
     drives = [name for name in signals.inputs if name not in signals.brakes]
     options = [turned(signals, [name]) for name in (*signals.axes, *drives)]
@@ -87,18 +68,12 @@ def _by_own_fits(
         k: [fit(k, one) or own.with_nothing_explained() for one in options]
         for k, own in stated.items()
     }
-    gains = {k: np.array([gain_of(stated[k], one, 0.0) for one in of]) for k, of in fits.items()}
+    gains = {k: np.array([gain(stated[k], one) for one in of]) for k, of in fits.items()}
     found: dict[int, list[tuple[float, int]]] = {}
     for place in range(len(options)):
         # Of signs that explain a trial, the one that does so best, or those that do alike.
-        against = [
-            k
-            for k, of in gains.items()
-            if of[place] > max(LEAST_GAIN, of.max() - ALIKE) and is_doubtful(stated[k])
-        ]
-        along = [
-            k for k, of in gains.items() if of[place] < -LEAST_GAIN and is_doubtful(fits[k][place])
-        ]
+        against = [k for k, of in gains.items() if of[place] > max(LEAST_GAIN, of.max() - ALIKE)]
+        along = [k for k, of in gains.items() if of[place] < -LEAST_GAIN]
         for k in min(against, along, key=len) if against and along else ():
             strength = float(np.mean([gains[j][place] for j in against]))
             found.setdefault(k, []).append((strength, place))

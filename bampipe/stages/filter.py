@@ -203,10 +203,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         sample_rate_hz=rate,
         axes={
             axis: AxisDifferentiation.of(
-                unit=axes[axis].unit,
-                band=bands[axis],
-                **written.median_sds(axis),
-                **about[axis],
+                unit=axes[axis].unit, band=bands[axis], **written.median_sds(axis), **about[axis]
             )
             for axis in axes
         },

@@ -140,9 +140,7 @@ def _ingest_trials(
     if all(row["status"] == "set_aside" for row in rows):
         first, *others = _reasons(rows, str(session.root))
         raise InputError(
-            f"none of the {total} trials is sound; {first.what}",
-            where=first.where,
-            others=others,
+            f"none of the {total} trials is sound; {first.what}", where=first.where, others=others
         )
     return rows
 

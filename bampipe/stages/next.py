@@ -47,15 +47,7 @@ from bampipe.progress import Progress
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
-from bampipe.results.next import (
-    Detectable,
-    Extent,
-    NextResult,
-    Plan,
-    Proposal,
-    Purpose,
-    Trajectory,
-)
+from bampipe.results.next import Detectable, Extent, NextResult, Plan, Proposal, Purpose, Trajectory
 from bampipe.results.validate import ValidateResult
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials, trial_of_block

@@ -26,12 +26,7 @@ INPUTS = (
     "compare.json?",
     "run.json?",  # the keys of the other stages
 )
-OUTPUTS = (
-    "report/report.pdf",
-    "report/report.html",
-    "report/explore.html",
-    "report/figures/*.svg",
-)
+OUTPUTS = ("report/report.pdf", "report/report.html", "report/explore.html", "report/figures/*.svg")
 
 
 @checked_dataclass(frozen=True, config=STRICT)

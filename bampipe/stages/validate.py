@@ -25,25 +25,11 @@ from bampipe.results.floor import AT_FLOOR, compare_with_floor
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.rounding import significant
-from bampipe.results.validate import (
-    ForceError,
-    FreeRun,
-    JudgedError,
-    TrialError,
-    ValidateResult,
-)
+from bampipe.results.validate import ForceError, FreeRun, JudgedError, TrialError, ValidateResult
 from bampipe.schema import STRICT, Count
-from bampipe.trials.comparison import (
-    ComparedTrial,
-    axis_errors,
-    compare_trial,
-)
+from bampipe.trials.comparison import ComparedTrial, axis_errors, compare_trial
 from bampipe.trials.kept import KeptItems
-from bampipe.trials.measured import (
-    MeasuredTrials,
-    read_measured_trials,
-    trial_of_block,
-)
+from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_of_block
 from bampipe.trials.motion import Motion, trial_names, trial_sizes
 from bampipe.trials.noise_floor import NoiseFloor, draw_trials, floor_replays
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions

@@ -25,12 +25,7 @@ from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.kinematics import Kinematics
-from bampipe.trials.motion import (
-    Motion,
-    Recording,
-    force_columns,
-    input_derivatives,
-)
+from bampipe.trials.motion import Motion, Recording, force_columns, input_derivatives
 from bampipe.trials.residuals import ModelOnTrial, standstill_of
 from bampipe.trials.sensors import Sensors
 

@@ -35,9 +35,7 @@ NUMERICAL = {
         "0.3": "nats by which it goes on",
         "0.5": "the middle of a range, towards which slopes are taken",
     },
-    "unknown": {
-        "3": "the fewest knots of a spline that bends",
-    },
+    "unknown": {"3": "the fewest knots of a spline that bends"},
     "set_cost": {
         "_LEAST_SLOPE": "below it the equation has no scale, and its cost no meaning",
         "NOTHING": "what moves nothing over its whole range cannot be told from rounding",

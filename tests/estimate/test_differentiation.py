@@ -5,12 +5,7 @@ import pytest
 
 from bampipe.arrays import Array
 from bampipe.estimate import butterworth, kalman_smoother
-from bampipe.estimate.differentiation import (
-    Derivatives,
-    extend,
-    spline_curvature,
-    uniform_grid,
-)
+from bampipe.estimate.differentiation import Derivatives, extend, spline_curvature, uniform_grid
 from bampipe.trials.motion import TIMING_ORDERS, Motion, input_derivatives
 
 RATE = 500.0

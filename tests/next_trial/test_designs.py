@@ -22,23 +22,11 @@ from bampipe.next_trial.primitives import (
     vary_surroundings,
 )
 from bampipe.next_trial.ranking import DesignSpace, RankedDesign, find_best_of_each, rank_designs
-from bampipe.next_trial.rehearsal import (
-    HASTY,
-    Rehearsal,
-    example_path,
-    follow_roughly,
-    stroke_path,
-)
+from bampipe.next_trial.rehearsal import HASTY, Rehearsal, example_path, follow_roughly, stroke_path
 from bampipe.phrases.forecast_outcome import compare_forecast, read_forecasts
 from bampipe.phrases.proposal import explain_proposal, find_shown
 from bampipe.physics import Model, compile_model, registry
-from bampipe.results.next import (
-    Detectable,
-    ExpectedConfusion,
-    ExpectedSd,
-    NextResult,
-    Proposal,
-)
+from bampipe.results.next import Detectable, ExpectedConfusion, ExpectedSd, NextResult, Proposal
 from bampipe.trials.motion import Motion
 
 SEEN = Envelope(
@@ -154,9 +142,7 @@ def test_each_parameter_gets_the_design_that_is_best_for_it():
         return np.array([[float(one[0].strokes[0].fast)], [-float(one[0].strokes[0].fast)]])
 
     fast, slow = find_best_of_each(
-        DesignSpace(made_rehearsal(SEEN), 20.0, [0]),
-        inform,
-        [lambda v: v[0, 0], lambda v: v[1, 0]],
+        DesignSpace(made_rehearsal(SEEN), 20.0, [0]), inform, [lambda v: v[0, 0], lambda v: v[1, 0]]
     )
     assert fast.design.strokes[0].fast == pytest.approx(0.6 * SEEN.speed[0])
     assert slow.design.strokes[0].fast < 0.1 * SEEN.speed[0]

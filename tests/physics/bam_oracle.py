@@ -30,11 +30,7 @@ def jacobian(q, shift=L):
     """d position / d q, (3, 3), by hand."""
     (s, c), (sp, cp), d = (np.sin(q[0]), np.cos(q[0])), (np.sin(q[1]), np.cos(q[1])), q[2] - shift
     return np.array(
-        [
-            [d * cp * c, -d * sp * s, cp * s],
-            [0.0, d * cp, sp],
-            [-d * cp * s, -d * sp * c, cp * c],
-        ]
+        [[d * cp * c, -d * sp * s, cp * s], [0.0, d * cp, sp], [-d * cp * s, -d * sp * c, cp * c]]
     )
 
 

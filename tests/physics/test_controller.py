@@ -90,8 +90,7 @@ def test_mistakes_are_named(controller, words):
 
 
 @pytest.mark.parametrize(
-    ("law", "words"),
-    [("mass*goal", "unknown symbol 'mass'"), ("ddt(carriage)", "has no ddt")],
+    ("law", "words"), [("mass*goal", "unknown symbol 'mass'"), ("ddt(carriage)", "has no ddt")]
 )
 def test_a_controller_knows_neither_parameters_nor_derivatives(law, words):
     with pytest.raises(InputError, match=words):

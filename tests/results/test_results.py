@@ -22,12 +22,7 @@ ERROR = AxisError(
     fit_percent=None,
     unit="N",
 )
-JUDGED = JudgedError(
-    **ERROR.model_dump(),
-    noise_floor=1.4,
-    noise_floor_sd=0.1,
-    standing="at_floor",
-)
+JUDGED = JudgedError(**ERROR.model_dump(), noise_floor=1.4, noise_floor_sd=0.1, standing="at_floor")
 
 
 def made(**changes: Any) -> ValidateResult:

@@ -185,18 +185,6 @@ def test_the_report_says_it_first(reversed_joint: bampipe.Run) -> None:
     assert "leaves something unexplained" not in page
 
 
-def scale_trials(column: str, factors: Sequence[float]) -> Callable[[Path], None]:
-    """A column times a factor of its own in each trial."""
-
-    def change(folder: Path) -> None:
-        for path, factor in zip(sorted(folder.glob("trials/*.csv")), factors, strict=True):
-            frame = pd.read_csv(path)
-            frame[column] *= factor
-            frame.to_csv(path, index=False)
-
-    return change
-
-
 @pytest.mark.parametrize(
     ("machine", "column", "factors", "named"),
     [
@@ -210,7 +198,7 @@ def scale_trials(column: str, factors: Sequence[float]) -> Callable[[Path], None
 def test_trials_with_a_sign_of_their_own_are_named_and_taken_in(
     machine: str, column: str, factors: Sequence[float], named: str, tmp_path: Path
 ) -> None:
-    turn = scale_trials(column, factors)
+    turn = mistakes.scale_trials(column, factors)
     (mistake,) = inspected(tmp_path, turn, machine=machine).mistakes
     assert mistake.sentence.startswith(named)
     signals = json.loads(re.findall(r"negated = (\[.*?\])", mistake.sentence)[0])
@@ -223,15 +211,7 @@ def test_trials_with_a_sign_of_their_own_are_named_and_taken_in(
 
 
 def test_what_hardly_follows_the_force_is_not_called_sound(tmp_path: Path) -> None:
-    """A force that is held even, but for noise: a constant explains it, the motion does not."""
-
-    def hold(folder: Path) -> None:
-        for path in folder.glob("trials/*.csv"):
-            frame = pd.read_csv(path)
-            frame["u"] = 1.0 + 0.02 * np.random.default_rng(31).standard_normal(len(frame))
-            frame.to_csv(path, index=False)
-
-    found = inspected(tmp_path, hold, machine="axis")
+    found = inspected(tmp_path, mistakes.hold_even, machine="axis")
     assert found.axes["carriage"].state == "unexplained"
     (line,) = list_setup_faults(found)
     assert line.startswith("carriage: of how the applied force varies, the bare device explains")

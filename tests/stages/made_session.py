@@ -40,10 +40,7 @@ SESSION: dict[str, Any] = {
         "zero_v": [0.021, -0.034, 0.012],
         "noise_sd_n": 0.05,
     },
-    "brakes": {
-        "columns": ["brake_yaw", "brake_pitch", "brake_extension"],
-        "unit": "N.m, N.m, N",
-    },
+    "brakes": {"columns": ["brake_yaw", "brake_pitch", "brake_extension"], "unit": "N.m, N.m, N"},
     "trials": [
         {"file": "trials/t01.csv", "kind": "free"},
         {"file": "trials/t02.csv", "kind": "free"},

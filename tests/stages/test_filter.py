@@ -164,11 +164,7 @@ def test_settings_that_make_no_sense(
 
 @pytest.mark.parametrize(
     ("settings", "cutoff_hz"),
-    [
-        ({}, 25.0),
-        ({"band_hz": 12.0}, 48.0),
-        ({"band_hz": 12.0, "force_cutoff_hz": 30.0}, 30.0),
-    ],
+    [({}, 25.0), ({"band_hz": 12.0}, 48.0), ({"band_hz": 12.0, "force_cutoff_hz": 30.0}, 30.0)],
 )
 def test_derivatives_of_the_force_reach_beyond_the_band(
     run: RunFolder, settings: dict[str, object], cutoff_hz: float

@@ -117,11 +117,7 @@ def test_friction_and_base_parameters_are_those_of_the_truth(
     robot = device_from(read_device_file(tmp_path / "device.toml")).robot
     assert robot is not None
     checked = 0
-    for base, entry in zip(
-        base_parameters(robot),
-        found["base_parameters"],
-        strict=True,
-    ):
+    for base, entry in zip(base_parameters(robot), found["base_parameters"], strict=True):
         # The first inertia and that of the drive are one number to any motion.
         if entry["shown"] and "inertia_zz" not in entry["combination"]:
             expected = sum(factor * truth[name] for name, factor in base.terms.items())

@@ -11,11 +11,7 @@ from bampipe.schema import STRICT
 from bampipe.stages.toy_read import log
 
 SUMMARY = "Fit the numbers"
-INPUTS = (
-    "toy/double.json",
-    "models/{model}/model.toml",
-    "models/{model}/effects/*.toml",
-)
+INPUTS = ("toy/double.json", "models/{model}/model.toml", "models/{model}/effects/*.toml")
 OUTPUTS = ("models/{model}/fit.json",)
 
 

@@ -352,12 +352,7 @@ class Form:
         return {"states": states} if states else {}
 
 
-_OF_AXIS = {
-    "q": "{axis}",
-    "qd": "qd_{axis}",
-    "sgn(qd)": "sgn(qd_{axis})",
-    "load": "load_{axis}",
-}
+_OF_AXIS = {"q": "{axis}", "qd": "qd_{axis}", "sgn(qd)": "sgn(qd_{axis})", "load": "load_{axis}"}
 _LARGEST = 50.0
 """Pure number in a formula: its quantities are ratios."""
 
