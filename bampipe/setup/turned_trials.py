@@ -37,10 +37,10 @@ class TurnedTrial:
 def find_turned_trials(
     system: System, motions: Sequence[Motion], band: Band, folds: Folds, signals: Signals
 ) -> list[TurnedTrial]:
-    """The fewer of trials whose own fits show opposite signs: inertia and friction only resist.
+    """Find the minority of trials whose signs contradict the others: inertia and friction resist.
 
-    However many they are, and also where trials have other parameters, as of another damper. Of
-    many joints, drawn bodies must tell the signs.
+    Each trial is fitted alone, so that trials may differ in parameters, as with different dampers.
+    With many joints, the drawn bodies give the signs.
     """
     fitted = folds.fitted_trials
     if len(fitted) < 2:

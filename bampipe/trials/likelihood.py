@@ -373,12 +373,12 @@ class Likelihood:
         known_precision, moment = np.diag(precision), precision * known
         cost_of_known = 0.5 * float(precision @ known**2)
         effects, p = evidence.system.model.effects, evidence.p[list(evidence.free)]
-        for at in [_places(evidence, item, strengths=True) for item in effects]:
-            own = (
-                take_samples(evidence.slopes, here, axis)[:, at]
-                for axis, here in enumerate(samples)
-            )
+        strengths = [_places(evidence, item, strengths=True) for item in effects]
+        if at := [place for places in strengths for place in places]:
+            member = np.repeat(np.arange(len(effects)), [*map(len, strengths)])
+            own = (take_samples(evidence.slopes, here, a)[:, at] for a, here in enumerate(samples))
             expected = expect_strengths([x.T @ x for x in own], self.applied)
+            expected = expected * (member[:, None] == member)
             known_precision[np.ix_(at, at)] += expected
             moment[at] -= expected @ p[at]
             cost_of_known += 0.5 * float(p[at] @ expected @ p[at])

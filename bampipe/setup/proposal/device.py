@@ -284,8 +284,8 @@ def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bo
         )
     coils = [c.name for c in currents if c.name not in match.used]
     notes.check += [
-        f"{name} is taken for the current of a coil that changes the friction, as of a brake or"
-        " damper; it was asked for, and none was measured"
+        f"{name} is taken for the current in the coil of a brake or damper; it is a commanded"
+        " value, since no measured current was found"
         for name in coils
         if REFERENCE_WORDS & set(words(name))
     ]
