@@ -215,7 +215,8 @@ def follow(
 
     With ``draft``, effects drafted for the unexplained rest are added too. An effect whose strength
     is identified as zero is removed again, and effects that did not improve the model are not
-    weighed again. Effects that the confirmation finds are added likewise.
+    weighed again. Effects that the confirmation finds are added likewise, unless the remainder is
+    unknown: then no effect is more probable than not, and a further one would only imitate it.
 
     Args:
         tell: called with a line on each finding and each step.
@@ -228,7 +229,7 @@ def follow(
     from bampipe.results.diagnose import DiagnoseResult
     from bampipe.results.draft import DraftResult
 
-    run = RunFolder(options.root)
+    run, given = RunFolder(options.root), model
     options.run("identify", "validate", model)  # the ladder compares each child with it
     left_out: dict[str, dict[str, object]] = {}
     for _ in range(MOST_ROUNDS):
@@ -238,7 +239,8 @@ def follow(
             tell(f"{model}, {axis}: {verdict(diagnosis, axis)}")
         for line in dict.fromkeys(_list_open_questions(diagnosis)):
             tell(line)
-        found = diagnosis.selected
+        verdicts = {diagnosis.axes[axis].verdict for axis in diagnosis.lacking}
+        found = () if model != given and verdicts == {"unknown_effect"} else diagnosis.selected
         if draft and diagnosis.unnamed_axes:
             options.run("draft", "draft", model)
             drafted = run.read(DraftResult, model)
