@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 
 
@@ -60,6 +61,16 @@ class InputError(Exception):
             asks = text.endswith("?")
             text += f" {remedy[:1].upper()}{remedy[1:]}" if asks else f"; {remedy}"
         return printable(" ".join(text.split()))
+
+
+@contextmanager
+def located(place: str, joint: str = ", ") -> Iterator[None]:
+    """Say before the ``where`` of an `InputError` from within that it is of ``place``."""
+    try:
+        yield
+    except InputError as error:
+        error.where = joint.join(filter(None, (place, error.where)))
+        raise
 
 
 class MissingResultError(InputError):

@@ -77,7 +77,7 @@ class Form:
     names: tuple[str, ...] = ()
 
 
-def find_form(head: str, name: str) -> Form | None:
+def find_form(head: str) -> Form | None:
     """The form of a text that begins with ``head`` (whole lines); None of a table as it is.
 
     InputError where it is known, and no table can be made of it.
@@ -88,7 +88,7 @@ def find_form(head: str, name: str) -> Form | None:
         return None
     if any(sign in head for sign in _TYPESET):
         plain = str.maketrans(_TYPESET)
-        inner = find_form(head.translate(plain), name) or Form("", str)
+        inner = find_form(head.translate(plain)) or Form("", str)
         said = "; ".join(
             filter(None, ("typeset minus signs and blanks are plain ones", inner.said))
         )
@@ -125,7 +125,7 @@ def find_form(head: str, name: str) -> Form | None:
     for line in (*whole[:_FEWEST], lines[-1]):
         for pattern, what, remedy in _FOREIGN:
             if pattern.match(line):
-                raise InputError(what, where=name, remedy=remedy)
+                raise InputError(what, remedy=remedy)
     return None
 
 
