@@ -65,11 +65,13 @@ class InputError(Exception):
 
 @contextmanager
 def located(place: str, joint: str = ", ") -> Iterator[None]:
-    """Say before the ``where`` of an `InputError` from within that it is of ``place``."""
+    """Say before the ``where`` of an `InputError` from within that it is of ``place``, if that
+    does not stand there yet."""
     try:
         yield
     except InputError as error:
-        error.where = joint.join(filter(None, (place, error.where)))
+        if not error.where.startswith(place):
+            error.where = joint.join(filter(None, (place, error.where)))
         raise
 
 
