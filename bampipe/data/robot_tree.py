@@ -297,7 +297,7 @@ class LumpedBodies:
     def held_on(self, link: str) -> Iterator[TreeJoint]:
         """The joints held still on a link and what is on it, of those that carry mass."""
         for joint in self._behind.get(link, ()):
-            if joint.kind != "fixed" and self._mass_on(joint.child) > 0.0:
+            if joint.kind != "fixed" and self.body_on(joint.child).mass > 0.0:
                 yield joint
             yield from self.held_on(joint.child)
 
@@ -316,10 +316,6 @@ class LumpedBodies:
             part = self.body_held_on(joint.child) if fixed else self.body_on(joint.child)
             total = total.joined(part.moved(joint.turn, joint.offset))
         return total
-
-    def _mass_on(self, link: str) -> float:
-        behind = self._behind.get(link, ())
-        return self.tree.bodies[link].mass + sum(self._mass_on(joint.child) for joint in behind)
 
 
 def put_bodies(

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 
 from bampipe.data.readers.moments import is_moment
-from bampipe.data.readers.trial import Dialect, check_columns
+from bampipe.data.readers.trial import NUMBER, Dialect, check_columns
 from bampipe.data.units import bare, unit
 from bampipe.errors import InputError
 
@@ -22,7 +22,7 @@ NULLS = ("", "nan", "NaN", "NAN", "NA", "N/A", "n/a", "#N/A", "null", "NULL", "N
 """Cells that mean: no number here."""
 
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
-_POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
+_POINT = re.compile(rf"{NUMBER}\Z")
 _COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+\Z")
 _GROUPED = re.compile(r"[-+]?(\d{1,3}(,\d{3})+\.\d*|\d{1,3}(\.\d{3})+,\d*)\Z")

@@ -15,7 +15,7 @@ import numpy as np
 
 from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import Stored, columns_of_arrays, read_arrays, stored
-from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves
+from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves, reads_as_number
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns
 from bampipe.errors import InputError, located
 
@@ -60,7 +60,7 @@ def columns(path: Path) -> dict[str, str]:
         return columns_of_arrays(samples) | dict.fromkeys(constants, "")
     found = {}
     for column, cell in leaves(samples[0]):
-        if isinstance(cell, int | float) or (isinstance(cell, str) and is_number(cell)):
+        if reads_as_number(cell):
             found[column] = ""
         elif isinstance(cell, str) and moments.is_moment(cell):
             found[column] = "datetime"
@@ -182,11 +182,10 @@ def _parsed(text: str, where: str = "") -> object:
 
 def _is_sample(value: object) -> bool:
     """Whether an object is a sample rather than a recording, whose values are long lists."""
-    cells = (cell for _, cell in leaves(value))
-    return any(isinstance(x, int | float) or (isinstance(x, str) and is_number(x)) for x in cells)
+    return any(reads_as_number(cell) for _, cell in leaves(value))
 
 
 def _numbers(content: object) -> dict[str, object]:
     """The numbers beside the samples of a parsed file."""
     found = leaves(content) if isinstance(content, dict) else ()
-    return {key: value for key, value in found if isinstance(value, int | float) and "[" not in key}
+    return {key: value for key, value in found if is_number(value) and "[" not in key}

@@ -14,6 +14,8 @@ from pydantic import Field
 from bampipe.errors import InputError, did_you_mean
 from bampipe.schema import Declaration, Distinct, Text
 
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+"""How a number is written, with a point."""
 LARGEST_BYTES = 4 << 30
 """A trial larger than this in memory is refused unless the caller allows more."""
 
