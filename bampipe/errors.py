@@ -65,12 +65,14 @@ class InputError(Exception):
 
 @contextmanager
 def located(place: str, joint: str = ", ") -> Iterator[None]:
-    """Say before the ``where`` of an `InputError` from within that it is of ``place``, if that
-    does not stand there yet."""
+    """Name a place, such as a file, before what an `InputError` from within says of its own.
+
+    It is named once.
+    """
     try:
         yield
     except InputError as error:
-        if not error.where.startswith(place):
+        if not f"{error.where}:".startswith((f"{place}:", f"{place},")):
             error.where = joint.join(filter(None, (place, error.where)))
         raise
 
