@@ -20,15 +20,13 @@ from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns,
 from bampipe.errors import InputError, located
 
 LARGEST_WIDTH = 64
-RUN = re.compile(
+_RUN = re.compile(
     r"(?i)(.+?(?=\[)|(?:.*[./_])?(?:trial|run|rep|test|take|rec|recording|exp|experiment|measurement"
     r"|messung|versuch|essai|episode|demo|trajectory|traj|log)s?_?(?=\d))"
     r"(?:\[([^\[\]:]+)\]|(\d+))[./]([^\[\]]+)"
 )
 """Name of an array of one of several recordings in a file."""
 _TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
-
-
 _NUMBERS, _STAMPED, LINK = "iufb", "MOSU", "link"
 """Kinds of arrays of numbers, and of dates and times or text; of what is elsewhere."""
 
@@ -196,7 +194,7 @@ def _join_runs(arrays: Arrays) -> tuple[dict[str, Stored], dict[str, tuple[int, 
     begun: dict[str, tuple[int, ...]] = {}
     runs: dict[str, dict[str, str]] = {}
     for label, array in found.items():
-        match = RUN.fullmatch(label)
+        match = _RUN.fullmatch(label)
         if match and len(labels("", array.shape)) == 1 < math.prod(array.shape):
             runs.setdefault(f"{match[1]}[:].{match[4]}", {})[match[2] or match[3]] = label
     timed = {name.partition("[")[0]: list(own) for name, own in runs.items() if _TIMES.search(name)}
