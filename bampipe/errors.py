@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 
 
@@ -60,6 +61,20 @@ class InputError(Exception):
             asks = text.endswith("?")
             text += f" {remedy[:1].upper()}{remedy[1:]}" if asks else f"; {remedy}"
         return printable(" ".join(text.split()))
+
+
+@contextmanager
+def located(place: str, joint: str = ", ") -> Iterator[None]:
+    """Name a place, such as a file, before what an `InputError` from within says of its own.
+
+    It is named once.
+    """
+    try:
+        yield
+    except InputError as error:
+        if not f"{error.where}:".startswith((f"{place}:", f"{place},")):
+            error.where = joint.join(filter(None, (place, error.where)))
+        raise
 
 
 class MissingResultError(InputError):

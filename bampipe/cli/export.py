@@ -7,7 +7,7 @@ import typer
 
 from bampipe.cli import places, show
 from bampipe.cli.options import RUNS, BestModelOption, RunArgument, RunsOption
-from bampipe.errors import InputError, did_you_mean
+from bampipe.errors import InputError, did_you_mean, located
 from bampipe.run import models
 
 
@@ -45,7 +45,9 @@ def export(
     if pack := recordings.get(form):
         root = places.find_run(run, runs)
         path = out or Path(f"{root.name}.{form}")
-        packed = pack(gather_recording(RunFolder(root)))
+        recording = gather_recording(RunFolder(root))
+        with located(f"--as {form}"):
+            packed = pack(recording)
         with atomic_writer(path) as stream:
             stream.write(packed)
         show.say(f"{path}: {root.name}, {len(packed) / 1e6:.1f} MB")

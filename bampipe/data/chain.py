@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
+from itertools import dropwhile, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,9 @@ from bampipe.data.robot_tree import (
     gravity_at,
     identifier,
 )
-from bampipe.data.robot_xml import DEEPEST, read_xml
+from bampipe.data.robot_xml import read_xml
 from bampipe.data.urdf import urdf_tree
-from bampipe.errors import InputError, did_you_mean
+from bampipe.errors import InputError, did_you_mean, located
 from bampipe.lists import join_names
 
 _MANY = 8
@@ -69,14 +69,13 @@ def read_tree(path: Path) -> Tree:
     Raises:
         InputError: neither URDF nor MJCF, or one with wrong entries.
     """
-    root = read_xml(path)
-    if root.tag == "mujoco":
-        return mjcf_tree(root, str(path))
-    if root.tag == "robot":
-        return urdf_tree(root, path)
-    raise InputError(
-        f"found <{root.tag}>, expected <robot> of a URDF or <mujoco> of an MJCF", where=str(path)
-    )
+    with located(str(path), ": "):
+        root = read_xml(path)
+        if root.tag == "mujoco":
+            return mjcf_tree(root)
+        if root.tag == "robot":
+            return urdf_tree(root, path)
+        raise InputError(f"found <{root.tag}>, expected <robot> of a URDF or <mujoco> of an MJCF")
 
 
 def read_chain(
@@ -93,20 +92,25 @@ def read_chain(
     Raises:
         InputError: another file, a wrong joint or link, or no single chain between the links.
     """
-    tree, where = read_tree(path), str(path)
-    _refuse_broken(tree, where)
-    base = _link(base, tree, where) if base else _only_root(tree, where)
-    tip = _link(tip, tree, where) if tip else _only_end(tree, base, where)
-    tree, held_alone = _hold_followers(tree, tree.path(base, tip, where))
-    joints = tree.path(base, tip, where)
+    with located(str(path), ": "):
+        return _chain(read_tree(path), base, tip, payload)
+
+
+def _chain(tree: Tree, base: str, tip: str, payload: Mapping[str, Any] | None) -> Chain:
+    _refuse_broken(tree)
+    for link in filter(None, (base, tip)):
+        _require_link(tree, link, f"no link {link!r}")
+    base = base or _only_root(tree)
+    tip = tip or _only_end(tree, base)
+    tree, held_alone = _hold_followers(tree, tree.path(base, tip))
+    joints = tree.path(base, tip)
     if payload is not None:
         held = tree.bodies[tip].joined(Body.of_table(payload))
         tree = replace(tree, bodies={**tree.bodies, tip: held})
     moving = [joint for joint in joints if joint.kind != "fixed"]
     if not moving:
-        raise InputError(f"no joint moves between {base!r} and {tip!r}", where=where)
+        raise InputError(f"no joint moves between {base!r} and {tip!r}")
     lumped = LumpedBodies(tree, moving)
-    tables = _tables(joints, lumped, where)
     limits = {identifier(joint.name): joint.limits for joint in moving}
     held_still = [*held_alone] + [
         joint.name for start in moving for joint in lumped.held_on(start.child)
@@ -114,7 +118,7 @@ def read_chain(
     notes = tree.notes
     if held_still:
         notes = (f"held at zero beside the chain: {join_names(held_still, _MANY)}", *notes)
-    return Chain(tables, limits, base, tip, notes, *gravity_at(tree, base))
+    return Chain(_tables(joints, lumped), limits, base, tip, notes, *gravity_at(tree, base))
 
 
 def _hold_followers(tree: Tree, path: Sequence[TreeJoint]) -> tuple[Tree, list[str]]:
@@ -156,7 +160,7 @@ def frame_of_tip(tree: Tree, base: str, tip: str) -> tuple[Array, Array]:
     return turn, offset
 
 
-def _tables(path: Sequence[TreeJoint], lumped: LumpedBodies, where: str) -> dict[str, Any]:
+def _tables(path: Sequence[TreeJoint], lumped: LumpedBodies) -> dict[str, Any]:
     """The tables of the moving joints of a path, each placed in the frame of the one before."""
     found: dict[str, Any] = {}
     turn, offset, before = np.eye(3), np.zeros(3), ""
@@ -169,7 +173,7 @@ def _tables(path: Sequence[TreeJoint], lumped: LumpedBodies, where: str) -> dict
             continue
         name = identifier(joint.name)
         if name in found:
-            raise InputError(f"two joints are called {name!r}", where=where)
+            raise InputError(f"two joints are called {name!r}")
         angles = Rotation.from_matrix(turn).as_euler("xyz") if fixed_between else joint.angles
         table: dict[str, Any] = {
             "kind": MOVING[joint.kind],
@@ -188,73 +192,48 @@ def _tables(path: Sequence[TreeJoint], lumped: LumpedBodies, where: str) -> dict
     return found
 
 
-def _refuse_broken(tree: Tree, where: str) -> None:
-    """Refuse joints without their links or without a direction, and loops."""
+def _refuse_broken(tree: Tree) -> None:
+    """Refuse joints without their links or without a direction, loops, and chains too long."""
     for joint in tree.joints:
         for end in (joint.parent, joint.child):
-            if end not in tree.bodies:
-                raise InputError(
-                    f"joint {joint.name!r} names link {end!r}, which is not there"
-                    f"{did_you_mean(end, tree.bodies)}",
-                    where=where,
-                )
+            what = f"joint {joint.name!r} names link {end!r}, which is not there"
+            _require_link(tree, end, what)
         if joint.kind in MOVING and not any(joint.axis):
-            raise InputError("an axis of length zero", where=f"{where}: joint {joint.name!r}")
+            raise InputError("an axis of length zero", where=f"joint {joint.name!r}")
     if len(tree.above) < len(tree.joints):
         twice = next(j for j in tree.joints if tree.above[j.child] is not j)
         raise InputError(
-            f"link {twice.child!r} has two joints above it: a closed loop", where=where,
+            f"link {twice.child!r} has two joints above it: a closed loop",
             remedy="cut the loop: leave one of the joints out",
-        )  # fmt: skip
-    _refuse_loops(tree.above, where)
+        )
+    for link in tree.above:
+        tree.way(link)
 
 
-def _link(name: str, tree: Tree, where: str) -> str:
+def _require_link(tree: Tree, name: str, what: str) -> None:
     if name not in tree.bodies:
-        raise InputError(f"no link {name!r}{did_you_mean(name, tree.bodies)}", where=where)
-    return name
+        raise InputError(f"{what}{did_you_mean(name, tree.bodies)}")
 
 
-def _refuse_loops(above: Mapping[str, TreeJoint], where: str) -> None:
-    """Refuse links that hang on themselves, or too many one behind another."""
-    deepest = 0
-    for first in above:
-        link, depth = first, 0
-        while link in above and depth <= DEEPEST:
-            link, depth = above[link].parent, depth + 1
-            if link == first:
-                raise InputError(f"the joints above {first!r} form a loop", where=where)
-        deepest = max(deepest, depth)
-    if deepest > DEEPEST:
-        raise InputError(f"more than {DEEPEST} links one behind another", where=where)
-
-
-def _only_root(tree: Tree, where: str) -> str:
+def _only_root(tree: Tree) -> str:
     roots = [name for name in tree.bodies if name not in tree.above]
     if not roots:
-        raise InputError("no links", where=where)
+        raise InputError("no links")
     if len(roots) != 1:
         raise InputError(
             f"{len(roots)} links have nothing above them: {join_names(roots, _MANY)}",
-            where=where,
             remedy="name the one that stands still: base = ...",
         )
     return roots[0]
 
 
-def _only_end(tree: Tree, base: str, where: str) -> str:
+def _only_end(tree: Tree, base: str) -> str:
     """The last link of the only chain of moving joints from ``base``."""
     above = tree.above
-
-    def moving(link: str) -> list[str]:
-        found = []
-        while link != base and link in above:
-            if above[link].kind != "fixed":
-                found.append(above[link].name)
-            link = above[link].parent
-        return found[::-1] if link == base else []
-
-    chains = {joint.child: moving(joint.child) for joint in tree.joints}
+    chains: dict[str, list[str]] = {}
+    for link in (joint.child for joint in tree.joints):
+        behind = dropwhile(lambda joint: joint.parent != base, tree.way(link))
+        chains[link] = [joint.name for joint in behind if joint.kind != "fixed"]
     longest = max(chains, key=lambda link: len(chains[link]), default="")
     ends = [
         link
@@ -262,20 +241,19 @@ def _only_end(tree: Tree, base: str, where: str) -> str:
         if names and above[link].kind != "fixed" and names != chains[longest][: len(names)]
     ]
     if not longest or not chains[longest]:
-        raise InputError(f"no joint moves below {base!r}", where=where)
+        raise InputError(f"no joint moves below {base!r}")
     if ends:
         others = [above[longest].child, *ends]
         levels = zip(*(chains[link] for link in others), strict=False)
         common = [level[0] for level in takewhile(lambda level: len(set(level)) == 1, levels)]
         stem = next((j.child for j in tree.joints if common and j.name == common[-1]), "")
-        behind = {joint.name: joint.child for joint in tree.joints}
+        linked = {joint.name: joint.child for joint in tree.joints}
         error = Branches(
             f"the joints branch; chains end at {join_names(others, _MANY)}",
-            where=where,
             remedy='choose one: base = "..." and tip = "..." in [robot] of a device file'
             + (f'; tip = "{stem}" ends before they branch' if stem else ""),
         )
         error.stem = stem
-        error.chains = {end: [(name, behind[name]) for name in chains[end]] for end in others}
+        error.chains = {end: [(name, linked[name]) for name in chains[end]] for end in others}
         raise error
     return longest

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
 from bampipe.data.robot_tree import Body, DriveLimits, Tree, TreeJoint, fixed_joint, symmetric
-from bampipe.data.robot_xml import document, number_list, numbers
-from bampipe.errors import InputError, did_you_mean
+from bampipe.data.robot_xml import document, number, number_list, numbers
+from bampipe.errors import InputError, did_you_mean, located
 from bampipe.lists import join_names
 
 Attributes = dict[str, str]
@@ -132,22 +132,19 @@ def _write_joint(
 class _Reader:
     """Walks the bodies of an MJCF and collects links and joints."""
 
-    def __init__(self, root: ElementTree.Element, where: str) -> None:
-        self.where = where
+    def __init__(self, root: ElementTree.Element) -> None:
         compiler = _merged(root, "compiler")
         self.radian = compiler.get("angle", "degree") == "radian"
         self.sequence = compiler.get("eulerseq", "xyz")
         if not re.fullmatch("[xyzXYZ]{3}", self.sequence):
-            raise InputError(
-                f'eulerseq: found "{self.sequence}", expected three of x, y, z', where=where
-            )
+            raise InputError(f'eulerseq: found "{self.sequence}", expected three of x, y, z')
         self.autolimits = compiler.get("autolimits", "true") == "true"
         self.by_shape = compiler.get("inertiafromgeom", "auto") == "true"
         if compiler.get("coordinate", "local") != "local":
-            raise InputError("coordinates are global", where=where, remedy=_FLAT)
+            raise InputError("coordinates are global", remedy=_FLAT)
         for tag in _BUILDS:
             if next(root.iter(tag), None) is not None:
-                raise InputError(f"a <{tag}>, which MuJoCo expands", where=where, remedy=_FLAT)
+                raise InputError(f"a <{tag}>, which MuJoCo expands", remedy=_FLAT)
         self.defaults: dict[str, dict[str, str]] = {"": {}, "main": {}}
         for entry in root.iterfind("default"):
             self._read_defaults(entry, {})
@@ -168,13 +165,13 @@ class _Reader:
     def _read_motor(self, motor: ElementTree.Element) -> None:
         """Note the effort of a joint that a motor alone is for."""
         joint = motor.get("joint")
-        place = f"{self.where}: actuator of {joint!r}"
         ranges = ("ctrlrange", "forcerange") if motor.tag == "motor" else ("forcerange",)
         key = next((key for key in ranges if motor.get(key)), "")
         if joint is None or not key:
             return
-        low, high = numbers(motor, key, "", 2, place)
-        gear = numbers(motor, "gear", "1", max(len(motor.get("gear", "1").split()), 1), place)[0]
+        with located(f"actuator of {joint!r}", ": "):
+            low, high = numbers(motor, key, "", 2)
+            gear = numbers(motor, "gear", "1", max(len(motor.get("gear", "1").split()), 1))[0]
         self.efforts[joint] = max(abs(low), abs(high)) * abs(gear)
 
     def walk(
@@ -188,64 +185,63 @@ class _Reader:
             given: class of defaults that it inherits; moves: whether a joint is above it.
         """
         name = body.get("name") or f"body_{len(self.bodies)}"
-        place = f"{self.where}: body {name!r}"
-        if name in self.bodies:
-            raise InputError("a second body of that name", where=place)
         given = body.get("childclass", given)
-        turn = self.orientation(body, place)
-        offset = shift + np.array(numbers(body, "pos", "0 0 0", 3, place))
-        joints = [*body.iterfind("freejoint"), *body.iterfind("joint")]
-        center = np.zeros(3)
-        for k, entry in enumerate(joints):
-            usual = entry.get("class", given)
-            if usual not in self.defaults:
-                near = did_you_mean(usual, self.defaults)
-                raise InputError(f"no <default> of class {usual!r}{near}", where=place)
-            known = {**self.defaults[usual], **entry.attrib}
-            joint = known.get("name") or f"{name}_joint{k or ''}"
-            own = ElementTree.Element("joint", known)
-            spot = f"{self.where}: joint {joint!r}"
-            at = np.array(numbers(own, "pos", "0 0 0", 3, spot))
-            kind = "free" if entry.tag == "freejoint" else known.get("type", "hinge")
-            kind = _READ.get(kind, kind)
-            axis = numbers(own, "axis", "0 0 1", 3, spot)
-            child = name if k == len(joints) - 1 else f"{name}_before_{k + 1}"
-            offset = offset + turn @ (at - center)
-            start = numbers(own, "ref", "0", 1, spot)[0]
-            along = _unit(np.array(axis))
-            if kind == "revolute" and start:
-                turn = turn @ Rotation.from_rotvec(-self.angle(start) * along).as_matrix()
-            elif kind == "prismatic":
-                offset = offset - turn @ along * start
-            roll, pitch, yaw = Rotation.from_matrix(turn).as_euler("xyz")
-            limits = self.limits(own, joint, kind, spot)
-            frame = turn, offset, (roll, pitch, yaw)
-            self.joints.append(TreeJoint(joint, kind, parent, child, *frame, axis, limits))
-            if child != name:
-                self.bodies[child] = Body()
-            parent, turn, offset, center, moves = child, np.eye(3), np.zeros(3), at, True
-        if not joints:
-            self.joints.append(fixed_joint(f"{name}_fixed", parent, name, turn, offset))
-        self.bodies[name] = self.body(body, moves, place).moved(np.eye(3), -center)
+        with located(f"body {name!r}", ": "):
+            if name in self.bodies:
+                raise InputError("a second body of that name")
+            turn = self.orientation(body)
+            offset = shift + np.array(numbers(body, "pos", "0 0 0", 3))
+            joints = [*body.iterfind("freejoint"), *body.iterfind("joint")]
+            center = np.zeros(3)
+            for k, entry in enumerate(joints):
+                usual = entry.get("class", given)
+                if usual not in self.defaults:
+                    near = did_you_mean(usual, self.defaults)
+                    raise InputError(f"no <default> of class {usual!r}{near}")
+                known = {**self.defaults[usual], **entry.attrib}
+                joint = known.get("name") or f"{name}_joint{k or ''}"
+                own = ElementTree.Element("joint", known)
+                kind = "free" if entry.tag == "freejoint" else known.get("type", "hinge")
+                kind = _READ.get(kind, kind)
+                with located(f"joint {joint!r}", ": "):
+                    at = np.array(numbers(own, "pos", "0 0 0", 3))
+                    axis = numbers(own, "axis", "0 0 1", 3)
+                    start, limits = number(own, "ref"), self.limits(own, joint, kind)
+                child = name if k == len(joints) - 1 else f"{name}_before_{k + 1}"
+                offset = offset + turn @ (at - center)
+                along = _unit(np.array(axis))
+                if kind == "revolute" and start:
+                    turn = turn @ Rotation.from_rotvec(-self.angle(start) * along).as_matrix()
+                elif kind == "prismatic":
+                    offset = offset - turn @ along * start
+                roll, pitch, yaw = Rotation.from_matrix(turn).as_euler("xyz")
+                frame = turn, offset, (roll, pitch, yaw)
+                self.joints.append(TreeJoint(joint, kind, parent, child, *frame, axis, limits))
+                if child != name:
+                    self.bodies[child] = Body()
+                parent, turn, offset, center, moves = child, np.eye(3), np.zeros(3), at, True
+            if not joints:
+                self.joints.append(fixed_joint(f"{name}_fixed", parent, name, turn, offset))
+            self.bodies[name] = self.body(body, moves).moved(np.eye(3), -center)
         for inner in body.iterfind("body"):
             self.walk(inner, name, -center, given, moves)
 
     def angle(self, value: float) -> float:
         return value if self.radian else math.radians(value)
 
-    def orientation(self, element: ElementTree.Element, place: str) -> Array:
+    def orientation(self, element: ElementTree.Element) -> Array:
         """Rotation of an element's frame, (3, 3)."""
         if element.get("quat"):
-            w, x, y, z = numbers(element, "quat", "", 4, place)
+            w, x, y, z = numbers(element, "quat", "", 4)
             if not any((w, x, y, z)):
-                raise InputError("a quat of length zero", where=place)
+                raise InputError("a quat of length zero")
             return np.asarray(Rotation.from_quat((x, y, z, w)).as_matrix())
         if element.get("axisangle"):
-            *about_axis, angle = numbers(element, "axisangle", "", 4, place)
+            *about_axis, angle = numbers(element, "axisangle", "", 4)
             turned = self.angle(angle) * _unit(np.array(about_axis))
             return np.asarray(Rotation.from_rotvec(turned).as_matrix())
         if element.get("euler"):
-            angles = [self.angle(v) for v in numbers(element, "euler", "", 3, place)]
+            angles = [self.angle(v) for v in numbers(element, "euler", "", 3)]
             turn = np.eye(3)
             for letter, angle in zip(self.sequence, angles, strict=True):
                 one = Rotation.from_euler(letter.lower(), angle).as_matrix()
@@ -253,12 +249,12 @@ class _Reader:
                 turn = turn @ one if letter.islower() else one @ turn
             return turn
         if element.get("xyaxes"):
-            six = np.array(numbers(element, "xyaxes", "", 6, place))
+            six = np.array(numbers(element, "xyaxes", "", 6))
             first = _unit(six[:3])
             second = _unit(six[3:] - (six[3:] @ first) * first)
             return np.column_stack([first, second, np.cross(first, second)])
         if element.get("zaxis"):
-            up = _unit(np.array(numbers(element, "zaxis", "", 3, place)))
+            up = _unit(np.array(numbers(element, "zaxis", "", 3)))
             about = np.cross([0.0, 0.0, 1.0], up)
             size = float(np.linalg.norm(about))
             if size == 0.0:
@@ -267,39 +263,34 @@ class _Reader:
             return np.asarray(Rotation.from_rotvec(turned).as_matrix())
         return np.eye(3)
 
-    def body(self, body: ElementTree.Element, moves: bool, place: str) -> Body:
+    def body(self, body: ElementTree.Element, moves: bool) -> Body:
         """Its mass; refused where it moves and follows from shapes."""
         inertial = body.find("inertial")
         shapes = body.find("geom") is not None
         if moves and shapes and (inertial is None or self.by_shape):
-            raise InputError("mass and inertia follow from shapes", where=place, remedy=_FLAT)
+            raise InputError("mass and inertia follow from shapes", remedy=_FLAT)
         if inertial is None:
             return Body()
-        mass = numbers(inertial, "mass", "0", 1, place)[0]
-        center = np.array(numbers(inertial, "pos", "0 0 0", 3, place))
+        mass, center = number(inertial, "mass"), np.array(numbers(inertial, "pos", "0 0 0", 3))
         if inertial.get("fullinertia"):
-            xx, yy, zz, xy, xz, yz = numbers(inertial, "fullinertia", "", 6, place)
+            xx, yy, zz, xy, xz, yz = numbers(inertial, "fullinertia", "", 6)
             return Body(mass, center, symmetric((xx, xy, xz, yy, yz, zz)))
-        inertia = np.diag(numbers(inertial, "diaginertia", "0 0 0", 3, place))
-        return Body(mass, np.zeros(3), inertia).moved(self.orientation(inertial, place), center)
+        inertia = np.diag(numbers(inertial, "diaginertia", "0 0 0", 3))
+        return Body(mass, np.zeros(3), inertia).moved(self.orientation(inertial), center)
 
-    def limits(self, own: ElementTree.Element, joint: str, kind: str, place: str) -> DriveLimits:
-        low, high = numbers(own, "range", "0 0", 2, place)
+    def limits(self, own: ElementTree.Element, joint: str, kind: str) -> DriveLimits:
+        low, high = numbers(own, "range", "0 0", 2)
         limited = own.get("limited", "auto")
         if limited == "false" or (limited == "auto" and not self.autolimits):
             low = high = 0.0
         if kind == "revolute":
             low, high = self.angle(low), self.angle(high)
-        effort = max(map(abs, numbers(own, "actuatorfrcrange", "0 0", 2, place)))
-        return DriveLimits(
-            low, high, effort or self.efforts.get(joint, 0.0), 0.0,
-            numbers(own, "damping", "0", 1, place)[0],
-            numbers(own, "frictionloss", "0", 1, place)[0],
-            numbers(own, "armature", "0", 1, place)[0],
-        )  # fmt: skip
+        effort = max(map(abs, numbers(own, "actuatorfrcrange", "0 0", 2)))
+        losses = (number(own, key) for key in ("damping", "frictionloss", "armature"))
+        return DriveLimits(low, high, effort or self.efforts.get(joint, 0.0), 0.0, *losses)
 
 
-def mjcf_tree(root: ElementTree.Element, where: str) -> Tree:
+def mjcf_tree(root: ElementTree.Element) -> Tree:
     """The bodies and joints of an MJCF.
 
     A joint beside a body's origin moves the frame of the link to the joint.
@@ -307,13 +298,12 @@ def mjcf_tree(root: ElementTree.Element, where: str) -> Tree:
     Raises:
         InputError: what only MuJoCo can expand, masses that follow from shapes, or wrong numbers.
     """
-    reader = _Reader(root, where)
-    for world in root.iterfind("worldbody"):
-        for body in world.iterfind("body"):
-            reader.walk(body, _WORLD, np.zeros(3), "", moves=False)
+    reader = _Reader(root)
+    for body in root.iterfind("worldbody/body"):
+        reader.walk(body, _WORLD, np.zeros(3), "", moves=False)
     coupled = [tag for tag in _COUPLES if root.find(f"{tag}/*") is not None]
     notes = (f"not heard: {join_names(coupled)}",) if coupled else ()
-    x, y, z = numbers(_merged(root, "option"), "gravity", "0 0 -9.81", 3, where)
+    x, y, z = numbers(_merged(root, "option"), "gravity", "0 0 -9.81", 3)
     return Tree(reader.bodies, reader.joints, notes, (x, y, z))
 
 

@@ -15,6 +15,8 @@ from bampipe.errors import InputError
 
 _BELOW_ZERO = 1e-6
 """Share of the largest second moment of mass by which one may be below zero."""
+DEEPEST = 200
+"""Most links one behind another."""
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 """Kinds of joint that a chain moves by, and what a device file calls them."""
 UPRIGHT = (0.0, 0.0, -9.81)
@@ -146,28 +148,40 @@ class Tree:
         """By link, the joint that it hangs on."""
         return {joint.child: joint for joint in self.joints}
 
-    def path(self, base: str, tip: str, where: str = "") -> list[TreeJoint]:
+    def way(self, link: str) -> list[TreeJoint]:
+        """Joints from the root to a link.
+
+        Raises:
+            InputError: they form a loop, or are too many.
+        """
+        found: dict[str, TreeJoint] = {}
+        while joint := self.above.get(link):
+            if link in found:
+                raise InputError(f"the joints above {link!r} form a loop")
+            if len(found) == DEEPEST:
+                raise InputError(f"more than {DEEPEST} links one behind another")
+            found[link], link = joint, joint.parent
+        return [*found.values()][::-1]
+
+    def path(self, base: str, tip: str) -> list[TreeJoint]:
         """Joints from base to tip.
 
         Raises:
             InputError: there is no such path, or one with a joint of another kind than a chain has.
         """
-        found: list[TreeJoint] = []
-        link = tip
-        while link != base:
-            if link not in self.above:
-                raise InputError(f"link {tip!r} does not hang on {base!r}", where=where)
-            joint = self.above[link]
+        way = self.way(tip)
+        links = [*(joint.parent for joint in way), tip]
+        if base not in links:
+            raise InputError(f"link {links[0]!r} does not hang on {base!r}")
+        for joint in way[links.index(base) :]:
             if joint.kind not in (*MOVING, "fixed"):
                 raise InputError(
                     f"a joint of type {joint.kind!r}",
-                    where=f"{where}: joint {joint.name!r}",
+                    where=f"joint {joint.name!r}",
                     remedy="between base and tip joints are revolute, continuous, prismatic or"
                     " fixed",
                 )
-            found.append(joint)
-            link = joint.parent
-        return found[::-1]
+        return way[links.index(base) :]
 
 
 def gravity_at(tree: Tree, base: str) -> tuple[tuple[float, float, float] | None, str]:
@@ -176,10 +190,7 @@ def gravity_at(tree: Tree, base: str) -> tuple[tuple[float, float, float] | None
     The root of a URDF stands upright. None where that goes for the link as well, or where a joint
     above it can tilt it.
     """
-    root, way = base, list[TreeJoint]()
-    while root in tree.above:
-        way.insert(0, tree.above[root])
-        root = tree.above[root].parent
+    way = tree.way(base)
     if not way:
         return tree.gravity, ""
     start = np.array(tree.gravity or UPRIGHT)
@@ -193,8 +204,8 @@ def gravity_at(tree: Tree, base: str) -> tuple[tuple[float, float, float] | None
     if tree.gravity is None and np.abs(down - start).max() <= least:
         return None, ""
     x, y, z = (float(v) for v in np.where(np.abs(down) <= least, 0.0, down))
-    said = f"gravity ({x:.4g}, {y:.4g}, {z:.4g}) m/s2 in the frame of {base}, from that of {root}"
-    return (x, y, z), said
+    said = f"gravity ({x:.4g}, {y:.4g}, {z:.4g}) m/s2 in the frame of {base}"
+    return (x, y, z), f"{said}, from that of {way[0].parent}"
 
 
 def hold_beside(tree: Tree, base: str, tip: str) -> Tree:
@@ -286,7 +297,7 @@ class LumpedBodies:
     def held_on(self, link: str) -> Iterator[TreeJoint]:
         """The joints held still on a link and what is on it, of those that carry mass."""
         for joint in self._behind.get(link, ()):
-            if joint.kind != "fixed" and self._mass_on(joint.child) > 0.0:
+            if joint.kind != "fixed" and self.body_on(joint.child).mass > 0.0:
                 yield joint
             yield from self.held_on(joint.child)
 
@@ -305,10 +316,6 @@ class LumpedBodies:
             part = self.body_held_on(joint.child) if fixed else self.body_on(joint.child)
             total = total.joined(part.moved(joint.turn, joint.offset))
         return total
-
-    def _mass_on(self, link: str) -> float:
-        behind = self._behind.get(link, ())
-        return self.tree.bodies[link].mass + sum(self._mass_on(joint.child) for joint in behind)
 
 
 def put_bodies(

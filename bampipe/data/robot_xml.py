@@ -13,7 +13,7 @@ from bampipe.files import read_bytes
 LARGEST_BYTES = 20_000_000
 _MEND = "mend it, or take it out of the folder"
 DEEPEST = 200
-"""Most elements inside one another, and most links one behind another."""
+"""Most elements inside one another."""
 
 
 def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
@@ -47,9 +47,7 @@ def read_xml(path: Path, to_write: bool = False) -> ElementTree.Element:
     return root
 
 
-def numbers(
-    element: ElementTree.Element | None, key: str, default: str, count: int, where: str
-) -> list[float]:
+def numbers(element: ElementTree.Element | None, key: str, default: str, count: int) -> list[float]:
     """The ``count`` numbers of an attribute, ``default`` where there is none.
 
     Raises:
@@ -63,8 +61,13 @@ def numbers(
     if len(found) != count or not all(map(math.isfinite, found)):
         tag = "" if element is None else f"<{element.tag} {key}>: "
         expected = "a number" if count == 1 else f"{count} numbers"
-        raise InputError(f'{tag}found "{text}", expected {expected}', where=where)
+        raise InputError(f'{tag}found "{text}", expected {expected}')
     return found
+
+
+def number(element: ElementTree.Element | None, key: str, default: str = "0") -> float:
+    """The number of an attribute; as `numbers`."""
+    return numbers(element, key, default, 1)[0]
 
 
 def document(root: ElementTree.Element, comment: str, indented: bool = True) -> str:

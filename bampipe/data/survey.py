@@ -218,7 +218,7 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
         raise logs.fault()
     columns, guessed = _by_looks(_with_commands(list(read)), folder)
     if guessed and sound[0].file.lower().endswith(".json"):
-        beside = objects.stated_units(folder / sound[0].file, sound[0].file)
+        beside = objects.stated_units(folder / sound[0].file)
         columns = tuple(_with_unit_beside(c, columns, beside) for c in columns)
     if dataset is not None:
         logs.remarks = [lerobot.REMARK]

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from bampipe.arrays import Array
 from bampipe.data.robot_tree import Body, DriveLimits, Tree, TreeJoint, symmetric
-from bampipe.data.robot_xml import document, number_list, numbers, read_xml
-from bampipe.errors import InputError
+from bampipe.data.robot_xml import document, number, number_list, numbers, read_xml
+from bampipe.errors import InputError, located
 
 _XACRO = ("{http://www.ros.org/wiki/xacro", "{http://ros.org/wiki/xacro", "{http://ros.org/xacro")
 _UNLIMITED = 1e6
@@ -22,7 +22,6 @@ def urdf_tree(root: ElementTree.Element, path: Path) -> Tree:
     Raises:
         InputError: a xacro file, or a link or joint that is wrong.
     """
-    where = str(path)
     parts = [root, *root.iterfind("link"), *root.iterfind("joint")]
     values = (value for part in parts for inner in part.iter() for value in inner.attrib.values())
     macros = any(str(element.tag).startswith(_XACRO) for element in root.iter())
@@ -30,11 +29,16 @@ def urdf_tree(root: ElementTree.Element, path: Path) -> Tree:
         raise unexpanded(path)
     bodies: dict[str, Body] = {}
     for link in root.iterfind("link"):
-        name = _name(link, where)
+        name = _name(link)
         if name in bodies:
-            raise InputError(f"two links are called {name!r}", where=where)
-        bodies[name] = _body(link, where)
-    return Tree(bodies, [_joint(entry, where) for entry in root.iterfind("joint")])
+            raise InputError(f"two links are called {name!r}")
+        with located(f"link {name!r}", ": "):
+            bodies[name] = _body(link)
+    joints = []
+    for entry in root.iterfind("joint"):
+        with located(f"joint {_name(entry)!r}", ": "):
+            joints.append(_joint(entry))
+    return Tree(bodies, joints)
 
 
 def unexpanded(path: Path) -> InputError:
@@ -46,64 +50,54 @@ def unexpanded(path: Path) -> InputError:
     )
 
 
-def _name(element: ElementTree.Element, where: str) -> str:
+def _name(element: ElementTree.Element) -> str:
     name = element.get("name", "")
     if not name:
-        raise InputError(f"a <{element.tag}> without a name", where=where)
+        raise InputError(f"a <{element.tag}> without a name")
     return name
 
 
-def _pose(element: ElementTree.Element | None, where: str) -> tuple[Array, Array, list[float]]:
-    angles = numbers(element, "rpy", "0 0 0", 3, where)
-    offset = np.array(numbers(element, "xyz", "0 0 0", 3, where))
+def _pose(element: ElementTree.Element | None) -> tuple[Array, Array, list[float]]:
+    angles = numbers(element, "rpy", "0 0 0", 3)
+    offset = np.array(numbers(element, "xyz", "0 0 0", 3))
     return Rotation.from_euler("xyz", angles).as_matrix(), offset, angles
 
 
-def _body(link: ElementTree.Element, where: str) -> Body:
+def _body(link: ElementTree.Element) -> Body:
     inertial = link.find("inertial")
     if inertial is None:
         return Body()
-    place = f"{where}: link {link.get('name')!r}"
-    turn, offset, _ = _pose(inertial.find("origin"), place)
-    mass = numbers(inertial.find("mass"), "value", "0", 1, place)[0]
+    turn, offset, _ = _pose(inertial.find("origin"))
+    mass = number(inertial.find("mass"), "value")
     entry = inertial.find("inertia")
     keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    moments = [numbers(entry, key, "0", 1, place)[0] for key in keys]
+    moments = [number(entry, key) for key in keys]
     return Body(mass, np.zeros(3), symmetric(moments)).moved(turn, offset)
 
 
-def _joint(entry: ElementTree.Element, where: str) -> TreeJoint:
-    name = _name(entry, where)
-    place = f"{where}: joint {name!r}"
+def _joint(entry: ElementTree.Element) -> TreeJoint:
     ends = []
     for tag in ("parent", "child"):
         element = entry.find(tag)
         if element is None or not element.get("link"):
-            raise InputError(f"no <{tag} link>", where=place)
+            raise InputError(f"no <{tag} link>")
         ends.append(str(element.get("link")))
-    turn, offset, angles = _pose(entry.find("origin"), place)
+    turn, offset, angles = _pose(entry.find("origin"))
     kind = entry.get("type", "")
-    axis = numbers(entry.find("axis"), "xyz", "1 0 0", 3, place)
-
-    def number(tag: str, key: str) -> float:
-        return numbers(entry.find(tag), key, "0", 1, place)[0]
-
-    bounded = kind != "continuous"
-    limits = DriveLimits(
-        number("limit", "lower") if bounded else 0.0,
-        number("limit", "upper") if bounded else 0.0,
-        number("limit", "effort"),
-        number("limit", "velocity"),
-        number("dynamics", "damping"),
-        number("dynamics", "friction"),
+    axis = numbers(entry.find("axis"), "xyz", "1 0 0", 3)
+    limit, losses = entry.find("limit"), entry.find("dynamics")
+    ends_at = (
+        (0.0, 0.0) if kind == "continuous" else (number(limit, "lower"), number(limit, "upper"))
     )
+    drive = (number(limit, "effort"), number(limit, "velocity"))
+    limits = DriveLimits(*ends_at, *drive, number(losses, "damping"), number(losses, "friction"))
     shown = (angles[0], angles[1], angles[2])
     mimic = None
     follows = entry.find("mimic")
     if follows is not None and follows.get("joint"):
-        ratio = numbers(follows, "multiplier", "1", 1, place)[0]
-        mimic = str(follows.get("joint")), ratio, numbers(follows, "offset", "0", 1, place)[0]
-    return TreeJoint(name, kind, ends[0], ends[1], turn, offset, shown, axis, limits, mimic)
+        ratio = number(follows, "multiplier", "1")
+        mimic = str(follows.get("joint")), ratio, number(follows, "offset")
+    return TreeJoint(_name(entry), kind, ends[0], ends[1], turn, offset, shown, axis, limits, mimic)
 
 
 def urdf_text(name: str, tree: Tree, comment: str) -> str:

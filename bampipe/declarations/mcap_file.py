@@ -22,7 +22,7 @@ def pack_recording(recording: Recording) -> bytes:
         InputError: the library mcap is not installed.
     """
     stream = io.BytesIO()
-    writer = need("mcap.writer", "ros", "--as mcap").Writer(stream)
+    writer = need("mcap.writer", "ros").Writer(stream)
     writer.start(library="bampipe")
 
     def open_topic(topic: str, schema: str, fields: dict[str, Any], **metadata: str) -> int:

@@ -153,10 +153,7 @@ def _pose_links(
         if f"q_{(name := identifier(joint.name))}" in motion
     }
     frames: list[Frame] = []
-    waiting = list(tree.joints)
-    while waiting:  # next is a joint whose parent link no waiting joint carries
-        joint = next(j for j in waiting if all(j.parent != other.child for other in waiting))
-        waiting.remove(joint)
+    for joint in sorted(tree.joints, key=lambda joint: len(tree.way(joint.parent))):
         at = q.get(joint.name, np.zeros(len(times)))
         if joint.mimic is not None and joint.mimic[0] in q:
             at = joint.mimic[1] * q[joint.mimic[0]] + joint.mimic[2]

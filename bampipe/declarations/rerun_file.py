@@ -14,7 +14,7 @@ def pack_recording(recording: Recording) -> bytes:
     Raises:
         InputError: the library rerun is not installed.
     """
-    rr = need("rerun", "rerun", "--as rrd")
+    rr = need("rerun", "rerun")
     stream = rr.RecordingStream("bampipe", recording_id=recording.name, send_properties=False)
     memory = stream.memory_recording()
 

@@ -88,7 +88,7 @@ def test_columns_of_matrices_in_matlab_files(tmp_path):
     trial = read_trial(path, ("X[0]", "X[2]"))
     np.testing.assert_array_equal(trial.columns["X[2]"], F)
     assert list(columns_of(path)) == ["X[0]", "X[1]", "X[2]", "s.q"]
-    assert "a struct, expected a vector of numbers; name what is in it: s.q" in refused(
+    assert "a structure, expected a vector of numbers; name what is in it: s.q" in refused(
         path, ("X[0]", "s")
     )
 
@@ -208,7 +208,7 @@ def test_tdms(tdms):
     trial = read_trial(tdms, columns)
     for column, values in zip(columns, (T, np.arange(50), F, T), strict=True):
         np.testing.assert_allclose(trial.columns[column], values, atol=1e-12)
-    assert trial.units == {"DAQ/Force": "N"}
+    assert trial.units == {"DAQ/Force": "N", "DAQ/Force@time": "s"}
     found = columns_of(tdms)
     assert set(found) == {*columns, "Log/When"} and found["Log/When"] == "datetime"
     trial = read_trial(tdms, ("Log/When", "Log/Angle"), datetimes={"Log/When": ""})

@@ -17,7 +17,7 @@ from types import ModuleType
 
 from bampipe.data.readers import arrays, bag, hdf5, mat, objects, parquet, tdms, text
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, Wanted
-from bampipe.errors import InputError
+from bampipe.errors import InputError, located
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
 """File extensions of tables as text."""
@@ -83,13 +83,14 @@ def read_trial(
         InputError: empty, of another kind, cut off, too large, a column missing or twice, a
             cell that is not a number, or a library that is not installed.
     """
-    path, name = Path(path), name or str(path)
-    reader = _READERS.get(_checked_extension(path, name), text)
+    path = Path(path)
     wanted = Wanted(tuple(columns), datetimes or {}, dialect or Dialect(), largest_bytes)
-    with _safely(path, name):
-        trial: RawTrial = reader.read(path, wanted, name)
-    if columns and len(trial) == 0:
-        raise InputError("a header but no samples", where=name)
+    with located(name or str(path)):
+        reader = _reader(path)
+        with _safely(path):
+            trial: RawTrial = reader.read(path, wanted)
+        if columns and len(trial) == 0:
+            raise InputError("a header but no samples")
     return trial
 
 
@@ -112,16 +113,17 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
     Raises:
         InputError: as :func:`read_trial`.
     """
-    path, name = Path(path), name or str(path)
-    reader = _READERS.get(_checked_extension(path, name), text)
-    more = (dialect,) if reader is text else ()
-    with _safely(path, name):
-        columns: dict[str, str] = reader.columns(path, name, *more)
+    path = Path(path)
+    with located(name or str(path)):
+        reader = _reader(path)
+        more = (dialect,) if reader is text else ()
+        with _safely(path):
+            columns: dict[str, str] = reader.columns(path, *more)
     return columns
 
 
 @contextmanager
-def _safely(path: Path, name: str) -> Iterator[None]:
+def _safely(path: Path) -> Iterator[None]:
     """Let this process take as much memory as the file may; where Linux is not, it takes any.
 
     InputError where it does not suffice, or the library that reads such files fails.
@@ -144,7 +146,6 @@ def _safely(path: Path, name: str) -> Iterator[None]:
     except MemoryError as error:
         raise InputError(
             "does not fit into memory",
-            where=name,
             remedy="is it damaged? else split it, or export the columns that are wanted",
         ) from error
     except InputError:
@@ -153,14 +154,14 @@ def _safely(path: Path, name: str) -> Iterator[None]:
         kind, remedy = _FOREIGN.get(path.suffix.lower(), ("", ""))
         if not kind:
             raise
-        raise InputError(f"not a sound {kind}", where=name, remedy=remedy) from error
+        raise InputError(f"not a sound {kind}", remedy=remedy) from error
     finally:
         if resource is not None:
             resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-def _checked_extension(path: Path, name: str) -> str:
-    """Extension of the file, after a look at whether its first bytes agree with it.
+def _reader(path: Path) -> ModuleType:
+    """The reader of a file by its extension, with which its first bytes must agree.
 
     InputError where it cannot be read, is empty, unsupported, or of another kind.
     """
@@ -168,26 +169,23 @@ def _checked_extension(path: Path, name: str) -> str:
     try:
         state = path.stat()
         if not stat.S_ISREG(state.st_mode):
-            raise InputError("not a regular file", where=name)
+            raise InputError("not a regular file")
         with path.open("rb") as stream:
             head = stream.read(_HEAD)
     except OSError as error:
-        raise InputError(
-            f"cannot be read: {(error.strerror or 'error').lower()}", where=name
-        ) from error
+        raise InputError(f"cannot be read: {(error.strerror or 'error').lower()}") from error
     if not is_log(path):
         raise InputError(
             f"unsupported file extension '{extension}'",
-            where=name,
             remedy=f"supported are {', '.join(EXTENSIONS)}, and text with rows of numbers",
         )
     if state.st_size == 0:
-        raise InputError("the file is empty", where=name)
+        raise InputError("the file is empty")
     matlab = head.startswith(b"MATLAB") or head[512:520] == hdf5.SIGNATURE
     kinds = [(magic, right, words) for magic, right, words in _KINDS if head.startswith(magic)]
     kinds += [(b"", (".mat",), "a MATLAB file")] if matlab else []
     for _, right, words in kinds:
         if extension not in right:
             remedy = f"name it *{right[0]}" if right[0] else "unpack it, or export it as CSV"
-            raise InputError(f"this is {words}, not *{extension}", where=name, remedy=remedy)
-    return extension
+            raise InputError(f"this is {words}, not *{extension}", remedy=remedy)
+    return _READERS.get(extension, text)

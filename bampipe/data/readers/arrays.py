@@ -1,92 +1,141 @@
-"""Variables that are vectors, or columns of a matrix named as ``X[0]``; arrays as NumPy saves them.
+"""Arrays of a file by their names: vectors, and columns of a matrix named as ``X[0]``.
 
-Of ``.npy`` with one array, and ``.npz`` with several by name; fields of a structured array are
-columns, too. Pickled objects, which may run any program, are not read.
+The readers of such formats say what a file holds; what is wanted of it is read here. So are the
+arrays that NumPy saves: of ``.npy`` one, and of ``.npz`` several by name; fields of a structured
+array are columns, too. Pickled objects, which may run any program, are not read.
 """
 
+import math
 import re
-from collections.abc import Container, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
 from bampipe.data.readers import moments
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
-from bampipe.errors import InputError
+from bampipe.errors import InputError, located
 
 LARGEST_WIDTH = 64
-_STAMPED = "MO"
-"""Kinds of arrays of dates and times: NumPy's own, and of texts."""
-RUN = re.compile(
+_RUN = re.compile(
     r"(?i)(.+?(?=\[)|(?:.*[./_])?(?:trial|run|rep|test|take|rec|recording|exp|experiment|measurement"
     r"|messung|versuch|essai|episode|demo|trajectory|traj|log)s?_?(?=\d))"
     r"(?:\[([^\[\]:]+)\]|(\d+))[./]([^\[\]]+)"
 )
 """Name of an array of one of several recordings in a file."""
 _TIMES = re.compile(r"(?i)\]\.(t|.*time.*|.*stamp.*)\Z")
+_NUMBERS, _STAMPED, LINK = "iufb", "MOSU", "link"
+"""Kinds of arrays of numbers, and of dates and times or text; of what is elsewhere."""
 
 
-def read_arrays(
-    arrays: Mapping[str, np.ndarray | None], wanted: Wanted, name: str, what: str
-) -> RawTrial:
+@dataclass(frozen=True)
+class Stored:
+    """An array in a file, which is read when it is wanted.
+
+    Attributes:
+        shape: of the array; kind: of its type, as NumPy has it, or what else it is; texts that are
+            known to be dates and times are of theirs.
+        load: reads it; texts come as objects.
+        unit: that the file states, "" where it does not.
+    """
+
+    shape: tuple[int, ...]
+    kind: str
+    load: Callable[[], np.ndarray]
+    unit: str = ""
+
+
+Arrays = Mapping[str, Stored]
+"""What a file holds, by name."""
+
+
+def stored(array: np.ndarray | None, unit: str = "", kind: str = "") -> Stored:
+    """An array that is in memory, or what is none."""
+    held = np.empty(0, "V1") if array is None else array
+    return Stored(held.shape, kind or held.dtype.kind, lambda: held, unit)
+
+
+def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
     """The wanted columns of the arrays of a file, runs of one recording end to end.
 
-    Args:
-        arrays: by name, of numbers, moments, or texts that are moments; None for what is neither.
-        wanted: columns; name, what: of the file and of its arrays, in messages.
+    ``what``: an array of such a file is called in messages.
 
     Raises:
         InputError: an array is missing, not a vector of numbers, or not as long as the others.
     """
     joined, begun = _join_runs(arrays)
-    known, values = {**arrays, **joined}, {}
+    known: Arrays = {**arrays, **joined}
+    values, units = dict[str, np.ndarray](), dict[str, str]()
     for column in wanted.columns:
         variable, index = split_index(column, known)
-        check_columns(list(known), [variable], name)
-        array, where = known[variable], f"{name}, {what} '{column}'"
-        if array is None:
-            _refuse_kind(variable, known, where)
-        elif column in wanted.datetimes:
-            if array.dtype.kind not in _STAMPED:
-                raise InputError("not text, expected dates and times", where=where)
-            stamps = array if array.dtype.kind == "M" else array.tolist()
-            stamps = moments.nanoseconds(stamps, wanted.datetimes[column], where)
-            values[column] = moments.seconds(stamps)
-        elif array.dtype.kind in _STAMPED:
-            raise InputError(
-                "found dates and times, or text; expected numbers",
-                where=where,
-                remedy='is it the time? then say unit = "datetime" under [time]',
-            )
-        else:
-            check_size(array.size, wanted, name)
-            # A copy: what stands in a file cannot be written to.
-            values[column] = np.array(pick(array, index, where), dtype=np.float64)
+        array = known.get(variable)
+        if array is None or array.kind not in _NUMBERS + _STAMPED:
+            raise _fault(variable, known, f"{what} '{column}'")
+        check_size(math.prod(array.shape), wanted)
+        with located(f"{what} '{column}'"):
+            values[column] = _read_column(array, index, wanted.datetimes.get(column))
+        units |= {column: array.unit} if array.unit else {}
     starts = next((begun[column] for column in wanted.columns if column in begun), ())
-    return RawTrial(aligned(values, name, what), first_row=1, begun=starts)
+    return RawTrial(aligned(values, what), first_row=1, units=units, begun=starts)
 
 
-def _refuse_kind(variable: str, known: Mapping[str, object], where: str) -> None:
-    inside = [other for other in known if other.startswith((f"{variable}.", f"{variable}[0]."))]
-    if inside:
+def _read_column(array: Stored, index: int | None, form: str | None) -> np.ndarray:
+    """An array or a column of it, dates and times of a ``form`` as s since the first."""
+    if form is not None and array.kind in _NUMBERS:
+        raise InputError("not text, expected dates and times")
+    if form is None and array.kind in _STAMPED:
         raise InputError(
-            "a struct, expected a vector of numbers",
-            where=where,
-            remedy=f"name what is in it: {', '.join(inside[:8])}",
+            "not numbers, but dates and times or text",
+            remedy='is it the time? then say unit = "datetime" under [time]',
         )
-    raise InputError(
+    cells = pick(array.load(), index)
+    if form is None:
+        return np.array(cells, dtype=np.float64)  # a copy: what stands in a file is not written to
+    stamps = cells if cells.dtype.kind == "M" else cells.tolist()
+    return moments.seconds(moments.nanoseconds(stamps, form))
+
+
+def _fault(variable: str, known: Arrays, where: str) -> InputError:
+    """That a variable is no array of numbers, moments or texts, or that it is not there."""
+    within = (f"{variable}.", f"{variable}/", f"{variable}[0].")
+    if inside := [other for other in known if other.startswith(within)]:
+        remedy = f"name what is in it: {', '.join(inside[:8])}"
+        return InputError("a structure, expected a vector of numbers", where=where, remedy=remedy)
+    paths = accumulate(variable.split("/"), "{}/{}".format)
+    if any(known[path].kind == LINK for path in paths if path in known):
+        return InputError("a link, expected numbers in this file", where=where)
+    if variable not in known:
+        check_columns(list(known), [variable])
+    return InputError(
         "not numbers, expected a vector of real numbers",
         where=where,
         remedy="save it as a numeric array: cells, tables and objects are not",
     )
 
 
-def columns_of_arrays(arrays: Mapping[str, np.ndarray | None]) -> dict[str, str]:
-    """Names of the columns that were recorded together; the unit of moments is "datetime"."""
+def columns_of_arrays(arrays: Arrays) -> dict[str, str]:
+    """Names and units of the columns that were recorded together; of moments, it is "datetime".
+
+    And of numbers that stand alone. Beside a log a file may keep what belongs to no sample: gains
+    by axis, a table of settings.
+    """
     joined = _join_runs(arrays)[0]
-    moment = {label for label, array in joined.items() if array.dtype.kind in _STAMPED}
-    found = recorded({label: array.shape for label, array in joined.items()})
-    return {column: "datetime" if column in moment else "" for column in found}
+    found = {name: array for name, array in joined.items() if array.kind in _NUMBERS + "M"}
+    by_length: dict[int, list[str]] = {}
+    for name, array in found.items():
+        by_length.setdefault(max(array.shape, default=1), []).extend(labels(name, array.shape))
+    longer = [length for length in by_length if length > 1]
+    samples = max(longer, key=lambda length: (len(by_length[length]), length), default=1)
+    kept = {*by_length.get(1, ()), *by_length.get(samples, ())}
+    return {
+        column: "datetime" if array.kind == "M" else array.unit
+        for name, array in found.items()
+        for column in labels(name, array.shape)
+        if column in kept
+    }
 
 
 def split_index(column: str, names: Container[str]) -> tuple[str, int | None]:
@@ -97,7 +146,7 @@ def split_index(column: str, names: Container[str]) -> tuple[str, int | None]:
     return match[1], int(match[2])
 
 
-def pick(values: np.ndarray, index: int | None, where: str) -> np.ndarray:
+def pick(values: np.ndarray, index: int | None) -> np.ndarray:
     """The vector, or column ``index`` of a matrix (counted along its shorter side, from 0).
 
     Raises:
@@ -106,20 +155,22 @@ def pick(values: np.ndarray, index: int | None, where: str) -> np.ndarray:
     sides = [extent for extent in values.shape if extent != 1] if 0 not in values.shape else []
     if index is None:
         if len(sides) > 1:
-            shown = " by ".join(map(str, values.shape))
             raise InputError(
-                f"a {shown} array, expected a vector",
-                where=where,
+                f"a {_by(values.shape)} array, expected a vector",
                 remedy="name one of its columns, as in X[0]" if len(sides) == 2 else "",
             )
         return values.ravel()
     if len(sides) > 2 or not sides:
-        raise InputError("has no columns to choose from", where=where)
+        raise InputError("has no columns to choose from")
     table = values.reshape(sides) if len(sides) == 2 else values.reshape(-1, 1)
     table = table if table.shape[0] >= table.shape[1] else table.T
     if index >= table.shape[1]:
-        raise InputError(f"has {table.shape[1]} columns, [{index}] is not among them", where=where)
+        raise InputError(f"has {table.shape[1]} columns, [{index}] is not among them")
     return np.ascontiguousarray(table[:, index])
+
+
+def _by(shape: Iterable[int]) -> str:
+    return " by ".join(map(str, shape))
 
 
 def labels(name: str, shape: tuple[int, ...]) -> list[str]:
@@ -132,92 +183,77 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [f"{name}[{k}]" for k in range(min(sides))] if min(sides) <= LARGEST_WIDTH else []
 
 
-def _join_runs(
-    arrays: Mapping[str, np.ndarray | None],
-) -> tuple[dict[str, np.ndarray], dict[str, tuple[int, ...]]]:
+def _join_runs(arrays: Arrays) -> tuple[dict[str, Stored], dict[str, tuple[int, ...]]]:
     """Vectors of one name in all structs of a list, end to end: ``runs[:].q`` of ``runs[0].q``.
 
     And of groups that are called trials by a number, as ``run1.q``. Of structs that each have a
     time, or are as long as no other; others are rather joints. All arrays, and by the name of each
     that was joined the samples before which one begins.
     """
-    found = {label: array for label, array in arrays.items() if array is not None}
+    found = dict(arrays)
     begun: dict[str, tuple[int, ...]] = {}
     runs: dict[str, dict[str, str]] = {}
     for label, array in found.items():
-        match = RUN.fullmatch(label)
-        if match and len(labels("", array.shape)) == 1 < array.size:
+        match = _RUN.fullmatch(label)
+        if match and len(labels("", array.shape)) == 1 < math.prod(array.shape):
             runs.setdefault(f"{match[1]}[:].{match[4]}", {})[match[2] or match[3]] = label
     timed = {name.partition("[")[0]: list(own) for name, own in runs.items() if _TIMES.search(name)}
     for name, own in runs.items():
-        parts = [found[label].ravel() for label in own.values()]
+        parts = [found[label] for label in own.values()]
+        sizes = [math.prod(part.shape) for part in parts]
         times = timed.get(name.partition("[")[0])
-        alike = len({part.size for part in parts}) == 1 and times is None
+        alike = len(set(sizes)) == 1 and times is None
         if alike or len(own) < 2 or list(own) != (times or list(own)):
             continue
         found = {label: array for label, array in found.items() if label not in own.values()}
-        found[name] = np.concatenate(parts)
-        begun[name] = tuple(map(int, np.cumsum([part.size for part in parts[:-1]])))
+        found[name] = replace(parts[0], shape=(sum(sizes),), load=partial(_end_to_end, parts))
+        begun[name] = tuple(accumulate(sizes[:-1]))
     return found, begun
 
 
-def _refuse_blocks(arrays: Mapping[str, np.ndarray | None], name: str) -> None:
+def _end_to_end(parts: Iterable[Stored]) -> np.ndarray:
+    return np.concatenate([part.load().ravel() for part in parts])
+
+
+def _refuse_blocks(arrays: Arrays) -> None:
     """Refuse a file whose arrays all have three dimensions or more."""
-    blocks = {label: a.shape for label, a in arrays.items() if a is not None and a.ndim > 2}
+    blocks = [(name, array.shape) for name, array in arrays.items() if len(array.shape) > 2]
     if blocks and len(blocks) == len(arrays):
-        label, shape = next(iter(blocks.items()))
+        name, shape = blocks[0]
         raise InputError(
-            f"'{label}' is a {' by '.join(map(str, shape))} array, of which no side is said to be"
-            " the samples",
-            where=name,
+            f"'{name}' is a {_by(shape)} array, of which no side is said to be the samples",
             remedy="save each trial as an array of its own, samples by channels",
         )
 
 
-def recorded(shapes: Mapping[str, tuple[int, ...]]) -> list[str]:
-    """Labels of the variables that were recorded together, and of numbers that stand alone.
-
-    Beside a log a file may keep what belongs to no sample: gains by axis, a table of settings.
-    """
-    by_length: dict[int, list[str]] = {}
-    for name, shape in shapes.items():
-        by_length.setdefault(max(shape, default=1), []).extend(labels(name, shape))
-    longer = [length for length in by_length if length > 1]
-    samples = max(longer, key=lambda length: (len(by_length[length]), length), default=1)
-    kept = {*by_length.get(1, ()), *by_length.get(samples, ())}
-    return [x for name, shape in shapes.items() for x in labels(name, shape) if x in kept]
-
-
-def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
+def read(path: Path, wanted: Wanted) -> RawTrial:
     """The wanted arrays; ``data[0]`` is the first column of the one array of a ``.npy``.
 
     Raises:
         InputError: damaged, pickled, an array missing, or not a vector of numbers.
     """
-    return read_arrays(_arrays(path, name), wanted, name, "array")
+    return read_arrays(_arrays(path), wanted, "array")
 
 
-def columns(path: Path, name: str) -> dict[str, str]:
+def columns(path: Path) -> dict[str, str]:
     """Names of the vectors of numbers that were recorded together, or of columns; no units."""
-    arrays = _arrays(path, name)
-    _refuse_blocks(arrays, name)
+    arrays = _arrays(path)
+    _refuse_blocks(arrays)
     return columns_of_arrays(arrays)
 
 
-def _arrays(path: Path, name: str) -> dict[str, np.ndarray | None]:
+def _arrays(path: Path) -> dict[str, Stored]:
     try:
         loaded = np.load(path, allow_pickle=False)
-        stored = {"data": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+        whole = {"data": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
     except ValueError as error:
         raise InputError(
             "not sound, or pickled Python objects, which are not read",
-            where=name,
             remedy="save arrays of numbers: np.savez(FILE, t=t, q=q, tau=tau)",
         ) from error
-    found: dict[str, np.ndarray | None] = {}
-    for key, array in stored.items():
+    found: dict[str, Stored] = {}
+    for key, array in whole.items():
         fields = array.dtype.names
         parts = {f"{key}.{part}": array[part] for part in fields} if fields else {key: array}
-        for label, part in parts.items():
-            found[label] = np.atleast_1d(part) if part.dtype.kind in "iufbM" else None
+        found |= {label: stored(np.atleast_1d(part)) for label, part in parts.items()}
     return found

@@ -68,27 +68,27 @@ class _Stream:
     cells: dict[str, list[float]] = field(default_factory=dict)
     counts: list[int] = field(default_factory=list)
 
-    def add(self, moment: int, message: Any, name: str) -> None:
+    def add(self, moment: int, message: Any) -> None:
         self.recorded.append(moment)
         self.stamped.append(_stamp(message))
         found = {column: items(message, column.partition(":")[2]) for column in self.cells}
         count = max(map(len, found.values()), default=1)
         for column, values in found.items():
-            where = f"{name}, column '{column}', message {len(self.recorded)}"
+            where = f"column '{column}', message {len(self.recorded)}"
             if any(value is MISSING for value in values) or len(values) not in (1, count):
                 raise InputError("no such field in this message, or a shorter list", where=where)
             numbers = [as_number(value, where) for value in values]
             self.cells[column] += numbers * count if len(numbers) < count else numbers
         self.counts.append(count)
 
-    def times(self, clock: Field, leads: bool, name: str) -> np.ndarray:
+    def times(self, clock: Field, leads: bool) -> np.ndarray:
         """Times of all samples (T,), ns, by the clock that the time column names if it has that."""
         known = [moment for moment in self.stamped if moment is not None]
         lost = len(self.stamped) - len(known)
         if lost and leads and clock.path == STAMP:
             raise InputError(
                 f"{lost} messages have no {STAMP}",
-                where=f"{name}, topic {clock.topic}",
+                where=f"topic {clock.topic}",
                 remedy=f"give {clock.topic}:{RECORDED} under [time]",
             )
         stamps = known if clock.path == STAMP and not lost else self.recorded
@@ -100,20 +100,20 @@ class _Stream:
         return np.repeat(times, counts) + np.rint(step * within).astype(np.int64)
 
 
-def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
+def read(path: Path, wanted: Wanted) -> RawTrial:
     """The wanted fields at the times of the first column, which is the time.
 
     Raises:
         InputError: a library is not installed, the file is damaged, a topic or field is missing or
             not a number.
     """
-    fields = {column: _field(column, name) for column in wanted.columns}
+    fields = {column: _field(column) for column in wanted.columns}
     clock_column, clock = next(iter(fields.items()))
-    streams = _read_streams(path, fields, wanted, name)
+    streams = _read_streams(path, fields, wanted)
     if not (clock.is_time or "[:]" in clock.path or "::" in clock.path):
         raise InputError(
             "is no time",
-            where=f"{name}, column '{clock_column}'",
+            where=f"column '{clock_column}'",
             remedy=f"give {clock.topic}:{RECORDED} or {clock.topic}:{STAMP} under [time]",
         )
     # The stream that has most of the columns, then most messages, comes first.
@@ -124,7 +124,7 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     alike = [stream for stream in streams if stream.topic == clock.topic]
     leading = max(here or alike, key=lambda s: (here.count(s), len(s.recorded)))
     of |= {column: leading for column, field in fields.items() if field.is_time}
-    times = {s: s.times(clock, s is leading, name) for s in dict.fromkeys(of.values())}
+    times = {s: s.times(clock, s is leading) for s in dict.fromkeys(of.values())}
     base = times[leading]
     values = {}
     for column, each in fields.items():
@@ -148,14 +148,12 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     return RawTrial(values, first_row=1, remarks=tuple(filter(None, remarks)))
 
 
-def _read_streams(
-    path: Path, fields: Mapping[str, Field], wanted: Wanted, name: str
-) -> list[_Stream]:
+def _read_streams(path: Path, fields: Mapping[str, Field], wanted: Wanted) -> list[_Stream]:
     """The messages by topic and kind, with the fields that each kind has."""
     topics = tuple(dict.fromkeys(field.topic for field in fields.values()))
     streams: dict[tuple[Any, ...], _Stream] = {}
     samples, near = 0, ""
-    for topic, moment, message in _messages(path, topics, name):
+    for topic, moment, message in _messages(path, topics):
         kind = _kind(message)
         stream = streams.get((topic, kind))
         if stream is None:
@@ -164,14 +162,14 @@ def _read_streams(
             there = {c: items(message, fields[c].path) for c in asked}
             stream.cells = {c: [] for c, v in there.items() if v and v[0] is not MISSING}
             near = near or ", ".join(path for path in _numbers_in(message) if path != STAMP)
-        stream.add(moment, message, name)
+        stream.add(moment, message)
         samples += stream.counts[-1]
-        check_size(samples, wanted, name)
+        check_size(samples, wanted)
     for column, each in fields.items():
         if not each.is_time and all(column not in s.cells for s in streams.values()):
             raise InputError(
                 f"no field '{each.path}'",
-                where=f"{name}, column '{column}'",
+                where=f"column '{column}'",
                 remedy=f"it has {near:.200}",
             )
     return list(streams.values())
@@ -198,11 +196,11 @@ def _left_out(topic: str, streams: list[_Stream], used: Collection[_Stream]) -> 
     )
 
 
-def columns(path: Path, name: str) -> dict[str, str]:
+def columns(path: Path) -> dict[str, str]:
     """Names of the numbers in the first message of each kind; times have the unit s."""
     found: dict[str, str] = {}
     seen: set[tuple[Any, ...]] = set()
-    for topic, _, message in _messages(path, (), name):
+    for topic, _, message in _messages(path, ()):
         key = (topic, _kind(message))
         if key in seen:
             continue
@@ -228,39 +226,38 @@ def _stamp(message: Any) -> int | None:
     return int(sec) * moments.NANOSECONDS + int(nanosec)
 
 
-def _field(column: str, name: str) -> Field:
+def _field(column: str) -> Field:
     topic, colon, path = column.partition(":")
     if not colon or not path:
         raise InputError(
             f"'{column}' does not say which field of which topic",
-            where=name,
             remedy="write /topic:field, as in /joint_states:position[0]",
         )
     return Field(topic, path)
 
 
-def _messages(path: Path, topics: Sequence[str], name: str) -> Iterator[tuple[str, int, Any]]:
+def _messages(path: Path, topics: Sequence[str]) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of recording (ns) and message, in the order of recording; all if no topics.
 
     InputError where a library or a topic is missing, or the file is damaged.
     """
-    highlevel = need("rosbags.highlevel", "ros", name)
+    highlevel = need("rosbags.highlevel", "ros")
     if path.suffix.lower() == ".mcap":
         with path.open("rb") as stream:
-            source = need("mcap.reader", "ros", name).make_reader(stream)
+            source = need("mcap.reader", "ros").make_reader(stream)
             summary = source.get_summary()
             channels = summary.channels.values() if summary else ()
             in_json = {c.topic for c in channels if c.message_encoding == "json"}
             if in_json:
-                check_columns(sorted(in_json), topics, name)
+                check_columns(sorted(in_json), topics)
                 for _, channel, message in source.iter_messages(topics=list(topics) or None):
                     if channel.topic in in_json:
                         yield channel.topic, message.log_time, json.loads(message.data)
                 return
     with highlevel.AnyReader([path]) as reader:
-        check_columns(sorted(reader.topics), topics, name)
+        check_columns(sorted(reader.topics), topics)
         chosen = [c for c in reader.connections if not topics or c.topic in topics]
         if not chosen:
-            raise InputError("holds no messages", where=name)
+            raise InputError("holds no messages")
         for connection, moment, raw in reader.messages(connections=chosen):
             yield connection.topic, moment, reader.deserialize(raw, connection.msgtype)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 
 from bampipe.data.readers.moments import is_moment
-from bampipe.data.readers.trial import Dialect, check_columns
+from bampipe.data.readers.trial import NUMBER, Dialect, check_columns
 from bampipe.data.units import bare, unit
 from bampipe.errors import InputError
 
@@ -22,7 +22,7 @@ NULLS = ("", "nan", "NaN", "NAN", "NA", "N/A", "n/a", "#N/A", "null", "NULL", "N
 """Cells that mean: no number here."""
 
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "blanks"}
-_POINT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
+_POINT = re.compile(rf"{NUMBER}\Z")
 _COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+\Z")
 _GROUPED = re.compile(r"[-+]?(\d{1,3}(,\d{3})+\.\d*|\d{1,3}(\.\d{3})+,\d*)\Z")
@@ -104,7 +104,7 @@ def cells(text: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([text], delimiter=delimiter), [])]
 
 
-def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str) -> TableLayout:
+def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableLayout:
     """Layout of the text file that begins with ``head``: its first 64 kB, or all of it, as UTF-8.
 
     The header must have ``columns``; any will do where these are empty.
@@ -112,11 +112,11 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
     Raises:
         InputError: no header, a column missing, or a layout that can be read in two ways.
     """
-    lines = _lines(head, name)
+    lines = _lines(head)
     if not _filled(lines):
-        raise InputError("the file holds no text", where=name)
+        raise InputError("the file holds no text")
     delimiters: list[str] = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
-    index, delimiter, header = _header(lines, columns, dialect, delimiters, name)
+    index, delimiter, header = _header(lines, columns, dialect, delimiters)
     body = lines[index + 1 :]
     units = _units_in(header) | _units_of_motion([line.text for line in lines[:index]], header)
     remarks = []
@@ -149,7 +149,7 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect, name: str
         passed += 1
     body = lines[passed + 1 :]
     header = _padded(header, body, delimiter)
-    decimal = dialect.decimal or _decimal(body, header, columns, delimiter, name)
+    decimal = dialect.decimal or _decimal(body, header, columns, delimiter)
     if decimal == "," and not dialect.decimal:
         remarks.append("decimal commas")
     start = lines[passed].end if passed >= 0 else _mark(head)
@@ -172,7 +172,7 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
     moments: Counter[int] = Counter()
     filled: Counter[int] = Counter()
     rows = 0
-    for line in _lines(head, "")[: layout.first_line + _TRIED]:
+    for line in _lines(head)[: layout.first_line + _TRIED]:
         if line.number < layout.first_line or not line.text.strip():
             continue
         rows += 1
@@ -192,7 +192,7 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
 
 def share_of_rows(head: bytes) -> float:
     """Share of the first lines that are rows of numbers, of more than one; prose has hardly any."""
-    lines = [line.text for line in _lines(head, "") if line.text.strip()][:_SEARCHED]
+    lines = [line.text for line in _lines(head) if line.text.strip()][:_SEARCHED]
 
     def is_row(row: list[str], mark: str) -> bool:
         numbers = sum(_is_number(cell, ",") or is_moment(cell) for cell in row)
@@ -210,7 +210,7 @@ def _mark(head: bytes) -> int:
     return 3 if head.startswith(b"\xef\xbb\xbf") else 0
 
 
-def _lines(head: bytes, name: str) -> list[Line]:
+def _lines(head: bytes) -> list[Line]:
     """The whole lines of ``head``, and the last one where it is all there is."""
     found: list[Line] = []
     start = _mark(head)
@@ -224,7 +224,7 @@ def _lines(head: bytes, name: str) -> list[Line]:
             if number <= 2 and not any(line.text.strip() for line in found):
                 raise InputError(
                     "the header is not UTF-8 text",
-                    where=f"{name}, row {number}",
+                    where=f"row {number}",
                     remedy='save it as UTF-8, or say encoding = "latin-1" under [csv]',
                 ) from error
             text = match[0].decode("utf-8", "replace")
@@ -233,11 +233,11 @@ def _lines(head: bytes, name: str) -> list[Line]:
 
 
 def _header(
-    lines: list[Line], columns: Sequence[str], dialect: Dialect, delimiters: list[str], name: str
+    lines: list[Line], columns: Sequence[str], dialect: Dialect, delimiters: list[str]
 ) -> tuple[int, str, list[str]]:
     """Place of the header among the lines (-1 where the session gives the names), and its cells."""
     if dialect.names:
-        check_columns(dialect.names, columns, f"{name}: csv.names")
+        check_columns(dialect.names, columns, "csv.names")
         first, delimiter = _guess(lines, delimiters)[0]
         return max(_filled(lines[:first]), default=-1), delimiter, list(dialect.names)
     guesses = _guess(lines, delimiters)
@@ -255,7 +255,7 @@ def _header(
         for delimiter in delimiters:
             row = names(index, delimiter)
             if set(columns) <= set(row):
-                check_columns(row, columns, f"{name}, row {line.number}")
+                check_columns(row, columns, f"row {line.number}")
                 first, below = _guess(lines[index + 1 :], delimiters)[0]
                 rows = lines[index + 1 + first :]  # may be separated otherwise than the header
                 fits = len(row) > 1 and rows and len(cells(rows[0].text, below)) == len(row)
@@ -269,12 +269,12 @@ def _header(
             return max(_filled(lines[:first]), default=-1), delimiter, row
         raise InputError(
             "no header: the first line holds numbers",
-            where=f"{name}, row {lines[0].number}",
+            where=f"row {lines[0].number}",
             remedy=f"add a line {','.join(columns)}, or give names under [csv]; without names, the"
             f" columns are {row[0]} to {row[-1]}",
         )
     row = names(index, delimiter)
-    check_columns(row, columns, f"{name}, row {lines[index].number}")
+    check_columns(row, columns, f"row {lines[index].number}")
     return index, delimiter, row
 
 
@@ -445,9 +445,7 @@ def _padded(header: list[str], body: list[Line], delimiter: str) -> list[str]:
     return ["", *header] if counted else header
 
 
-def _decimal(
-    body: list[Line], header: list[str], columns: Sequence[str], delimiter: str, name: str
-) -> str:
+def _decimal(body: list[Line], header: list[str], columns: Sequence[str], delimiter: str) -> str:
     """Decimal sign of the first lines; InputError where there are both, or digits in thousands."""
     indices = [n for n, column in enumerate(header) if column in columns or not columns]
     seen: dict[str, tuple[str, int]] = {}
@@ -456,7 +454,7 @@ def _decimal(
         row = cells(line.text, delimiter)
         for index in indices:
             cell = row[index] if index < len(row) else ""
-            at = f"{name}, row {line.number}, column '{header[index]}'"
+            at = f"row {line.number}, column '{header[index]}'"
             if _GROUPED.match(cell):
                 raise InputError(
                     f"'{cell}' groups its digits in thousands",
@@ -474,13 +472,12 @@ def _decimal(
         (comma, row_1), (point, row_2) = seen[","], seen["."]
         raise InputError(
             f"'{comma}' in row {row_1} has a decimal comma, '{point}' in row {row_2} a point",
-            where=name,
             remedy='export with one decimal sign, or say decimal = "," or "." under [csv]',
         )
     if not plain:
         raise InputError(
             f"'{seen[','][0]}' may be a decimal comma or digits in thousands",
-            where=f"{name}, row {seen[','][1]}",
+            where=f"row {seen[','][1]}",
             remedy='say decimal = "," under [csv], or export without thousands separators',
         )
     return ","

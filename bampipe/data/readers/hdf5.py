@@ -4,10 +4,9 @@ A column is the path of a dataset (``log/force``), a field of a compound one (``
 or a column of a matrix (``log/pose[2]``). What lies outside the file is not followed.
 """
 
-import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from itertools import accumulate
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,15 @@ import numpy as np
 
 from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import (
-    RUN,
+    LINK,
+    Stored,
     columns_of_arrays,
-    labels,
     pick,
     read_arrays,
-    recorded,
     split_index,
+    stored,
 )
-from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size
+from bampipe.data.readers.trial import RawTrial, Wanted
 from bampipe.errors import InputError
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -33,7 +32,7 @@ _COLUMNS = ("columns", "channels", "names", "column_names", "labels", "fields")
 """Attributes with the names of the columns of a matrix."""
 
 
-def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTrial:
+def read(path: Path, wanted: Wanted, what: str = "dataset") -> RawTrial:
     """The wanted columns of an HDF5 file, whose parts are called ``what`` in messages.
 
     Raises:
@@ -41,120 +40,66 @@ def read(path: Path, wanted: Wanted, name: str, what: str = "dataset") -> RawTri
     """
     import h5py  # heavy: only for these files
 
-    matlab = what == "variable"
     with h5py.File(path, "r") as file:
-        if any("[:]" in column for column in wanted.columns):
-            return read_arrays(_vectors(file), wanted, name, what)
-        known = _list_columns(file)
-        arrays: dict[str, np.ndarray | None] = {}
-        units: dict[str, str] = {}
-        for column in wanted.columns:
-            where = f"{name}, {what} '{column}'"
-            own, index = split_index(column, known)
-            # A field of a struct of MATLAB is a path here.
-            own = next((n for n in (own, own.replace(".", "/")) if n in known), own)
-            _require_column(file, own, [*known], name, where)
-            data, field, place = known[own]
-            check_size(math.prod(data.shape), wanted, name)
-            kind = _kind(data, field)
-            text = kind.kind in "OS" or data.attrs.get("MATLAB_class") == b"char"
-            arrays[column] = None
-            if column in wanted.datetimes if text else kind.kind in "iufb":
-                if kind.kind == "S" and kind.itemsize > moments.LONGEST:
-                    what = f"a text of {kind.itemsize} bytes, expected a date and time"
-                    raise InputError(what, where=where)
-                cells = data[()] if field is None else _read_field(data, field)
-                cells = pick(cells, index if place is None else place, where)
-                arrays[column] = np.array(_texts(cells), dtype=object) if text else cells
-            unit = "" if matlab else _unit(data)
-            units |= {column: unit} if unit else {}
-    return replace(read_arrays(arrays, wanted, name, what), units=units)
+        known = dict(_arrays(file))
+        for column in wanted.columns:  # a field of a struct of MATLAB is a path here
+            own, _ = split_index(column, known)
+            known |= {own: known[at]} if (at := own.replace(".", "/")) in known else {}
+        return read_arrays(known, wanted, what)
 
 
-def columns(path: Path, name: str) -> dict[str, str]:
+def columns(path: Path) -> dict[str, str]:
     """Names and units of the vectors of numbers that were recorded together."""
     import h5py  # heavy: only for these files
 
-    shapes: dict[str, tuple[int, ...]] = {}
-    units: dict[str, str] = {}
-    named: dict[str, str] = {}
     with h5py.File(path, "r") as file:
-        for column, (data, field, place) in _list_columns(file).items():
-            numeric = _kind(data, field).kind in "iufb"
-            if place is None and numeric and data.attrs.get("MATLAB_class") != b"char":
-                shapes[column] = data.shape
-                units |= dict.fromkeys(labels(column, data.shape), _unit(data))
-            elif place is not None:
-                named[f"{column.rpartition('/')[0]}[{place}]"] = column
-        if any(map(RUN.fullmatch, shapes)):
-            runs = columns_of_arrays(_vectors(file))
-            if any("[:]" in column for column in runs):
-                return runs
-    return {named.get(column, column): units[column] for column in recorded(shapes)}
+        return columns_of_arrays(dict(_arrays(file, alone=True)))
 
 
-def _list_columns(file: Any) -> dict[str, tuple[Any, str | None, int | None]]:
-    """Every column of a file by its name: its dataset, which field and which column of it.
+def _arrays(file: Any, alone: bool = False) -> Iterator[tuple[str, Stored]]:
+    """What a file holds by name: datasets, fields of compound ones, columns of a matrix with names.
 
-    A matrix is one, each of its columns that has a name another.
+    Such a matrix itself, too, unless its columns are wanted ``alone``.
     """
-    found: dict[str, tuple[Any, str | None, int | None]] = {}
     for label, data in _datasets(file):
+        if data is None:
+            yield label, stored(None, kind=LINK)
+            continue
+        names = _names(data)
         for field in data.dtype.names or (None,):
-            found[label if field is None else f"{label}.{field}"] = data, field, None
-        found |= {f"{label}/{text}": (data, None, k) for k, text in enumerate(_names(data))}
-    return found
+            array = _stored(data, field)
+            if not (alone and names):
+                yield label if field is None else f"{label}.{field}", array
+            for place, name in enumerate(names):
+                column = replace(
+                    array, shape=(max(data.shape),), load=partial(_column, data, place)
+                )
+                yield f"{label}/{name}", column
 
 
-def _kind(data: Any, field: str | None) -> Any:
-    return data.dtype if field is None else data.dtype[field]
-
-
-def _vectors(file: Any) -> dict[str, np.ndarray | None]:
-    """The vectors of numbers of a file, by their path."""
-    found = dict(_datasets(file))
-    return {
-        label: data[()]
-        for label, data in found.items()
-        if data.dtype.kind in "iufb" and max(data.shape, default=0) == data.size
-    }
+def _stored(data: Any, field: str | None) -> Stored:
+    kind = (data.dtype if field is None else data.dtype[field]).kind
+    kind = "U" if data.attrs.get("MATLAB_class") == b"char" else kind
+    return Stored(data.shape, kind, partial(_read, data, field), _unit(data))
 
 
 def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
-    """Every dataset of the file itself, by its path; links are not followed."""
+    """Every dataset of the file itself, by its path; None for links, which are not followed."""
     import h5py
 
     for count, key in enumerate(group):
         if count > _MOST_DATASETS or key.startswith("#"):
             continue
+        label = f"{prefix}{key}"
         if not isinstance(group.get(key, getlink=True), h5py.HardLink):
+            yield label, None
             continue
         item = group[key]
-        label = f"{prefix}{key}"
         if isinstance(item, h5py.Dataset):
             if not item.external and not item.is_virtual:
                 yield label, item
         elif depth < 8:
             yield from _datasets(item, f"{label}/", depth + 1)
-
-
-def _require_column(file: Any, column: str, known: Sequence[str], name: str, where: str) -> None:
-    """Refuse a column that is not among those ``known``."""
-    import h5py
-
-    if column in known:
-        return
-    for path in accumulate(column.split("/"), "{}/{}".format):
-        if isinstance(file.get(path, getlink=True), h5py.SoftLink | h5py.ExternalLink):
-            raise InputError("a link, expected numbers in this file", where=where)
-    inside = [other for other in known if other.startswith((f"{column}/", f"{column}."))]
-    if inside:
-        raise InputError(
-            "a structure, expected a vector of numbers",
-            where=where,
-            remedy=f"name what is in it: {', '.join(inside[:6])}",
-        )
-    check_columns(known, [column], name)
 
 
 def _names(data: Any) -> list[str]:
@@ -169,11 +114,22 @@ def _names(data: Any) -> list[str]:
     return texts if data.ndim == 2 and len(texts) == width and len(set(texts)) == width else []
 
 
-def _read_field(data: Any, field: str) -> np.ndarray:
-    """A field of all rows, in blocks: rows may be wide, and memory that HDF5 lacks ends it."""
-    starts = range(0, max(data.shape[:1], default=0), _BLOCK_ROWS)
-    parts = [data[k : k + _BLOCK_ROWS][field] for k in starts]
-    return np.concatenate(parts) if parts else np.asarray(data[field])
+def _read(data: Any, field: str | None) -> np.ndarray:
+    """A dataset, or a field of all its rows; texts as objects."""
+    kind = data.dtype if field is None else data.dtype[field]
+    if kind.kind == "S" and kind.itemsize > moments.LONGEST:
+        raise InputError(f"a text of {kind.itemsize} bytes, expected a date and time")
+    if field is None:
+        cells = np.asarray(data[()])
+    else:  # in blocks: rows may be wide, and memory that HDF5 lacks ends it
+        starts = range(0, max(data.shape[:1], default=0), _BLOCK_ROWS)
+        parts = [data[k : k + _BLOCK_ROWS][field] for k in starts]
+        cells = np.concatenate(parts) if parts else np.asarray(data[field])
+    return np.array(_texts(cells), dtype=object) if kind.kind in "OS" else cells
+
+
+def _column(data: Any, place: int) -> np.ndarray:
+    return pick(_read(data, None), place)
 
 
 def _texts(cells: Iterable[Any]) -> list[str]:

@@ -6,13 +6,12 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from bampipe.data.readers import hdf5
-from bampipe.data.readers.arrays import columns_of_arrays, read_arrays
+from bampipe.data.readers.arrays import Stored, columns_of_arrays, read_arrays, stored
 from bampipe.data.readers.trial import RawTrial, Wanted
 from bampipe.errors import InputError
 
@@ -29,7 +28,7 @@ _VALUES = ("values", "value", "data")
 """Fields that hold the name of a signal, and its samples."""
 
 
-def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
+def read(path: Path, wanted: Wanted) -> RawTrial:
     """The wanted variables; ``X[0]`` is the first column of ``X``, ``S.q`` a field of ``S``.
 
     Raises:
@@ -38,29 +37,22 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     for column in wanted.datetimes:
         raise InputError(
             "dates and times of MATLAB are not read",
-            where=f"{name}, variable '{column}'",
+            where=f"variable '{column}'",
             remedy="save seconds: t = seconds(stamp - stamp(1))",
         )
-    if not _is_level_5(path, name):
-        return hdf5.read(path, wanted, name, "variable")
-    arrays, units, root = _arrays(path, name)
-    arrays |= {f"{root}{label}": array for label, array in arrays.items() if root}
-    return replace(
-        read_arrays(arrays, wanted, name, "variable"),
-        units={column: units[column] for column in wanted.columns if column in units},
-    )
+    if not _is_level_5(path):
+        return hdf5.read(path, wanted, "variable")
+    arrays, root = _arrays(path)
+    whole = {f"{root}{label}": array for label, array in arrays.items()}
+    return read_arrays(whole | arrays, wanted, "variable")
 
 
-def columns(path: Path, name: str) -> dict[str, str]:
-    """Names of the vectors of numbers that were recorded together, or of columns; no units."""
-    if not _is_level_5(path, name):
-        return hdf5.columns(path, name)
-    arrays, units, _ = _arrays(path, name)
-    found = columns_of_arrays(arrays)
-    return {column: units.get(column, "") for column in found}
+def columns(path: Path) -> dict[str, str]:
+    """Names and units of the vectors of numbers that were recorded together, or of columns."""
+    return columns_of_arrays(_arrays(path)[0]) if _is_level_5(path) else hdf5.columns(path)
 
 
-def _is_level_5(path: Path, name: str) -> bool:
+def _is_level_5(path: Path) -> bool:
     with path.open("rb") as stream:
         head = stream.read(1024)
     if hdf5.SIGNATURE in (head[:8], head[512:520]):  # the latter behind MATLAB's user block
@@ -69,14 +61,12 @@ def _is_level_5(path: Path, name: str) -> bool:
         return True
     raise InputError(
         "not a MATLAB file of version 5 or newer",
-        where=name,
         remedy="save it again from MATLAB (-v7)",
     )
 
 
-def _arrays(path: Path, name: str) -> tuple[dict[str, np.ndarray | None], dict[str, str], str]:
-    """Arrays of a file, each struct followed by what is in it, None for what are no real numbers;
-    their units; and what is left out of the names.
+def _arrays(path: Path) -> tuple[dict[str, Stored], str]:
+    """Arrays of a file, each struct followed by what is in it; and what is left out of the names.
 
     Structs of a list that say what they are called go by that name, and units beside an array are
     its own: so scopes and recorders write their channels. A struct that is all of the file and has
@@ -100,9 +90,7 @@ def _arrays(path: Path, name: str) -> tuple[dict[str, np.ndarray | None], dict[s
     return _called(found)
 
 
-def _called(
-    found: dict[str, np.ndarray | str | None],
-) -> tuple[dict[str, np.ndarray | None], dict[str, str], str]:
+def _called(found: dict[str, np.ndarray | str | None]) -> tuple[dict[str, Stored], str]:
     texts = {label: text for label, text in found.items() if isinstance(text, str) and text}
     names, units = dict[str, str](), dict[str, str]()
     for label, text in texts.items():
@@ -128,18 +116,16 @@ def _called(
     whole = {label.partition(".")[0] for label in found}
     root = f"{whole.pop()}." if len(whole) == 1 else ""
     root = root if re.search(r"\d", root) else ""
-    arrays: dict[str, np.ndarray | None] = {}
-    stated: dict[str, str] = {}
+    arrays: dict[str, Stored] = {}
     for label, value in found.items():
         owner, _, key = label.rpartition(".")
-        kept = owner.rpartition("[")[0]
+        kept, sampled = owner.rpartition("[")[0], key.lower() in _VALUES
         if owner in names and several[kept, names[owner]] == 1:
-            label = f"{kept}.{names[owner]}" + ("" if key.lower() in _VALUES else f".{key}")
-        label = label.removeprefix(root)
-        arrays[label] = None if isinstance(value, str) else value
-        if owner in units and key.lower() in _VALUES:
-            stated[label] = units[owner]
-    return arrays, stated, root
+            label = f"{kept}.{names[owner]}" + ("" if sampled else f".{key}")
+        unit = units.get(owner, "") if sampled else ""
+        array = None if isinstance(value, str) else value
+        arrays[label.removeprefix(root)] = stored(array, unit)
+    return arrays, root
 
 
 class _Elements:

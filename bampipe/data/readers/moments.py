@@ -34,14 +34,14 @@ def is_moment(cell: str) -> bool:
 
 
 def nanoseconds(
-    values: Sequence[str | None] | np.ndarray, form: str, where: str, first_row: int = 1
+    values: Sequence[str | None] | np.ndarray, form: str, first_row: int = 1
 ) -> np.ndarray:
     """Moments as whole nanoseconds since 1970 (UTC), (T,) int64; the least one where missing.
 
     Args:
         values: text, or numpy datetime64.
         form: as of ``strptime``; "" for ISO 8601 or times of day, which are of 1970-01-01.
-        where, first_row: file and column, and the number of the first row, for messages.
+        first_row: number of the first row, for messages.
 
     Raises:
         InputError: a cell is no date and time of that form.
@@ -50,7 +50,7 @@ def nanoseconds(
         return values.astype("datetime64[ns]").astype(np.int64)
     longest = max((len(value) for value in values if value is not None), default=0)
     if longest > LONGEST:
-        raise InputError(f"a text of {longest} characters, expected a date and time", where=where)
+        raise InputError(f"a text of {longest} characters, expected a date and time")
     text = pd.Series(values, dtype="string").str.strip()
     plain = text
     if not form:
@@ -63,16 +63,14 @@ def nanoseconds(
     try:
         moments = pd.to_datetime(plain, format=form or "ISO8601", utc=True, errors="coerce")
     except (ValueError, OverflowError) as error:
-        raise InputError(
-            f"'{form}' is no form of a date and time", where=where, remedy="as of strptime"
-        ) from error
+        what = f"'{form}' is no form of a date and time"
+        raise InputError(what, remedy="as of strptime") from error
     wrong = (moments.isna() & text.notna() & (text != "")).to_numpy()
     if wrong.any():
         at = int(np.argmax(wrong))
         raise InputError(
             f"row {first_row + at}: found '{str(text.iloc[at])[:40]}', expected a date and time"
             + (f" like {form}" if form else " like 2026-10-03T10:12:00.125"),
-            where=where,
             remedy="" if form else 'give its form: format = "%d.%m.%Y %H:%M:%S.%f" under [time]',
         )
     return np.asarray(moments.dt.tz_localize(None), dtype="datetime64[ns]").astype(np.int64)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from bampipe.data.readers.trial import NUMBER
 from bampipe.errors import InputError
 
 MISSING = object()
@@ -60,12 +61,12 @@ def spread(value: Any, path: str = "") -> Iterator[str]:
         if isinstance(part, list | tuple | np.ndarray):
             if len(part) <= _MOST_ITEMS:
                 continue
-            if _is_number(part[0]):
+            if is_number(part[0]):
                 width = _width(value, len(part))
                 ends = [f"[{k}::{width}]" for k in range(width)] if width > 1 else ["[:]"]
                 yield from (inner + end for end in ends)
             else:
-                numbers = (leaf for leaf, item in leaves(part[0]) if _is_number(item))
+                numbers = (leaf for leaf, item in leaves(part[0]) if is_number(item))
                 yield from (f"{inner}[:].{leaf}" for leaf in numbers)
         elif path.count(".") < _DEEPEST:
             yield from spread(part, inner)
@@ -76,10 +77,6 @@ def _width(parent: Any, count: int) -> int:
     sizes = [find(parent, f"layout.dim[{k}].size") for k in range(2)]
     fits = all(isinstance(size, int | np.integer) for size in sizes)
     return int(sizes[1]) if fits and sizes[0] * sizes[1] == count and sizes[1] <= _MOST_ITEMS else 1
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.number)
 
 
 def leaves(value: Any, path: str = "", parent: Any = None) -> Iterator[tuple[str, Any]]:
@@ -124,9 +121,14 @@ def _part(value: Any, key: str) -> Any:
     return getattr(value, key, MISSING) if key in _keys(value) else MISSING
 
 
-def is_number(text: str) -> bool:
-    """Whether a text is a number, as some programs write them into JSON."""
-    return bool(re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", text))
+def is_number(value: Any) -> bool:
+    """Whether a value is a number rather than a text of one."""
+    return isinstance(value, int | float | np.number)
+
+
+def reads_as_number(value: Any) -> bool:
+    """Whether a value is a number, or a text of one, as some programs write them into JSON."""
+    return is_number(value) or (isinstance(value, str) and bool(re.fullmatch(NUMBER, value)))
 
 
 def as_number(cell: Any, where: str) -> float:
@@ -137,9 +139,7 @@ def as_number(cell: Any, where: str) -> float:
     """
     if cell is None:
         return float("nan")
-    if isinstance(cell, str) and is_number(cell):
-        return float(cell)
-    if not isinstance(cell, bool | int | float | np.number | np.bool_):
+    if not (reads_as_number(cell) or isinstance(cell, np.bool_)):
         raise InputError(f"found {str(cell)[:40]!r}, expected a number", where=where)
     try:
         return float(cell)

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import columns_of_arrays, read_arrays
-from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves
+from bampipe.data.readers.arrays import Stored, columns_of_arrays, read_arrays, stored
+from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves, reads_as_number
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns
-from bampipe.errors import InputError
+from bampipe.errors import InputError, located
 
 
-def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
+def read(path: Path, wanted: Wanted) -> RawTrial:
     """The wanted columns: a list of objects, a list under one key, or one object a line (.jsonl).
 
     Numbers beside that list are the same at every sample: a column for each of them.
@@ -28,52 +28,48 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     Raises:
         InputError: not JSON, no such list, a column missing or not of numbers.
     """
-    samples, constants, notes = _samples(path, name)
+    samples, constants, notes = _samples(path)
     if isinstance(samples, dict):
         fixed = [column for column in wanted.columns if column in constants]
-        alone = {c: np.array([as_number(constants[c], f"{name}, '{c}'")]) for c in fixed}
-        return replace(read_arrays(alone | samples, wanted, name, "array"), notes=notes)
+        alone = {c: stored(np.array([as_number(constants[c], f"'{c}'")])) for c in fixed}
+        return replace(read_arrays(alone | samples, wanted, "array"), notes=notes)
     first, values = samples[0], {}
     beside = [column for column in wanted.columns if find(first, column) is MISSING]
     unknown = [column for column in beside if column not in constants]
-    check_columns([path for path, _ in leaves(first)] + list(constants), unknown, name)
+    check_columns([path for path, _ in leaves(first)] + list(constants), unknown)
     for column in wanted.columns:
         parts = [constants] if column in beside else samples
         cells = [None if (c := find(part, column)) is MISSING else c for part in parts]
-        places = (f"{name}, sample {n}, '{column}'" for n, _ in enumerate(cells, 1))
+        places = (f"sample {n}, '{column}'" for n, _ in enumerate(cells, 1))
         if column in wanted.datetimes:
             for cell, where in zip(cells, places, strict=True):
                 if not isinstance(cell, str | None):
                     raise InputError(f"found {cell!r:.40}, expected a date and time", where=where)
-            stamps = moments.nanoseconds(cells, wanted.datetimes[column], f"{name}, '{column}'")
+            with located(f"'{column}'"):
+                stamps = moments.nanoseconds(cells, wanted.datetimes[column])
             values[column] = moments.seconds(stamps)
         else:
             values[column] = np.fromiter(map(as_number, cells, places), float, len(cells))
-    return RawTrial(aligned(values, name, "value"), first_row=1, notes=notes)
+    return RawTrial(aligned(values, "value"), first_row=1, notes=notes)
 
 
-def columns(path: Path, name: str) -> dict[str, str]:
+def columns(path: Path) -> dict[str, str]:
     """Names of the values that are numbers, or moments (unit "datetime"), in the first sample."""
-    samples, constants, _ = _samples(path, name)
+    samples, constants, _ = _samples(path)
     if isinstance(samples, dict):
-        lines = path.suffix.lower() != ".json"
-        content = {} if lines else _parsed(path.read_text(encoding="utf-8-sig"), name)
-        beside = {label: find(content, f"{label.rpartition('.')[0]}.unit") for label in samples}
-        units = {label: unit for label, unit in beside.items() if isinstance(unit, str)}
-        found = columns_of_arrays(samples) | dict.fromkeys(constants, "")
-        return {column: units.get(column, stated) for column, stated in found.items()}
+        return columns_of_arrays(samples) | dict.fromkeys(constants, "")
     found = {}
     for column, cell in leaves(samples[0]):
-        if isinstance(cell, int | float) or (isinstance(cell, str) and is_number(cell)):
+        if reads_as_number(cell):
             found[column] = ""
         elif isinstance(cell, str) and moments.is_moment(cell):
             found[column] = "datetime"
     return found | {c: "" for c in constants if c not in found}
 
 
-def stated_units(path: Path, name: str) -> dict[str, str]:
+def stated_units(path: Path) -> dict[str, str]:
     """Units stated beside the samples, such as ``"force units": "kip"``, by quantity."""
-    content = _parsed(path.read_text(encoding="utf-8-sig"), name)
+    content = _parsed(path.read_text(encoding="utf-8-sig"))
     items = content.items() if isinstance(content, dict) else ()
     parts = [(re.split(r"[ _]units?$", str(key), flags=re.I), value) for key, value in items]
     return {key[0]: value for key, value in parts if len(key) > 1 and isinstance(value, str)}
@@ -127,51 +123,54 @@ def _with_lists(content: object, depth: int = 2) -> object:
 
 
 def _samples(
-    path: Path, name: str
-) -> tuple[list[object] | dict[str, np.ndarray], Mapping[str, object], tuple[str, ...]]:
+    path: Path,
+) -> tuple[list[object] | dict[str, Stored], Mapping[str, object], tuple[str, ...]]:
     """Samples of a file, or its arrays; the numbers beside them, and what was left out."""
     data = path.read_bytes()
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError("not UTF-8 text", where=name, remedy="save it as UTF-8") from error
+        raise InputError("not UTF-8 text", remedy="save it as UTF-8") from error
     del data
     notes: tuple[str, ...] = ()
     content: object = None
     if path.suffix.lower() in (".jsonl", ".ndjson"):
         lines = [line for line in text.splitlines() if line.strip()]
-        content = parsed = [_parsed(x, f"{name}, sample {n}") for n, x in enumerate(lines[:-1], 1)]
+        content = parsed = [_parsed(x, f"sample {n}") for n, x in enumerate(lines[:-1], 1)]
         try:
-            parsed += [_parsed(x, f"{name}, sample {len(lines)}") for x in lines[-1:]]
+            parsed += [_parsed(x, f"sample {len(lines)}") for x in lines[-1:]]
         except InputError:
             if text.endswith("\n"):
                 raise
             notes = ("last line is cut off: 1 row dropped",)
     else:
-        content = _with_lists(_parsed(text, name))
+        content = _with_lists(_parsed(text))
     items = content.items() if isinstance(content, dict) else [("", content)]
     lists = {str(k): v for k, v in items if isinstance(v, list) and v and isinstance(v[0], dict)}
     single = all(_is_sample(items[0]) for items in lists.values())
     if not (lists and single) and (arrays := dict(_arrays(content))):
-        return arrays, _numbers(content), notes
+        units = {label: find(content, f"{label.rpartition('.')[0]}.unit") for label in arrays}
+        stated = {label: unit if isinstance(unit, str) else "" for label, unit in units.items()}
+        kinds = {label: "M" * (array.dtype.kind == "O") for label, array in arrays.items()}
+        held = {label: stored(a, stated[label], kinds[label]) for label, a in arrays.items()}
+        return held, _numbers(content), notes
     if not isinstance(content, list) and len(lists) != 1:
         raise InputError(
             f"{len(lists)} lists of samples: {', '.join(lists)}"
             if lists
             else "no list of samples, that is of objects with named values, and no array",
-            where=name,
             remedy="leave one list in the file, or export the log as CSV",
         )
     samples = content if isinstance(content, list) else next(iter(lists.values()))
     if not samples:
-        raise InputError("a header but no samples", where=name)
+        raise InputError("a header but no samples")
     for count, sample in enumerate(samples, 1):
         if not isinstance(sample, dict):
-            raise InputError("not an object with named values", where=f"{name}, sample {count}")
+            raise InputError("not an object with named values", where=f"sample {count}")
     return samples, _numbers(content), notes
 
 
-def _parsed(text: str, where: str) -> object:
+def _parsed(text: str, where: str = "") -> object:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -183,11 +182,10 @@ def _parsed(text: str, where: str) -> object:
 
 def _is_sample(value: object) -> bool:
     """Whether an object is a sample rather than a recording, whose values are long lists."""
-    cells = (cell for _, cell in leaves(value))
-    return any(isinstance(x, int | float) or (isinstance(x, str) and is_number(x)) for x in cells)
+    return any(reads_as_number(cell) for _, cell in leaves(value))
 
 
 def _numbers(content: object) -> dict[str, object]:
     """The numbers beside the samples of a parsed file."""
     found = leaves(content) if isinstance(content, dict) else ()
-    return {key: value for key, value in found if isinstance(value, int | float) and "[" not in key}
+    return {key: value for key, value in found if is_number(value) and "[" not in key}

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 
 from bampipe.data.readers import lerobot, moments
 from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size
-from bampipe.errors import InputError
+from bampipe.errors import InputError, located
 
 BATCH_ROWS = 1 << 16
 _BUFFER = 1 << 20
@@ -17,7 +17,7 @@ _NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.t
 _MOMENTS = (pa.types.is_timestamp, pa.types.is_date, pa.types.is_string, pa.types.is_large_string)
 
 
-def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
+def read(path: Path, wanted: Wanted) -> RawTrial:
     """The wanted columns of a Parquet file.
 
     Raises:
@@ -29,14 +29,14 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     ) as file:
         schema = file.schema_arrow
         vectors = lerobot.vector_columns(path, schema)
-        check_columns([*schema.names, *vectors], wanted.columns, name)
+        check_columns([*schema.names, *vectors], wanted.columns)
         places = {column: vectors.get(column, (column, None)) for column in wanted.columns}
         for column, (_, place) in places.items():
             if place is None:
-                _check_kind(schema.field(column).type, column in wanted.datetimes, name, column)
+                _check_kind(schema.field(column).type, column in wanted.datetimes, column)
         stored = list(dict.fromkeys(where for where, _ in places.values()))
         rows = file.metadata.num_rows
-        check_size(rows, wanted, name)
+        check_size(rows, wanted)
         values = {
             column: np.empty(rows, np.int64 if column in wanted.datetimes else np.float64)
             for column in wanted.columns
@@ -47,18 +47,18 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
                 cells = batch.column(where)
                 if place is not None:
                     cells = pc.list_element(cells, place)
-                values[column][done : done + batch.num_rows] = _numbers(
-                    cells, wanted.datetimes.get(column), f"{name}, column '{column}'", done + 1
-                )
+                with located(f"column '{column}'"):
+                    numbers = _numbers(cells, wanted.datetimes.get(column), done + 1)
+                values[column][done : done + batch.num_rows] = numbers
             done += batch.num_rows
     if done != rows:
-        raise InputError(f"{done} rows, where it claims {rows}", where=name)
+        raise InputError(f"{done} rows, where it claims {rows}")
     for column in wanted.datetimes:
         values[column] = moments.seconds(values[column])
     return RawTrial(values, first_row=1, begun=lerobot.episodes_begin(path))
 
 
-def columns(path: Path, name: str) -> dict[str, str]:
+def columns(path: Path) -> dict[str, str]:
     """Names of the columns that hold numbers or moments; the unit is "datetime" for these."""
     schema = pq.read_schema(path)
     found = dict.fromkeys(lerobot.vector_columns(path, schema), "")
@@ -73,19 +73,19 @@ def columns(path: Path, name: str) -> dict[str, str]:
     return found
 
 
-def _check_kind(kind: pa.DataType, moment: bool, name: str, column: str) -> None:
+def _check_kind(kind: pa.DataType, moment: bool, column: str) -> None:
     if moment and pa.types.is_dictionary(kind):
         kind = kind.value_type
     if not any(check(kind) for check in (_MOMENTS if moment else _NUMBERS)):
         stamped = pa.types.is_timestamp(kind)
         raise InputError(
             f"holds {kind}, expected {'dates and times' if moment else 'numbers'}",
-            where=f"{name}, column '{column}'",
+            where=f"column '{column}'",
             remedy='is it the time? then say unit = "datetime" under [time]' if stamped else "",
         )
 
 
-def _numbers(cells: pa.Array, form: str | None, where: str, first: int) -> np.ndarray:
+def _numbers(cells: pa.Array, form: str | None, first: int) -> np.ndarray:
     if form is None:
         if pa.types.is_boolean(cells.type):
             cells = cells.cast(pa.uint8())
@@ -93,12 +93,11 @@ def _numbers(cells: pa.Array, form: str | None, where: str, first: int) -> np.nd
         return np.asarray(numbers.to_numpy(zero_copy_only=False))
     if pa.types.is_timestamp(cells.type) or pa.types.is_date(cells.type):
         stamps = cells.cast(pa.timestamp("ns", getattr(cells.type, "tz", None)), safe=False)
-        return moments.nanoseconds(
-            stamps.to_numpy(zero_copy_only=False).astype("datetime64[ns]"), form, where
-        )
+        plain = stamps.to_numpy(zero_copy_only=False).astype("datetime64[ns]")
+        return moments.nanoseconds(plain, form)
     if pa.types.is_dictionary(cells.type):
         longest = pc.max(pc.binary_length(cells.dictionary)).as_py() or 0
         if longest > 4 * moments.LONGEST:
-            raise InputError(f"a text of {longest} bytes, expected a date and time", where=where)
+            raise InputError(f"a text of {longest} bytes, expected a date and time")
         cells = cells.dictionary_decode()
-    return moments.nanoseconds(cells.to_pylist(), form, where, first)
+    return moments.nanoseconds(cells.to_pylist(), form, first)

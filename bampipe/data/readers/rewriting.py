@@ -13,11 +13,11 @@ from typing import Any
 
 from bampipe.data.readers.dialect import cells
 from bampipe.data.readers.moments import is_moment
+from bampipe.data.readers.trial import NUMBER
 from bampipe.data.units import unit
 from bampipe.errors import InputError
 
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_PAIR = re.compile(rf"""["']?([A-Za-z_][\w./]*)["']?\s*[=:]\s*({_NUMBER})(?![\w.:])""")
+_PAIR = re.compile(rf"""["']?([A-Za-z_][\w./]*)["']?\s*[=:]\s*({NUMBER})(?![\w.:])""")
 _STAMPED = re.compile(
     r"\s*\[?((?:\d{4}-\d\d-\d\d[ T])?\d{1,2}:\d\d:\d\d[.,]\d+)"
     r"(?:\]|\s*->|\s+(?:DEBUG|INFO|WARN\w*|ERROR)\b)\s*(.*)"
@@ -25,7 +25,7 @@ _STAMPED = re.compile(
 _QUOTED = re.compile(r'\A\s*"[^"]*\d[,;\t][^"]*"\s*\Z')
 _LINE_PROTOCOL = re.compile(r"[^\s,=]+(?:,\S+)? (\w[^\s=]*=\S+) (\d{10,19})\s*")
 _ELEMENT = re.compile(r"<(\w+)((?:\s+\w+=\"[^\"]*\")+)\s*/?>|<(\w+)>([^<>]*)</")
-_WITH_UNIT = re.compile(rf"({_NUMBER})[ \u00a0]?([^\W\d_]\S*|[%°]\S*)")
+_WITH_UNIT = re.compile(rf"({NUMBER})[ \u00a0]?([^\W\d_]\S*|[%°]\S*)")
 _FORTRAN = re.compile(r"(\d\.?\d*)[Dd]([-+]\d)")
 _HEX = re.compile(r"(?i)(?<![\w.])0x[0-9a-f]{1,8}(?!\w)")
 _NAMES = re.compile(r"(?i)(?:channel|signal|marker)_names?[\t;,]")
@@ -77,7 +77,7 @@ class Form:
     names: tuple[str, ...] = ()
 
 
-def find_form(head: str, name: str) -> Form | None:
+def find_form(head: str) -> Form | None:
     """The form of a text that begins with ``head`` (whole lines); None of a table as it is.
 
     InputError where it is known, and no table can be made of it.
@@ -88,7 +88,7 @@ def find_form(head: str, name: str) -> Form | None:
         return None
     if any(sign in head for sign in _TYPESET):
         plain = str.maketrans(_TYPESET)
-        inner = find_form(head.translate(plain), name) or Form("", str)
+        inner = find_form(head.translate(plain)) or Form("", str)
         said = "; ".join(
             filter(None, ("typeset minus signs and blanks are plain ones", inner.said))
         )
@@ -125,7 +125,7 @@ def find_form(head: str, name: str) -> Form | None:
     for line in (*whole[:_FEWEST], lines[-1]):
         for pattern, what, remedy in _FOREIGN:
             if pattern.match(line):
-                raise InputError(what, where=name, remedy=remedy)
+                raise InputError(what, remedy=remedy)
     return None
 
 
@@ -213,7 +213,7 @@ def _elements(line: str) -> list[tuple[str, str]]:
     for name, inner, single, content in _ELEMENT.findall(line):
         parts = re.findall(r'(\w+)="([^"]*)"', inner) if inner else [("", content)]
         found += [(f"{name}.{key}" if key else single, value) for key, value in parts]
-    return [(name, value) for name, value in found if re.fullmatch(_NUMBER, value)]
+    return [(name, value) for name, value in found if re.fullmatch(NUMBER, value)]
 
 
 def _pairs(lines: Sequence[str], find: Callable[[str], list[tuple[str, str]]]) -> Form | None:
@@ -244,7 +244,7 @@ def _cells(header: list[str], rows: list[list[str]], delimiter: str) -> Form | N
     if any(widths):
         return Form("cells that are lists", _by_cell(delimiter, widths, _unpacked))
     signals = Counter(row[1] for row in rows if row != header)
-    numbers = sum(bool(re.fullmatch(_NUMBER, row[-1])) for row in rows)
+    numbers = sum(bool(re.fullmatch(NUMBER, row[-1])) for row in rows)
     in_turn = sum(one[1] != other[1] for one, other in pairwise(rows))
     if (
         len(header) == 3
@@ -297,4 +297,4 @@ def _items(cell: str) -> list[str]:
     """The numbers of a list; none where it is none."""
     inner = re.fullmatch(r"[\[(](.*)[\])]", cell)
     items = re.split(r"[,;\s]+", inner[1].strip()) if inner else []
-    return items if all(re.fullmatch(_NUMBER, item) for item in items) else []
+    return items if all(re.fullmatch(NUMBER, item) for item in items) else []

@@ -21,7 +21,7 @@ from bampipe.data.readers import dialect as dialects
 from bampipe.data.readers import moments, rewriting
 from bampipe.data.readers.dialect import HEAD, NULLS, Line, TableLayout
 from bampipe.data.readers.trial import Dialect, RawTrial, Wanted, check_size, need
-from bampipe.errors import InputError
+from bampipe.errors import InputError, located
 
 BLOCK = 1 << 20
 _MOST_CHATTER = 50
@@ -40,19 +40,19 @@ _TAKEN_AS = {
 }
 
 
-def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
+def read(path: Path, wanted: Wanted) -> RawTrial:
     """The wanted columns of a text file.
 
     Raises:
         InputError: binary data, a wrong layout, or a cell that is not a number; names the row.
     """
-    with _opened(path, wanted.dialect, name) as (stream, dialect, said):
-        layout = dialects.find_layout(_head(stream, name), wanted.columns, dialect, name)
+    with _opened(path, wanted.dialect) as (stream, dialect, said):
+        layout = dialects.find_layout(_head(stream), wanted.columns, dialect)
         end, notes = _sound_end(stream, layout)
         samples = _Samples(wanted)
-        _read_samples(stream, layout, end, samples, name)
+        _read_samples(stream, layout, end, samples)
     if samples.rows == 0:
-        raise InputError("a header but no samples", where=name)
+        raise InputError("a header but no samples")
     units = {column: layout.units[column] for column in wanted.columns if column in layout.units}
     return RawTrial(
         samples.values(),
@@ -66,13 +66,13 @@ def read(path: Path, wanted: Wanted, name: str) -> RawTrial:
     )
 
 
-def columns(path: Path, name: str, dialect: Dialect | None = None) -> dict[str, str]:
+def columns(path: Path, dialect: Dialect | None = None) -> dict[str, str]:
     """Names and units of the columns of numbers, or of moments (unit "datetime")."""
-    with _opened(path, dialect or Dialect(), name) as (stream, dialect, _):
-        head = _head(stream, name)
+    with _opened(path, dialect or Dialect()) as (stream, dialect, _):
+        head = _head(stream)
     if dialects.share_of_rows(head) < _LEAST_ROWS:
         return {}
-    layout = dialects.find_layout(head, (), dialect, name)
+    layout = dialects.find_layout(head, (), dialect)
     return {
         column: "datetime" if is_moment else layout.units.get(column, "")
         for column, is_moment in dialects.readable_columns(head, layout).items()
@@ -83,26 +83,24 @@ def is_table(path: Path) -> bool:
     """Whether a file of an unknown extension is text with rows of numbers."""
     try:
         with path.open("rb") as stream:
-            return dialects.share_of_rows(_head(stream, "")) > _MANY_ROWS
+            return dialects.share_of_rows(_head(stream)) > _MANY_ROWS
     except (OSError, InputError):
         return False
 
 
 @contextmanager
-def _opened(
-    path: Path, dialect: Dialect, name: str
-) -> Iterator[tuple[BinaryIO, Dialect, tuple[str, ...]]]:
+def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, tuple[str, ...]]]:
     """The file as a table in UTF-8, itself or a copy in memory; its dialect, and what to say of it.
 
     InputError where it is not in the encoding that it claims.
     """
     with path.open("rb") as file:
-        stream = _sheet(file, name) if path.suffix.lower().startswith(".xls") else file
+        stream = _sheet(file) if path.suffix.lower().startswith(".xls") else file
         head = stream.read(HEAD)
         stream.seek(0)
         encoding = dialect.encoding or _encoding(head)
         whole = head[: head.rfind(b"\n") + 1] or head
-        form = rewriting.find_form(whole.decode(encoding, "ignore").removeprefix("\ufeff"), name)
+        form = rewriting.find_form(whole.decode(encoding, "ignore").removeprefix("\ufeff"))
         if encoding == "utf-8" and form is None:
             yield stream, dialect, ()
             return
@@ -111,7 +109,6 @@ def _opened(
         except UnicodeDecodeError as error:
             raise InputError(
                 f"not sound {encoding.upper()} text ({error.reason})",
-                where=name,
                 remedy="save it as UTF-8, or say another encoding under [csv]",
             ) from error
         said = () if dialect.encoding or encoding not in _TAKEN_AS else (_TAKEN_AS[encoding],)
@@ -123,9 +120,9 @@ def _opened(
         yield io.BytesIO(text.encode("utf-8", "replace")), dialect, said
 
 
-def _sheet(file: BinaryIO, name: str) -> BinaryIO:
+def _sheet(file: BinaryIO) -> BinaryIO:
     """The first sheet of a workbook that holds rows, as CSV; InputError without openpyxl."""
-    book = need("openpyxl", "xlsx", name).load_workbook(file, read_only=True, data_only=True)
+    book = need("openpyxl", "xlsx").load_workbook(file, read_only=True, data_only=True)
     rows = next(
         (r for s in book.worksheets if len(r := list(s.iter_rows(values_only=True))) > 1), []
     )
@@ -172,15 +169,15 @@ def _sound(head: bytes, encoding: str) -> bool:
     return True
 
 
-def _head(stream: BinaryIO, name: str) -> bytes:
+def _head(stream: BinaryIO) -> bytes:
     """The first 64 kB, if they can be lines of a table."""
     head = stream.read(HEAD)
     line = re.split(rb"[\r\n]", head, maxsplit=1)[0]
     text = line.decode("utf-8", "ignore").removeprefix("\ufeff")
     if b"\0" in head or not (text.isprintable() or "\t" in text):
-        raise InputError("binary data, not text", where=name, remedy="export the log as CSV")
+        raise InputError("binary data, not text", remedy="export the log as CSV")
     if len(line) == HEAD:
-        raise InputError("no line end in the first 64 kB: not a table", where=name)
+        raise InputError("no line end in the first 64 kB: not a table")
     return head
 
 
@@ -197,18 +194,18 @@ class _Samples:
     begun: list[int] = field(default_factory=list)
     since: dict[str, int] = field(default_factory=dict)
 
-    def add(self, batch: pa.RecordBatch, first_line: int, name: str) -> None:
+    def add(self, batch: pa.RecordBatch, first_line: int) -> None:
         for column in self.wanted.columns:
             cells = batch.column(column)
             if column in self.wanted.datetimes:
                 form = self.wanted.datetimes[column]
-                where = f"{name}, column '{column}'"
-                part = moments.nanoseconds(cells.to_pylist(), form, where, first_line)
+                with located(f"column '{column}'"):
+                    part = moments.nanoseconds(cells.to_pylist(), form, first_line)
             else:
                 part = np.array(cells.to_numpy(zero_copy_only=False), dtype=np.float64)
             self.parts.setdefault(column, []).append(part)
         self.rows += batch.num_rows
-        check_size(self.rows, self.wanted, name)
+        check_size(self.rows, self.wanted)
 
     def passes_over(self, message: str, line: Line, layout: TableLayout) -> bool:
         """Whether a word stands where a number is expected: no reading, as "OVERLOAD" says."""
@@ -239,9 +236,7 @@ class _Samples:
         return values
 
 
-def _read_samples(
-    stream: BinaryIO, layout: TableLayout, end: int, samples: _Samples, name: str
-) -> None:
+def _read_samples(stream: BinaryIO, layout: TableLayout, end: int, samples: _Samples) -> None:
     """Read the samples before byte ``end``, past lines of text that hold none.
 
     InputError where a row is damaged, or too many lines are text.
@@ -249,7 +244,7 @@ def _read_samples(
     while True:
         rows, parts = samples.rows, max(map(len, samples.parts.values()), default=0)
         try:
-            _read_stretch(stream, layout, end, samples, name)
+            _read_stretch(stream, layout, end, samples)
             return
         except pa.ArrowInvalid as error:
             line = _faulty_line(stream, str(error), layout)
@@ -265,17 +260,17 @@ def _read_samples(
                 if line is not None and samples.resumed and line.number - layout.first_line < 5:
                     raise InputError(
                         "another table begins",
-                        where=f"{name}, row {line.number}",
+                        where=f"row {line.number}",
                         remedy="save each table as a file of its own",
                     ) from error
-                raise _fault(str(error), layout, line, name) from error
-            _read_samples(stream, layout, line.start, samples, name)
+                raise _fault(str(error), layout, line) from error
+            _read_samples(stream, layout, line.start, samples)
             if again:
                 samples.begun += [samples.rows] if samples.rows else []
             elif len(samples.notes) == _MOST_CHATTER:
                 raise InputError(
                     f"{_MOST_CHATTER} lines hold text and no sample, and there are more",
-                    where=f"{name}, row {line.number}",
+                    where=f"row {line.number}",
                     remedy="take them out, or log them to another file",
                 ) from error
             else:
@@ -284,9 +279,7 @@ def _read_samples(
             layout = replace(layout, start=line.end, first_line=line.number + 1)
 
 
-def _read_stretch(
-    stream: BinaryIO, layout: TableLayout, end: int, samples: _Samples, name: str
-) -> None:
+def _read_stretch(stream: BinaryIO, layout: TableLayout, end: int, samples: _Samples) -> None:
     wanted = samples.wanted
     kinds = {c: pa.string() if c in wanted.datetimes else pa.float64() for c in wanted.columns}
     # Names that are not wanted may be repeated or empty: a number stands for them.
@@ -302,7 +295,7 @@ def _read_stretch(
         cut = max(held.rfind(b"\n"), held.rfind(b"\r")) + 1
         whole, held = held[:cut], held[cut:]
         if len(held) > BLOCK:
-            raise InputError("a line is far too long", where=name)
+            raise InputError("a line is far too long")
         if layout.delimiter == " ":
             whole = re.sub(
                 rb"[ \t]*([\r\n]+)[ \t]*", rb"\1", re.sub(rb"[ \t]+", b" ", whole)
@@ -330,7 +323,7 @@ def _read_stretch(
             message = re.sub(r"(?<=Row #)\d+", row, str(error), count=1)
             raise pa.ArrowInvalid(message) from error
         for batch in table.to_batches():
-            samples.add(batch, layout.first_line + samples.rows - before, name)
+            samples.add(batch, layout.first_line + samples.rows - before)
 
 
 def _is_end(stream: BinaryIO, line: Line, end: int, layout: TableLayout) -> bool:
@@ -398,9 +391,9 @@ def _faulty_line(stream: BinaryIO, message: str, layout: TableLayout) -> Line | 
     return None
 
 
-def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> InputError:
+def _fault(message: str, layout: TableLayout, line: Line | None) -> InputError:
     """The plain form of what Arrow says about a text file."""
-    at = f", row {line.number}" if line is not None else ""
+    at = [f"row {line.number}"] if line is not None else []
     torn = _TORN.search(message)
     if torn:
         expected, actual, text = int(torn[2]), int(torn[3]), torn[4]
@@ -417,11 +410,11 @@ def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> I
                 " columns, or a point before the fraction of a second"
             )
         return InputError(
-            f"{actual} cells, where the header has {expected}", where=f"{name}{at}", remedy=remedy
+            f"{actual} cells, where the header has {expected}", where="".join(at), remedy=remedy
         )
     cell = _CELL.search(message)
     if cell is None:
-        return InputError(message, where=name)
+        return InputError(message)
     column, value = layout.header[int(cell[1])], cell[3]
     shown = value if value.isprintable() and len(value) <= 40 else ascii(value)[1:41]
     other = "," if layout.decimal == "." else "."
@@ -438,5 +431,7 @@ def _fault(message: str, layout: TableLayout, line: Line | None, name: str) -> I
     elif shown == value and re.fullmatch(r"[^\"\\]*[^\W\d][^\"\\]*", value.strip()):
         remedy = f'if that means no reading, say missing = ["{value.strip()}"] under [csv]'
     return InputError(
-        f"found '{shown}', expected a number", where=f"{name}{at}, column '{column}'", remedy=remedy
+        f"found '{shown}', expected a number",
+        where=", ".join([*at, f"column '{column}'"]),
+        remedy=remedy,
     )

@@ -14,6 +14,8 @@ from pydantic import Field
 from bampipe.errors import InputError, did_you_mean
 from bampipe.schema import Declaration, Distinct, Text
 
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+"""How a number is written, with a point."""
 LARGEST_BYTES = 4 << 30
 """A trial larger than this in memory is refused unless the caller allows more."""
 
@@ -103,18 +105,17 @@ class RawTrial:
         )
 
 
-def check_size(rows: int, wanted: Wanted, name: str) -> None:
+def check_size(rows: int, wanted: Wanted) -> None:
     """Raise InputError where ``rows`` samples of the wanted columns take too much memory."""
     if rows * len(wanted.columns) * 8 > wanted.largest_bytes:
         raise InputError(
             f"{rows} rows of {len(wanted.columns)} columns are more than the"
             f" {wanted.largest_bytes >> 20} MB allowed",
-            where=name,
             remedy="split the trial, or allow more (largest_trial_mb)",
         )
 
 
-def check_columns(found: Sequence[str], wanted: Sequence[str], name: str) -> None:
+def check_columns(found: Sequence[str], wanted: Sequence[str], where: str = "") -> None:
     """Raise InputError where a wanted column is missing or stands twice."""
     for column in wanted:
         if column not in found:
@@ -122,23 +123,23 @@ def check_columns(found: Sequence[str], wanted: Sequence[str], name: str) -> Non
             others = [other for other in found if other not in wanted]
             raise InputError(
                 f"no column '{column}'{did_you_mean(column, others)}",
-                where=name,
+                where=where,
                 remedy=f"it has {shown}" if shown else "",
             )
         if list(found).count(column) > 1:
             first, second = [n for n, other in enumerate(found, 1) if other == column][:2]
             raise InputError(
                 f"column '{column}' stands twice, as columns {first} and {second}",
-                where=name,
+                where=where,
                 remedy="keep the right one",
             )
 
 
-def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np.ndarray]:
+def aligned(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
     """The columns (T,), all of one length; a single number (1,) is a column that does not change.
 
     Raises:
-        InputError: a column, which the file ``name`` calls a ``what``, is of another length.
+        InputError: a column, which the file calls a ``what``, is of another length.
     """
     first = max(values, key=lambda column: len(values[column]) > 1, default="")
     count = len(values[first]) if values else 0
@@ -146,7 +147,7 @@ def aligned(values: dict[str, np.ndarray], name: str, what: str) -> dict[str, np
         if len(value) not in (1, count):
             raise InputError(
                 f"{len(value)} values, where '{first}' has {count}",
-                where=f"{name}, {what} '{column}'",
+                where=f"{what} '{column}'",
             )
     return {c: np.repeat(v, count) if len(v) == 1 < count else v for c, v in values.items()}
 
@@ -163,11 +164,11 @@ def interpolated(at: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.nd
     return np.asarray(np.interp(at, times[order], values[order], left=np.nan, right=np.nan))
 
 
-def need(module: str, extra: str, name: str) -> ModuleType:
+def need(module: str, extra: str) -> ModuleType:
     """The module, which belongs to an optional extra of bampipe.
 
     Raises:
-        InputError: it is not installed and the file ``name`` needs it; names the pip command.
+        InputError: it is not installed; names the pip command.
     """
     try:
         return importlib.import_module(module)
@@ -175,6 +176,5 @@ def need(module: str, extra: str, name: str) -> ModuleType:
         package = module.partition(".")[0]
         raise InputError(
             f"this needs {package}, which is not installed",
-            where=name,
             remedy=f"pip install 'bampipe[{extra}]'",
         ) from error
