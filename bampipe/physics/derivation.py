@@ -418,10 +418,11 @@ def _find_dependence(
     p, varying = [*d.p.values()], {*d.p.values(), *d.z.values()}
     inputs, no_noise = {*d.channel.values()}, dict.fromkeys(w, 0)
     elsewhere = _collect_symbols(beside)
-    # An expression has few of a robot's hundred parameters, and sympy is slow to find a slope zero.
-    with_symbols = [(k, e, e.free_symbols) for k, e in enumerate(residual)]
+    # A term has few of the model's parameters, and sympy is slow to find a slope zero.
+    terms = [[(t, t.free_symbols) for t in sp.Add.make_args(e)] for e in residual]
     for i, symbol in enumerate(p):
-        by_axis = {k: sp.diff(e, symbol) for k, e, symbols in with_symbols if symbol in symbols}
+        by_term = {k: [t for t, symbols in row if symbol in symbols] for k, row in enumerate(terms)}
+        by_axis = {k: sp.Add(*(t.diff(symbol) for t in row)) for k, row in by_term.items() if row}
         slopes = [*by_axis.values()]
         slope_symbols, bodily = _collect_symbols(slopes), symbol in numbers
         candidates = slope_symbols.intersection(p[: i + 1])
