@@ -17,7 +17,7 @@ def _with_one_number(select: Callable[..., Any], values: Iterable[Any]) -> froze
     return frozenset({*values} - numbers | ({select(numbers)} if numbers else set()))
 
 
-class Max(sp.Max):
+class Max(sp.Max):  # type: ignore[misc]
     """The largest of its arguments."""
 
     @classmethod
@@ -29,7 +29,7 @@ class Max(sp.Max):
         return _with_one_number(max, values)
 
 
-class Min(sp.Min):
+class Min(sp.Min):  # type: ignore[misc]
     """The smallest of its arguments."""
 
     @classmethod
