@@ -40,6 +40,7 @@ from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.validate import ValidateResult
+from bampipe.run import models
 from bampipe.stages import filter as filter_stage
 from bampipe.stages import identify, ingest, validate
 
@@ -225,7 +226,7 @@ def _search(case: Case, root: Path, truth: dict[str, Any]) -> Outcome:
     begun = time.perf_counter()
     if case.auto:
         run = bampipe.follow(run)
-        named = tuple(run.model.split("+")[1:])
+        named = models.read(run.root, run.model).effects
     diagnosis = bampipe.diagnose(run, replicates=case.replicates, jobs=1, seed=case.seed)
     seconds = time.perf_counter() - begun
     axes = diagnosis["axes"].values()

@@ -166,6 +166,20 @@ def test_what_came_to_nothing_is_not_weighed_again(
     ]
 
 
+def test_a_confirmation_adds_nothing_to_an_unknown_remainder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What describes it best is added once: each further effect would only imitate it."""
+    content = diagnosis({"joint": {"verdict": "unknown_effect"}}, {("quadratic_drag:joint",): 0.3})
+    found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
+    assert found.selected
+    monkeypatch.setattr(loop.LoopOptions, "run", lambda *_: None)
+    monkeypatch.setattr(loop.RunFolder, "read", lambda *_: found)
+    monkeypatch.setattr(loop, "_add", lambda _, model, *__: f"{model}+")
+    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
+    assert loop.follow(options, "base", lambda _: None) == "base+"
+
+
 def test_the_device_file_gives_the_base_model_its_effects(tmp_path: Path) -> None:
     effects = ["stribeck:carriage"]
     write_result(tmp_path, IngestResult, device="axis", axes={"x": {}}, default_effects=effects)

@@ -173,9 +173,8 @@ class Search(SetCosts):
         place = 0
         for key, b in zip(keys, strengths, strict=True):
             here = self.atoms[key]
-            for other in _neighbours(key):
+            for j, other in enumerate(_neighbours(key)):
                 there = self.atoms.get(other)
-                j = _which(key, other)
                 if there is None or here is None:
                     return None
                 step = other[1][j] - key[1][j]
@@ -252,10 +251,6 @@ def _neighbours(key: Key) -> list[Key]:
         moved = u + (_STEP if u <= 0.5 else -_STEP)
         found.append((name, (*shape[:j], moved, *shape[j + 1 :])))
     return found
-
-
-def _which(key: Key, other: Key) -> int:
-    return next(j for j, (a, b) in enumerate(zip(key[1], other[1], strict=True)) if a != b)
 
 
 def _shares(keys: tuple[Key, ...], to: tuple[Key, ...]) -> Iterator[tuple[Key, ...]]:

@@ -207,7 +207,8 @@ def _fit_better(
 ) -> tuple[Fit | None, dict[tuple[str, ...], float]]:
     """Fit sets in turn until one is better than the current model when fitted, too.
 
-    Of the sets ``better``, the most promising first; with what each kept when fitted, nats.
+    Of the sets ``better``, the most promising first; with what each kept when fitted, nats. One
+    whose error on unseen trials is larger is not better, whatever the bias of its replays explains.
     """
     broken: list[set[Key]] = []
     kept: dict[tuple[str, ...], float] = {}
@@ -224,8 +225,10 @@ def _fit_better(
             fits[members] = session.try_fit(wider, start_of(search, keys, wider))
         moved = fits[members]
         if moved is not None:
-            kept[names(keys)] = gain_when_fitted(current, moved, search, keys)
-            if kept[names(keys)] > _WORTH:
+            gain = gain_when_fitted(current, moved, search, keys)
+            if gain <= _WORTH:
+                kept[names(keys)] = gain
+            elif not moved.errs_more_than(current):
                 return moved, kept
         broken.append({*keys})
         if fresh:

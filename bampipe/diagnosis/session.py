@@ -22,6 +22,7 @@ from bampipe.estimate.simulation import Runaway
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
+from bampipe.results.compare import NOTICEABLE
 from bampipe.results.floor import compare_with_floor
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import HELD_OUT
@@ -423,6 +424,11 @@ class Fit:
         With one group of trials only, that of the fit.
         """
         return self.held_out_without()
+
+    def errs_more_than(self, other: Fit) -> bool:
+        """Whether its held-out error, as the product over the axes, is noticeably larger."""
+        ratios = self.held_out_rmse / np.maximum(other.held_out_rmse, 1e-300)
+        return bool(np.prod(ratios) > 1.0 + NOTICEABLE)
 
     def held_out_without(self, effects: Iterable[str] = ()) -> Array:
         """`held_out_rmse` where some of the model's effects are taken away."""

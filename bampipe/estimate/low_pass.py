@@ -105,14 +105,9 @@ class Band:
         object.__setattr__(self, "cutoff_hz", tuple(min(float(f), most) for f in self.cutoff_hz))
 
     @property
-    def widest_hz(self) -> float:
-        """The highest cut-off of all axes, Hz."""
-        return max(self.cutoff_hz)
-
-    @property
     def step(self) -> int:
         """Samples from one thinned value to the next: five a period of the highest cut-off."""
-        return max(1, int(self.rate_hz / (5.0 * self.widest_hz)))
+        return max(1, int(self.rate_hz / (5.0 * max(self.cutoff_hz))))
 
     @property
     def independent_share(self) -> Array:

@@ -8,7 +8,7 @@ The bodies of a robot enter by Newton and Euler's equations instead: `newton_eul
 import ast
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple
 
 import sympy as sp
@@ -399,6 +399,12 @@ def _apply_newton_euler(
     return _Motion(text.steps, mass, bias, dynamics, kinetic, potential)
 
 
+@lru_cache(maxsize=4096)
+def _slope(term: Any, symbol: Any) -> Any:
+    """Its derivative, kept: models of one device have most of their terms in common."""
+    return term.diff(symbol)
+
+
 def _find_dependence(
     d: Vocabulary,
     residual: Sequence[Any],
@@ -418,10 +424,11 @@ def _find_dependence(
     p, varying = [*d.p.values()], {*d.p.values(), *d.z.values()}
     inputs, no_noise = {*d.channel.values()}, dict.fromkeys(w, 0)
     elsewhere = _collect_symbols(beside)
-    # An expression has few of a robot's hundred parameters, and sympy is slow to find a slope zero.
-    with_symbols = [(k, e, e.free_symbols) for k, e in enumerate(residual)]
+    # A term has few of the model's parameters, and sympy is slow to find a slope zero.
+    terms = [[(t, t.free_symbols) for t in sp.Add.make_args(e)] for e in residual]
     for i, symbol in enumerate(p):
-        by_axis = {k: sp.diff(e, symbol) for k, e, symbols in with_symbols if symbol in symbols}
+        by_term = {k: [t for t, symbols in row if symbol in symbols] for k, row in enumerate(terms)}
+        by_axis = {k: sp.Add(*(t.diff(symbol) for t in row)) for k, row in by_term.items() if row}
         slopes = [*by_axis.values()]
         slope_symbols, bodily = _collect_symbols(slopes), symbol in numbers
         candidates = slope_symbols.intersection(p[: i + 1])
@@ -429,7 +436,7 @@ def _find_dependence(
         small = [slope for slope, is_large in sized if not is_large]
         # A large slope is taken to vary with every symbol in it: terms cancel in small ones only.
         curving = candidates & _collect_symbols(slope for slope, is_large in sized if is_large)
-        curving |= {s for s in candidates - curving if any(sp.diff(e, s) != 0 for e in small)}
+        curving |= {s for s in candidates - curving if any(_slope(e, s) != 0 for e in small)}
         linear = symbol not in curving and symbol not in elsewhere
         constant = linear and not slope_symbols & varying
         lasts = constant and not bodily and slope_symbols.isdisjoint(step_names)

@@ -205,12 +205,14 @@ def _is_bounded(value: Any) -> bool:
 def _builders() -> dict[str, Callable[..., Any]]:
     import sympy as sp
 
+    from bampipe.physics.extrema import Max, Min
+
     same = {n: getattr(sp, n) for n in ("sin", "cos", "tan", "atan", "exp", "log", "sqrt", "tanh")}
     return same | {
         "abs": sp.Abs,
-        "min": sp.Min,
-        "max": sp.Max,
-        "clip": lambda x, low, high: sp.Max(low, sp.Min(x, high)),
+        "min": Min,
+        "max": Max,
+        "clip": lambda x, low, high: Max(low, Min(x, high)),
         "heaviside": lambda x: sp.Heaviside(x, sp.Rational(1, 2)),
     }
 

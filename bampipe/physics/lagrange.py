@@ -34,7 +34,12 @@ def check_inertia(model: Model, mass: list[list[Any]], symbols: list[Any]) -> No
     numbers |= {
         sp.Symbol(f"p{i}", real=True): p.prior or 1.0 for i, p in enumerate(model.parameters)
     }
-    values = np.array([[float(m.subs(numbers)) for m in row] for row in mass])
+    values = np.array(
+        [
+            [_value(m, frozenset((s, numbers[s]) for s in m.free_symbols)) for m in row]
+            for row in mass
+        ]
+    )
     if np.linalg.matrix_rank(values) < len(values):
         rows = zip(model.device.coordinates, values, strict=True)
         bare = [c.name for c, v in rows if not v.any()]
@@ -43,6 +48,11 @@ def check_inertia(model: Model, mass: list[list[Any]], symbols: list[Any]) -> No
             where=f"device {model.device.name!r}: energy.kinetic",
             remedy="the kinetic energy must grow with the rate of every coordinate",
         )
+
+
+@cache
+def _value(expression: Any, numbers: frozenset[tuple[Any, float]]) -> float:
+    return float(expression.subs(dict(numbers)))
 
 
 @cache

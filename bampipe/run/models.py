@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, choose_from
-from bampipe.files import read_toml, write_text
+from bampipe.files import digest_bytes, read_toml, write_text
 
 if TYPE_CHECKING:
     from bampipe.declarations.model import ModelFile
 
 BASE = "base"
+_LONGEST = 160
+"""Characters of a name that lists its effects; a file system takes 255."""
 ADOPTED = "effects"
 """Folder beside the run folders: effect files of the lab's own, for every run."""
 
@@ -101,5 +103,12 @@ def _bring_adopted_effects(root: Path) -> None:
 
 
 def child_name(parent: str, effects: tuple[str, ...]) -> str:
-    """Return the name of the model that adds ``effects`` to ``parent``."""
-    return "+".join([parent, *(effect.replace(":", ".") for effect in effects)])
+    """Return the name of the model that adds ``effects`` to ``parent``.
+
+    Where that would be longer than `_LONGEST`, their number and a digest stand for the effects: no
+    file system has room for all names of a dozen.
+    """
+    name = "+".join([parent, *(effect.replace(":", ".") for effect in effects)])
+    if len(name) <= _LONGEST:
+        return name
+    return f"{parent}+{len(effects)}_effects_{digest_bytes(' '.join(effects).encode())[:6]}"

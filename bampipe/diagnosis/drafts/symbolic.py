@@ -146,7 +146,8 @@ def write_form(
     texts = []
     for k, p in enumerate(products):
         text = re.sub(r"\bX(\d+)\b", ratio, str(p.xreplace(names)).replace("Abs(", "abs("))
-        texts.append(f"h{k + 1}" if p == 1 else f"h{k + 1}*{_bracketed(text, p)}")
+        part = f"({text})" if p.is_Add else text
+        texts.append(f"h{k + 1}" if p == 1 else f"h{k + 1}*{part}")
     strengths = {f"h{k + 1}": f"of part {k + 1} of the formula" for k in range(len(products))}
     shape = Shape(
         "formula", " + ".join(texts), strengths, {str(c): "number" for c in names.values()},
@@ -158,7 +159,3 @@ def write_form(
         axis, forms.axis, FORCE, shape, first, span, forms.times, 1.0, tuple(beside)
     )  # fmt: skip
     return form, {str(name): float(n) for n, name in names.items()}
-
-
-def _bracketed(text: str, product: Any) -> str:
-    return f"({text})" if product.is_Add else text
