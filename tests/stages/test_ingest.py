@@ -94,7 +94,7 @@ def test_the_time_column_rules_over_the_announced_rate(tmp_path):
 def test_trials_of_one_name_in_two_folders_keep_apart(tmp_path):
     made = Made()
     made.session["trials"][1]["file"] = "more/t01.csv"
-    made.tables["more/t01.csv"] = made.tables.pop("trials/t02.csv")
+    made.tables["more/t01.csv"] = made.tables.pop("trials/t02.parquet")
     run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
     trials = read_parquet(tmp_path / "out/ingest/trials.parquet")
     assert trials.trial_id.tolist() == ["trials_t01_csv", "more_t01_csv", "t03"]
