@@ -82,7 +82,7 @@ def test_drives_with_a_delay_of_their_own_do_not_tell_the_clock() -> None:
     # Two of three are 9 ms late, of which the model says so.
     found, sd = find_robot_timing(system, [motion], Band(RATE, (8.0, 8.0, 8.0)), p)
     assert found == pytest.approx(CLOCK_S, abs=4.0 * sd)
-    named = tuple(f"drive_delay:{force}" for force in "abc")
+    system = compile_model(Model(device_from(ARM), [f"drive_delay:{name}" for name in "abc"]))
     assert system.takes_timing
     motion = logged(compile_model(Model(device_from(ARM), [])), np.full(3, CLOCK_S))
     found, sd = find_robot_timing(system, [motion], Band(RATE, (8.0, 8.0, 8.0)), system.prior)

@@ -38,11 +38,14 @@ def motion(size: int = 20000) -> Motion:
     return Motion("t01", t, q, q, q, q, {})
 
 
-def test_trials_and_report_say_that_there_is_no_space(full: Path) -> None:
+def test_stored_trials(full: Path) -> None:
     with pytest.raises(InputError, match="written: the disk is full") as caught:
         KeptItems([motion()], most=1)
     assert caught.value.where == str(full) and "TMPDIR" in caught.value.remedy
     assert [path.name for path in full.iterdir()] == ["filler"]
+
+
+def test_the_report(full: Path) -> None:
     (full / "more").write_bytes(b"x" * 4096)
     with pytest.raises(InputError, match="no temporary files can be written"):
         typeset.render_pdf(Document("title", "subtitle", ()), 0)
