@@ -43,15 +43,13 @@ def everything(url: str) -> dict[str, bytes]:
 
 def test_what_is_published_comes_back_and_is_not_sent_again(tmp_path: Path, url: str) -> None:
     root = make_run(tmp_path / "runs/s1")
-    publish(root, url)
+    first = publish(root, url)
     assert published(url) == ["s1"]
     assert not any("/.bampipe/" in name for name in everything(url))
     back = fetch(url, "s1", tmp_path / "elsewhere")
     assert contents(back) == contents(root)
     assert (back / "run.json").read_bytes() == (root / "run.json").read_bytes()
     assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["s1"]
-    root = make_run(tmp_path / "runs/s1")
-    first = publish(root, url)
     before = everything(url)
     assert publish(root, url) == first
     assert everything(url) == before

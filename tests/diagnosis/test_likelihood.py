@@ -159,7 +159,6 @@ def test_what_is_taken_away_changes_the_rest_unless_another_parameter_replaces_i
     given = np.linalg.lstsq(base[:, :1], -y - 0.25 * base[:, 1], rcond=None)[0]
     assert gone.base[0] == pytest.approx(given[0], abs=1e-3)
     # Of two parameters that do the same, the trials determine the sum alone.
-    y, base = line
     both = np.array([[0.5, 0.0], [0.5, 0.0], [0.0, 1.0]])
     held = replace(problem_of(y, base), to_parameters=both)
     loose = replace(held, loose=np.array([[1.0], [-1.0], [0.0]]))

@@ -95,14 +95,11 @@ def test_the_arm_follows_the_motion_it_wants_and_its_force_gives_it_again():
     t = 0.002 * np.arange(4000)
     assert np.abs(x[:, 0] - 0.15 * np.sin(2 * np.pi * 0.4 * t)).max() < 0.05
     assert np.abs(u[:, 0]).max() > 3.5
-    x, u = recording()
     again = simulate(slider, x[0], u, np.array([3.5, 10.0, 3.5]), 0.002, width=WIDTH, n_noise=1)
     np.testing.assert_allclose(again, x, atol=1e-12)
-    x, u = recording()
     again, total = track(u, [3.5, 10.0, 3.5], x[:, :1], x[:, 1:])
     np.testing.assert_allclose(again, x, atol=1e-9)
     np.testing.assert_allclose(total, u, atol=1e-6)
-    x, u = recording()
     again, total = track(u, [3.5, 10.0, 4.5], x[:, :1], x[:, 1:])
     assert np.abs(again[:, 0] - x[:, 0]).max() < 0.01
     moving = np.abs(x[:, 1]) > 0.1

@@ -107,8 +107,6 @@ def test_columns_and_bands_and_a_force_that_is_not_filtered(run: RunFolder) -> N
         for kind in ("qd", "qdd"):
             error = np.abs(rows[f"{kind}_{axis}"] - truth[f"{kind}_{axis}"])
             assert np.mean(error < 2.0 * rows[f"{kind}_sd_{axis}"]) > 0.9
-    _, kinematics = run_stage(run)
-    rows = kinematics[kinematics["trial_id"] == "a"]
     np.testing.assert_array_equal(rows["force_x"], free_trial(0)[0]["force_x"])
 
 
@@ -194,7 +192,6 @@ def test_trials_that_are_too_few_or_too_short_are_said_with_their_size(tmp_path:
     )
     with pytest.raises(InputError, match=said):
         run_stage(run)
-    whole = free_trial(0)[0]
     frames = {"a": whole, "b": whole.head(31)}
     run = write_ingested(tmp_path / "run", frames, dict.fromkeys(frames, ("free", "")), AXES)
     summary = stage.execute(run, run.root, configure("filter", {}), silent)

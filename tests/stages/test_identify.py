@@ -77,7 +77,6 @@ def test_intervals_hold_on_a_simulated_session(published: tuple[Path, dict]) -> 
     assert np.sqrt(np.mean(np.square(z))) < 2.0
     assert np.max(np.abs(z)) < 4.0
     assert content["repeats"] == 0  # linear in its parameters: one pass is enough
-    _, content = published
     for name in ("viscous.yaw", "coulomb.yaw", "viscous.extension", "coulomb.extension"):
         entry = content["parameters"][name]
         assert 0.75 < entry["filter_sd"] / entry["bound_sd"] < 1.5, name
