@@ -244,7 +244,7 @@ def test_the_torque_constant_of_a_last_joint_stays_where_noise_is_large(tmp_path
 
 def test_reductions_of_a_log_from_the_motors_side_follow_from_the_drawing(tmp_path: Path) -> None:
     truth = record_logs(
-        tmp_path / "log", 7, "ZYYX", style="motor", drawing_error=0.03, turned=["elbow"]
+        tmp_path / "log", 7, "ZYY", style="motor", drawing_error=0.03, turned=["elbow"]
     )
     _, _, proposal = paired(tmp_path / "log")
     session = read_session(tmp_path / "log")
