@@ -56,6 +56,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path not in slow)
 
 
+Command = Callable[..., tuple[int, str, str]]
+"""``bampipe ARGUMENTS`` in this process: exit code, output and errors."""
+
+
 class Toy:
     """A session of the toy stages in a folder of its own, and how to run it."""
 
@@ -131,9 +135,7 @@ def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Toy]:
 
 
 @pytest.fixture
-def command(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, str]]:
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
     """Run ``bampipe ARGUMENTS`` in this process; returns exit code, output and errors."""
     from bampipe.cli import main
 

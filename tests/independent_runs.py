@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import independent
+from binary_logs import to_parquet
 from independent.sensors import Conditions
 
 import bampipe
@@ -45,6 +46,7 @@ def record_run(
     chosen = replace(SHORT[machine], **conditions)
     strengths = dict.fromkeys(effects, 1.0)
     truth = independent.record(machine, root / machine, seed, strengths, chosen)
+    to_parquet(root / machine)
     (root / "short.toml").write_text(PIPELINE)
     run = bampipe.run_session(root / machine, runs=root / "runs", pipeline=str(root / "short.toml"))
     return run, truth["parameters"]
@@ -67,6 +69,7 @@ def record_trials(
     chosen = replace(SHORT[machine], **conditions)
     strengths = dict.fromkeys(effects, 1.0)
     truth = independent.record(machine, root / machine, seed, strengths, chosen)
+    to_parquet(root / machine)
     run = RunFolder(root / "run")
     for stage in ("ingest", "filter"):
         run.path(stage).mkdir(parents=True)

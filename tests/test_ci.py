@@ -5,10 +5,10 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from conftest import Command
 from made_results import write_result
 
 from bampipe.api.opened import Run
@@ -149,7 +149,7 @@ def test_a_gate_advises_on_what_the_word_says(tmp_path: Path) -> None:
 
 
 def test_every_command_takes_the_best_confirmed_model(
-    tmp_path: Path, command: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     root = made(tmp_path / "runs/s1", mass=2.0)
@@ -204,7 +204,7 @@ def test_a_damaged_file_of_accepted_values_is_named(tmp_path: Path) -> None:
 
 
 def test_accept_refuses_what_failed(
-    tmp_path: Path, command: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     root = made(tmp_path / "runs/s1", mass=2.0)
@@ -251,19 +251,16 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", text, re.S)
 
 
-def test_the_workflow_is_yaml_with_steps() -> None:
+def test_the_documented_workflow_and_gate_are_valid(tmp_path: Path) -> None:
+    path = tmp_path / "own.toml"
+    head = 'schema = "bampipe.pipeline/1"\nname = "own"\nstages = ["ingest"]\n'
+    path.write_text(head + blocks("toml")[0])
+    assert pipeline.load(str(path)).gates[0].max == 1.2
     yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
     content = yaml.safe_load(blocks("yaml")[0])
     steps = content["jobs"]["bampipe"]["steps"]
     assert any("bampipe run" in step.get("run", "") for step in steps)
     assert all(("run" in step) != ("uses" in step) for step in steps)
-
-
-def test_the_documented_gate_is_valid(tmp_path: Path) -> None:
-    path = tmp_path / "own.toml"
-    head = 'schema = "bampipe.pipeline/1"\nname = "own"\nstages = ["ingest"]\n'
-    path.write_text(head + blocks("toml")[0])
-    assert pipeline.load(str(path)).gates[0].max == 1.2
 
 
 @pytest.mark.long

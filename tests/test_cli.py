@@ -6,12 +6,13 @@ import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import install_toys
 import pytest
-from conftest import Toy
+from conftest import Command, Toy
 from made_results import filled, write_result
 
 import bampipe
@@ -21,15 +22,13 @@ from bampipe.errors import InputError
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.draft import DraftResult
-from bampipe.results.identify import IdentifyResult
+from bampipe.results.identify import EffectEstimate, IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.next import NextResult
 from bampipe.results.validate import ValidateResult
 from bampipe.run.events import Event
 from bampipe.run.pipeline import load
 from bampipe.run.status import StepStatus
-
-Command = Callable[..., tuple[int, str, str]]
 
 COMMANDS = [
     "run", "ingest", "filter", "stiffness", "identify", "viscous", "performance", "validate",
@@ -72,20 +71,17 @@ def test_help_lists_the_commands_and_cuts_no_summary_short(
     assert group or all(f"  {name} " in out for name in COMMANDS)
 
 
-def test_wrong_command_gets_a_suggestion(command: Command) -> None:
+def test_wrong_command_gets_a_suggestion_and_version_is_said(command: Command) -> None:
     code, _, err = command("identfy")
     assert code == 2
     assert "identify" in err
-
-
-def test_version(command: Command) -> None:
     assert command("version") == command("--version") == (0, bampipe.__version__ + "\n", "")
 
 
 # Run, on toy stages
 
 
-def test_run_shows_steps_and_what_to_do_next(toy: Toy, command: Command) -> None:
+def test_run_shows_steps_and_what_to_do_next_unless_quiet(toy: Toy, command: Command) -> None:
     code, out, err = command("run", *arguments(toy))
     assert code == 0
     assert "toy_read" in out
@@ -93,9 +89,6 @@ def test_run_shows_steps_and_what_to_do_next(toy: Toy, command: Command) -> None
     assert "small enough" in out
     assert out.rstrip().splitlines()[-1].startswith("next: bampipe status ")
     assert "toy_double\n" in err and "never run" not in err
-
-
-def test_quiet_says_nothing_on_the_way(toy: Toy, command: Command) -> None:
     _, out, err = command("run", *arguments(toy), "--quiet")
     assert err == ""
     assert "next:" not in out
@@ -138,20 +131,14 @@ def test_several_sessions_end_in_a_table(toy: Toy, command: Command) -> None:
     assert suites["c"].get("failures") == "1"
 
 
-def test_two_sessions_with_one_id(toy: Toy, command: Command) -> None:
+def test_sessions_of_one_id_and_settings_reach_the_run_once(toy: Toy, command: Command) -> None:
     other = install_toys.make_session(toy.folder / "other" / "first")
     code, out, _ = command("run", *arguments(toy), str(other))
     assert code == 2
     assert "session_id 'first' is that of" in out
-
-
-def test_a_session_named_twice_runs_once(toy: Toy, command: Command) -> None:
     code, out, _ = command("run", *arguments(toy), str(toy.session), "--json")
     assert code == 0
     assert len(json.loads(out)["sessions"]) == 1
-
-
-def test_set_reaches_the_stage(toy: Toy, command: Command) -> None:
     command("run", *arguments(toy), "--set", "toy_double.factor=5")
     assert json.loads((toy.root / "toy/double.json").read_text())["axes"]["n0"]["value"] == 5.0
 
@@ -296,13 +283,10 @@ def test_stage_without_a_run(name: str, command: Command, tmp_path: Path) -> Non
     assert "bampipe run SESSION" in one_line_error(*command(name, "--runs", tmp_path))
 
 
-def test_settings_are_listed(command: Command) -> None:
+def test_settings_and_effects_are_listed(command: Command) -> None:
     code, out, _ = command("filter", "--settings")
     assert code == 0
     assert "cutoff_hz" in out
-
-
-def test_effects(command: Command) -> None:
     from bampipe.physics import registry
 
     code, out, _ = command("effects")
@@ -372,7 +356,9 @@ def test_cells(value: object, text: str) -> None:
     assert show.format_cell(value) == text
 
 
-def test_summary_prints_tables(capsys: pytest.CaptureFixture[str]) -> None:
+def test_summary_prints_tables_of_long_names_and_the_ladder(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     show.print_summary(
         {
             "headline": "two axes",
@@ -383,17 +369,11 @@ def test_summary_prints_tables(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert "estimate   sd  unit" in out
     assert "note: mind the gap" in out
-
-
-def test_long_names_of_models_are_broken(capsys: pytest.CaptureFixture[str]) -> None:
     name = "base+asymmetric_coulomb.carriage+thermal_damping.carriage+actuator_delay"
     show.print_table(["model", "rmse", ""], [["base", 2.0, ""], [name, 1.0, "x " * 50]])
     lines = capsys.readouterr().out.splitlines()
     assert lines[2].split()[:2] == [name.removesuffix("actuator_delay"), "1"]
     assert lines[3] == "  actuator_delay" and lines[2].endswith("x x")
-
-
-def test_summary_prints_the_ladder(capsys: pytest.CaptureFixture[str]) -> None:
     rung = {"held_out_rmse": {"yaw": 0.5}, "noise_floor": {"yaw": 0.25}, "unit": {"yaw": "N.m"}}
     axis = {"mean_absolute": 0.1, "rmse": 0.2, "relative_error_percent": 3.0, "unit": "rad"}
     axis["velocity_relative_error_percent"] = 4.0
@@ -556,3 +536,43 @@ def test_a_diagnosis_that_is_older_than_its_inputs_is_said(
         said = capsys.readouterr().out
         assert ("bampipe diagnose runs/s01" in said) == ("identify.json" in said)
         assert bool(said) == ("identify.json" in reason)
+
+
+def step(name: str, **summary: Any) -> Any:
+    return SimpleNamespace(step=name, state="done", seconds=1.0, summary=summary)
+
+
+def test_notes_of_the_logs_and_a_second_that_stands_out_are_said(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found: Any = SimpleNamespace(
+        steps=[
+            step("ingest", notes=["a force in counts"]),
+            step("filter", notes=["t02: not used: 20 sound samples"]),
+            step("identify:base", notes=["in the report"], influence={
+                "worst_second": {"sentence": "The second from 5.1 s of trial t02 on moves `mass`."}
+            }),
+            step("identify:more", influence={"worst_second": {"sentence": ""}}),
+        ],
+        verdicts=[], model="",
+    )  # fmt: skip
+    show.print_outcome(found)
+    printed = capsys.readouterr()
+    notes = [line for line in (printed.out + printed.err).splitlines() if line.startswith("note:")]
+    assert notes == [
+        "note: a force in counts",
+        "note: t02: not used: 20 sound samples",
+        "note: The second from 5.1 s of trial t02 on moves `mass`.",
+    ]
+
+
+def test_an_effect_that_is_not_identified_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    why = "`stribeck.joint.force` is 18 \u00b1 46 N.m, an interval larger than itself"
+    show.print_unidentified(
+        {
+            "play:joint": EffectEstimate(identified=True),
+            "stribeck:joint": EffectEstimate(identified=False, reasons=(why,)),
+        }
+    )
+    said = f"note: `stribeck:joint` does not count as identified: {why}.\n"
+    assert capsys.readouterr().out == said

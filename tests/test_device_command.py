@@ -8,6 +8,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from conftest import Command
 from independent import arm
 from jsonschema import Draft202012Validator
 
@@ -16,7 +17,6 @@ from bampipe.physics.device import Device
 from bampipe.physics.effect import Effect
 from bampipe.schema import json_schema
 
-Command = Callable[..., tuple[int, str, str]]
 DOCUMENT = Path(__file__).parent.parent / "docs" / "devices.md"
 RAIL = re.findall(r"```toml\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.S)[0]
 SNAG = re.findall(

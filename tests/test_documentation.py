@@ -23,23 +23,17 @@ def blocks(name, language="toml"):
     return re.findall(rf"```{language}\n(.*?)```", text, re.S)
 
 
-def test_example_effect_is_consistent_and_compiles_on_every_axis():
+def test_examples_are_consistent_and_all_functions_listed():
     effect = registry.effect_from(tomllib.loads(blocks("effects.md")[0]), "snag.toml")
     device = registry.device("bam")
     for axis in effect.targets(device):
         assert check_effect(effect, device, axis) == []
         system = compile_model(Model(device, (f"snag:{axis}",), (effect,)))
         assert f"snag.{axis}.drag" in [p.name for p in system.parameters]
-
-
-def test_example_device_is_consistent_and_has_effects():
     device = registry.device_from(tomllib.loads(blocks("devices.md")[0]), "rail.toml")
     assert check_device(device) == []
     for name in ("stribeck:position", "force_bias:x", "inertia_mismatch:position"):
         Model(device, (name,))
-
-
-def test_functions_of_expressions_are_all_listed():
     text = (ROOT / "docs/effects.md").read_text(encoding="utf-8")
     listed = re.search(r"^ {4}(sin .*)$", text, re.M)
     assert listed is not None

@@ -12,11 +12,12 @@ import os
 import re
 import runpy
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from decimal import Decimal
 from pathlib import Path
 
 import pytest
+from conftest import Command
 
 from bampipe.run.settings import configure, parse_assignment
 from bampipe.stages import base
@@ -195,7 +196,7 @@ def test_a_page_prints_what_it_shows(
     page: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    command: Callable[..., tuple[int, str, str]],
+    command: Command,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sample_runs").symlink_to(ROOT / "sample_runs")

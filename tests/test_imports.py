@@ -169,12 +169,9 @@ def test_no_modules_of_a_layer_import_each_other_in_a_circle(layer: str) -> None
         pytest.fail(f"a circle of imports: {' <- '.join(error.args[1])}")
 
 
-def test_every_layer_is_under_the_law() -> None:
+def test_every_layer_is_under_the_law_and_what_is_compiled_kept() -> None:
     layers = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
     assert layers == set(LAWS)
-
-
-def test_what_is_compiled_is_kept_where_it_is_checked() -> None:
     for path in sorted(PACKAGE.rglob("*.py")):
         if path.name != "compiled.py":
             names = imported(path) | {f"numba.{text}" for text in _attributes_of_numba(path)}
@@ -210,7 +207,7 @@ def test_a_change_in_whatever_stages_import_reruns_them(monkeypatch: pytest.Monk
         monkeypatch.undo()
 
 
-def test_no_stage_imports_another() -> None:
+def test_no_stage_imports_another_and_filterpy_is_known_to_its_engine_only() -> None:
     names = set(base.STAGES)
     for name in names:
         path = PACKAGE / "stages" / f"{name}.py"
@@ -219,9 +216,6 @@ def test_no_stage_imports_another() -> None:
         others = {f"bampipe.stages.{other}" for other in names - {name}}
         for found in imported(path):
             assert not any(found == o or found.startswith(o + ".") for o in others), (name, found)
-
-
-def test_only_the_filterpy_engine_knows_filterpy_and_only_when_asked() -> None:
     for path in sources("estimate"):
         assert not any(name.startswith("filterpy") for name in imported(path, lazily=False)), path
 

@@ -21,7 +21,7 @@ def read_yaml(name: str) -> dict[str, object]:
     return content
 
 
-def test_the_conda_recipe_asks_for_the_same() -> None:
+def test_recipe_citation_and_documents_are_of_this_version() -> None:
     recipe = read_yaml(".ci/conda/recipe.yaml")
     split = (re.fullmatch(r"([\w-]+)(.*)", text) for text in PROJECT["dependencies"])
     wanted = [f"{NAMES_IN_CONDA.get(m[1], m[1])} {m[2]}" for m in split if m]
@@ -30,16 +30,10 @@ def test_the_conda_recipe_asks_for_the_same() -> None:
     assert recipe["about"]["summary"] == PROJECT["description"]
     assert recipe["about"]["license"] == PROJECT["license"]
     assert recipe["about"]["license_file"] == PROJECT["license-files"]
-
-
-def test_the_citation_is_of_this_version() -> None:
     citation = read_yaml("CITATION.cff")
     assert citation["version"] == bampipe.__version__
     assert citation["abstract"] == PROJECT["description"]
     assert citation["keywords"] == PROJECT["keywords"]
-
-
-def test_the_supported_pythons_and_every_extra_are_documented() -> None:
     classified = re.findall(r":: Python :: (3\.\d+)", "\n".join(PROJECT["classifiers"]))
     head = INSTALL.partition("## Supported range")[2]
     stated = re.search(r"Python ([\d., and]+);", head)

@@ -6,6 +6,7 @@ from pathlib import Path
 import independent
 import numpy as np
 import pytest
+from binary_logs import to_parquet
 from independent import joint
 from independent.sensors import Conditions
 from made_results import diagnosis, write_result
@@ -55,7 +56,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         kept = trials[:4] if name == "first" else trials[4:]
         path.write_text("[[trials]]".join([head, *kept]))
         run = bampipe.run_session(
-            root / name, runs=root / "runs", pipeline=str(root / "short.toml")
+            to_parquet(root / name), runs=root / "runs", pipeline=str(root / "short.toml")
         )
         found[name] = run.root
     return found

@@ -2,12 +2,12 @@
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import Toy, contents
+from conftest import Command, Toy, contents
 
 from bampipe.errors import InputError
 from bampipe.run.publish import CURRENT, fetch, publish, published
@@ -41,20 +41,15 @@ def everything(url: str) -> dict[str, bytes]:
     return {str(path): system.cat_file(path) for path in system.find(base)}
 
 
-def test_what_is_published_comes_back(tmp_path: Path, url: str) -> None:
+def test_what_is_published_comes_back_and_is_not_sent_again(tmp_path: Path, url: str) -> None:
     root = make_run(tmp_path / "runs/s1")
-    publish(root, url)
+    first = publish(root, url)
     assert published(url) == ["s1"]
     assert not any("/.bampipe/" in name for name in everything(url))
     back = fetch(url, "s1", tmp_path / "elsewhere")
     assert contents(back) == contents(root)
     assert (back / "run.json").read_bytes() == (root / "run.json").read_bytes()
     assert [path.name for path in (tmp_path / "elsewhere").iterdir()] == ["s1"]
-
-
-def test_the_same_run_is_not_sent_again(tmp_path: Path, url: str) -> None:
-    root = make_run(tmp_path / "runs/s1")
-    first = publish(root, url)
     before = everything(url)
     assert publish(root, url) == first
     assert everything(url) == before
@@ -172,9 +167,7 @@ def test_a_session_that_is_not_published_is_one_line(tmp_path: Path) -> None:
         fetch(f"file://{tmp_path / 'empty'}", "s1", tmp_path / "runs")
 
 
-def test_run_publishes_and_fetch_fetches(
-    toy: Toy, command: Callable[..., tuple[int, str, str]]
-) -> None:
+def test_run_publishes_and_fetch_fetches(toy: Toy, command: Command) -> None:
     url = f"file://{toy.folder / 'far'}"
     arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs, "--publish", url)
     assert command("run", toy.session, *arguments)[0] == 0
@@ -192,9 +185,7 @@ def test_run_publishes_and_fetch_fetches(
 
 
 @pytest.mark.parametrize("url", ["nowhere://x", "dir://x", "hdfs://x"])
-def test_an_address_of_no_use_is_said_before_the_run(
-    toy: Toy, command: Callable[..., tuple[int, str, str]], url: str
-) -> None:
+def test_an_address_of_no_use_is_said_before_the_run(toy: Toy, command: Command, url: str) -> None:
     arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs, "--publish", url)
     code, _, said = command("run", toy.session, *arguments)
     assert code == 2 and said.count("\n") == 1 and "no such file system" in said

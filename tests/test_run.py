@@ -156,11 +156,13 @@ def test_a_stage_asked_for_too_early_is_no_failure_of_the_run(toy: Toy) -> None:
     assert record.read(toy.root).failures == {}
 
 
-def test_until_stops_after_the_stage(toy: Toy) -> None:
+def test_until_and_force_choose_the_steps(toy: Toy) -> None:
     toy.run(last="toy_double", judge=False)
     assert toy.ran() == ALL[:2]
     toy.run()
     assert toy.ran() == ALL[2:]
+    with pytest.raises(InputError, match="comes after"):
+        toy.run(first="toy_sum", last="toy_read")
 
 
 def test_force_runs_the_selected_steps(toy: Toy) -> None:
@@ -168,11 +170,6 @@ def test_force_runs_the_selected_steps(toy: Toy) -> None:
     toy.ran()
     toy.run(first="toy_double", last="toy_fit", force=True)
     assert toy.ran() == ["toy_double", "toy_fit:base"]
-
-
-def test_from_after_until_is_refused(toy: Toy) -> None:
-    with pytest.raises(InputError, match="comes after"):
-        toy.run(first="toy_sum", last="toy_read")
 
 
 # Faults

@@ -89,15 +89,12 @@ def test_columns_are_found_without_being_asked_for(tmp_path, name):
         assert list(columns_of(tmp_path / f"a.{ending}"))[:3] == ["t", "x", "n"]
 
 
-def test_units_are_taken_from_names_and_from_the_line_below(tmp_path):
+def test_units_of_names_and_of_the_line_below_are_taken_and_what_was_found_is_said(tmp_path):
     text = table(";", header="t [s],x (mm),n")
     assert read(tmp_path, text, ("t [s]", "x (mm)", "n")).units == {"t [s]": "s", "x (mm)": "mm"}
     trial = read(tmp_path, WRITTEN["unit row in brackets"])
     assert trial.units == {"t": "s", "x": "mm", "n": "-"}
     assert trial.first_row == 3 and "row 2 gives units" in trial.remarks
-
-
-def test_what_was_found_is_said(tmp_path):
     trial = read(tmp_path, PREAMBLE + table(";", ","))
     assert trial.remarks == (
         "columns are separated by semicolons",
@@ -180,10 +177,16 @@ def test_dates_and_times_become_seconds(tmp_path, stamps, form):
     np.testing.assert_array_equal(trial.columns["when"], T)
 
 
-def test_a_date_that_could_be_two_is_refused(tmp_path):
+def test_what_could_be_two_dates_is_refused_and_times_of_day_pass_midnight(tmp_path):
     text = "when,x\n03/10/2026 10:12,1\n04/10/2026 10:12,1\n"
     with pytest.raises(InputError, match=r"row 2: found '03/10/2026 10:12'.*give its form"):
         read(tmp_path, text, ("when", "x"), datetimes={"when": ""})
+    stamps = ["9:59:59,990", "10:00:00,010", "23:59:59,990", "", "0:00:00,010"]
+    text = "when;q\n" + "".join(f"{stamp};{n}\n" for n, stamp in enumerate(stamps))
+    trial = read(tmp_path, text, ("when", "q"), datetimes={"when": ""})
+    expected = [0.0, 0.02, 50400.0, np.nan, 50400.02]
+    np.testing.assert_allclose(trial.columns["when"], expected, rtol=1e-12)
+    assert columns_of(tmp_path / "a.csv", name="a.csv") == {"when": "datetime", "q": ""}
 
 
 def test_dates_and_times_are_told_from_numbers_and_text(tmp_path: Path) -> None:
@@ -191,15 +194,6 @@ def test_dates_and_times_are_told_from_numbers_and_text(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("stamp;q;note;clock\n" + rows)
     found = columns_of(tmp_path / "a.csv", name="a.csv")
     assert found == {"stamp": "datetime", "q": "", "clock": "datetime"}
-
-
-def test_times_of_day_need_no_form_and_pass_midnight(tmp_path):
-    stamps = ["9:59:59,990", "10:00:00,010", "23:59:59,990", "", "0:00:00,010"]
-    text = "when;q\n" + "".join(f"{stamp};{n}\n" for n, stamp in enumerate(stamps))
-    trial = read(tmp_path, text, ("when", "q"), datetimes={"when": ""})
-    expected = [0.0, 0.02, 50400.0, np.nan, 50400.02]
-    np.testing.assert_allclose(trial.columns["when"], expected, rtol=1e-12)
-    assert columns_of(tmp_path / "a.csv", name="a.csv") == {"when": "datetime", "q": ""}
 
 
 def test_the_first_rows_may_lack_cells(tmp_path):

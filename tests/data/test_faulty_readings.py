@@ -40,14 +40,11 @@ def test_what_machines_do_is_not_wild(values: np.ndarray, rule: tuple[float, flo
     assert not find_spikes(values, rule).any()
 
 
-def test_a_controllers_kick_is_not_wild() -> None:
+def test_a_dead_second_is_found_and_a_controllers_kick_is_not_wild() -> None:
     """It leaves the drive unsteady, as no wild reading does."""
     kicked = FORCE.copy()
     kicked[2000:2006] += [0.0, -30.0, -9.0, 6.0, 3.0, 1.0]
     assert not find_spikes(kicked, INPUT).any()
-
-
-def test_a_dead_second_is_found() -> None:
     spoilt = FORCE.copy()
     spoilt[1000:1500] = spoilt[1000]
     assert find_equal_runs(spoilt, T) == [(1000, 1500)]

@@ -440,18 +440,6 @@ def test_json_of_arrays(tmp_path, content, names):
     assert "no column 'x'" in refused(path, ("x",))
 
 
-def test_mcap_of_json(tmp_path):
-    messages = [(0.01 * n, {"q": [q], "ok": True}) for n, q in enumerate(Q)]
-    path = write_json_mcap(tmp_path / "a.mcap", messages)
-    trial = read_trial(path, ("/state:@time", "/state:q[0]", "/state:ok"))
-    np.testing.assert_allclose(trial.columns["/state:@time"], T, atol=1e-12)
-    np.testing.assert_array_equal(trial.columns["/state:q[0]"], Q)
-    assert columns_of(path) == {"/state:@time": "s", "/state:q[0]": "", "/state:ok": ""}
-    assert "no column '/stat'" in refused(path, ("/stat:@time",))
-    path.write_bytes(path.read_bytes()[:200])
-    assert "not a sound MCAP file" in refused(path, ("/state:@time",))
-
-
 @pytest.mark.parametrize(
     ("lie", "said"), [("summary", "not a sound MCAP file"), ("chunk", "does not fit into memory")]
 )

@@ -101,15 +101,12 @@ def test_what_looks_like_a_rail_or_a_jump_and_is_none_is_left(change):
     assert cleaned(table).repairs == []
 
 
-def test_an_angle_that_goes_on_past_a_full_turn_is_unwrapped():
+def test_turns_wraps_and_missing_samples():
     table = columns()
     table["turn"] = np.linspace(0, 14, N)
     wrapped = cleaned({**table, "turn": np.mod(table["turn"] + np.pi, 2 * np.pi) - np.pi})
     assert "wraps at a full turn 2 times" in wrapped.repairs[0]
     np.testing.assert_allclose(wrapped.columns["q_turn"], table["turn"], atol=1e-9)
-
-
-def test_wraps_and_missing_samples_together():
     table = columns()
     table["yaw"] = np.mod(table["yaw"] + 2**15, 2**16)
     table["yaw"][[0, 375, 376, 1000]] = np.nan
@@ -117,9 +114,6 @@ def test_wraps_and_missing_samples_together():
     assert "1 row with missing samples at the ends dropped" in trial.repairs
     assert "column 'yaw': 3 missing samples interpolated" in trial.repairs
     assert np.abs(np.diff(trial.columns["q_yaw"])).max() < 0.01
-
-
-def test_a_second_of_samples_is_a_second():
     table = columns(500)
     assert len(cleaned(table).t) == 500
     with pytest.raises(InputError, match=r"499 samples over 0\.998 s, less than 1 s"):
@@ -159,7 +153,7 @@ def test_an_unsigned_register_is_read_as_signed():
         cleaned(columns() | {"pwm": signed}, session=session)
 
 
-def test_limits_are_heeded():
+def test_limits_and_long_gaps_are_heeded_and_interpolation_follows_the_stamps():
     table = columns()
     table["force_x"][100:107] = np.nan
     with pytest.raises(InputError, match=r"b\.csv, row 102, column 'force_x': 7 samples in a row"):
@@ -167,9 +161,6 @@ def test_limits_are_heeded():
     assert cleaned(table).dead[0].missing
     lenient = cleaned(table, limits=CleaningLimits(nan_run=7))
     assert "7 missing samples interpolated" in lenient.repairs[0]
-
-
-def test_what_a_long_gap_spans_is_left_out_and_most_of_a_trial_is_not():
     table = columns()
     table["turn"][400:500] = np.nan
     table["force_x"][500:520] = np.nan
@@ -180,6 +171,12 @@ def test_what_a_long_gap_spans_is_left_out_and_most_of_a_trial_is_not():
     table["turn"][400:800] = np.nan
     with pytest.raises(InputError, match=r"400 samples in a row are missing.*start_s and end_s"):
         cleaned(table)
+    table = columns()
+    table["time_us"][500:] += 2000
+    table["turn"] = table["time_us"] * 1e-6
+    expected = table["turn"].copy()
+    table["turn"][499:502] = np.nan
+    np.testing.assert_allclose(cleaned(table).columns["q_turn"], expected, atol=1e-12)
 
 
 def test_a_force_that_is_zeroed_anew_sets_the_trial_aside():
@@ -192,15 +189,6 @@ def test_a_force_that_is_zeroed_anew_sets_the_trial_aside():
     table["force_x"] = force + 0.7 * (t >= 1.2)
     with pytest.raises(InputError, match=r"jumps and stays there.*end_s and start_s = 1\.2 in"):
         cleaned(table)
-
-
-def test_interpolation_follows_the_time_stamps():
-    table = columns()
-    table["time_us"][500:] += 2000
-    table["turn"] = table["time_us"] * 1e-6
-    expected = table["turn"].copy()
-    table["turn"][499:502] = np.nan
-    np.testing.assert_allclose(cleaned(table).columns["q_turn"], expected, atol=1e-12)
 
 
 DAMAGE = st.lists(

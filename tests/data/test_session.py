@@ -88,13 +88,10 @@ def test_what_is_read():
     assert session.device_file is None
 
 
-def test_brakes_with_other_names_follow_the_order_of_the_axes():
+def test_brakes_follow_the_order_of_the_axes_and_an_error_names_its_field():
     table = copy.deepcopy(TABLE)
     table["brakes"] = {"columns": ["b1", "b2"], "unit": "N.m, N"}
     assert [b.axis for b in session_from(table, Path()).brakes] == ["yaw", "slide"]
-
-
-def test_the_error_names_the_field_and_counts_the_others():
     with pytest.raises(InputError) as caught:
         session_from({**TABLE, "sample_rate_hz": "x", "device": 3}, Path())
     assert str(caught.value) == "session.toml: device: found 3, expected text (and 1 more)"

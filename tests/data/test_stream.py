@@ -89,20 +89,14 @@ def test_a_position_may_be_missing():
     np.testing.assert_array_equal(rows[:, [0, 2]], [[0.0, 1.0], [0.1, 1.0], [0.2, 1.0]])
 
 
-def test_only_the_first_complaints_are_said():
+def test_what_is_no_log_is_refused_and_complaints_are_few():
     pipe = Pipe()
     pipe.write("t,q_yaw,force_x\n" + "x,1,1\n" * 50)
     assert pipe.stream.bad_lines == 50
     assert len(pipe.said) == 3
     assert "only counted" in pipe.said[-1]
-
-
-def test_a_header_that_lacks_a_column():
     with pytest.raises(InputError, match=r"log: line 2.*no column 'force_x'"):
         Pipe().write("# head\nt,q_yaw,force\n")
-
-
-def test_what_is_no_text_is_refused():
     pipe = Pipe()
     pipe.write("t,q_yaw,force_x\n")
     with pytest.raises(InputError, match="line without end"):

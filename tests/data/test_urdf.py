@@ -62,7 +62,7 @@ ARM = (
 )
 
 
-def test_a_chain_is_read_with_what_is_fixed_to_it(tmp_path: Path) -> None:
+def test_a_chain_is_read_with_what_is_fixed_to_it_and_held_beside_it(tmp_path: Path) -> None:
     chain = read_chain(write(tmp_path, *ARM))
     assert list(chain.joints) == ["shoulder_pan", "elbow"]
     elbow = chain.joints["elbow"]
@@ -73,6 +73,14 @@ def test_a_chain_is_read_with_what_is_fixed_to_it(tmp_path: Path) -> None:
     apart = 1.0 * 0.5 / 1.5 * 0.25**2
     assert elbow["inertia"][0] == pytest.approx(0.2 + 0.1)
     assert elbow["inertia"][3] == pytest.approx(0.1 + 0.2 + apart)
+    held = {"mass": 1.5, "center": [0.2, 0.0, 0.0]}
+    chain = read_chain(write(tmp_path, *ARM), tip="tool", payload=held)
+    assert chain.joints["elbow"]["mass"] == pytest.approx(3.0)
+    finger = (link("finger", 0.1), joint("grip", "tool", "finger", "prismatic", x=0.0))
+    chain = read_chain(write(tmp_path, *ARM, *finger), tip="tool")
+    assert list(chain.joints) == ["shoulder_pan", "elbow"]
+    assert chain.joints["elbow"]["mass"] == pytest.approx(1.6)
+    assert chain.notes == ("held at zero beside the chain: grip",)
 
 
 def test_a_device_file_needs_no_more_than_the_urdf(tmp_path: Path) -> None:
@@ -84,20 +92,6 @@ def test_a_device_file_needs_no_more_than_the_urdf(tmp_path: Path) -> None:
     assert device.friction["elbow"].coulomb.prior == 0.25
     assert device.source == "arm.urdf, base to lower"
     assert check_device(device) == []
-
-
-def test_a_payload_is_joined_to_the_tip(tmp_path: Path) -> None:
-    held = {"mass": 1.5, "center": [0.2, 0.0, 0.0]}
-    chain = read_chain(write(tmp_path, *ARM), tip="tool", payload=held)
-    assert chain.joints["elbow"]["mass"] == pytest.approx(3.0)
-
-
-def test_joints_beside_the_chain_are_held_and_named(tmp_path: Path) -> None:
-    finger = (link("finger", 0.1), joint("grip", "tool", "finger", "prismatic", x=0.0))
-    chain = read_chain(write(tmp_path, *ARM, *finger), tip="tool")
-    assert list(chain.joints) == ["shoulder_pan", "elbow"]
-    assert chain.joints["elbow"]["mass"] == pytest.approx(1.6)
-    assert chain.notes == ("held at zero beside the chain: grip",)
 
 
 @pytest.mark.parametrize(
@@ -175,14 +169,13 @@ def test_what_cannot_be_computed_is_one_line(
     assert not caught.value.others and "\n" not in str(caught.value)
 
 
-def test_a_limit_below_zero_is_one_that_is_not_known(tmp_path: Path) -> None:
+def test_limits_below_zero_are_not_known_and_no_urdf_lies_outside_the_folder(
+    tmp_path: Path,
+) -> None:
     parts = (link("a"), link("b"), joint("j", "a", "b"))
     parts = tuple(part.replace('effort="40"', 'effort="-40"') for part in parts)
     device = device_of(tmp_path, parts=parts)
     assert {p.name: p.sd for p in device.parameters}["coulomb.j"] == 5.0
-
-
-def test_a_urdf_outside_the_folder_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "device.toml"
     path.write_text('name = "arm"\n[robot]\nurdf = "../arm.urdf"\n')
     with pytest.raises(InputError, match="leaves the folder"):

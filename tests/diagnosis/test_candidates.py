@@ -91,23 +91,6 @@ NAMED = [
     ("joint", 41, "shear_thinning:joint", ("stribeck:joint", "quadratic_drag:joint")),
     ("joint", 43, "maxwell_slip:joint", ("presliding:joint", "stribeck:joint")),
     ("joint", 45, "presliding:joint", ("maxwell_slip:joint", "stribeck:joint")),
-    pytest.param(
-        "bam",
-        52,
-        "return_spring:yaw",
-        ("upper_stop:yaw", "lower_stop:yaw", "base_tilt"),
-        marks=pytest.mark.long,
-    ),
-    pytest.param(
-        "bam", 53, "upper_stop:yaw", ("return_spring:yaw", "lower_stop:yaw"), marks=pytest.mark.long
-    ),
-    pytest.param(
-        "bam",
-        54,
-        "friction_by_pose:yaw-extension",
-        ("friction_by_pose:yaw-pitch", "stribeck:yaw"),
-        marks=pytest.mark.long,
-    ),
     ("wrist", 56, "unbalance:a", ("force_bias:a", "torque_ripple:a", "return_spring:a")),
     ("damper", 57, "upper_stop:piston", ("return_spring:piston", "quadratic_drag:piston")),
     ("bam", 59, "backlash:yaw", ("presliding:yaw", "maxwell_slip:yaw")),

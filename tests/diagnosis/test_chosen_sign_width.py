@@ -35,9 +35,6 @@ def test_a_damper_that_truly_stops_is_given_a_narrower_sign(stopped):
     assert f"`sign_width = {DECLARED * found.sign_width_factor:.2g}`" in said
     coulomb = found.parameters["coulomb.piston"]
     assert abs(coulomb.estimate - truth["coulomb.piston"]) < 3.0 * coulomb.sd
-
-
-def test_what_is_made_of_the_model_has_that_width_and_its_declaration_has_not(stopped):
     run, _ = stopped
     factor = run.read(IdentifyResult, "base").sign_width_factor
     assert width_of(load_model(run, "base")) == pytest.approx(DECLARED * factor)

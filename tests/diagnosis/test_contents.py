@@ -1,16 +1,22 @@
-"""Candidates belong to the content of a device, not to its name or to what a process did before."""
+"""What a diagnosis holds of candidates, axes, windows and doubt."""
 
 import copy
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from sessions import BAND, KINEMATICS, SENSORS, folds, made
 
+from bampipe.diagnosis.candidates import build_candidate_model, compile_candidate
+from bampipe.diagnosis.dictionary import Dictionary
+from bampipe.diagnosis.probability import _share_explained
+from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.session import candidates_of, system_of
-from bampipe.diagnosis.shape import worst_windows
+from bampipe.diagnosis.shape import _size, worst_windows
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
 from bampipe.results.floor import compare_with_floor
+from bampipe.stages.diagnose import _map_variables
 from bampipe.trials.evidence import gather_evidence
 from bampipe.trials.measured import MeasuredTrials
 
@@ -60,7 +66,7 @@ def test_one_judgement_of_at_the_floor(error, floor, sd, expected):
     assert compare_with_floor(error, floor, sd) == expected
 
 
-def test_every_axis_has_its_worst_window():
+def test_every_axis_has_its_worst_window_and_filters_keep_their_order():
     trials = made(bam_with_force(1.0), {}, trials=2, seconds=4.0)
     system = system_of(bam_with_force(1.0))
     evidence = gather_evidence(system, trials.motions, BAND, system.prior, folds(2))
@@ -69,8 +75,71 @@ def test_every_axis_has_its_worst_window():
     for window in found:
         alike = [w.rmse for w in worst_windows(evidence, count=1000) if w.axis == window.axis]
         assert window.rmse == max(alike) and len(alike) > 3
-
-
-def test_the_filters_of_a_session_keep_the_order_of_its_model():
     assert tuple(KINEMATICS.axes) == ("yaw", "pitch", "extension")
     assert SENSORS.scatter_sd.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "words"),
+    [
+        (-2e-5, "m", "-0.02 mm"),
+        (-1e-9, "m", "0.00 mm"),
+        (0.25, "m", "0.25 m"),
+        (-0.001, "rad", "0.00 rad"),
+        (1.554, "rad", "1.55 rad"),
+    ],
+)
+def test_a_small_stroke_is_given_in_millimetres_and_no_zero_has_a_sign(
+    value: float, unit: str, words: str
+) -> None:
+    assert _size(value, unit) == words
+
+
+def test_blocks_of_one_trial_are_mapped_under_its_name() -> None:
+    """As residuals.parquet has them: the page for exploring joins the two."""
+    motions = [SimpleNamespace(trial_id=f"t1@{k}.0s", t=np.arange(k, k + 3.0)) for k in (0, 4)]
+    initial = SimpleNamespace(
+        motions=motions,
+        band=SimpleNamespace(thinned_rows=lambda n: np.arange(n)),
+        system=SimpleNamespace(coordinates=()),
+    )
+    found = _map_variables(initial)  # type: ignore[arg-type]
+    assert set(found["trial_id"]) == {"t1"}
+    assert found["t"].tolist() == [0.0, 1.0, 2.0, 4.0, 5.0, 6.0]
+
+
+AXIS = MachineScale(
+    np.array([-0.05]), np.array([0.2]), np.array([0.3]), np.array([100.0]),
+    np.array([50.0]), {"carriage": ("m", "N")}, 1e-3, 20.0, (16.0,),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("without", "probability"),
+    [
+        ((30.0, 1.0), 1.0 - 20.0 / 30.0),  # only the axis that is far shows it
+        ((30.0, 1.5), 1.0),  # the other one does, by 40 nats
+        ((20.2, 1.1), 1.0),  # the other one does, if by less than 14, by more than the far one
+    ],
+)
+def test_what_only_an_axis_far_above_the_noise_shows_is_as_sure_as_its_share(without, probability):
+    rows = {(): (20.0, 1.0), (("-stribeck:yaw", ()),): without}
+    search = SimpleNamespace(
+        p=SimpleNamespace(independent=np.array([100.0, 100.0])),
+        residual_rows=lambda keys: [np.full(50, level) for level in rows[keys]],
+    )
+    found = _share_explained(search, "stribeck:yaw", np.array([True, False]))
+    assert found == pytest.approx(probability)
+
+
+@pytest.mark.parametrize("name", ["loose_load:carriage", "loose_drive:carriage"])
+def test_a_grid_over_several_shapes_covers_each_of_their_ranges(name):
+    item = compile_candidate(build_candidate_model(registry.device("slider"), name))
+    grid = Dictionary(None, (), {name: item}, AXIS).grid(name)
+    assert len(set(grid)) == len(grid) <= 300
+    values = [sorted({shape[k] for _, shape in grid}) for k in range(len(grid[0][1]))]
+    own = [item.parameters[i].name.rpartition(".")[2] for i in item.searched_indices]
+    assert len(values[own.index("gap")]) == max(map(len, values)) >= 9
+    for each in values:
+        assert len(each) >= 3
+        assert each[0] <= 0.2 and each[-1] >= 0.8

@@ -107,16 +107,13 @@ def test_the_draft_is_the_curve_that_was_hidden(detent):
     assert np.abs(height[:, :, None] * magnet - mean).max(2).min() < 0.02 * 4.0
 
 
-def test_of_what_was_fitted_the_draft_is_the_most_probable_that_lowers_the_error(detent):
+def test_the_draft_is_the_most_probable_and_its_file_one_that_a_person_can_keep(detent):
     _, found = detent
     options = found.axes["joint"].options
     assert options[0].effects == () and options[0].constants == 0
     assert len(options) >= 3
     (best,) = (o for o in options if o.held_out_rmse == found.axes["joint"].rmse_after)
     assert best.log_evidence == max(o.log_evidence for o in options)
-
-
-def test_the_file_is_an_effect_file_that_a_person_can_keep(detent):
     run, found = detent
     (effect,) = found.effects.values()
     declaration = tomllib.loads((run.root / effect.file).read_text(encoding="utf-8"))

@@ -19,16 +19,13 @@ from bampipe.trials.motion import Motion, Recording
 from bampipe.trials.residuals import problem_of
 
 
-def test_thinning_equals_the_library_filter_away_from_the_ends():
+def test_thinning_is_that_of_the_library_with_a_cut_off_an_axis():
     band = Band(RATE, (8.0, 8.0))
     values = np.random.default_rng(0).normal(size=(3000, 2))
     sections = butter(2, 8.0, fs=RATE, output="sos")
     expected = sosfiltfilt(sections, values, axis=0)[band.thinned_rows(3000)]
     inner = slice(8, -8)
     assert np.allclose(band.thin(values)[inner], expected[inner], atol=1e-6)
-
-
-def test_each_axis_has_its_own_cut_off():
     values = np.random.default_rng(1).normal(size=(3000, 2))
     both = Band(RATE, (8.0, 20.0)).thin(values)
     for column, cutoff in enumerate((8.0, 20.0)):

@@ -151,18 +151,14 @@ def test_parameters_and_strengths_stay_within_bounds_and_the_rest_moves_along(li
     assert inside.unknowns == pytest.approx(free.base, abs=1e-6)
 
 
-def test_an_effect_that_is_taken_away_has_the_change_that_takes_it_away(line):
+def test_what_is_taken_away_changes_the_rest_unless_another_parameter_replaces_it(line):
     y, base = line
     problem = problem_of(y, base)
     gone = solve_bounded(problem, *problem.sums(), absent={1: 0.25})
     assert gone.base[1] == pytest.approx(0.25)
     given = np.linalg.lstsq(base[:, :1], -y - 0.25 * base[:, 1], rcond=None)[0]
     assert gone.base[0] == pytest.approx(given[0], abs=1e-3)
-
-
-def test_what_another_parameter_can_replace_is_taken_away_at_no_cost(line):
-    """Of two parameters that do the same, the trials determine the sum alone."""
-    y, base = line
+    # Of two parameters that do the same, the trials determine the sum alone.
     both = np.array([[0.5, 0.0], [0.5, 0.0], [0.0, 1.0]])
     held = replace(problem_of(y, base), to_parameters=both)
     loose = replace(held, loose=np.array([[1.0], [-1.0], [0.0]]))

@@ -34,9 +34,9 @@ def moved(trials, change):
         pytest.param("joint", 7, {"creep": True}, marks=pytest.mark.long),
         pytest.param("axis", 58, {"creep": True}, marks=pytest.mark.long),
         ("damper", 57, {}),
-        ("wrist", 56, {}),
+        pytest.param("wrist", 56, {}, marks=pytest.mark.long),
         pytest.param("bam", 6, {}, marks=pytest.mark.long),
-        ("bam", 6, {"coarse": 8.0}),  # play would make of counts what the model lacks
+        pytest.param("bam", 6, {"coarse": 8.0}, marks=pytest.mark.long),
         ("axis", 58, {"creep": False}),  # it truly stops: no Stribeck friction, no compliance
         ("joint", 5, {}),
     ],
@@ -159,7 +159,7 @@ def test_twins_are_undecided_and_their_probabilities_sum_to_one(record):
 @pytest.mark.parametrize(
     ("machine", "effect", "doubt"),
     [
-        ("bam", "detent:yaw", set()),
+        pytest.param("bam", "detent:yaw", set(), marks=pytest.mark.long),
         ("axis", "rough_patch:carriage", {"position_dependent_friction:carriage"}),
     ],
 )
@@ -173,18 +173,23 @@ def test_what_no_effect_of_the_library_is_is_called_unknown(record, machine, eff
 
 
 def test_the_numbers_that_decide_are_those_that_are_given(record):
-    """A dozen replays make nobody surer than one in ten thousand; half the force nothing is."""
+    """A dozen replays make nobody surer than one in ten thousand; half the force nothing is.
+
+    By the usual ones the effect is missing: `stages/test_diagnose.py`.
+    """
     trials, recipe = record("joint", 41, "shear_thinning:joint")
-    _, usual = diagnose_trials(trials, recipe)
-    assert verdicts(usual) == ["missing"] and usual.selected == ("shear_thinning:joint",)
     for criteria in ({"size": 0.5}, {"probability": 0.99999}):
         _, found = diagnose_trials(trials, recipe, **criteria)
         assert verdicts(found) != ["missing"]
         assert (found.selected == ()) == ("size" in criteria)
 
 
-def test_the_pose_of_an_arm_is_no_reason_to_doubt_it(record):
-    """A weight in the hand is the mass of the arm to any trial; neither is missing."""
-    trials, _ = record("bam", 6)
-    _, found = diagnose_trials(trials, bam(), only=("handle_payload", "force_gain:y"))
+@pytest.mark.parametrize(
+    ("weighed", "conditions"),
+    [(("handle_payload", "force_gain:y"), {}), (("backlash:yaw",), {"coarse": 8.0})],
+)
+def test_the_pose_and_the_counts_of_an_arm_are_no_reason_to_doubt_it(record, weighed, conditions):
+    """A weight in the hand is the mass of the arm to any trial; play would explain counts."""
+    trials, _ = record("bam", 6, **conditions)
+    _, found = diagnose_trials(trials, bam(), only=weighed)
     assert found.selected == ()

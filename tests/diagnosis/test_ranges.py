@@ -44,21 +44,15 @@ def test_a_range_follows_travel_speed_load_and_sampling(effect, parameter, low, 
     assert (found.low, found.high) == pytest.approx((low, high), rel=1e-9)
 
 
-def test_one_drive_of_several_is_late_by_half_a_sample_at_least():
+def test_where_drives_are_late_and_stops_are_looked_for():
     """Less than that is what friction leaves where it stops a joint, and the timing of all."""
     lag = f"actuator_lag:{registry.device('slider').components[0]}"
     beside = replace(AXIS, coordinates={**AXIS.coordinates, "tool": ("m", "N")})
     assert range_of(lag, "time_constant").low == pytest.approx(2e-4)
     assert range_of(lag, "time_constant", beside).low == pytest.approx(5e-4)
-
-
-def test_a_stop_is_looked_for_in_its_half_of_the_travel():
     upper, lower = (range_of(f"{name}_stop:carriage", "position") for name in ("upper", "lower"))
     assert (upper.low, upper.high) == pytest.approx((0.075, 0.195))
     assert (lower.low, lower.high) == pytest.approx((-0.045, 0.075))
-
-
-def test_the_end_of_a_gas_spring_is_looked_for_beyond_either_end_of_the_travel():
     ends = range_of("gas_spring:carriage", "end")
     shares = np.linspace(0.0, 1.0, 21)
     found = np.array([ends.value_at(ends.within(share)) for share in shares])

@@ -58,7 +58,7 @@ def test_a_set_of_three_is_found_whole_in_any_order_of_the_candidates(session, b
     assert search.cost(keys) == search.cost(keys[::-1])
 
 
-def test_strengths_are_within_the_bounds_of_their_files(search):
+def test_strengths_stay_within_bounds_and_a_shape_moves_to_its_truth(search):
     for beam in search.beam(2):
         for _, keys in beam:
             for key, strengths in zip(added(keys), search.solve(keys).strengths, strict=True):
@@ -66,9 +66,6 @@ def test_strengths_are_within_the_bounds_of_their_files(search):
                     strengths, search.dictionary.bounds(key[0]), strict=True
                 ):
                     assert low - 1e-9 <= value <= high + 1e-9
-
-
-def test_a_shape_moves_to_its_truth(search):
     others = tuple(key for key in best_set(search, 3) if key[0] != "stribeck:yaw")
     far = ("stribeck:yaw", (0.75,))
     before = search.dictionary.values(far)[0]

@@ -104,13 +104,10 @@ def test_a_verdict_names_what_is_probable(verdict: str, sets: Sets, start: str) 
     assert say(verdict, sets).startswith(start)
 
 
-def test_an_effect_that_may_be_chance_is_not_said_to_be_missing() -> None:
+def test_what_is_doubted_left_or_of_another_axis_is_said() -> None:
     unsure = {A: 0.66, B: 0.6, C: 0.4}
     said = say("undecided", {(A, B): 0.6, (A, C): 0.4}, probabilities=unsure)
     assert "a:joint (probability 0.66) may be missing, and these trials do not decide" in said
-
-
-def test_what_is_left_beside_named_effects_is_said_with_its_shape() -> None:
     for verdict, sets in (("missing", {(A,): 1.0}), ("undecided", {(A,): 0.6, (B,): 0.4})):
         said = say(verdict, sets, remains=True, unknown=0.957)
         assert "In addition, something is missing that no effect of the library explains" in said
@@ -119,16 +116,10 @@ def test_what_is_left_beside_named_effects_is_said_with_its_shape() -> None:
     assert say("unknown_effect", {(): 1.0}).endswith(f"Its shape: {SHAPE}.")
     assert "Its shape" not in say("unknown_effect", {(): 1.0}, shape="")
     assert "the library" not in say("unknown_effect", {(): 1.0}, cut_short=True)
-
-
-def test_effects_of_other_axes_that_errors_come_from_are_named() -> None:
     both = {(A, "b:elbow"): 1.0}
     assert "adding all selected effects (a:joint and b:elbow) takes" in say("missing", both)
     clean = say("nothing_missing", {("b:elbow",): 1.0}, before=0.104)
     assert "the held-out error is 0.104 N.m" in clean and "b:elbow" not in clean
-
-
-def test_an_error_above_its_floor_with_nothing_missing_says_what_filters_leave() -> None:
     filters = (
         "Without the bias that filters leave where friction changes sign, the error is 0.0831 N.m."
     )
@@ -162,9 +153,6 @@ def test_nothing_is_called_certain() -> None:
     shares = (0.5, 0.988, 0.99961, 0.9999993, -0.2)
     shown = ["50.0 %", "98.8 %", "99.96 %", "99.99993 %", "-20.0 %"]
     assert [phrases.percent_of_force(share) for share in shares] == shown
-
-
-def test_alternatives_that_trials_do_not_decide_are_doubted() -> None:
     found = made("undecided", {(A, B): 0.6, (A, C): 0.4})
     assert phrases.find_open_effects(found) == {B, C} and found.lacking == ("joint",)
     shown = "undecided: a:joint (> 0.99), and either b:joint (0.60) or c:joint (0.40)"

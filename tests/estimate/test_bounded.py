@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import least_squares, lsq_linear
 
 from bampipe.estimate.bounded import descend, invert_scaled, solve_bounded
+from bampipe.estimate.normal_equations import NormalEquations
 
 
 def problem(seed: int, rows: int = 60, n: int = 7) -> tuple[np.ndarray, np.ndarray]:
@@ -33,22 +34,16 @@ def test_scipy_finds_the_same_within_bounds(seed: int) -> None:
     assert np.all((found >= lower) & (found <= upper))
 
 
-def test_a_coefficient_is_released_from_a_bound() -> None:
+def test_a_coefficient_is_released_from_a_bound_and_held_between_equal_ones() -> None:
     """Clipped at first, the second is inside its range once the first one is at its own bound."""
     a, b = np.array([[1.0, 0.0], [2.0, 1.0]]), np.array([2.0, 3.0])
     assert np.linalg.solve(a, b).tolist() == [2.0, -1.0]
     found = solve_bounded(a.T @ a, a.T @ b, np.zeros(2), np.array([1.0, 9.0]))
     np.testing.assert_allclose(found, [1.0, 1.0])
-
-
-def test_without_bounds_it_is_least_squares() -> None:
     a, b = problem(3)
     free = np.full(7, np.inf)
     found = solve_bounded(a.T @ a, a.T @ b, -free, free)
     np.testing.assert_allclose(found, np.linalg.lstsq(a, b, rcond=None)[0], rtol=1e-7)
-
-
-def test_a_coefficient_with_equal_bounds_is_held() -> None:
     a, b = problem(4)
     lower, upper = np.full(7, -np.inf), np.full(7, np.inf)
     lower[2] = upper[2] = 0.3
@@ -61,7 +56,7 @@ def test_a_coefficient_with_equal_bounds_is_held() -> None:
     assert all_held.tolist() == [1.0] * 7
 
 
-def test_what_the_data_do_not_determine_stays_small_where_others_are_at_a_bound() -> None:
+def test_what_the_data_do_not_determine_stays_small() -> None:
     # Two columns of ones: with this draw, the method of bounds ends at 1e14 and minus that.
     rng = np.random.default_rng(1437)
     mixed = rng.normal(size=(50, 8)) @ (np.eye(8) + 0.9 * rng.normal(size=(8, 8)))
@@ -75,9 +70,6 @@ def test_what_the_data_do_not_determine_stays_small_where_others_are_at_a_bound(
     assert found[0] == pytest.approx(-found[1])
     assert found[1] - found[0] == pytest.approx(best.x[0], rel=1e-6)
     assert found[2:] == pytest.approx(best.x[1:], rel=1e-4, abs=1e-6)
-
-
-def test_what_the_data_do_not_determine_stays_at_zero() -> None:
     a, b = problem(5)
     twice = np.column_stack([a, a[:, 0], np.zeros(len(a))])
     free = np.full(9, np.inf)
@@ -134,3 +126,26 @@ def test_the_inverse_of_normal_equations_does_not_depend_on_units() -> None:
     np.testing.assert_allclose(found[:3, :3], expected, rtol=1e-9)
     assert not found[3].any()
     assert not found[:, 3].any()
+
+
+RNG = np.random.default_rng(2)
+TRIALS, COUNT, AXES, P = 3, 40, 2, 5
+FREE = np.full(P, np.inf)
+
+
+def test_what_is_known_beforehand_counts_as_so_many_samples() -> None:
+    """A coefficient known as 3 with variance 1/4 is as four samples of it that read 3."""
+    slopes, left = RNG.normal(size=(TRIALS, COUNT, AXES, P)), RNG.normal(size=(TRIALS, COUNT, AXES))
+    used = [np.ones((COUNT, AXES), dtype=bool)] * TRIALS
+    precision, known = np.zeros(P), np.zeros(P)
+    precision[1], known[1] = 4.0, 3.0
+    weight = np.ones(AXES)
+    found = NormalEquations.from_samples(slopes, left, used, precision, known)
+    rows, target = slopes.reshape(-1, P), -left.ravel()
+    unit = np.zeros((4, P))
+    unit[:, 1] = 1.0
+    expected = np.linalg.lstsq(np.vstack([rows, unit]), np.append(target, [3.0] * 4), rcond=None)[0]
+    np.testing.assert_allclose(found.solve(weight, -FREE, FREE), expected, rtol=1e-9)
+    x = RNG.normal(size=(400, 1))
+    exact = NormalEquations.from_samples([x[:, :, None]], [-x], [np.ones((400, 1), dtype=bool)])
+    assert 0.0 < exact.mean_square(np.array([1.0]))[0] < 1e-10 * float(np.mean(x**2))

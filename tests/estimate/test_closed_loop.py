@@ -50,7 +50,7 @@ def test_a_fast_controller_is_a_spring_and_a_damper():
     np.testing.assert_allclose(u[:, 0], -STIFFNESS * x[:, 0] - DAMPING * x[:, 1], atol=1e-9)
 
 
-def test_a_held_command_comes_half_a_tick_late():
+def test_a_controller_is_late_saturates_and_sees_its_encoders():
     """Late by h/2, the spring takes damping away: k h / 2."""
     coarse = run(501, 0.01, rate=1.0 / DT)[0]
     fine = run(501, 0.01)[0]
@@ -59,21 +59,12 @@ def test_a_held_command_comes_half_a_tick_late():
     size = [np.hypot(x[at, 0], x[at, 1] / np.sqrt(STIFFNESS / MASS)) for x in (coarse, fine)]
     grown = np.polyfit(DT * at, np.log(size[0] / size[1]), 1)[0]
     assert grown == pytest.approx(lost, rel=0.1)
-
-
-def test_a_saturated_command_pushes_evenly():
     x, u, _ = run(51, 1.0, limit=3.0)
     assert np.all(u == -3.0)
     np.testing.assert_allclose(x[-1, 0], 1.0 - 0.5 * 3.0 / MASS * (50 * DT) ** 2, rtol=1e-9)
-
-
-def test_the_controller_sees_encoders_that_the_load_moves():
     x, u, seen = run(501, 0.01, compliance=2e-4)
     np.testing.assert_allclose(seen[5:, 0], x[5:, 0] + 2e-4 * u[5:, 0], atol=2e-5)
     assert np.abs(seen[5:, 0] - x[5:, 0]).max() > 5e-4
-
-
-def test_an_unstable_loop_is_said():
     r = np.tile([0.0, -1e8, np.inf], (2000, 1))
     with pytest.raises(InputError, match="grows without bounds"):
         simulate_controlled(

@@ -121,7 +121,7 @@ def test_half_of_the_amplitude_at_the_cut_off(method: str) -> None:
     assert gain == pytest.approx(0.5, abs=0.05)
 
 
-def test_noise_gains_are_those_of_white_noise() -> None:
+def test_noise_decides_gains_and_the_frequency_of_the_floor() -> None:
     rng = np.random.default_rng(0)
     found = butterworth.smooth(np.zeros(400), RATE, 25.0, 1.0)
     draws = [butterworth.zero_phase(rng.standard_normal(400), RATE, 25.0) for _ in range(800)]
@@ -130,9 +130,6 @@ def test_noise_gains_are_those_of_white_noise() -> None:
         measured, (found.position_sd, found.velocity_sd, found.acceleration_sd), strict=True
     ):
         np.testing.assert_allclose(value, band, rtol=0.15)
-
-
-def test_floor_frequency_rises_as_the_noise_falls() -> None:
     rng = np.random.default_rng(0)
     true = np.cumsum(np.cumsum(rng.standard_normal(8000))) * 1e-6
     found = [

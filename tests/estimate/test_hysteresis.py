@@ -34,7 +34,7 @@ def test_stiffness_within_a_percent(kind: str, friction: float, slip: float) -> 
         assert np.mean(widths) == pytest.approx(2 * friction * AMPLITUDE, rel=0.1)
 
 
-def test_a_loop_of_seventy_counts() -> None:
+def test_coarse_readings_and_noise_do_not_stiffen_the_axis() -> None:
     """The extension of the BAM: 109 kN/m under 120 N is 73 counts of 30 um."""
     stiffness, errors = 109e3, []
     for seed in range(4):
@@ -43,9 +43,6 @@ def test_a_loop_of_seventy_counts() -> None:
         found = hy.hysteresis(*measure(load, true, 3e-5, 0.05, seed), RATE)
         errors.append(found.stiffness / stiffness - 1.0)
     assert np.max(np.abs(errors)) < 0.003
-
-
-def test_noise_of_the_torque_does_not_stiffen_the_axis() -> None:
     load = load_cycles(6, AMPLITUDE, seed=5)
     true = simulate("bouc_wen_1", load, K, 3.0, 0.03 * AMPLITUDE / K)
     found = hy.hysteresis(*measure(load, true, 4.7e-5, 6.0), RATE)
@@ -63,30 +60,21 @@ def test_energy_is_the_area_of_the_loop() -> None:
         assert cycle.energy == pytest.approx(2 * friction * (np.ptp(part) - 2 * slip), rel=0.05)
 
 
-def test_a_load_that_does_not_overcome_friction_is_said() -> None:
+def test_a_load_below_friction_and_the_scatter_of_cycles_are_said() -> None:
     load = load_cycles(4, AMPLITUDE, seed=2)
     true = simulate("bouc_wen_1", load, K, 15.0, 0.6 * AMPLITUDE / K)
     found = hy.hysteresis(*measure(load, true, 4.7e-5, 0.05), RATE)
     assert not found.yielded
     assert found.slope_change > 0.02
-
-
-def test_standard_deviation_is_that_of_the_cycles() -> None:
     load = load_cycles(6, 120.0, seed=1)
     true = bouc_wen(load, 109e3, 7.0, 1.2e-4, 1.0)
     found = hy.hysteresis(*measure(load, true, 3e-5, 0.05), RATE)
     assert found.scatter == pytest.approx(np.std([c.stiffness for c in found.cycles], ddof=1))
     assert 1e-5 < found.scatter / found.stiffness < 0.01
-
-
-def test_pauses_and_tremor_are_no_reversals() -> None:
     t = np.arange(0.0, 16.0, 1.0 / RATE)
     phase = t + 0.6 * np.sin(2 * np.pi * t / 4.0 * 3.0) / 3.0
     load = AMPLITUDE * np.sin(2 * np.pi * phase / 4.0) + 0.6 * np.sin(2 * np.pi * 9.0 * t)
     assert len(hy.reversals(hy.smoothed(load, RATE))) == 8
-
-
-def test_noise_is_read_from_the_record() -> None:
     rng = np.random.default_rng(0)
     signal = load_cycles(3, AMPLITUDE) + 0.2 * rng.standard_normal(6000)
     signal[100] += 40.0

@@ -57,7 +57,7 @@ def test_an_axis_that_nothing_drives_is_not_free_of_noise() -> None:
     assert 0.0 < free[0, 0] <= free[-1, 0]
 
 
-def test_parameters_that_look_alike_are_named() -> None:
+def test_what_looks_alike_says_nothing_or_adds_nothing_shows() -> None:
     rng = np.random.default_rng(3)
     x = slope(rng, 1000, 3)[:, 0]
     x[:, 2] = x[:, 0] + 0.05 * rng.normal(size=1000)
@@ -70,9 +70,6 @@ def test_parameters_that_look_alike_are_named() -> None:
         weak_directions(slope(rng, 1000, 3)[:, 0].T @ slope(rng, 1000, 3)[:, 0] + 900 * np.eye(3))
         == []
     )
-
-
-def test_what_data_say_nothing_of_has_no_bound() -> None:
     x = np.zeros((50, 3))
     x[:, 0], x[:, 1] = 1.0, np.linspace(-1, 1, 50)
     matrix = x.T @ x
@@ -83,9 +80,6 @@ def test_what_data_say_nothing_of_has_no_bound() -> None:
     sd = np.sqrt(np.diag(cramer_rao_bound(same.T @ same)))
     assert np.isinf(sd[:2]).all()
     assert np.isfinite(sd[2])
-
-
-def test_a_trial_that_adds_nothing_shows() -> None:
     rng = np.random.default_rng(4)
     parts = [x.T @ x for x in (slope(rng, n, 2)[:, 0] for n in (500, 500))]
     growth = growth_without([*parts, 1e-6 * parts[0]])

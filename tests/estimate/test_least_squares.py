@@ -85,7 +85,7 @@ def test_recovers_the_truth_from_any_start(factor: float) -> None:
     np.testing.assert_allclose(found.p, TRUTH, rtol=1e-2)
 
 
-def test_a_model_that_is_not_linear_is_found_by_gauss_newton() -> None:
+def test_gauss_newton_finds_what_is_not_linear_within_bounds() -> None:
     inner = problem()
 
     def residual(trial: int, p: np.ndarray) -> np.ndarray:
@@ -96,9 +96,6 @@ def test_a_model_that_is_not_linear_is_found_by_gauss_newton() -> None:
     )
     found = minimise(curved, np.log(2.0 * TRUTH))
     np.testing.assert_allclose(np.exp(found.p), minimise(inner, TRUTH).p, rtol=1e-5)
-
-
-def test_bounds_hold() -> None:
     truth = np.array([4.0, 0.0, 2.0])
     inside = problem(truth=truth, lower=np.array([0.0, 0.5, 0.01]))
     found = minimise(inside, TRUTH)
@@ -150,16 +147,13 @@ def largest_step(
     return float(np.abs(step / sd).max())
 
 
-def test_parameters_not_free_stay() -> None:
+def test_parameters_held_and_trials_left_out_are_as_never_seen() -> None:
     held = problem(
         free=np.array([0, 1]), lower=np.zeros(2), upper=np.full(2, np.inf), step=np.ones(2)
     )
     found = minimise(held, np.array([1.0, 1.0, 2.0]))
     assert found.p[2] == 2.0
     assert found.stacked[0].slope.shape[2] == 2
-
-
-def test_trial_left_out_is_the_same_as_never_seen() -> None:
     whole = problem(3)
     direct = minimise(whole, TRUTH, trials=[0, 2]).p
     stacked = [stacked_residual(whole, k, TRUTH) for k in (0, 2)]
@@ -167,9 +161,6 @@ def test_trial_left_out_is_the_same_as_never_seen() -> None:
     residual = np.concatenate([s.residual[:, 0] for s in stacked])
     solved = TRUTH - np.linalg.lstsq(slope, residual, rcond=None)[0]
     np.testing.assert_allclose(direct, solved, rtol=1e-6)
-
-
-def test_slopes_are_those_of_the_filtered_regressors() -> None:
     at = stacked_residual(problem(1), 0, TRUTH)
     moved = stacked_residual(problem(1), 0, TRUTH + np.array([0.3, -0.2, 0.1]))
     step = at.slope @ np.array([0.3, -0.2, 0.1])
@@ -239,10 +230,7 @@ def test_rest_is_told_from_a_change_of_direction() -> None:
     still = find_standstill(qd, np.full_like(qd, 1e-3), RATE)
     assert still[1001:1199].all()
     assert not still[:990].any()
-
-
-def test_a_slow_change_of_direction_is_no_rest() -> None:
-    """The velocity stays within its noise for 0.16 s, and a rest of 0.1 s within the same noise."""
+    # The velocity stays within its noise for 0.16 s, and a rest of 0.1 s within the same noise.
     t = np.arange(-2.0, 2.0, 1.0 / RATE)[:, None]
     sd = np.full_like(t, 1e-3)
     turning = np.abs(0.0625 * t) < 5e-3
@@ -270,7 +258,7 @@ def test_a_rest_is_seen_through_the_ringing_of_a_smoothed_velocity(rate: float) 
     assert not find_standstill(turn, np.full_like(turn, 1e-3), rate).any()
 
 
-def test_no_sample_between_two_that_a_rest_reaches_counts() -> None:
+def test_samples_at_rest_do_not_count_unless_a_brake_may_hold_the_axis() -> None:
     """The low-passed rest passes zero there, which makes none of its friction small."""
     band = Band(RATE, (8.0,), 0.1)
     rest = np.zeros((4000, 1), dtype=bool)
@@ -279,18 +267,12 @@ def test_no_sample_between_two_that_a_rest_reaches_counts() -> None:
     left_out = np.flatnonzero(~used)
     alone = used[1:-1] & ~used[:-2] & ~used[2:]
     assert left_out.size and not alone.any()
-
-
-def test_a_brake_may_hold_an_axis_at_every_change_of_direction() -> None:
     t = np.arange(0.0, 2.0, 1.0 / RATE)
     qd = np.stack(2 * [np.sin(2 * np.pi * t)], axis=1)
     still = find_standstill(qd, np.full_like(qd, 1e-2), RATE, np.array([False, True]))
     assert not still[:, 0].any()
     np.testing.assert_array_equal(still[:, 1], np.abs(qd[:, 1]) < 0.1)
     assert 0.04 < still[:, 1].mean() < 0.09
-
-
-def test_samples_at_rest_do_not_count() -> None:
     inner = problem(1)
     mask = np.zeros((4000, 1), dtype=bool)
     mask[1000:2000] = True
@@ -302,7 +284,7 @@ def test_samples_at_rest_do_not_count() -> None:
     np.testing.assert_allclose(found.p, TRUTH, rtol=2e-2)
 
 
-def test_too_short_a_record_is_refused() -> None:
+def test_what_cannot_be_fitted_is_refused() -> None:
     inner = problem(1)
     short = problem(
         1,
@@ -311,16 +293,6 @@ def test_too_short_a_record_is_refused() -> None:
     )
     with pytest.raises(ValueError, match="fewer samples"):
         minimise(short, TRUTH)
-
-
-def test_the_low_pass_ends_at_a_fifth_of_a_low_sampling_rate():
-    assert Band(500.0, (8.0,)).cutoff_hz == (8.0,)
-    slow = Band(20.0, (8.0,))
-    assert slow.cutoff_hz == (4.0,) and slow.step == 1
-    assert np.isfinite(slow.thin(np.ones((100, 1)))).all()
-
-
-def test_a_start_without_numbers_is_refused() -> None:
     inner = problem(1)
 
     def lost(trial: int, p: np.ndarray) -> np.ndarray:
@@ -330,6 +302,13 @@ def test_a_start_without_numbers_is_refused() -> None:
         minimise(problem(1, residual=lost, linear=False), np.array([6.0, 1.0, 2.0]))
     with np.errstate(invalid="ignore"), pytest.raises(InputError, match="parameter number 1, 5"):
         minimise(problem(1, residual=lost, linear=False), np.array([5.0, 1.0, 2.0]))
+
+
+def test_the_low_pass_ends_at_a_fifth_of_a_low_sampling_rate():
+    assert Band(500.0, (8.0,)).cutoff_hz == (8.0,)
+    slow = Band(20.0, (8.0,))
+    assert slow.cutoff_hz == (4.0,) and slow.step == 1
+    assert np.isfinite(slow.thin(np.ones((100, 1)))).all()
 
 
 def test_axes_that_count_unequally_and_disagree_are_weighed_to_rest() -> None:

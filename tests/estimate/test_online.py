@@ -35,7 +35,7 @@ def test_portions_do_not_matter() -> None:
     np.testing.assert_allclose(np.concatenate(nis), whole.nis, rtol=1e-9)
 
 
-def test_threshold_is_exceeded_as_often_as_stated() -> None:
+def test_thresholds_hold_and_windows_without_readings_are_wrong() -> None:
     rng = np.random.default_rng(2)
     samples, readings = 50, 3
     nis = np.sum(rng.normal(size=(200_000, readings)) ** 2, axis=1)
@@ -45,13 +45,7 @@ def test_threshold_is_exceeded_as_often_as_stated() -> None:
         Reference.of_windows(means[:200], samples * readings),
     ):
         assert np.mean(means[200:] > law.threshold(0.01)) == pytest.approx(0.01, abs=0.006)
-
-
-def test_few_good_windows_leave_theory() -> None:
     assert Reference.of_windows(np.full(3, 0.2), 60) == Reference.of_theory(60)
-
-
-def test_windows_half_empty_are_not_judged() -> None:
     nis = np.concatenate([np.full(10, 2.0), np.full(6, np.nan), np.full(4, 2.0), np.full(5, 9.0)])
     np.testing.assert_allclose(window_means(nis, 2, 10), [1.0])
     test = WindowTest(2, 10)
@@ -62,9 +56,6 @@ def test_windows_half_empty_are_not_judged() -> None:
     assert judged == pytest.approx([1.0])
     assert test.windows == 1
     np.testing.assert_allclose(test.by_reading, 1.0)
-
-
-def test_a_window_without_readings_is_infinitely_wrong() -> None:
     test = WindowTest(2, 10)
     nis, squares = np.full(10, np.nan), np.full((10, 2), np.nan)
     there = np.zeros((10, 2), dtype=bool)

@@ -20,7 +20,7 @@ def bodies(count: int) -> np.ndarray:
     return np.array([body(RNG.normal(size=(6, 3)), RNG.uniform(0.1, 1.0, 6)) for _ in range(count)])
 
 
-def test_point_masses_are_possible_and_their_negatives_are_not() -> None:
+def test_point_masses_are_possible_and_their_own_nearest() -> None:
     for numbers in bodies(20):
         assert is_possible(numbers)
         assert not is_possible(-numbers)
@@ -28,9 +28,6 @@ def test_point_masses_are_possible_and_their_negatives_are_not() -> None:
     assert is_possible(one)  # a single point: at the edge
     one[4] *= 0.9
     assert not is_possible(one)
-
-
-def test_a_possible_estimate_is_its_own_nearest() -> None:
     value, start = bodies(2), bodies(2)
     weight = np.diag(RNG.uniform(1.0, 10.0, 20))
     found = nearest_possible(value.ravel(), weight, PLACES, start, (-EVERY, EVERY))

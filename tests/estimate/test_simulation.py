@@ -23,10 +23,17 @@ def run(u, p, v0=0.0, **options):
     return simulate(slider, x0, u, np.array(p), 0.002, width=WIDTH, n_noise=1, **options)
 
 
-def test_viscous_decay_is_exact():
+def test_friction_decays_stops_and_holds():
     x = run(np.zeros((1001, 3)), [2.0, 3.0, 0.0], v0=1.0)
     t = 0.002 * np.arange(1001)
     np.testing.assert_allclose(x[:, 1], np.exp(-1.5 * t), rtol=1e-9)
+    p = [3.5, 0.0, 3.5]
+    u = np.zeros((2001, 3))
+    u[:, 0] = 0.9 * 3.5 * (np.arange(2001) > 1000)
+    x = run(u, p, v0=0.5)
+    assert x[250, 1] == pytest.approx(0.0, abs=2.5e-4)
+    assert x[200, 0] == pytest.approx(0.5 * 0.4 - 0.5 * 0.4**2, rel=1e-3)
+    assert np.abs(x[1010:, 1]).max() < 5e-4  # creeps within the smoothing, does not slide
 
 
 def test_a_smooth_force_keeps_its_strength_between_coarse_samples():
@@ -45,16 +52,6 @@ def test_a_smooth_force_keeps_its_strength_between_coarse_samples():
     assert moved(smooth=[0]) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_coulomb_friction_stops_and_holds():
-    p = [3.5, 0.0, 3.5]
-    u = np.zeros((2001, 3))
-    u[:, 0] = 0.9 * 3.5 * (np.arange(2001) > 1000)
-    x = run(u, p, v0=0.5)
-    assert x[250, 1] == pytest.approx(0.0, abs=2.5e-4)
-    assert x[200, 0] == pytest.approx(0.5 * 0.4 - 0.5 * 0.4**2, rel=1e-3)
-    assert np.abs(x[1010:, 1]).max() < 5e-4  # creeps within the smoothing, does not slide
-
-
 @pytest.mark.parametrize("brake", [60.0, 600.0])
 def test_a_strong_brake_stays_stable(brake):
     u = np.zeros((1001, 3))
@@ -65,16 +62,13 @@ def test_a_strong_brake_stays_stable(brake):
     assert np.abs(x[100:, 1]).max() < 2.5e-4
 
 
-def test_step_length_does_not_change_the_answer():
+def test_step_length_does_not_change_the_answer_and_growth_is_reported():
     rng = np.random.default_rng(1)
     t = 0.002 * np.arange(3000)
     u = np.zeros((3000, 3))
     u[:, 0] = 8 * np.sin(np.outer(t, rng.uniform(1, 10, 5)) + rng.uniform(0, 6, 5)).sum(axis=1)
     coarse, fine = run(u, [3.5, 10.0, 3.5]), run(u, [3.5, 10.0, 3.5], max_step=2e-5)
     assert np.abs(coarse - fine).max() < 2e-4
-
-
-def test_growth_without_bounds_is_reported():
     with pytest.raises(InputError, match="without bounds after"):
         run(np.zeros((3000, 3)), [1.0, -800.0, 0.0], v0=1.0)
 
@@ -96,28 +90,16 @@ def track(u, p, q_ref, qd_ref, **options):
     )  # fmt: skip
 
 
-def test_the_arm_follows_the_motion_it_wants():
+def test_the_arm_follows_the_motion_it_wants_and_its_force_gives_it_again():
     x, u = recording()
     t = 0.002 * np.arange(4000)
     assert np.abs(x[:, 0] - 0.15 * np.sin(2 * np.pi * 0.4 * t)).max() < 0.05
     assert np.abs(u[:, 0]).max() > 3.5
-
-
-def test_total_force_alone_gives_the_same_motion():
-    x, u = recording()
     again = simulate(slider, x[0], u, np.array([3.5, 10.0, 3.5]), 0.002, width=WIDTH, n_noise=1)
     np.testing.assert_allclose(again, x, atol=1e-12)
-
-
-def test_replay_of_the_true_model_needs_no_arm():
-    x, u = recording()
     again, total = track(u, [3.5, 10.0, 3.5], x[:, :1], x[:, 1:])
     np.testing.assert_allclose(again, x, atol=1e-9)
     np.testing.assert_allclose(total, u, atol=1e-6)
-
-
-def test_replay_with_other_friction_stays_near_the_motion():
-    x, u = recording()
     again, total = track(u, [3.5, 10.0, 4.5], x[:, :1], x[:, 1:])
     assert np.abs(again[:, 0] - x[:, 0]).max() < 0.01
     moving = np.abs(x[:, 1]) > 0.1

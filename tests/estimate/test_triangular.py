@@ -45,16 +45,13 @@ def test_conditioning_is_the_kalman_update():
     assert not np.tril(root, -1).any()
 
 
-def test_an_update_adds_its_square_also_where_nothing_was():
+def test_an_update_and_a_root_where_nothing_was():
     upper, vector = np.triu(RNG.normal(size=(4, 4))) + 3.0 * np.eye(4), RNG.normal(size=4)
     upper[2] = 0.0
     expected, product = upper.T @ upper + np.outer(vector, vector), np.empty((4, 4))
     rank_one_update(upper, 4, vector)
     covariance_of(upper, product)
     np.testing.assert_allclose(product, expected, atol=1e-13)
-
-
-def test_the_root_of_a_covariance_that_rounding_left_indefinite() -> None:
     spread = np.array([1e6, 1e-6, 3.0])
     whole = np.outer(spread, spread)  # all three are one and the same
     whole[0, 1] = whole[1, 0] = whole[0, 1] * (1 + 1e-14)

@@ -148,7 +148,7 @@ def test_a_parameter_of_which_no_block_says_anything_keeps_its_spread() -> None:
     assert np.sqrt(covariance[-1, -1]) == pytest.approx(0.05, rel=1e-6)
 
 
-def test_timing_of_the_inputs_is_found() -> None:
+def test_timing_of_the_inputs_is_found_and_forces_between_samples_are_cubic() -> None:
     trials = []
     for seed in range(3):
         trial = position_only(record(seed))
@@ -160,10 +160,7 @@ def test_timing_of_the_inputs_is_found() -> None:
     value, _ = slider.to_physical(found.theta)
     assert value[3] == pytest.approx(3e-4, abs=5e-5)
     np.testing.assert_allclose(value[:3], TRUTH, rtol=5e-3)
-
-
-def test_forces_between_samples_are_cubic() -> None:
-    """At 20 samples a second, straight forces would fall short of those of 2 Hz by 3 %."""
+    # At 20 samples a second, straight forces would fall short of those of 2 Hz by 3 %.
     straight = []
     for seed in range(3):
         trial = position_only(record(seed))
@@ -183,7 +180,7 @@ def test_blocks_are_short_enough_to_scatter() -> None:
     assert choose_block([60.0, 60.0], 11, 2.0) == 2.0
 
 
-def test_ends_within_the_physical_range() -> None:
+def test_ends_within_the_physical_range_over_missing_readings() -> None:
     """Without Coulomb friction the estimate is zero or above, and unbiased."""
     truth = np.array([4.0, 0.0, 2.0])
     values = []
@@ -195,9 +192,6 @@ def test_ends_within_the_physical_range() -> None:
         assert abs(found.theta[1]) < 4.0 * np.sqrt(found.covariance[1, 1])
     assert np.min(values) >= 0.0
     np.testing.assert_allclose(np.array(values)[:, 0], 4.0, rtol=2e-3)
-
-
-def test_missing_readings_are_bridged() -> None:
     trial = position_only(record(5))
     y = trial.y.copy()
     y[1000:1050] = np.nan

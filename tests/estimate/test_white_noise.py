@@ -1,10 +1,11 @@
-"""White noise of a record is found beside what else is in it."""
+"""White noise told from hum, lines of the mains, fast signals and coarse counts."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from bampipe.estimate.spectral_lines import remove_mains
 from bampipe.estimate.white_noise import slow_noise_sd, white_noise_sd
 from bampipe.trials.sensors import RecordNoise, settle_force
 
@@ -23,7 +24,7 @@ def test_a_hum_is_no_white_noise(rate_hz, hum, jitter):
     assert not slow_noise_sd(record, t) > 0.03
 
 
-def test_a_fast_signal_in_some_trials_is_no_noise():
+def test_a_fast_signal_or_a_smoothing_sensor_is_told_from_noise():
     """A stroke of noise up to 60 Hz beside smooth ones, as dampers are tested with."""
     rng = np.random.default_rng(2)
     t = np.arange(5000) / 500.0
@@ -35,9 +36,6 @@ def test_a_fast_signal_in_some_trials_is_no_noise():
     assert records[1].slow_sd > 10.0
     found = settle_force("force", "N", None, records)
     assert found.noise_sd == pytest.approx(1.0, rel=0.15)
-
-
-def test_noise_that_a_sensor_smooths_is_seen_at_a_lower_rate():
     rng = np.random.default_rng(3)
     t = np.arange(20000) / 1000.0
     smoothed = np.convolve(rng.normal(size=t.size), np.ones(10) / 10.0, "same")
@@ -91,3 +89,42 @@ def test_pulses_of_a_controller_whose_log_keeps_every_fourth_sample_are_noise():
     assert settled == pytest.approx(found.white_sd * np.sqrt(1.02 / 3.0))
     whole = RecordNoise.of_inputs({"command": command}, [counts], t)["command"]
     assert whole.white_sd == pytest.approx(0.02, rel=0.1)
+
+
+NOISE = 0.02
+
+
+def _signal(t, rng):
+    """Weight and dry friction along a hand's motion."""
+    tones, phases = rng.uniform(1.0, 13.0, 6), rng.uniform(0.0, 6.0, 6)
+    moved = np.sin(np.outer(t, tones) + phases).sum(axis=1)
+    return 5.0 * np.sin(4.4 * t) + 2.0 * np.tanh(30.0 * moved)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "jitter"), [(94.0, 0.02), (250.0, 0.0), (500.0, 0.0), (5000.0, 0.0)]
+)
+def test_mains_and_their_third_harmonic_are_taken_off(rate_hz, jitter):
+    rng = np.random.default_rng(1)
+    t = (np.arange(int(16.0 * rate_hz)) + jitter * rng.normal(size=int(16.0 * rate_hz))) / rate_hz
+    sound = _signal(t, rng) + NOISE * rng.normal(size=t.size)
+    mains = 2.0 * np.pi * 50.013 * t
+    hum = 10.0 * NOISE * (np.sin(mains + 1.0) + 0.2 * np.sin(3.0 * mains))
+    clear, found = remove_mains(sound + hum, t)
+    assert found[50.0] == pytest.approx(10.0 * NOISE, rel=0.05)
+    assert np.std(clear - sound) < 0.2 * np.std(hum)
+
+
+@pytest.mark.parametrize("rate_hz", [94.0, 500.0, 1000.0])
+def test_without_hum_a_record_stays_as_it_is(rate_hz):
+    """Nor are the lines of friction along a test machine's sine a hum, or a motion at 50 Hz."""
+    rng = np.random.default_rng(2)
+    t = np.arange(int(16.0 * rate_hz)) / rate_hz
+    noise = NOISE * rng.normal(size=t.size)
+    periodic = 2.0 * np.tanh(30.0 * np.sin(2.0 * np.pi * 2.0 * t))
+    for record in (_signal(t, rng) + noise, periodic + noise, noise[:100]):
+        clear, found = remove_mains(record, t[: record.size])
+        assert not found
+        np.testing.assert_array_equal(clear, record)
+    shaken = np.sin(2.0 * np.pi * 50.0 * t + 0.3) + noise
+    assert not remove_mains(3.0 * shaken, t, moving=[shaken])[1]

@@ -102,14 +102,11 @@ def test_code_is_cached_and_read_again(call: Call, cached: Path, saved: list[str
     assert saved == [], "nothing was compiled again"
 
 
-def test_the_same_sources_elsewhere_find_the_same_code(call: Call, saved: list[str]) -> None:
-    assert call(2.0, checkout="another") == 7.0
-    assert saved == []
-
-
-def test_a_changed_callee_recompiles_its_callers_in_other_files(
+def test_sources_elsewhere_find_the_code_and_a_changed_callee_recompiles_its_callers(
     call: Call, saved: list[str]
 ) -> None:
+    assert call(2.0, checkout="another") == 7.0
+    assert saved == []
     assert call(5.0) == 16.0
     assert saved == ["inner_of_test.inner", "outer_of_test.outer"]
     saved.clear()

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import Toy
+from conftest import Command, Toy
 
 from bampipe.api import loop
 from bampipe.data.session import read_session
@@ -18,8 +18,6 @@ from bampipe.files import is_inside, is_normal, read_json, read_toml
 from bampipe.results.run import is_result
 from bampipe.run import models
 from bampipe.run.events import unheard
-
-Command = Callable[..., tuple[int, str, str]]
 
 
 def digest(text: str) -> str:

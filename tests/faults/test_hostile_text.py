@@ -4,11 +4,10 @@ import io
 import os
 import shutil
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import Toy
+from conftest import Command, Toy
 
 from bampipe.cli import show
 from bampipe.errors import InputError, printable
@@ -75,9 +74,7 @@ def test_progress_takes_a_trial_for_text(name: str, monkeypatch: pytest.MonkeyPa
     assert printable(name) in screen.getvalue()
 
 
-def test_a_column_of_a_log_cannot_move_the_cursor(
-    tmp_path: Path, command: Callable[..., tuple[int, str, str]]
-) -> None:
+def test_a_column_of_a_log_cannot_move_the_cursor(tmp_path: Path, command: Command) -> None:
     folder = tmp_path / "s"
     folder.mkdir()
     name = CLEAR_SCREEN.replace("\x1b", "\\u001b")
@@ -127,9 +124,7 @@ def test_markdown_takes_a_session_for_text(tmp_path: Path) -> None:
         assert mark not in inside.replace(f"\\{mark}", ""), mark
 
 
-def test_a_path_that_is_no_text_is_one_line(
-    toy: Toy, command: Callable[..., tuple[int, str, str]]
-) -> None:
+def test_a_path_that_is_no_text_is_one_line(toy: Toy, command: Command) -> None:
     folder = os.fsdecode(os.fsencode(toy.folder) + b"/b\xffd")
     shutil.copytree(toy.session, folder)
     arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs)

@@ -127,22 +127,16 @@ def double(number: int) -> int:
     return 2 * number
 
 
-def test_results_come_in_order_from_maps_side_by_side() -> None:
+def test_results_come_in_order_and_what_ends_a_worker_is_said() -> None:
     with process_pool(3, os.getpid) as pool:
         first, second = pool.map(double, range(5)), pool.map(double, range(20, 25))
         pairs = list(zip(first, second, strict=True))
     assert pairs == [(2 * k, 40 + 2 * k) for k in range(5)]
-
-
-def test_a_worker_that_is_killed_is_one_line() -> None:
     with (
         pytest.raises(InputError, match=r"a worker process was ended \(exit code -9\)"),
         process_pool(2, os.getpid) as pool,
     ):
         list(pool.map(double, [1, 2, -1, 3]))
-
-
-def test_an_error_in_a_worker_says_where_it_was() -> None:
     with pytest.raises(ValueError, match="unlucky") as caught, process_pool(2, os.getpid) as pool:
         list(pool.map(double, [1, 13]))
     assert "in double" in caught.value.__notes__[0]

@@ -101,15 +101,12 @@ def spin(seconds: float) -> None:
         pass
 
 
-def test_the_time_limit_counts_one_thread_only() -> None:
+def test_the_time_limit_counts_one_thread_and_outlives_a_finalizer() -> None:
     other = threading.Thread(target=spin, args=(0.6,))
     other.start()
     with time_limit(0.3):
         time.sleep(0.8)
     other.join()
-
-
-def test_a_finalizer_that_swallows_the_time_limit_does_not_lift_it() -> None:
     with pytest.raises(OutOfTime), time_limit(0.2):
         with suppress(OutOfTime):
             while True:

@@ -5,6 +5,7 @@ from pathlib import Path
 import independent
 import numpy as np
 import pytest
+from binary_logs import to_parquet
 from independent.sensors import Conditions
 from mistakes import scale_column, set_text
 
@@ -26,6 +27,7 @@ def parameters_of(root: Path, *changes) -> dict[str, ParameterEstimate]:
     independent.record("joint", folder, 41, {}, Conditions(creep=True, trials=3, seconds=8.0))
     for change in changes:
         change(folder)
+    to_parquet(folder)
     (root / "short.toml").write_text(PIPELINE)
     run = bampipe.run_session(folder, runs=root / "runs", pipeline=str(root / "short.toml"))
     return dict(IdentifyResult.read(run.root / "models/base/identify.json").parameters)
@@ -56,7 +58,7 @@ def test_what_scales_the_input_scales_all(tmp_path, bare, pattern, new, file) ->
         assert entry.sd == pytest.approx(total, rel=1e-6)
 
 
-def test_the_scale_of_an_encoder(tmp_path, bare) -> None:
+def test_the_scale_of_an_encoder_and_the_truth_of_a_sensor_that_errs(tmp_path, bare) -> None:
     """Friction follows the speed, dry friction does not, and gravity is found at other angles."""
     found = parameters_of(tmp_path, set_text('unit = "rad",', f'unit = "rad", scale_sd = {SHARE},'))
     expected = {"viscous.joint": 1.0, "inertia": 1.0, "coulomb.joint": 0.0}
@@ -67,9 +69,6 @@ def test_the_scale_of_an_encoder(tmp_path, bare) -> None:
     for name, entry in found.items():
         moved = abs(changed[name].estimate - bare[name].estimate)
         assert moved == pytest.approx(entry.calibration_sd, rel=0.15, abs=2.0 * bare[name].sd), name
-
-
-def test_an_interval_holds_the_truth_of_a_sensor_that_errs(tmp_path, bare) -> None:
     off = scale_column("i", 1.0 + SHARE)
     stated = set_text('unit = "A" }', f'unit = "A", scale_sd = {SHARE} }}')
     for name, entry in parameters_of(tmp_path, off, stated).items():
@@ -95,6 +94,7 @@ def test_a_stiffness_is_as_uncertain_as_its_force(tmp_path) -> None:
     conditions = Conditions(trials=1, seconds=3.0, locked_trials=True)
     independent.record("bam", tmp_path / "bam", 41, {}, conditions)
     set_text("noise_sd_n", "gain_sd = 0.01\nnoise_sd_n")(tmp_path / "bam")
+    to_parquet(tmp_path / "bam")
     pipeline = PIPELINE.replace('"filter", "identify"', '"filter", "stiffness"')
     (tmp_path / "short.toml").write_text(pipeline.replace("settings", "#"))
     run = bampipe.run_session(

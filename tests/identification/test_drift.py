@@ -1,6 +1,8 @@
-"""Short free runs: their drift by hand, on an independent simulator, and where there is none."""
+"""Free runs and their drift, of models whose error is known, and only of trials that count."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,14 +58,12 @@ def test_friction_that_builds_up_within_micrometres_does_not_run_away():
     assert not found.reason and found.horizons[0].median < 1e-6
 
 
-def test_only_judged_trials_count():
+def test_only_what_means_something_is_judged():
     trials, wrong = [motion(), motion()], parameters(offset=0.4)
     found = find_drift(SLIDER, trials, [parameters(), wrong], [True, False])["carriage"]
     assert max(h.median for h in found.horizons) < 1e-5
     assert find_drift(SLIDER, trials, [wrong, wrong], [False, False])["carriage"].horizons
 
-
-def test_where_it_means_nothing_there_is_none_and_a_reason():
     def reason(trial: Motion, **values: float) -> tuple[int, str]:
         found = find_drift(SLIDER, [trial], [parameters(**values)], [True])["carriage"]
         return len(found.horizons), found.reason
@@ -76,9 +76,6 @@ def test_where_it_means_nothing_there_is_none_and_a_reason():
     assert count == 2 and why == "In 2 s the model drifts further than the axis moves."
     count, why = reason(motion(seconds=1.2))
     assert count == 2 and why == "In 0 windows of 2 s the axis moves: too few."
-
-
-def test_nothing_is_said_of_a_motion_that_a_machine_prescribes():
     damper = compile_model(Model(registry.device("magnetic_damper")))
     found = find_drift(damper, [], [], [])
     assert all("prescribes" in entry.reason and not entry.horizons for entry in found.values())
@@ -107,3 +104,31 @@ def test_of_more_trials_than_starts_each_of_so_many_has_one(monkeypatch: pytest.
     trials = [motion(seconds=4.0)] * 30
     found = find_drift(SLIDER, trials, [parameters()] * 30, [True] * 30)["carriage"]
     assert found.horizons[0].windows == 12
+
+
+def test_in_closed_loop_only_judged_trials_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A trial that was fitted is followed to 1 %, one held out to 20 %, in position and command."""
+    off = {"fitted": 1.01, "held": 1.2}
+
+    def closed(run: Any, system: Any, motion: Any, p: Any, law: Any) -> free_run._Run:
+        motion_of = np.sin(np.linspace(0.0, 6.0, 50))[:, None]
+        both, factor = np.hstack([motion_of, motion_of]), off[motion.trial_id]
+        return free_run._Run(
+            motion.trial_id, both, factor * both, motion_of, factor * motion_of
+        )  # fmt: skip
+
+    monkeypatch.setattr(free_run, "_closed", closed)
+    monkeypatch.setattr(free_run, "_lacks", lambda *_: "")
+    monkeypatch.setattr(free_run, "why_not_free", lambda *_: "")
+    monkeypatch.setattr(free_run, "compile_law", lambda _: SimpleNamespace())
+    device = SimpleNamespace(prescribed=False, forces=("force_motor",))
+    system: Any = SimpleNamespace(
+        model=SimpleNamespace(device=device), coordinates=("axis",), coordinate_units=("m",)
+    )
+    motions: Any = [SimpleNamespace(trial_id=name) for name in off]
+    run: Any = None
+    for judged, expected in (((False, True), 20.0), ((True, False), 1.0)):
+        found = free_run.free_runs(run, system, motions, [np.ones(1)] * 2, judged)
+        assert found.mode == "closed_loop" and set(found.trials) == set(off)
+        assert found.axes["axis"].relative_error_percent == pytest.approx(expected)
+        assert found.forces["force_motor"].relative_error_percent == pytest.approx(expected)

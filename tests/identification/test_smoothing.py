@@ -11,6 +11,7 @@ from bampipe.data.run_folder import RunFolder
 from bampipe.estimate.unscented import FilterSettings
 from bampipe.files import write_text
 from bampipe.identification.filter_estimate import _Widths
+from bampipe.identification.sensor_noise import choose_tuning_trials
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import device
 from bampipe.progress import silent
@@ -43,11 +44,8 @@ def widths(likely: dict[tuple[float, int], float]) -> _Widths:
     return _Widths(found, None, 1.0, None, None, 1e-3, filtered)  # type: ignore[arg-type]
 
 
-def test_three_filters_answer_where_no_narrower_sign_is_likelier() -> None:
-    assert widths({(1.0, 2): 0.0, (0.5, 2): -20.0, (0.25, 2): -50.0}).choose() is None
-
-
 def test_the_likeliest_width_is_chosen_with_the_longest_step_that_serves() -> None:
+    assert widths({(1.0, 2): 0.0, (0.5, 2): -20.0, (0.25, 2): -50.0}).choose() is None
     best = {1.0: 10.0, 0.5: 100.0, 0.25: 200.0, 0.0625: 150.0}
     likely = {(width, parts): best[width] for width in best for parts in (1, 2, 4)}
     chosen = widths(likely | {(0.25, 1): 120.0}).choose()
@@ -88,3 +86,19 @@ def test_an_arm_that_creeps_as_the_model_does_has_nothing_added(tmp_path) -> Non
     result, _ = identified(tmp_path, creep=True)
     assert all(entry.smoothing_sd == 0.0 for entry in result.parameters.values())
     assert not any("smooths the sign" in note for note in result.notes)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "places", "samples"),
+    [
+        ([9000], [0], 3000),
+        ([3000, 3000], [0, 1], 1500),
+        ([8000] * 11, [0, 2, 4, 6, 8, 10], 500),
+        ([400] * 3, [0, 1, 2], 1000),  # all there is
+        ([300] * 40, [0, 4, 9, 13, 17, 22, 26, 30, 35, 39], 300),
+    ],
+)
+def test_several_trials_share_the_samples(
+    sizes: list[int], places: list[int], samples: int
+) -> None:
+    assert choose_tuning_trials(sizes) == (places, samples)

@@ -50,42 +50,27 @@ def test_false_alarms_with_scatter_between_and_within(within: float) -> None:
     assert alarms / (500 * 12) < 2.5 * FALSE_ALARM
 
 
-def test_one_session_off_and_two_neighbours_off_are_seen() -> None:
+def test_a_trend_a_step_and_one_session_off_are_seen() -> None:
     rng = np.random.default_rng(6)
     x = 4.0 + 0.02 * rng.normal(size=12)
     x[5] += 0.5
     assert outside(x, np.full(12, 0.002)) == ["5"]
     x[6] += 0.5
     assert outside(x, np.full(12, 0.002)) == ["5", "6"]
-
-
-def test_an_uncertain_session_is_given_its_room() -> None:
     x = np.array([4.0, 4.02, 3.98, 4.01, 3.99, 4.6, 4.0, 4.01])
     sds = np.full(8, 0.005)
     assert outside(x, sds) == ["5"]
     sds[5] = 0.3
     assert outside(x, sds) == []
-
-
-def test_a_slow_drift_is_a_trend_and_does_not_hide_in_its_own_scatter() -> None:
     rng = np.random.default_rng(7)
     found = chart(np.linspace(4.0, 4.6, 15) + 0.01 * rng.normal(size=15), np.full(15, 0.005))
     assert found.drifts
     assert found.slope_per_session == pytest.approx(0.6 / 14, rel=0.05)
     assert found.points[0].outside_limits and found.points[-1].outside_limits
-
-
-def test_a_step_is_a_run_on_one_side() -> None:
     x = np.where(np.arange(20) < 10, 0.99, 1.01) + 0.004 * np.sin(np.arange(20) * 2.1)
     assert outside(x, np.full(20, 0.01)) == []
     assert chart(x, np.full(20, 0.01)).run == ("0", "9")
-
-
-def test_no_limits_from_too_few_sessions() -> None:
     found = chart([1.0] * (FEWEST_SESSIONS - 2) + [9.0], [0.1] * (FEWEST_SESSIONS - 1))
     assert not found.has_limits and not any(one.outside_limits for one in found.points)
-
-
-def test_the_same_value_every_time_is_in_control() -> None:
     found = chart([2.0] * 8, [0.0] * 8)
     assert outside([2.0] * 8, [0.0] * 8) == [] and not found.drifts and found.run is None

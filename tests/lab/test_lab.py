@@ -2,13 +2,12 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import misfits
+from conftest import Command, misfits
 from made_results import diagnosis, write_result
 from made_runs import Made
 
@@ -309,9 +308,7 @@ def test_the_page_links_the_pages_of_every_session(tmp_path: Path) -> None:
     assert all((tmp_path / "out/lab" / target).is_file() for target in targets)
 
 
-def test_the_command(
-    tmp_path: Path, command: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     drifted = changed(5, estimates(5, coulomb__yaw=4.9), verdicts=CLEAN)
     make_lab(tmp_path, {5: drifted})
     monkeypatch.chdir(tmp_path)

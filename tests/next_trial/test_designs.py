@@ -383,7 +383,7 @@ def made_precision(sd: float, formal: float, blocks: int, lasting: float = 0.0) 
     )  # fmt: skip
 
 
-def test_twice_the_information_narrows_an_uncertainty_by_the_root_of_two():
+def test_information_narrows_an_uncertainty_by_its_root_and_blocks_widen_it():
     known = made_precision(0.01, 0.01, 10_000)
     after = known.expect(known.information, 20.0).median
     assert after[0] == pytest.approx(0.01 / np.sqrt(2.0), rel=1e-3)
@@ -392,16 +392,10 @@ def test_twice_the_information_narrows_an_uncertainty_by_the_root_of_two():
     much = 3.0 * known.information
     assert known.worth(much, 20.0, "mass") == pytest.approx(np.log(2.0), rel=1e-3)
     assert known.worth(much, 20.0) == known.gain(much)
-
-
-def test_what_few_blocks_widen_goes_with_more_of_them():
     few = made_precision(0.01 * np.sqrt(6 / 4), 0.01, 6)
     nothing = np.zeros((2, 2))
     assert few.expect(nothing, 0.0).median[0] < few.sd[0]
     assert few.expect(nothing, 1000.0).median[0] == pytest.approx(0.01, rel=0.02)
-
-
-def test_what_a_calibration_leaves_open_stays():
     known = made_precision(np.hypot(0.01, 0.02), 0.01, 10_000, 0.02)
     nothing, much = np.zeros((2, 2)), 1e6 * known.information
     assert known.expect(nothing, 0.0).median[0] == pytest.approx(known.sd[0], rel=1e-3)
@@ -521,14 +515,11 @@ def test_what_a_trial_was_to_show_is_held_against_the_diagnosis_that_knows_it(
     assert second == f"it was to reveal drag:x from 0.9 N on; {said}"
 
 
-def test_pairs_weigh_by_the_product_of_their_odds():
+def test_confusion_is_that_of_a_choice_by_the_odds_that_further_trials_leave():
     alternatives = tuple(Alternative((), (), share) for share in (0.6, 0.3, 0.1))
     weights = Comparison(None, None, None, alternatives).weights()
     assert weights[0, 1] == pytest.approx(0.18 / 0.27)
     assert sum(weights.values()) == pytest.approx(1.0)
-
-
-def test_confusion_is_that_of_a_choice_by_the_odds_that_further_trials_leave():
     assert chance_of_confusion(0.6, 0.2, 0.0) == pytest.approx(0.25)
     rng, gained = np.random.default_rng(0), 2.0
     scatter = rng.normal(gained, np.sqrt(2.0 * gained), 200_000)

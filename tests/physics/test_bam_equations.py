@@ -46,16 +46,13 @@ def at_rest(system, rows):
     return np.zeros((rows, 0)), np.zeros((rows, len(system.inputs)))
 
 
-def test_mass_matrix_is_symmetric_positive_definite_over_the_workspace(system):
+def test_mass_matrix_is_the_one_by_hand_and_positive_definite(system):
     grids = [np.linspace(*BAM.limits[c.name], 9) for c in BAM.coordinates]
     q = np.stack(np.meshgrid(*grids), axis=-1).reshape(-1, 3)
     for mass in (0.1, 3.56, 10.0):
         matrices = system.mass_matrix(q, with_values(system, {"mass": mass}))
         assert np.array_equal(matrices, matrices.transpose(0, 2, 1))
         assert np.linalg.eigvalsh(matrices).min() > 0.05
-
-
-def test_mass_matrix_equals_the_one_by_hand(system):
     q, _, _ = random_motion(BAM, 200, 1)
     expected = np.array([oracle.mass_matrix(row, 3.2) for row in q])
     found = system.mass_matrix(q, with_values(system, {"mass": 3.2}))
@@ -201,13 +198,6 @@ def test_a_brake_holds_an_axis_that_is_pushed_less_than_its_command(system):
     creep = BAM.coordinate("yaw").sign_width * np.arctanh(torque / (60.0 + 1.5))
     assert x[3] == pytest.approx(creep, rel=1e-2)
     assert abs(rate[3]) < 1e-3
-
-
-def test_mass_matrix_stays_regular_where_rho_or_the_cosine_of_pitch_vanish(system):
-    """The drives' inertia keeps the BAM regular; only a device without one can be singular."""
-    for pose in ([0.0, 0.0, oracle.L], [0.0, np.pi / 2, 1.0], [0.0, -np.pi / 2, oracle.L]):
-        matrix = system.mass_matrix(np.array([pose]), system.prior)[0]
-        assert np.linalg.eigvalsh(matrix).min() > 0.3
 
 
 def test_singular_mass_matrix_gives_a_value_that_is_not_finite_instead_of_a_wrong_one():

@@ -1,5 +1,6 @@
 """Effects that meet on one channel or axis act in their order, on what the one before leaves."""
 
+import tomllib
 from itertools import combinations
 
 import numpy as np
@@ -8,7 +9,7 @@ import sympy as sp
 from motions import with_values
 from scipy.signal import lfilter
 
-from bampipe.physics import Model, compile_model, registry
+from bampipe.physics import Model, System, compile_model, registry
 from bampipe.physics.derivation import derive
 
 RATE = 1000.0
@@ -27,16 +28,6 @@ def pairs(machine, places):
         yield from ((machine, a, b) for a, b in combinations(met, 2))
 
 
-def once(met):
-    """Of pairs, those whose effects no machine before has had meet."""
-    seen = set()
-    for machine, *effects in met:
-        names = frozenset(effect.partition(":")[0] for effect in effects)
-        if len(names) == 1 or names not in seen:
-            yield (machine, *effects)
-        seen.add(names)
-
-
 def kind_of(name):
     """What decides where an effect acts, and on what."""
     e = registry.effect(name.partition(":")[0])
@@ -45,23 +36,23 @@ def kind_of(name):
     return (*way, "dry" in e.names, e.uses_weight, e.uses_pull, e.pulls, by_load)
 
 
-def one_a_kind(met):
-    """Pairs as parameters of a test: those of two kinds that have met before are `long`."""
-    seen = set()
-    for machine, first, second in met:
-        kinds = frozenset((kind_of(first), kind_of(second)))
-        yield pytest.param(machine, first, second, marks=[pytest.mark.long] * (kinds in seen))
-        seen.add(kinds)
-
-
 # Of the arm, what meets on one reading and one encoder; of the others, everything.
-PAIRS = list(one_a_kind(once([
+PAIRS = [
     *pairs("magnetic_damper", [("piston", "current", "load_cell")]),
     *pairs("slider", [("carriage", "motor")]),
     *(p for p in pairs("bam", [("x", "xy")]) if "force" in p[1] and "force" in p[2]),
     ("bam", "base_tilt", "handle_payload"),
     ("bam", "encoder_scale:yaw", "transmission_compliance:yaw"),
-])))  # fmt: skip
+]
+
+
+def one_a_kind(machine):
+    """Of the effects that meet on a machine, the first of each kind."""
+    met = (effect for where, *both in PAIRS if where == machine for effect in both)
+    kinds = {}
+    for effect in met:
+        kinds.setdefault(kind_of(effect), effect)
+    return [*kinds.values()]
 
 
 def numbers(equations, model):
@@ -81,11 +72,18 @@ def numbers(equations, model):
     return np.array(sp.lambdify(list(at), expressions, "numpy")(*at.values()), dtype=float)
 
 
-@pytest.mark.parametrize(("machine", "first", "second"), PAIRS)
-def test_order_of_adding_does_not_matter(machine, first, second):
+@pytest.mark.parametrize(
+    ("machine", "effects"),
+    [
+        *((machine, one_a_kind(machine)) for machine in ("magnetic_damper", "slider", "bam")),
+        *(pytest.param(machine, both, marks=pytest.mark.long) for machine, *both in PAIRS),
+    ],
+)
+def test_order_of_adding_does_not_matter(machine, effects):
+    """Turned round, every two of several effects have changed places."""
     device = registry.device(machine)
     found = []
-    for names in ((first, second), (second, first)):
+    for names in (effects, effects[::-1]):
         model = Model(device, names)
         found.append(numbers(derive(model), model))
     assert np.isfinite(found[0]).all()
@@ -275,3 +273,72 @@ def test_parameters_that_multiply_each_other_are_not_fitted_as_if_they_added_up(
     assert system.linear[mass] and system.linear[tilt]
     assert system.is_linear_in([mass]) and not system.is_linear_in([mass, tilt])
     assert compile_model(Model(model.device)).is_linear_in(range(7))
+
+
+Q = np.array([[0.1, 0.2, 1.1], [-0.4, -0.3, 0.8]])
+QD = np.array([[0.3, -0.1, 0.2], [0.0, 0.4, -0.3]])
+BALANCED = 3.56 * 9.81 * (Q[:, 2] - 0.461) * np.cos(Q[:, 1])
+
+
+def torque(system: System, values: dict[str, float], z: np.ndarray | None = None) -> np.ndarray:
+    p = with_values(system, values)
+    z = np.zeros((2, len(system.memory_names))) if z is None else z
+    return system.compensation(Q, QD, z, np.zeros((2, len(system.inputs))), p)
+
+
+def test_the_compensator_balances_gravity_on_pitch() -> None:
+    system = compile_model(Model(registry.device("bam")))
+    found = torque(system, {})
+    assert [system.coordinates[i] for i in system.compensated] == ["pitch"]
+    np.testing.assert_allclose(found[:, 1], BALANCED, rtol=1e-12)
+    assert not found[:, [0, 2]].any()
+
+
+def test_effects_of_the_compensator_change_its_torque_and_others_do_not() -> None:
+    names = ("gravity_compensator_mistuned", "gravity_compensator_lag", "base_tilt")
+    system = compile_model(Model(registry.device("bam"), names))
+    wrong = {"gravity_compensator_mistuned.error": 0.1}
+    behind = Q[:, 2:] - 0.461 - 0.05
+    found = torque(system, wrong, behind)[:, 1]
+    np.testing.assert_allclose(found, 1.1 * BALANCED - 3.56 * 9.81 * 0.05 * np.cos(Q[:, 1]))
+
+
+def test_an_offset_where_nothing_is_to_be_balanced_is_none() -> None:
+    system = compile_model(Model(registry.device("slider")))
+    assert system.compensated == ()
+    assert system.compensation(*[np.zeros((3, 1))] * 2, np.zeros((3, 0)), np.zeros((3, 1)),
+                               system.prior).tolist() == [[0.0]] * 3  # fmt: skip
+
+
+OWN = """
+schema = "bampipe.effect/1"
+name = "late_push"
+summary = "One channel is read early"
+scope = "force_component"
+kind = "input"
+looks_like = "residual like the rate of that force"
+source = "test"
+input = "f - lead*f_rate"
+[parameters.lead]
+unit = "s"
+prior = 0.0
+sd = 0.01
+strength = true
+"""
+
+
+@pytest.mark.parametrize(
+    ("effects", "delays"),
+    [
+        ((), ()),
+        (("force_gain:x", "force_drift:y", "transmission_compliance:yaw"), ()),
+        (("stribeck:yaw", "force_delay"), ("force_delay.delay",)),
+        (("late_push:z",), ("late_push.z.lead",)),
+    ],
+)
+def test_delays_are_told_from_what_they_do(
+    effects: tuple[str, ...], delays: tuple[str, ...]
+) -> None:
+    own = registry.effect_from(tomllib.loads(OWN), "late_push.toml")
+    system = compile_model(Model(registry.device("bam"), effects, (own,)))
+    assert system.delays == delays

@@ -19,7 +19,7 @@ def declared(**controller: object):
     return registry.device_from(content, "axis.toml")
 
 
-def test_the_servo_saturates_at_full_duty():
+def test_the_servo_saturates_and_the_slider_damps_with_its_measured_rate():
     law = compile_law(registry.device("servo_pendulum"))
     assert law is not None and law.inputs == ("goal", "gain", "supply", "t")
     out = np.empty(1)
@@ -27,27 +27,16 @@ def test_the_servo_saturates_at_full_duty():
         r = np.array([goal, 1.15, 7.4, 0.0])
         law.command(np.zeros(2), r, np.empty(0), out)
         assert out[0] == pytest.approx(duty, rel=1e-6)
-
-
-def test_the_cascade_of_the_slider_damps_with_its_measured_rate():
     device = registry.device("slider")
     compile_model(Model(device))  # generated code of the same device, kept beside the law's
     law = compile_law(device)
     out = np.empty(1)
     law.command(np.array([0.1, 0.5]), np.array([0.2, 10.0, 3.0, 0.0]), np.empty(0), out)
     assert out[0] == pytest.approx(3.0 * (10.0 * 0.1 - 0.5))
-
-
-def test_a_device_without_a_controller_has_no_law():
     assert compile_law(registry.device("bam")) is None
 
 
-def test_built_in_controllers_have_consistent_units():
-    for name in ("slider", "servo_pendulum"):
-        assert check_device(registry.device(name)) == []
-
-
-def test_a_loop_with_an_integral_part():
+def test_a_loop_with_an_integral_part_and_a_law_of_the_wrong_unit():
     device = declared(
         channels={"goal": "m", "gain": "N/m", "wind": "N/m/s"},
         states={"wound": {"unit": "m.s", "rate": "goal - carriage", "lower": -1, "upper": 0.4}},
@@ -61,9 +50,6 @@ def test_a_loop_with_an_integral_part():
     assert out == pytest.approx([10.0 * 0.2 + 7.0 * 0.2, 0.2])
     wrong = declared(states={"wound": {"unit": "m", "rate": "goal - carriage"}})
     assert any("controller.states.wound.rate" in line for line in check_device(wrong))
-
-
-def test_a_law_of_the_wrong_unit_is_said():
     device = declared(command={"force_motor": "position_gain*(goal - carriage)"})
     assert any(line.startswith("controller.command.force_motor") for line in check_device(device))
 

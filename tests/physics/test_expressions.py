@@ -95,13 +95,10 @@ def test_what_is_not_text_is_refused(value):
         expression.parse(value, "here")
 
 
-def test_decimals_mean_what_whole_numbers_mean():
+def test_decimals_are_whole_numbers_and_wrong_names_suggest_right_ones():
     yaw = SYMBOLS["yaw"]
     assert read("yaw**0.5") == sp.sqrt(yaw) and read("yaw**2.0") == yaw**2
     assert read("0.0*yaw") == 0 and read("0.0") == 0 and read("sgn(0.0)") == 0
-
-
-def test_a_wrong_name_suggests_the_right_one():
     with pytest.raises(InputError, match="did you mean 'pitch'"):
         read("pich")
     with pytest.raises(InputError, match="did you mean 'tanh'"):

@@ -185,7 +185,7 @@ def test_internal_states_settle_where_their_rate_vanishes():
     np.testing.assert_allclose(z[later, 0], expected, atol=0.005)
 
 
-def test_key_changes_with_the_text_of_an_effect_and_only_then():
+def test_key_changes_with_the_text_of_effect_and_device_and_only_then():
     text = dict(registry.effect("stribeck").declaration)
     keys = [
         Model(BAM, ("stribeck:yaw",), (registry.effect_from(copy.deepcopy(d)),)).key
@@ -194,9 +194,6 @@ def test_key_changes_with_the_text_of_an_effect_and_only_then():
     assert keys[0] == keys[1] == Model(BAM, ("stribeck:yaw",)).key
     assert len(set(keys)) == 3
     assert Model(BAM, ("stribeck:pitch",)).key != keys[0]
-
-
-def test_key_follows_the_device():
     same, other = registry.device_from(declaration()), declaration()
     other["constants"]["L"]["value"] = 0.462
     assert Model(same).key == Model(BAM).key
@@ -257,8 +254,8 @@ def test_generated_code_holds_no_name_from_a_file(tmp_path, monkeypatch):
     ("machine", "effect", "share"),
     [
         ("bam", "presliding:yaw", 2e-3),
-        ("bam", "thermal_damping:yaw", 1e-4),
-        ("bam", "gravity_compensator_lag", 1e-4),
+        pytest.param("bam", "thermal_damping:yaw", 1e-4, marks=pytest.mark.long),
+        pytest.param("bam", "gravity_compensator_lag", 1e-4, marks=pytest.mark.long),
         ("bam", "maxwell_slip:yaw", 2e-3),
         ("bam", "brake_lag", 1e-4),
         ("slider", "actuator_lag:motor", 1e-4),

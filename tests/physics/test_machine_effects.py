@@ -66,7 +66,7 @@ def test_what_turns_with_two_joints_acts_on_both(word, sign):
     np.testing.assert_allclose(force[:, 2], 0.0, atol=1e-12)
 
 
-def test_friction_by_pose_takes_every_two_axes_either_way_and_of_a_robot_neighbours():
+def test_friction_by_pose_takes_every_two_axes_from_the_middle_of_the_other():
     effect = registry.effect("friction_by_pose")
     assert effect.targets(registry.device("bam")) == (
         "yaw-pitch", "yaw-extension", "pitch-yaw", "pitch-extension", "extension-yaw",
@@ -78,9 +78,6 @@ def test_friction_by_pose_takes_every_two_axes_either_way_and_of_a_robot_neighbo
         "two-rail",
         "rail-two",
     )
-
-
-def test_friction_by_pose_is_counted_from_the_middle_of_the_other_axis():
     system = compile_model(Model(registry.device("bam"), ["friction_by_pose:yaw-extension"]))
     own = system.model.effects[0].parameters
     assert [p.unit for p in own] == ["N.m/m", "N.m.s/rad/m"]
@@ -203,13 +200,10 @@ def test_the_rotors_part_is_open_only_where_a_weight_or_a_spring_shows_it(potent
     assert not registry.device("bam").has_weight("yaw")
 
 
-def test_hysteresis_of_all_dry_friction_needs_a_device_that_adds_some():
+def test_hysteresis_takes_all_dry_friction_of_a_device_that_adds_some():
     effect = registry.effect("hysteresis")
     assert effect.targets(registry.device("magnetic_damper")) == ("piston",)
     assert effect.targets(registry.device("slider")) == ()
-
-
-def test_dry_friction_is_all_that_turns_with_the_motion():
     device = registry.device("magnetic_damper")
     system = compile_model(Model(device, ["hysteresis:piston"]))
     values = {"coulomb.piston": 40.0, "coulomb_gain": 200.0, "hysteresis.piston.share": 1.0}

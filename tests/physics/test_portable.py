@@ -70,11 +70,15 @@ def test_c(model: Model, tmp_path: Path) -> None:
         np.testing.assert_allclose(out, required[k], rtol=1e-10, atol=1e-10)
 
 
-def test_a_model_with_memory_is_refused() -> None:
+def test_models_with_memory_or_of_what_encoders_read_are_refused() -> None:
     model = Model(registry.device("bam"), ["presliding:yaw"])
     p = compile_model(model).prior
     with pytest.raises(InputError, match="has internal states"):
         portable_source(model, p, "c")
+    device = registry.device("bam")
+    model = Model(device, ["encoder_scale:yaw"])
+    with pytest.raises(InputError, match="acts on what encoders read"):
+        portable_source(model, compile_model(model).prior, "python")
 
 
 def test_the_offset_of_a_drive_is_no_part_of_the_force_and_is_named() -> None:
@@ -89,10 +93,3 @@ def test_the_offset_of_a_drive_is_no_part_of_the_force_and_is_named() -> None:
         text.replace(f" Forces are those that act; what is logged differs by {name}.", "")
         == without
     )
-
-
-def test_a_model_of_what_encoders_read_is_refused() -> None:
-    device = registry.device("bam")
-    model = Model(device, ["encoder_scale:yaw"])
-    with pytest.raises(InputError, match="acts on what encoders read"):
-        portable_source(model, compile_model(model).prior, "python")

@@ -28,7 +28,7 @@ def value(text, q, qd, qdd=None):
     return float(sp.sympify(python, locals=names).subs({names[n]: v for n, v in numbers.items()}))
 
 
-def test_printed_mass_matrix_and_bias_are_those_that_are_computed(lines):
+def test_what_is_printed_is_what_is_computed(lines):
     system = compile_model(Model(BAM))
     q, qd = np.array([0.2, 0.4, 1.1]), np.array([0.5, -0.3, 0.2])
     matrix = system.mass_matrix(q[None], system.prior)[0]
@@ -42,9 +42,6 @@ def test_printed_mass_matrix_and_bias_are_those_that_are_computed(lines):
     needed[1] += 3.56 * 9.81 * (1.1 - 0.461) * np.cos(0.4)
     for i, mark in enumerate("θφr"):
         assert value(lines[f"h[{mark}]"], q, qd) == pytest.approx(needed[i])
-
-
-def test_generalised_forces_are_named(lines):
     assert lines["Q[θ]"] == (
         "-brake_yaw sgn(θ') - coulomb.yaw sgn(θ') + force_x r cos(φ) - viscous.yaw θ'"
     )

@@ -33,7 +33,7 @@ def check(system, reach):
     require_sound(system, q, flat, flat, u, system.prior, np.arange(count) * 0.01, "trial t01")
 
 
-def test_no_inertia_at_the_pivot():
+def test_no_inertia_at_the_pivot_without_a_rotor():
     system = compile_model(Model(arm(0.0)))
     check(system, np.linspace(0.2, 0.8, 7))
     with pytest.raises(InputError) as caught:
@@ -42,9 +42,6 @@ def test_no_inertia_at_the_pivot():
     assert "no inverse" in said
     assert "angle = 0.3 rad, reach = 0 m, 0.020 s: angle has no inertia there" in said
     assert "trial t01" in said
-
-
-def test_a_rotor_is_inertia_enough():
     check(compile_model(Model(arm(0.01))), np.linspace(0.4, -0.4, 5))
 
 

@@ -5,8 +5,12 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
+import pytest
+from physics.small_arm import ARM
 
 from bampipe.physics import Model, compile_model, registry
+from bampipe.physics.device import Device
+from bampipe.physics.registry import device, device_from
 from bampipe.physics.structure import structure
 
 RAIL = re.findall(
@@ -53,7 +57,7 @@ def test_slopes_are_those_of_the_residual() -> None:
     np.testing.assert_allclose(slopes[:, :, place["L"]], difference, rtol=1e-3, atol=1e-3)
 
 
-def test_any_device_is_understood() -> None:
+def test_any_device_is_understood_and_what_hides_another() -> None:
     rail = registry.device_from(tomllib.loads(RAIL), "rail.toml")
     (group,) = structure(compile_model(Model(rail))).together
     assert set(group.combinations) == {
@@ -61,9 +65,6 @@ def test_any_device_is_understood() -> None:
         "mass + 2 pulley_inertia/pulley_radius^2",
     }
     assert structure(compile_model(Model(registry.device("slider")))).together == ()
-
-
-def test_a_payload_and_the_lever_hide_each_other_without_a_compensator() -> None:
     device = registry.device("bam")
     bare = registry.device_from({k: v for k, v in device.declaration.items() if k != "torque"})
     (group,) = structure(compile_model(Model(bare, ("handle_payload",)))).together
@@ -72,3 +73,51 @@ def test_a_payload_and_the_lever_hide_each_other_without_a_compensator() -> None
     assert "g" not in group.members
     (group,) = structure(compile_model(Model(device, ("handle_payload",)))).together
     assert "L" not in group.members  # the compensator shows it
+
+
+SAMPLES = 1500
+"""More than are taken together."""
+ROBOT = device_from(ARM)
+
+
+@pytest.mark.parametrize(
+    ("machine", "effects"),
+    [
+        (device("bam"), ()),
+        (device("bam"), ("stribeck:yaw", "handle_payload")),
+        (device("bam"), ("transmission_compliance:yaw", "force_bias:x")),
+        (ROBOT, ()),
+        (ROBOT, ("shear_thinning:one", "friction_of_sum:one-two")),
+        (ROBOT, ("gear_loss:two", "encoder_scale:one")),
+    ],
+)
+def test_slopes_equal_differences(machine: Device, effects: tuple[str, ...]) -> None:
+    system = compile_model(Model(machine, effects))
+    rng, n = np.random.default_rng(3), len(system.coordinates)
+    q, qd, qdd = 0.5 * rng.normal(size=(3, SAMPLES, n))
+    u, p = rng.normal(size=(SAMPLES, len(system.inputs))), system.prior
+    motion = q, qd, qdd
+    z = rng.normal(size=(SAMPLES, len(system.memory_names)))
+    wanted = sorted(system.lasting)
+
+    found = system.slopes(wanted, *motion, u)
+
+    base = system.residual(*motion, z, u, p)
+    for k, i in enumerate(wanted):
+        moved = p.copy()
+        moved[i] += 1.0
+        difference = system.residual(*motion, z, u, moved) - base
+        scale = np.abs(base).max() + np.abs(difference).max()
+        assert np.abs(found[:, :, k] - difference).max() < 1e-12 * scale, system.parameters[i].name
+
+
+@pytest.mark.parametrize("machine", [device("bam"), ROBOT])
+def test_every_slope_that_no_parameter_changes_is_written_out(machine: Device) -> None:
+    system = compile_model(Model(machine))
+    assert system.lasting == {i for i, constant in enumerate(system.constant) if constant}
+
+
+def test_what_is_not_asked_for_is_left_out() -> None:
+    system = compile_model(Model(ROBOT))
+    motion = (np.ones((5, len(system.coordinates))) for _ in range(3))
+    assert system.slopes([], *motion, np.ones((5, len(system.inputs)))).shape[2] == 0

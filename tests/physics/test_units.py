@@ -52,12 +52,15 @@ def test_a_unit_that_is_not_coherent_si_is_refused(text):
         parse_unit(text, "constants.L")
 
 
-def test_dimensions_print_as_units():
+def test_dimensions_print_as_units_and_stay_exact():
     assert str(parse_unit("J", "")) == "N.m"
     assert str(parse_unit("N.s/m", "")) == "kg/s"
     assert str(parse_unit("m2/s3", "")) == "m2/s3"
     assert str(parse_unit("1/s", "")) == "1/s"
     assert str(PURE) == "a pure number"
+    metre = parse_unit("m", "")
+    assert (metre ** Fraction(1, 2)) ** 2 == metre
+    assert metre / metre == PURE
 
 
 @pytest.mark.parametrize(
@@ -122,14 +125,11 @@ def wrong_device(change):
     return check_device(registry.device_from(entries))
 
 
-def test_a_wrong_unit_in_a_device_is_found_where_it_matters():
+def test_wrong_units_and_expressions_of_a_device_are_found_where_they_matter():
     found = wrong_device(lambda d: d["constants"]["I_g"].update(unit="kg.m"))
     assert len(found) == 1
     assert found[0].startswith("energy.kinetic: ")
     assert "(kg.m)" in found[0]
-
-
-def test_a_wrong_expression_in_a_device_is_found():
     found = wrong_device(lambda d: d["applied"].update(pitch="force_y"))
     assert found == ["applied.pitch: is N where N.m is needed"]
     found = wrong_device(lambda d: d["energy"].update(potential="mass*g*sin(pitch)"))
@@ -139,9 +139,6 @@ def test_a_wrong_expression_in_a_device_is_found():
         "definitions.rho: 'extension - pitch' puts together 'extension' (m) "
         "and 'pitch' (a pure number)"
     ]
-
-
-def test_wrong_units_of_friction_and_noise_are_found():
     found = wrong_device(lambda d: d["friction"]["yaw"]["viscous"].update(unit="N.m.s2/rad"))
     assert found == ["friction.yaw.viscous: unit 'N.m.s2/rad' where kg.m2/s is needed"]
     found = wrong_device(lambda d: d["process_noise"]["gravity_compensator"].update(unit="N"))
@@ -154,9 +151,6 @@ def test_wrong_units_of_friction_and_noise_are_found():
         "applied.pitch",
         "applied.extension",
     ]
-
-
-def test_an_unknown_unit_or_symbol_is_a_sentence_not_an_error():
     found = wrong_device(lambda d: d["constants"]["L"].update(unit="inch"))
     assert len(found) == 1
     assert "constants.L" in found[0]
@@ -172,7 +166,7 @@ def wrong_effect(name, target, **changes):
     return check_effect(registry.effect_from(entries), BAM, target)
 
 
-def test_a_wrong_effect_is_found():
+def test_a_wrong_effect_is_found_at_the_axis_where_it_is_wrong():
     assert wrong_effect("stribeck", "yaw", torque="-force*exp(-(qd/speed)**2)*qd") == [
         "torque: is W where N.m is needed"
     ]
@@ -186,9 +180,6 @@ def test_a_wrong_effect_is_found():
     )
     states = {"deflection": {"unit": "", "rate": "qd - deflection/distance"}}
     assert "puts together" in wrong_effect("presliding", "extension", states=states)[0]
-
-
-def test_a_finding_may_depend_on_the_kind_of_axis():
     torque = "-force*sin(q)"
     assert wrong_effect("stribeck", "yaw", torque=torque) == []
     assert wrong_effect("stribeck", "extension", torque=torque) == [
@@ -201,9 +192,3 @@ def test_states_have_the_unit_of_their_axis():
     flexible, stribeck = Model(registry.device("slider"), names).effects
     assert state_units(flexible, registry.device("slider")) == {"stretch": "m", "rate": "m/s"}
     assert state_units(stribeck, registry.device("slider")) == {}
-
-
-def test_exponents_stay_exact():
-    metre = parse_unit("m", "")
-    assert (metre ** Fraction(1, 2)) ** 2 == metre
-    assert metre / metre == PURE

@@ -56,11 +56,8 @@ def results_with(found: NextResult | None) -> SimpleNamespace:
     )
 
 
-def test_the_section_stands_only_where_somebody_asked():
+def test_the_section_says_what_to_do_where_somebody_asked():
     assert next_trial.section(results_with(None)) is None
-
-
-def test_the_section_says_what_to_do_and_what_went_unseen():
     section = next_trial.section(results_with(NextResult.model_validate(FOUND)))
     first = section.blocks[0]
     assert isinstance(first, Callout)
@@ -72,9 +69,6 @@ def test_the_section_says_what_to_do_and_what_went_unseen():
     assert [row[0] for row in sensitivity.rows] == ["`force_bias:x`", "`stribeck:yaw`"]
     assert sensitivity.rows[0][1:4:2] == ("–", "–")
     assert sensitivity.rows[1][3:6] == ("2.0", "0.50", "1.0")
-
-
-def test_beside_nothing_missing_stands_what_the_trials_would_not_have_shown():
     asked = diagnosis._tell_sensitivity(results_with(NextResult.model_validate(FOUND)), "base")
     assert asked.text == (
         "These trials would not have shown stribeck:yaw below 2 N.m. The table under What to record"
@@ -82,9 +76,6 @@ def test_beside_nothing_missing_stands_what_the_trials_would_not_have_shown():
     )
     without = diagnosis._tell_sensitivity(results_with(None), "base")
     assert "`bampipe next s01` computes" in without.text
-
-
-def test_where_one_number_cannot_be_trusted_a_range_is_shown():
     entry = FOUND["proposals"][0]["sd"]["coulomb.yaw"] | {"low": 0.002, "high": 0.009}
     table = next_trial.tabulate_sds("Expected", {"coulomb.yaw": ExpectedSd.model_validate(entry)})
     assert table.rows == (("`coulomb.yaw`", "0.010", "0.0020 to 0.0090", "N·m"),)

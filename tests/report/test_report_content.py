@@ -5,12 +5,12 @@ import json
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
 import pytest
 import synthetic_run
+from conftest import Command
 from made_results import diagnosis, write_result
 
 from bampipe.data.store import write_parquet
@@ -78,23 +78,23 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Report:
     return build_run_report(Results(root), quiet)
 
 
-def test_sections_in_order_summary_first_provenance_last(full: Report) -> None:
+def test_sections_stand_in_order_and_the_summary_gives_the_key_numbers(full: Report) -> None:
     assert full.sections[0] == "Summary"
     assert full.sections[-1] == "Provenance"
     headings = re.findall(r"<h2[^>]*>(.*?)</h2>", full.html)
     assert headings == list(full.sections)
-
-
-def test_summary_gives_the_verdict_and_the_key_numbers(full: Report) -> None:
     words = text_of(full.html)
     start = words[: words.index("Trials")]
     assert "The model with stribeck:yaw explains this session: nothing is missing" in start
     assert "yaw 0.562 to 0.212 N·m (floor 0.203)" in start
     assert row_of(full.html, "Viscous damping")[1] == "4.17 ± 0.13 N·m·s/rad"
     assert row_of(full.html, "Noise floor")[1:] == ["0.203 N·m", "0.229 N·m", "0.601 N"]
+    assert row_of(full.html, "t04_free")[2:] == ["–", "–", "set aside", "force_x frozen"]
+    assert row_of(full.html, "t03_free")[-2] == "repaired"
+    assert "interpolated" in row_of(full.html, "t03_free")[-1]
 
 
-def test_parameters_are_the_stored_ones_rounded_to_their_uncertainty(full: Report) -> None:
+def test_parameters_and_errors_are_the_stored_ones_rounded(full: Report) -> None:
     for name, (value, sd, unit) in synthetic_run.parameters(synthetic_run.CHILD).items():
         shown = row_of(full.html, name_parameter(name), name)
         estimate, spread = float(shown[2].removesuffix(" *")), float(shown[3])
@@ -106,20 +106,11 @@ def test_parameters_are_the_stored_ones_rounded_to_their_uncertainty(full: Repor
         assert low == pytest.approx(value - 1.96 * sd, abs=0.06 * sd)
         assert high == pytest.approx(value + 1.96 * sd, abs=0.06 * sd)
         assert shown[6] == unit.replace(".", "·")
-
-
-def test_errors_of_every_axis_stand_beside_the_floor(full: Report) -> None:
     table = full.html[full.html.index("Error of the predicted force") :]
     for axis, error in synthetic_run.held_out(synthetic_run.CHILD).items():
         cells = row_of(table, axis)
         assert float(cells[1]) == pytest.approx(error, rel=3e-3)
         assert float(cells[2]) == pytest.approx(synthetic_run.FLOOR[axis], rel=3e-3)
-
-
-def test_trials_set_aside_and_repaired_say_why(full: Report) -> None:
-    assert row_of(full.html, "t04_free")[2:] == ["–", "–", "set aside", "force_x frozen"]
-    assert row_of(full.html, "t03_free")[-2] == "repaired"
-    assert "interpolated" in row_of(full.html, "t03_free")[-1]
 
 
 def test_a_long_remark_of_several_trials_stands_once_below_the_table(own_run: Path) -> None:
@@ -179,11 +170,19 @@ def test_a_simulated_session_says_so_and_who_recorded_what(own_run: Path) -> Non
     assert "It replicates nothing that was measured" in words
 
 
-def test_ladder_shows_every_version_and_what_moved(full: Report) -> None:
+def test_the_ladder_the_stiffness_and_the_paper_stand_beside_the_session(full: Report) -> None:
     table = full.html[full.html.index("RMSE on the same held-out trials") :]
     assert row_of(table, "base")[2] == "0.562 (0.203)"
     assert row_of(table, "version 1")[1:3] == ["stribeck:yaw", "0.212 (0.203)"]
     assert "coulomb.yaw fell by 0.21 N·m" in text_of(full.html)
+    table = full.html[full.html.index("Stiffness of the locked axes") :]
+    assert row_of(table, "yaw")[1:] == [
+        "2.304 ± 0.013 kN·m/rad", "3", "5.53 N·m", "197 mJ", "25.1", "4.00",
+    ]  # fmt: skip
+    assert row_of(full.html, "Viscous damping, yaw", "Table VII")[2:4] == [
+        "4.17 ± 0.128", "4.17 ± 0.13",
+    ]  # fmt: skip
+    assert row_of(full.html, "Stiffness, pitch")[3] == "–"
 
 
 @pytest.mark.parametrize(
@@ -206,20 +205,6 @@ def test_the_verdict_on_the_session_is_that_of_its_diagnosis(
     fields = diagnosis(axes, sets)
     write_result(own_run, DiagnoseResult, model=synthetic_run.CHILD, **fields)
     assert title in text_of(page_of(own_run))
-
-
-def test_stiffness_in_both_units_of_bandwidth(full: Report) -> None:
-    table = full.html[full.html.index("Stiffness of the locked axes") :]
-    assert row_of(table, "yaw")[1:] == [
-        "2.304 ± 0.013 kN·m/rad", "3", "5.53 N·m", "197 mJ", "25.1", "4.00",
-    ]  # fmt: skip
-
-
-def test_paper_beside_session(full: Report) -> None:
-    assert row_of(full.html, "Viscous damping, yaw", "Table VII")[2:4] == [
-        "4.17 ± 0.128", "4.17 ± 0.13",
-    ]  # fmt: skip
-    assert row_of(full.html, "Stiffness, pitch")[3] == "–"
 
 
 def test_provenance_lists_inputs_versions_and_keys_in_order(full: Report) -> None:
@@ -264,13 +249,25 @@ def test_results_older_than_their_inputs_are_named_first(full: Report, own_run: 
     assert place < page.index("<table") and "identify:base" in page[place:][:400]
 
 
-def test_all_figures_of_the_paper(full: Report) -> None:
+def test_figures_are_vectors_and_the_page_is_self_contained(full: Report) -> None:
     assert {
         "stiffness-loops", "error-without-friction", "torques-and-motion", "convergence",
         "force-prediction", "ladder",
     } <= full.figures.keys()  # fmt: skip
     for place in ("Fig. 3", "Fig. 4", "Fig. 6", "Fig. 7", "Fig. 9", "Table I", "Table VI"):
         assert f"the paper's {place}" in text_of(full.html)
+    known = {*style.COLOURS.values(), "#ffffff", "#000000"}
+    for name, svg in full.figures.items():
+        assert "<image" not in svg, name
+        assert set(re.findall(r"#[0-9a-f]{6}\b", svg)) <= known, name
+        assert "<dc:date>" not in svg
+    assert set(re.findall(r'(?:src|href)="(?!#)([^"]*)"', full.html)) == {"explore.html"}
+    assert "@import" not in full.html
+    ids = re.findall(r'\bid="([^"]+)"', full.html)
+    assert len(ids) == len(set(ids))
+    targets = set(re.findall(r'(?:href="|url\()#([^")]+)', full.html))
+    assert targets <= set(ids)
+    assert "prefers-color-scheme: dark" in full.html
 
 
 def test_what_did_not_run_along_the_data_has_no_picture_of_its_convergence(own_run: Path) -> None:
@@ -296,24 +293,6 @@ def test_the_drift_of_a_model_is_a_table_and_its_absence_a_sentence(own_run: Pat
     table = next(b for b in blocks if getattr(b, "caption", "").startswith("Drift"))
     assert list(table.rows) == [("yaw", "1.2", "3.4", "200", "mrad")]
     assert any(f"yaw: {why[:1].lower()}{why[1:]}" in getattr(b, "items", ()) for b in blocks)
-
-
-def test_figures_are_vectors_in_the_palette(full: Report) -> None:
-    known = {*style.COLOURS.values(), "#ffffff", "#000000"}
-    for name, svg in full.figures.items():
-        assert "<image" not in svg, name
-        assert set(re.findall(r"#[0-9a-f]{6}\b", svg)) <= known, name
-        assert "<dc:date>" not in svg
-
-
-def test_page_is_self_contained_with_unique_ids(full: Report) -> None:
-    assert set(re.findall(r'(?:src|href)="(?!#)([^"]*)"', full.html)) == {"explore.html"}
-    assert "@import" not in full.html
-    ids = re.findall(r'\bid="([^"]+)"', full.html)
-    assert len(ids) == len(set(ids))
-    targets = set(re.findall(r'(?:href="|url\()#([^")]+)', full.html))
-    assert targets <= set(ids)
-    assert "prefers-color-scheme: dark" in full.html
 
 
 def test_pdf_text_and_pages(full: Report, tmp_path: Path) -> None:
@@ -425,7 +404,7 @@ def test_a_draft_is_shown_with_its_curve_its_length_and_its_chance(own_run: Path
 
 
 def test_a_model_that_is_not_there_changes_nothing_in_the_run(
-    own_run: Path, command: Callable[..., tuple[int, str, str]]
+    own_run: Path, command: Command
 ) -> None:
     before = (own_run / "run.json").read_bytes()
     code, _, err = command("report", own_run, "--model", "bse")
@@ -433,13 +412,10 @@ def test_a_model_that_is_not_there_changes_nothing_in_the_run(
     assert (own_run / "run.json").read_bytes() == before and not (own_run / "report").exists()
 
 
-def test_long_names_break_behind_underscores_so_that_neighbours_do_not_touch():
+def test_long_names_break_and_no_figure_is_taller_than_a_page():
     assert style.break_heading("shoulder_pan_joint", 6) == "shoulder_\npan_joint"
     assert style.break_heading("shoulder_pan_joint", 3) == "shoulder_pan_joint"
     assert break_lines("two words, joint_1", 9) == "two\nwords,\njoint_1"
     assert style.label_axis("wrist_1_joint, torque", "N·m", 20) == "wrist_1_joint,\ntorque (N·m)"
-
-
-def test_no_figure_is_taller_than_a_page_leaves_beside_its_caption():
     figure, _ = style.make_panels(10, 2, 14.0)
     assert figure.get_figheight() == style.TALLEST

@@ -1,4 +1,4 @@
-"""Every check that a model can fail is heard, and said with its axis."""
+"""Checks of a model by its results, and how results are rounded."""
 
 from typing import Any
 
@@ -8,6 +8,7 @@ from made_results import filled
 from bampipe.phrases.results import find_failed_checks
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
+from bampipe.results.rounding import round_with_sd, significant
 from bampipe.results.validate import JudgedError
 
 SOUND: dict[str, Any] = {
@@ -74,3 +75,33 @@ def test_a_timing_that_was_not_estimated_or_determined_is_at_no_limit(
     sd: float, limit: float
 ) -> None:
     assert failed(fit={"input_timing": {"estimate": 1e-3, "sd": sd, "limit": limit}}) == []
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "words"),
+    [
+        (4.1700, 0.0011, "4.1700 ± 0.0011"),
+        (206.4, 9.96, "206 ± 10"),
+        (108623.0, 52.0, "108623 ± 52"),
+        (-0.0002, 0.02, "0.000 ± 0.020"),
+        (3.2e-9, 1.2e-10, "3.20e-09 ± 0.12e-09"),
+        (2.0, 0.0, "2 ± 0"),
+        (4.4e-6, 3.8e-6, "4.4e-06 ± 3.8e-06"),
+        (14.1340, 0.0024, "14.1340 ± 0.0024"),
+    ],
+)
+def test_both_end_at_the_second_digit_of_the_uncertainty(
+    value: float, sd: float, words: str
+) -> None:
+    assert round_with_sd(value, sd) == words
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (0.073, "0.0730"), (2.4, "2.40"), (0.03196, "0.0320"), (9.996, "10.0"), (1234.5, "1234"),
+        (0.0, "0"), (3.4e-5, "3.40e-05"), (-0.5, "-0.500"), (9.9996e-5, "0.000100"),
+    ],
+)  # fmt: skip
+def test_sentences_round_as_tables_do(value: float, words: str) -> None:
+    assert significant(value) == words

@@ -91,15 +91,14 @@ def test_what_is_wrong_with_a_file_is_said_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_what_another_version_added_is_passed_over(tmp_path: Path) -> None:
+def test_what_another_version_added_is_passed_over_and_an_absent_result_is_named(
+    tmp_path: Path,
+) -> None:
     def add(content: dict[str, Any]) -> None:
         content["later"] = 1
         content["axes"]["yaw"]["later"] = {"a": 1}
 
     assert RunFolder(changed(tmp_path, add)).read(ValidateResult, "base") == made()
-
-
-def test_a_result_that_is_not_there_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"run `bampipe ingest .*` first"):
         RunFolder(tmp_path).read(IngestResult)
 

@@ -110,16 +110,13 @@ def test_much_friction_is_no_mistake_of_units(viscous: float) -> None:
     assert find_mistakes(motions(1.0, viscous)) == ()
 
 
-def test_reductions_that_are_known_badly_are_no_mistake_of_units() -> None:
+def test_torques_of_another_unit_are_told_from_reductions_known_badly() -> None:
     """Bodies come out wrong in shape, more in what few motions show than their spread says."""
     gears = np.array([1.1, 1.0, 1.0, 0.9])
     given = [
         replace(m, q=m.q * gears, qd=m.qd * gears, qdd=m.qdd * gears) for m in motions(1.0, 9.0)
     ]
     assert find_mistakes(given) == ()
-
-
-def test_torques_of_another_unit_are_named() -> None:
     (found,) = find_mistakes(motions(4.0, 2.0))
     assert found.correction.kind == "scale" and len(found.correction.signals) == 4
     assert found.correction.factor == pytest.approx(0.25)

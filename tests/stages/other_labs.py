@@ -1,14 +1,21 @@
 """Logs such as other labs keep, made from known physics: a robot joint and a magnetic damper."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 INERTIA, VISCOUS, COULOMB, MOMENT, PER_AMPERE = 0.06, 0.25, 0.35, 0.8, 1.4
 
 
 def joint_log(seed: int, seconds: float = 30.0) -> dict[str, np.ndarray]:
     """A motor joint that lifts a link, sampled at about 100 Hz: s, deg, deg/s, mA."""
+    return dict(_joint_log(seed, seconds))
+
+
+@cache
+def _joint_log(seed: int, seconds: float) -> dict[str, np.ndarray]:
     rng = np.random.default_rng([31, seed])
     dt = 5e-4
     t = np.arange(0.0, seconds, dt)
@@ -68,7 +75,10 @@ DAMPER_UNITS = {
 
 
 def write_table(path: Path, table: dict[str, np.ndarray], form: str = "%.7g") -> None:
-    """Columns of numbers with a header, between commas."""
+    """Columns of numbers with a header, between commas or as Parquet."""
+    if path.suffix == ".parquet":
+        pd.DataFrame(table).to_parquet(path)
+        return
     rows = np.column_stack(list(table.values()))
     np.savetxt(path, rows, form, ",", header=",".join(table), comments="")
 

@@ -2,16 +2,14 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from conftest import Command
 from made_session import Made
 from test_bad_sessions import ASIDE, REFUSED, REPAIRED, T01, Damage
 
 from bampipe.data.store import read_parquet
-
-Command = Callable[..., tuple[int, str, str]]
 
 
 def make(damage: Damage, session: Path) -> Path:

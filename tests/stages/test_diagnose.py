@@ -34,14 +34,21 @@ def written(run: bampipe.Run, jobs: int, seed: int = 0) -> bytes:
     return path.read_bytes()
 
 
-def test_the_file_is_the_same_byte_for_byte_with_one_process_or_two(run: bampipe.Run) -> None:
-    one = written(run, jobs=1)
+@pytest.fixture(scope="module")
+def one(run: bampipe.Run) -> bytes:
+    """What one process writes."""
+    return written(run, jobs=1)
+
+
+def test_the_file_is_the_same_byte_for_byte_with_one_process_or_two(
+    run: bampipe.Run, one: bytes
+) -> None:
     assert one == written(run, jobs=2)
     assert one != written(run, jobs=1, seed=1)
 
 
-def test_what_other_programs_read_is_there_and_true(run: bampipe.Run) -> None:
-    found = json.loads(written(run, jobs=1))
+def test_what_other_programs_read_is_there_and_true(one: bytes) -> None:
+    found = json.loads(one)
     axis = found["axes"]["joint"]
     assert axis["verdict"] == "missing" and axis["effects"] == ["shear_thinning:joint"]
     assert 0.9 < axis["explainable_share"] <= 1.0 and axis["remains"] is False

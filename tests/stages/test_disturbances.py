@@ -9,6 +9,7 @@ import independent
 import numpy as np
 import pandas as pd
 import pytest
+from binary_logs import to_parquet
 from disturbances import DRIVES, SPOILT
 from independent_runs import PIPELINE, SHORT
 
@@ -34,6 +35,7 @@ def identified(root: Path, name: str, spoil: Spoil | None = None, machine: str =
         spoil(force, 1.0 / float(np.median(np.diff(table["t"]))))
         table[DRIVES[machine]] = force
         table.to_csv(path, index=False)
+    to_parquet(folder)
     (root / "short.toml").write_text(PIPELINE)
     run = bampipe.run_session(folder, runs=root / "runs", pipeline=str(root / "short.toml"))
     return RunFolder(run.root)

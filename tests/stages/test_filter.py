@@ -93,7 +93,7 @@ def test_motion_is_recovered(run: RunFolder, method: str) -> None:
         assert entry["measurement_noise_sd"] >= 0.999 * entry["quantisation_sd"]
 
 
-def test_columns_and_bands(run: RunFolder) -> None:
+def test_columns_and_bands_and_a_force_that_is_not_filtered(run: RunFolder) -> None:
     _, kinematics = run_stage(run)
     expected = {f"{kind}_{axis}" for kind in KINEMATIC for axis in AXES}
     expected |= {"trial_id", "t", "bridged", "brake_yaw"}
@@ -107,11 +107,6 @@ def test_columns_and_bands(run: RunFolder) -> None:
         for kind in ("qd", "qdd"):
             error = np.abs(rows[f"{kind}_{axis}"] - truth[f"{kind}_{axis}"])
             assert np.mean(error < 2.0 * rows[f"{kind}_sd_{axis}"]) > 0.9
-
-
-def test_force_is_not_filtered(run: RunFolder) -> None:
-    _, kinematics = run_stage(run)
-    rows = kinematics[kinematics["trial_id"] == "a"]
     np.testing.assert_array_equal(rows["force_x"], free_trial(0)[0]["force_x"])
 
 
@@ -132,13 +127,10 @@ def test_jitter_and_gaps(tmp_path: Path) -> None:
     assert np.max(error) < 6.0
 
 
-def test_cut_off_of_the_user(run: RunFolder) -> None:
+def test_cut_off_and_minimum_of_the_user(run: RunFolder) -> None:
     content, _ = run_stage(run, cutoff_hz=33.0)
     assert {entry["bandwidth_hz"] for entry in content["axes"].values()} == {33.0}
     assert {entry["bandwidth_reason"] for entry in content["axes"].values()} == {"set by the user"}
-
-
-def test_minimum_bandwidth(run: RunFolder) -> None:
     content, _ = run_stage(run, minimum_bandwidth_hz=48.0)
     for entry in content["axes"].values():
         assert entry["bandwidth_hz"] == pytest.approx(48.0)
@@ -187,14 +179,11 @@ def test_motion_that_outruns_its_log_is_told_from_a_coarse_encoder() -> None:
     assert not stage._outruns(1e-4 * np.sin(t) + rng.normal(0.0, 1e-5, t.size), 1e-5)
 
 
-def test_no_trial_to_differentiate(tmp_path: Path) -> None:
+def test_trials_that_are_too_few_or_too_short_are_said_with_their_size(tmp_path: Path) -> None:
     frames = {"a": free_trial(0)[0]}
     run = write_ingested(tmp_path / "run", frames, {"a": ("locked", "yaw")}, AXES)
     with pytest.raises(InputError, match=r'no free or viscous trial among 1: .*kind = "free"'):
         run_stage(run)
-
-
-def test_trials_too_short_to_differentiate_are_said_with_their_size(tmp_path: Path) -> None:
     whole = free_trial(0)[0]
     frames = {"a": whole.head(20), "b": whole.head(31)}
     run = write_ingested(tmp_path / "run", frames, dict.fromkeys(frames, ("free", "")), AXES)
@@ -203,10 +192,6 @@ def test_trials_too_short_to_differentiate_are_said_with_their_size(tmp_path: Pa
     )
     with pytest.raises(InputError, match=said):
         run_stage(run)
-
-
-def test_one_trial_too_short_is_noted(tmp_path: Path) -> None:
-    whole = free_trial(0)[0]
     frames = {"a": whole, "b": whole.head(31)}
     run = write_ingested(tmp_path / "run", frames, dict.fromkeys(frames, ("free", "")), AXES)
     summary = stage.execute(run, run.root, configure("filter", {}), silent)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from other_labs import write_table
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
@@ -28,9 +29,7 @@ def write_trial(path: Path, seed: int, offset: float, ways: float = 0.0) -> None
     friction = 0.5 * np.tanh(qd / 2e-3) + 0.7 * qd
     torque = 0.3 * np.gradient(qd, t) + friction + (3.3 * np.sin(q) if ways == 0.0 else 0.0)
     force = torque / LEVER + offset + rng.normal(0.0, 0.05, len(t))
-    table = np.column_stack([t, q, force])
-    header = "time_s,lever_angle_rad,handle_force_N"
-    np.savetxt(path, table, "%.6f", ",", header=header, comments="")
+    write_table(path, {"time_s": t, "lever_angle_rad": q, "handle_force_N": force})
 
 
 def filtered(folder: Path, out: Path, hold_out: bool = False) -> tuple[dict, dict]:
@@ -46,7 +45,7 @@ def filtered(folder: Path, out: Path, hold_out: bool = False) -> tuple[dict, dic
 @pytest.mark.parametrize("hold_out", [False, True])
 def test_offsets_by_trial_are_found_and_taken_off(tmp_path: Path, hold_out: bool):
     for number, offset in enumerate(OFFSETS):
-        write_trial(tmp_path / f"t{number}.csv", number, offset)
+        write_trial(tmp_path / f"t{number}.parquet", number, offset)
     out = tmp_path / "out"
     result, summary = filtered(tmp_path, out, hold_out)
     fitted = OFFSETS[:-1] if hold_out else OFFSETS
@@ -63,12 +62,12 @@ def test_offsets_by_trial_are_found_and_taken_off(tmp_path: Path, hold_out: bool
 
 def test_one_offset_for_all_is_left_to_the_model(tmp_path: Path):
     for number in range(4):
-        write_trial(tmp_path / f"t{number}.csv", number, 2.0)
+        write_trial(tmp_path / f"t{number}.parquet", number, 2.0)
     assert filtered(tmp_path, tmp_path / "out")[0]["force_offsets"] == {}
 
 
 def test_trials_that_each_go_one_way_tell_no_offset(tmp_path: Path):
     """What friction differs by direction would pass for it."""
     for number, ways in enumerate((0.5, -0.5, 0.9, -0.9)):
-        write_trial(tmp_path / f"t{number}.csv", number, 0.8 * np.sign(ways), ways)
+        write_trial(tmp_path / f"t{number}.parquet", number, 0.8 * np.sign(ways), ways)
     assert filtered(tmp_path, tmp_path / "out")[0]["force_offsets"] == {}

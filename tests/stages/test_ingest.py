@@ -48,7 +48,7 @@ def test_every_shared_session_is_sound(name, tmp_path):
     assert samples.metadata.num_rows == trials.n_samples.sum()
 
 
-def test_samples_are_the_raw_columns_in_si_units(tmp_path):
+def test_samples_are_the_raw_columns_in_si_units_with_what_later_stages_need(tmp_path):
     made = Made()
     run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
     frame = read_parquet(tmp_path / "out/ingest/samples.parquet", trial="t01")
@@ -64,10 +64,6 @@ def test_samples_are_the_raw_columns_in_si_units(tmp_path):
     volts = np.column_stack([raw[name] for name in force["columns"]]) - force["zero_v"]
     expected = volts @ np.array(force["calibration_n_per_v"]).T
     np.testing.assert_allclose(frame[["force_x", "force_y", "force_z"]], expected, atol=1e-12)
-
-
-def test_session_json_says_what_later_stages_need(tmp_path):
-    run_ingest(Made().write(tmp_path / "session"), tmp_path / "out")
     content = read_json(tmp_path / "out/ingest/session.json")
     assert content["session_id"] == "made" and content["device"] == "bam"
     extension = content["axes"]["extension"]
@@ -94,7 +90,7 @@ def test_the_time_column_rules_over_the_announced_rate(tmp_path):
 def test_trials_of_one_name_in_two_folders_keep_apart(tmp_path):
     made = Made()
     made.session["trials"][1]["file"] = "more/t01.csv"
-    made.tables["more/t01.csv"] = made.tables.pop("trials/t02.csv")
+    made.tables["more/t01.csv"] = made.tables.pop("trials/t02.parquet")
     run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
     trials = read_parquet(tmp_path / "out/ingest/trials.parquet")
     assert trials.trial_id.tolist() == ["trials_t01_csv", "more_t01_csv", "t03"]

@@ -7,12 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import Command
 from identified_run import MODEL, RESOLUTION, TRUTH, simulated_run
 from made_results import write_result
 
@@ -235,7 +235,7 @@ def test_follows_a_growing_file_until_told_to_stop(run: RunFolder, tmp_path: Pat
 )
 def test_mistakes_are_one_line(
     tmp_path: Path,
-    command: Callable[..., tuple[int, str, str]],
+    command: Command,
     text: str,
     options: list[str],
     said: str,
@@ -316,9 +316,7 @@ def followed(begun: tuple, text: str, folder: Path) -> dict:
 
 
 @pytest.mark.parametrize("value", ["0", "-1", "nan"])
-def test_an_option_is_called_by_its_name(
-    command: Callable[..., tuple[int, str, str]], value: str
-) -> None:
+def test_an_option_is_called_by_its_name(command: Command, value: str) -> None:
     for option in ("--window", "--false-alarms", "--memory", "--every"):
         code, _, said = command("monitor", "x.csv", "--device", "slider", option, value)
         assert (code, said) == (2, f"bampipe: error: {option}: must be positive\n")

@@ -28,7 +28,7 @@ def run(tmp_path: Path) -> RunFolder:
     )
 
 
-def test_writes_what_it_declares(run: RunFolder, tmp_path: Path) -> None:
+def test_writes_what_it_declares_and_mentions_no_paper(run: RunFolder, tmp_path: Path) -> None:
     out = tmp_path / "out"
     summary = report.execute(run, out, report.Config(), silent)
     written = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
@@ -37,22 +37,16 @@ def test_writes_what_it_declares(run: RunFolder, tmp_path: Path) -> None:
     assert summary["sections"] == [
         "Summary", "Data", "Identification", "Validation", "Diagnosis", "Provenance",
     ]  # fmt: skip
-
-
-def test_device_without_paper_mentions_none(run: RunFolder, tmp_path: Path) -> None:
     report.execute(run, tmp_path, report.Config(), silent)
     page = (tmp_path / "report/report.html").read_text(encoding="utf-8")
     assert "paper's" not in page
     assert "slide" in page
 
 
-def test_required_inputs_are_those_of_ingest() -> None:
+def test_what_the_stage_needs_and_does_not_import() -> None:
     declared = report.INPUTS
     required = {name for name in declared if "*" not in name and not name.endswith("?")}
     assert required == {"ingest/session.json", "ingest/trials.parquet"}
-
-
-def test_importing_the_stage_does_not_import_matplotlib() -> None:
     code = "import bampipe.stages.report, sys; print('matplotlib' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -2,10 +2,12 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from binary_logs import to_parquet
 from independent import arm
 
 import bampipe
@@ -56,9 +58,15 @@ def write_log(folder: Path, gains: tuple[float, float] = (1.0, 1.0), swing: floa
     torque = (torque + np.random.default_rng(0).normal(0.0, 0.05, torque.shape)) * gains
     table = {"time_s": t, "q1": q[:, 0], "q2": q[:, 1], "tau1": torque[:, 0], "tau2": torque[:, 1]}
     # An acceleration beside them is never taken for a drive.
-    pd.DataFrame(table | {"acc1": qdd[:, 0], "acc2": qdd[:, 1]}).to_csv(
-        folder / "log.csv", index=False
-    )
+    accelerations = {"acc1": qdd[:, 0], "acc2": qdd[:, 1]}
+    pd.DataFrame(table | accelerations).to_parquet(folder / "log.parquet")
+
+
+def record_logs(folder: Path, *arm_of: Any, **how: Any) -> dict[str, Any]:
+    """Logs of the simulator as Parquet; one trial tells as much as three. Returns the truth."""
+    truth = arm.record_logs(folder, *arm_of, **{"trials": 1} | how)
+    to_parquet(folder)
+    return truth
 
 
 def proposed(folder: Path) -> ProposedSession:
@@ -127,11 +135,11 @@ def test_a_position_beyond_the_range_that_nothing_explains_may_be_that_of_a_moto
     tmp_path: Path,
 ) -> None:
     write_log(tmp_path)
-    table = pd.read_csv(tmp_path / "log.csv")
+    table = pd.read_parquet(tmp_path / "log.parquet")
     rng = np.random.default_rng(0)
     table[["q1", "q2"]] *= 50.0
     table[["tau1", "tau2"]] = rng.normal(size=(len(table), 2))
-    table.to_csv(tmp_path / "log.csv", index=False)
+    table.to_parquet(tmp_path / "log.parquet")
     assert any("a position of the motor," in line for line in proposed(tmp_path).check)
 
 
@@ -148,7 +156,7 @@ def paired(folder: Path) -> tuple[dict[str, str], dict[str, str], ProposedSessio
 
 def test_columns_with_the_names_of_joints_go_to_these_joints(tmp_path: Path) -> None:
     # Speeds of the joints differ little: what follows the motion of one fits others, too.
-    arm.record_logs(tmp_path / "log", 3, "ZYZYZYZ", style="joint_states", turned=["elbow"])
+    record_logs(tmp_path / "log", 3, "ZYZYZYZ", style="joint_states", turned=["elbow"])
     positions, drives, proposal = paired(tmp_path / "log")
     assert positions == {name: f"/joint_states/{name}/position" for name in NAMES}
     assert drives == {name: f"/joint_states/{name}/effort" for name in NAMES}
@@ -158,7 +166,7 @@ def test_columns_with_the_names_of_joints_go_to_these_joints(tmp_path: Path) -> 
 
 
 def test_numbers_without_names_may_count_joints_in_alphabetical_order(tmp_path: Path) -> None:
-    arm.record_logs(tmp_path / "log", 4, "ZYYX", style="indexed")
+    record_logs(tmp_path / "log", 4, "ZYYX", style="indexed")
     positions, drives, proposal = paired(tmp_path / "log")
     order = {name: place for place, name in enumerate(sorted(NAMES[:4]))}
     assert positions == {name: f"position[{place}]" for name, place in order.items()}
@@ -180,7 +188,7 @@ def test_degrees_and_millimetres_of_numbered_joints(tmp_path: Path) -> None:
 
 
 def test_torque_constants_are_proposed_by_the_drawing(tmp_path: Path) -> None:
-    truth = arm.record_logs(tmp_path / "log", 6, "ZYYX", style="controller", drawing_error=0.02)
+    truth = record_logs(tmp_path / "log", 6, "ZYYX", style="controller", drawing_error=0.02)
     positions, drives, _ = paired(tmp_path / "log")
     assert list(positions.values()) == [f"actual_q_{k}" for k in range(4)]
     assert list(drives.values()) == [f"actual_current_{k}" for k in range(4)]
@@ -193,7 +201,7 @@ def test_torque_constants_are_proposed_by_the_drawing(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_all_torque_constants_but_one_are_estimated(tmp_path: Path) -> None:
     """A drawing that is off gives constants that are off, each by its own: drives would lack it."""
-    truth = arm.record_logs(tmp_path / "log", 6, "ZYYX", style="controller", drawing_error=0.15)
+    truth = record_logs(tmp_path / "log", 6, "ZYYX", style="controller", drawing_error=0.15)
     paired(tmp_path / "log")
     device = registry.device_from(read_device_file(tmp_path / "log/device.toml"))
     assert device.robot is not None
@@ -214,7 +222,7 @@ def test_all_torque_constants_but_one_are_estimated(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_the_torque_constant_of_a_last_joint_stays_where_noise_is_large(tmp_path: Path) -> None:
     """Nothing behind that joint tells its scale but its drawing, and its model lacks an offset."""
-    truth = arm.record_logs(
+    truth = record_logs(
         tmp_path / "log", 71003, "ZYYX", {"drive_offset:forearm": 1.0}, style="controller",
         trials=2, seconds=8.0, rate_hz=125.0, noise=0.2,
     )  # fmt: skip
@@ -235,8 +243,8 @@ def test_the_torque_constant_of_a_last_joint_stays_where_noise_is_large(tmp_path
 
 
 def test_reductions_of_a_log_from_the_motors_side_follow_from_the_drawing(tmp_path: Path) -> None:
-    truth = arm.record_logs(
-        tmp_path / "log", 7, "ZYYX", style="motor", drawing_error=0.03, turned=["elbow"]
+    truth = record_logs(
+        tmp_path / "log", 7, "ZYY", style="motor", drawing_error=0.03, turned=["elbow"]
     )
     _, _, proposal = paired(tmp_path / "log")
     session = read_session(tmp_path / "log")
@@ -253,16 +261,16 @@ def test_reductions_of_a_log_from_the_motors_side_follow_from_the_drawing(tmp_pa
 def test_reductions_of_a_device_file_beside_the_logs_are_taken(tmp_path: Path) -> None:
     """Also of currents, of which the drawing tells no reductions, and of a motor that is turned."""
     folder = tmp_path / "log"
-    truth = arm.record_logs(folder, 41, "ZYYX", style="motor", trials=1, drawing_error=0.1)
+    truth = record_logs(folder, 41, "ZYYX", style="motor", drawing_error=0.1)
     turns = [*truth["ratio"]]
     turns[2] *= -1.0
-    table = pd.read_csv(folder / "log_01.csv")
+    table = pd.read_parquet(folder / "log_01.parquet")
     table.columns = table.columns.str.replace("_nm", "_A")
     table["act_pos_mot_deg_2"] *= (turns[1] + 0.0625) / turns[1]
     turns[1] += 0.0625
     for column in ("act_pos_mot_deg_3", "act_torque_mot_A_3"):
         table[column] *= -1.0
-    table.to_csv(folder / "log_01.csv", index=False)
+    table.to_parquet(folder / "log_01.parquet")
     lines = ['name = "arm"', "[robot]", 'urdf = "arm.urdf"']
     for name, ratio in zip(NAMES[:4], turns, strict=True):
         lines += [f"[robot.motors.{name}]", f"turns = {{ {name} = {ratio} }}"]
@@ -282,9 +290,9 @@ def test_many_radians_of_a_motor_are_no_degrees_though_these_stay_in_the_range(
 ) -> None:
     """A hundred turns read as degrees are 1.7 times the joint's angle."""
     write_log(tmp_path, gains=(0.01, 0.01))
-    table = pd.read_csv(tmp_path / "log.csv")
+    table = pd.read_parquet(tmp_path / "log.parquet")
     table[["q1", "q2"]] *= 100.0
-    table.to_csv(tmp_path / "log.csv", index=False)
+    table.to_parquet(tmp_path / "log.parquet")
     proposed(tmp_path)
     encoders = read_session(tmp_path).encoders
     assert [encoder.stated_unit for encoder in encoders] == ["rad"] * 2
@@ -296,8 +304,8 @@ def test_a_drive_that_was_not_logged_is_asked_for_and_the_other_stays_where_it_i
     tmp_path: Path, names: tuple[str, str]
 ) -> None:
     write_log(tmp_path)
-    table = pd.read_csv(tmp_path / "log.csv").drop(columns="tau1")
-    table.rename(columns={"tau2": names[1]}).to_csv(tmp_path / "log.csv", index=False)
+    table = pd.read_parquet(tmp_path / "log.parquet").drop(columns="tau1")
+    table.rename(columns={"tau2": names[1]}).to_parquet(tmp_path / "log.parquet")
     proposal = proposed(tmp_path)
     assert proposal.fill_in == ["the column of torque_shoulder in N.m. To find it: " + COLUMNS]
     assert f'torque_elbow = {{ column = "{names[1]}"' in proposal.session
@@ -353,8 +361,8 @@ def test_an_mjcf_that_cannot_be_read_is_not_passed_over(
 ) -> None:
     (tmp_path / "arm.xml").write_text(text)
     t = np.arange(400) / 100.0
-    pd.DataFrame({"t": t, "position": np.sin(t), "current": np.cos(t)}).to_csv(
-        tmp_path / "log.csv", index=False
+    pd.DataFrame({"t": t, "position": np.sin(t), "current": np.cos(t)}).to_parquet(
+        tmp_path / "log.parquet"
     )
     with pytest.raises(InputError, match=said) as caught:
         propose(tmp_path)
@@ -384,13 +392,13 @@ def test_joints_counted_otherwise_than_drawn(
     tmp_path: Path, counted: dict[str, tuple[float, float]], turned: list[str]
 ) -> None:
     """Six joints; without their zeros half of the drives look turned, and none is."""
-    arm.record_logs(tmp_path / "log", 21, "ZYYXYX", style="joint_states", trials=1, turned=turned)
-    table = pd.read_csv(tmp_path / "log/log_01.csv")
+    record_logs(tmp_path / "log", 21, "ZYYXYX", style="joint_states", turned=turned)
+    table = pd.read_parquet(tmp_path / "log/log_01.parquet")
     for joint, (direction, zero) in counted.items():
         column = f"/joint_states/{joint}/position"
         table[column] = direction * table[column] + zero
         table[column.replace("position", "velocity")] *= direction
-    table.to_csv(tmp_path / "log/log_01.csv", index=False)
+    table.to_parquet(tmp_path / "log/log_01.parquet")
     _, _, proposal = paired(tmp_path / "log")
     session = read_session(tmp_path / "log")
     for encoder in session.encoders:
@@ -417,13 +425,13 @@ def test_gravity_of_a_base_that_does_not_stand(
 ) -> None:
     """With a joint that counts the other way, and a drive that is turned."""
     gravity = 9.81 * np.array(down) / np.linalg.norm(down)
-    arm.record_logs(
-        tmp_path / "log", 21, "ZYYX", style="joint_states", trials=1, turned=["shoulder"],
+    record_logs(
+        tmp_path / "log", 21, "ZYYX", style="joint_states", turned=["shoulder"],
         gravity=gravity,
     )  # fmt: skip
-    table = pd.read_csv(tmp_path / "log/log_01.csv")
+    table = pd.read_parquet(tmp_path / "log/log_01.parquet")
     table[["/joint_states/elbow/position", "/joint_states/elbow/velocity"]] *= -1.0
-    table.to_csv(tmp_path / "log/log_01.csv", index=False)
+    table.to_parquet(tmp_path / "log/log_01.parquet")
     _, _, proposal = paired(tmp_path / "log")
     assert any("in the frame of the base, by weight and inertia" in line for line in proposal.check)
     device = read_device_file(tmp_path / "log/device.toml")
@@ -434,8 +442,8 @@ def test_gravity_of_a_base_that_does_not_stand(
 
 
 def test_a_heavy_tool_is_said_with_the_payload_that_it_suggests(tmp_path: Path) -> None:
-    arm.record_logs(
-        tmp_path / "log", 6, "ZYYX", style="joint_states", trials=1, drawing_error=0.0,
+    record_logs(
+        tmp_path / "log", 6, "ZYYX", style="joint_states", drawing_error=0.0,
         heavier={"forearm": 4.0},
     )  # fmt: skip
     _, _, proposal = paired(tmp_path / "log")
@@ -469,8 +477,8 @@ def test_a_robot_of_which_the_urdf_shows_more_ends_with_the_last_joint_logged(
     names = {
         f"{c}{k}": f"{j}_{c}" for k, j in ((1, "shoulder"), (2, "elbow")) for c in ("q", "tau")
     }
-    table = pd.read_csv(tmp_path / "log.csv").rename(columns=names)
-    table.to_csv(tmp_path / "log.csv", index=False)
+    table = pd.read_parquet(tmp_path / "log.parquet").rename(columns=names)
+    table.to_parquet(tmp_path / "log.parquet")
     proposal = proposed(tmp_path)
     assert 'tip = "lower"' in proposal.device
     assert {e.name: e.column for e in read_session(tmp_path).encoders} == {
@@ -485,8 +493,8 @@ def test_joint_states_in_a_bag_go_to_the_joints_that_they_name(tmp_path: Path) -
     from rosbags.typesys import Stores, get_typestore
 
     write_log(tmp_path, gains=(1.0, -1.0))
-    table = pd.read_csv(tmp_path / "log.csv")
-    (tmp_path / "log.csv").unlink()
+    table = pd.read_parquet(tmp_path / "log.parquet")
+    (tmp_path / "log.parquet").unlink()
     store = get_typestore(Stores.ROS2_HUMBLE)
     kinds = ("sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
     state, header, time = (store.types[kind] for kind in kinds)
@@ -517,16 +525,16 @@ def test_joint_states_in_a_bag_go_to_the_joints_that_they_name(tmp_path: Path) -
 @pytest.mark.long
 def test_zeros_of_a_log_from_the_motors_side(tmp_path: Path) -> None:
     """Reductions and zeros hide each other: neither alone lets the drawing explain the drives."""
-    truth = arm.record_logs(
-        tmp_path / "log", 22, "ZYYX", style="motor", trials=1, drawing_error=0.03, turned=["elbow"]
+    truth = record_logs(
+        tmp_path / "log", 22, "ZYYX", style="motor", drawing_error=0.03, turned=["elbow"]
     )
     counted = {"shoulder": (1.0, -QUARTER), "elbow": (-1.0, QUARTER)}
-    table = pd.read_csv(tmp_path / "log/log_01.csv")
+    table = pd.read_parquet(tmp_path / "log/log_01.parquet")
     for number, name in enumerate(NAMES[:4], 1):
         direction, zero = counted.get(name, (1.0, 0.0))
         column, turns = f"act_pos_mot_deg_{number}", truth["ratio"][number - 1]
         table[column] = direction * table[column] + np.rad2deg(zero) * turns
-    table.to_csv(tmp_path / "log/log_01.csv", index=False)
+    table.to_parquet(tmp_path / "log/log_01.parquet")
     paired(tmp_path / "log")
     for encoder, turns in zip(read_session(tmp_path / "log").encoders, truth["ratio"], strict=True):
         direction, zero = counted.get(encoder.name, (1.0, 0.0))

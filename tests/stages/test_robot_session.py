@@ -88,8 +88,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
         lines += [f"[encoders.{joint}]", f'column = "q_{joint}_rad"', 'unit = "rad"']
         lines += [f"[channels.torque_{joint}]", f'column = "torque_{joint}"', 'unit = "N.m"']
     for seed in range(3):
-        simulate(seed, 12.0).to_csv(folder / f"t{seed}.csv", index=False)
-        lines += ["[[trials]]", f'file = "t{seed}.csv"', 'kind = "free"']
+        simulate(seed, 12.0).to_parquet(folder / f"t{seed}.parquet")
+        lines += ["[[trials]]", f'file = "t{seed}.parquet"', 'kind = "free"']
     (folder / "session.toml").write_text("\n".join(lines) + "\n")
     bampipe.run_session(folder, runs=folder.parent / "runs", last="validate")
     return RunFolder(folder.parent / "runs" / "arm")

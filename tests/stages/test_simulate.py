@@ -231,15 +231,6 @@ def test_own_effect_file(tmp_path):
     assert np.sqrt(np.mean((seen - true)[:, 2] ** 2)) > 0.05 * true[:, 2].std()
 
 
-def test_parquet_holds_the_same(tmp_path):
-    for form in ("csv", "parquet"):
-        config = Config(duration=1.0, trials=1, file_format=form)
-        simulate_session(tmp_path / form, config)
-    a, b = read(tmp_path / "csv", 0), read(tmp_path / "parquet", 0)
-    for left, right in zip(a[1:], b[1:], strict=True):
-        np.testing.assert_allclose(left, right, atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -283,15 +274,12 @@ def test_sample_sessions_are_what_their_truth_says(tmp_path, name):
             np.testing.assert_allclose(left, right, atol=2e-3)  # other processors round otherwise
 
 
-def test_names_that_no_session_can_have(tmp_path):
+def test_names_and_folders_that_no_session_can_have(tmp_path):
     with pytest.raises(InputError, match="cannot name a session"):
         simulate_session(tmp_path / "two words", Config())
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot make the folder"):
         simulate_session(tmp_path / "file" / "inside", Config(duration=1.0))
-
-
-def test_does_not_overwrite(tmp_path):
     (tmp_path / "made").mkdir()
     (tmp_path / "made" / "precious.txt").write_text("x")
     with pytest.raises(InputError, match="not an empty folder"):

@@ -1,4 +1,4 @@
-"""The stiffness stage on simulated and shared sessions."""
+"""Stiffness of locked axes, and of gears with encoders on their two sides."""
 
 import json
 from pathlib import Path
@@ -6,14 +6,21 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from binary_logs import to_parquet
 from conftest import schema_misfits
+from independent import arm
 from run_folders import SESSIONS, ingested_session, write_ingested
 
+import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
 from bampipe.files import read_json
 from bampipe.progress import silent
+from bampipe.report.document import Table
+from bampipe.report.run_results import Results
+from bampipe.report.sections import stiffness as report_section
+from bampipe.setup.proposal import propose, write_proposal
 from bampipe.stages import stiffness
 
 AXES = {
@@ -74,29 +81,20 @@ def test_every_axis_through_the_device(tmp_path: Path) -> None:
     assert loops["post_yield"].mean() > 0.3
 
 
-def test_a_slipping_brake_is_said(tmp_path: Path) -> None:
+def test_trials_that_slip_repeat_or_lack_what_is_needed_are_said(tmp_path: Path) -> None:
     frames = {"a": locked_trial("yaw", 2000.0, creep=5e-4)}
     content = run_stage(write_ingested(tmp_path / "run", frames, {"a": ("locked", "yaw")}, AXES))
     assert any("brake slips" in note for note in content["notes"])
-
-
-def test_two_trials_of_one_axis(tmp_path: Path) -> None:
     frames = {name: locked_trial("yaw", 2000.0, seed=k) for k, name in enumerate("ab")}
     kinds = {name: ("locked", "yaw") for name in "ab"}
     entry = run_stage(write_ingested(tmp_path / "run", frames, kinds, AXES))["axes"]["yaw"]
     assert entry["n_cycles"] == 8
     assert set(entry["trials"]) == {"a", "b"}
-
-
-def test_no_locked_trial(tmp_path: Path) -> None:
     frames = {"a": locked_trial("yaw", 2000.0)}
     content = run_stage(write_ingested(tmp_path / "run", frames, {"a": ("free", None)}, AXES))
     assert content["axes"] == {}
     assert "No locked trials" in content["headline"]
     assert len(read_parquet(tmp_path / "run/stiffness/loops.parquet")) == 0
-
-
-def test_a_trial_without_load(tmp_path: Path) -> None:
     frame = locked_trial("yaw", 2000.0)
     frame["q_yaw"] = 0.1
     content = run_stage(
@@ -104,9 +102,6 @@ def test_a_trial_without_load(tmp_path: Path) -> None:
     )
     assert content["axes"] == {}
     assert content["notes"][0].startswith("a: ")
-
-
-def test_an_axis_that_is_not_there(tmp_path: Path) -> None:
     frames = {"a": locked_trial("yaw", 2000.0)}
     run = write_ingested(tmp_path / "run", frames, {"a": ("locked", "roll")}, AXES)
     with pytest.raises(InputError, match="roll"):
@@ -122,3 +117,57 @@ def test_shared_sessions_within_a_percent(name: str, tmp_path: Path) -> None:
         entry = content["axes"][axis]
         assert entry["stiffness"] == pytest.approx(k, rel=0.01)
         assert entry["yielded"]
+
+
+SECOND = """
+[channels.second_{axis}]
+column = "motor_side_{axis}_rad"
+unit = "rad"
+second_encoder_of = "{axis}"
+"""
+
+
+def recorded(root: Path, effects: dict[str, float]) -> Path:
+    """A session of an arm whose log has positions of joints and motors."""
+    folder = root / "arm"
+    arm.record_logs(folder, 41, "ZYY", effects, style="joint_states", trials=2, seconds=8.0)
+    write_proposal(folder, propose(to_parquet(folder)))
+    return folder
+
+
+def test_wind_up_and_play_of_a_gear_are_those_of_the_truth(tmp_path: Path) -> None:
+    folder = recorded(tmp_path, {"gear_windup:elbow": 1.0})
+    with (folder / "session.toml").open("a") as file:
+        file.write(SECOND.format(axis="elbow") + SECOND.format(axis="base_yaw"))
+    bampipe.run_session(folder, runs=tmp_path / "runs", last="stiffness")
+    found = read_json(tmp_path / "runs/arm/stiffness/stiffness.json")
+    truth = read_json(tmp_path / "arm.truth.json")["effects"]["gear_windup:elbow"]
+    gear = found["gears"]["elbow"]
+    assert gear["side"] == "motor" and gear["unit"] == "N.m/rad"
+    assert abs(gear["stiffness"] - truth["stiffness"]) < max(
+        4 * gear["sd"], 0.05 * gear["stiffness"]
+    )
+    if gear["play"] is not None:
+        assert abs(gear["play"] - truth["play"]) < max(4 * gear["play_sd"], 0.1 * truth["play"])
+    assert gear["explained"] > 0.95
+    assert "gear of elbow" in found["headline"]
+    # Its motor follows the base's joint exactly.
+    assert found["gears"]["base_yaw"]["stiffness"] is None
+    assert any(note.startswith("base_yaw: its two encoders") for note in found["notes"])
+    section = report_section.section(Results(tmp_path / "runs/arm"))
+    assert section is not None
+    (table,) = (block for block in section.blocks if isinstance(block, Table))
+    assert [row[0] for row in table.rows] == ["base_yaw", "elbow"]
+    assert table.rows[0][1] == "not seen" and table.rows[1][5] == "motor"
+
+
+def test_a_second_encoder_is_of_an_axis_and_in_its_unit(tmp_path: Path) -> None:
+    folder = recorded(tmp_path, {"gear_windup:elbow": 1.0})
+    text = (folder / "session.toml").read_text()
+    for change, said in (
+        (('second_encoder_of = "elbow"', 'second_encoder_of = "elbo"'), "no axis 'elbo'"),
+        (('unit = "rad"', 'unit = "m"'), "a unit of m, expected one of rad"),
+    ):
+        (folder / "session.toml").write_text(text + SECOND.format(axis="elbow").replace(*change))
+        with pytest.raises(InputError, match=said):
+            bampipe.run_session(folder, runs=tmp_path / "runs", last="ingest")

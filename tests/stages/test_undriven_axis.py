@@ -1,10 +1,10 @@
 """A machine with an axis that nothing drives: a pole that hangs on a motorised cart."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import Command
 
 from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
@@ -81,9 +81,7 @@ def log(seed: int) -> np.ndarray:
     return table
 
 
-def test_is_identified_by_the_filter_and_not_diagnosed(
-    tmp_path: Path, command: Callable[..., tuple[int, str, str]]
-) -> None:
+def test_is_identified_by_the_filter_and_not_diagnosed(tmp_path: Path, command: Command) -> None:
     folder = tmp_path / "cart"
     folder.mkdir()
     text = SESSION

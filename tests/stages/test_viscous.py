@@ -34,7 +34,9 @@ def identified(root: Path, session: Path) -> RunFolder:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunFolder]:
     folder = tmp_path_factory.mktemp("viscous")
-    config = simulation.Config(seed=31, trials=2, viscous_trials=2, duration=10.0)
+    config = simulation.Config(
+        seed=31, trials=2, viscous_trials=2, duration=10.0, file_format="parquet"
+    )
     simulation.simulate_session(folder / "session", config)
     yield identified(folder / "run", folder / "session")
 
@@ -140,6 +142,7 @@ def test_performance_at_the_handle(run: RunFolder) -> None:
     assert "stiffness" not in handle
 
 
+@pytest.mark.long
 def test_the_shared_session_renders_what_was_commanded(tmp_path: Path) -> None:
     if not (SESSIONS / "open-09").is_dir():
         pytest.skip("the shared sessions are not here")
