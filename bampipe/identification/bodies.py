@@ -22,9 +22,9 @@ _SHOWN = 0.5
 def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list[str]]:
     """The fit with inertial numbers that some body can have, the nearest; and what to tell of it.
 
-    Nearest is what explains the trials and the drawing least badly: the normal equations of the fit
-    weigh, and what is no inertial number follows. Where the nearest explain the trials far worse,
-    the fit stays as it is: the model lacks something, such as a counterbalance.
+    Distance is measured by the normal equations of the fit, drawing included, and all other
+    parameters adapt. If the nearest possible bodies explain the trials far worse, the fit stays as
+    it is: the model lacks something, such as a counterbalance.
     """
     robot = system.model.device.robot
     if robot is None:
@@ -37,11 +37,14 @@ def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list
         return squares, []
     drawn = np.array([joint.inertial for joint in robot.joints])
     p = _find_nearest(system, squares, places.reshape(-1, INERTIAL), drawn)
-    nearest = f"No body has the inertial numbers that fit {join_names(wrong)} best: the nearest"
+    nearest = (
+        f"The best-fitting inertial parameters of {join_names(wrong)} are physically impossible:"
+        " the nearest"
+    )
     error, of_fit = (squares.held_out_rmse(values) for values in (p, squares.p))
     if worse := describe_worse(system, error, of_fit, "the fit"):
-        return squares, [f"{nearest} possible ones are not given, for they {worse}."]
-    return replace(squares, p=p), [f"{nearest} possible ones are given."]
+        return squares, [f"{nearest} possible ones were rejected, because they {worse}."]
+    return replace(squares, p=p), [f"{nearest} possible ones are published."]
 
 
 def _find_nearest(system: System, squares: SquaresFit, places: Array, drawn: Array) -> Array:
@@ -97,7 +100,7 @@ def base_estimates(system: System, p: Array, covariance: Array) -> tuple[BaseEst
 
 
 def summarise_bases(system: System, found: tuple[BaseEstimate, ...] | None) -> list[str]:
-    """Say how many combinations the trials show, and of which joints none."""
+    """Say how many base parameters the trials determine, and for which joints none."""
     robot = system.model.device.robot
     if robot is None or found is None:
         return []
@@ -105,9 +108,11 @@ def summarise_bases(system: System, found: tuple[BaseEstimate, ...] | None) -> l
     seen = {name.rpartition(".")[2] for entry in shown for name in entry.members}
     silent = [joint.name for joint in robot.joints if joint.name not in seen]
     lines = [
-        f"Of the {len(found)} combinations of inertial numbers that motion can show, these trials"
-        f" show {len(shown)}; of the others the drawing stands."
+        f"These trials determine {len(shown)} of the {len(found)} base parameters; the others keep"
+        " the values of the drawing."
     ]
     if silent:
-        lines.append(f"Of the bodies of {join_names(silent)} the trials say next to nothing.")
+        lines.append(
+            f"These trials contain almost no information about the bodies of {join_names(silent)}."
+        )
     return lines

@@ -81,14 +81,15 @@ def _sources(system: System, recipe: Recipe, session: IngestResult) -> Iterator[
 
 
 def describe_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> tuple[str, ...]:
-    """A sentence on what calibration adds, or that it is not stated."""
+    """Say what calibration adds to the intervals, or that no uncertainty is stated."""
     if all(name.startswith(ZERO_OF) for name in moved):
         return (
-            "No uncertainty of gains, scales and constants is stated: the intervals hold none.",
+            "No uncertainty of gains, scales and constants is stated, so the intervals include"
+            " none.",
         )
     sd = np.maximum(estimate.sd, np.finfo(float).tiny)
     largest = max(moved, key=lambda name: float(np.max(np.abs(moved[name]) / sd)))
     return (
-        f"The uncertainty of the calibration is in the intervals ({len(moved)} sources); most of it"
-        f" comes from {largest}.",
+        f"The intervals include the uncertainty of the calibration ({len(moved)} sources); most of"
+        f" it comes from {largest}.",
     )

@@ -167,7 +167,7 @@ def collect_result(
             *notes,
             *identifiability.sentences,
             *(
-                f"`{name}` lies at the limit of its range: its interval is no guide."
+                f"`{name}` is at the limit of its range, so its interval is not valid."
                 for name, there in zip(names, estimate.at_bound, strict=True)
                 if there
             ),
@@ -177,7 +177,7 @@ def collect_result(
 
 
 def _headline(parameters: Mapping[str, ParameterEstimate]) -> str:
-    """The parameters in one line; of a robot's many, the first."""
+    """Return the parameters in one line; only the first of many."""
     shown = [
         f"{name} {round_with_sd(entry.estimate, entry.sd)} {entry.unit}".rstrip()
         for name, entry in parameters.items()
@@ -215,9 +215,9 @@ def _assess_influence(
             start_s=worst.start_s,
             parameter=names[place],
             move=move,
-            sentence=f"The second from {worst.start_s:.1f} s of trial {trial} on moves"
-            f" `{names[place]}` by {abs(move):.1f} standard deviations that the rest leaves it, a"
-            f" typical one by {worst.typical[place]:.2g}: look there for a transient or an outlier."
+            sentence=f"Without the second from {worst.start_s:.1f} s of trial {trial} on,"
+            f" `{names[place]}` changes by {abs(move):.1f} standard deviations, without a typical"
+            f" one by {worst.typical[place]:.2g}: look there for a transient or an outlier."
             if stands_out
             else "",
         ),
@@ -227,7 +227,7 @@ def _assess_influence(
 def _judge_effect(
     effect: BoundEffect, parameters: Mapping[str, ParameterEstimate], covariance: Array
 ) -> EffectEstimate:
-    """Say whether an effect is determined: a strength that is not nothing, and all of its shape.
+    """Say whether an effect is determined: its strength differs from zero, and its shape is known.
 
     Several strengths, such as those of sine and cosine, are taken together: their errors may be
     correlated so that none is determined alone. A shape that cannot be negative needs an interval
@@ -262,7 +262,7 @@ def _differs_from_zero(value: Array, covariance: Array) -> bool:
 def _fault(name: str, entry: ParameterEstimate) -> str:
     """Return why a parameter is not determined, "" where it is."""
     if entry.at_bound:
-        return f"`{name}` lies at the limit of its range"
+        return f"`{name}` is at the limit of its range"
     if NORMAL_95 * entry.sd >= abs(entry.estimate):
         half = NORMAL_95 * entry.sd
         return (
@@ -276,11 +276,11 @@ def _describe_limit(timing: InputTiming) -> str:
     way = "later" if timing.estimate > 0.0 else "earlier"
     if abs(timing.estimate) < NORMAL_95 * timing.sd:
         return (
-            f"The timing of the force lies at its limit, {1e3 * timing.limit:.3g} ms {way} than"
-            f" logged, half a sample, and is uncertain by {1e3 * timing.sd:.2g} ms: these trials do"
-            f" not determine it, or {TIMING_AT_LIMIT}."
+            f"The input delay is at its limit of half a sample ({1e3 * timing.limit:.3g} ms {way}"
+            f" than logged, ± {1e3 * timing.sd:.2g} ms): these trials do not determine it, or"
+            f" {TIMING_AT_LIMIT}."
         )
     return (
-        f"The force acts {1e3 * timing.limit:.3g} ms or more {way} than logged, half a sample, all"
-        f" that the timing of the samples may be: {TIMING_AT_LIMIT}."
+        f"The force acts at least {1e3 * timing.limit:.3g} ms {way} than logged, the limit of half"
+        f" a sample: {TIMING_AT_LIMIT}."
     )

@@ -260,8 +260,8 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
     smoothing = np.hypot(off, spread)[:count]
     rows = filtering.choice.trace_rows
     doubt = (
-        f"its normalised innovations squared are {nis.mean:.2g} on average, 1 where its noise"
-        " levels are right"
+        f"its mean normalised innovation squared is {nis.mean:.2g}; it is 1 if the noise levels"
+        " are right"
     )
     return Estimate(
         method="ukf",
@@ -282,14 +282,14 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
 
 
 def _find_smoothing(width: _Width | None, widths: _Widths) -> tuple[Array, Array]:
-    """How far the answer is from that without smoothing, and between likely widths, both (nt,).
+    """Return the bias by smoothing, and the spread between likely widths, both (nt,).
 
-    A machine with dry friction truly stands still, where the model creeps within the width of its
-    smoothed sign. The filter errs in proportion to that width: it is off by twice what half the
-    width that it took moves it. A machine that does creep shows that by readings that the narrower
-    sign makes less likely; there, and where that fails, nothing is off. Both are filtered around
-    the answer, over some of the trials and in finer steps, for the narrower one may be stiffer.
-    What widths that are nearly as likely disagree on is as uncertain.
+    A machine with dry friction truly stands still, whereas the model creeps within the width of its
+    smoothed sign. The error of the filter is proportional to that width: it is twice the change at
+    half the chosen width. If the narrower sign makes the readings less likely, or fails, the
+    machine creeps and the bias is zero. Both widths are filtered around the answer, over some of
+    the trials and in finer steps, because the narrower one may be stiffer. The spread is the
+    disagreement of widths that are nearly as likely.
     """
     factor, parts = (1.0, 1) if width is None else (width.factor, width.parts)
     likely, value = widths.filter(factor, 2 * parts)
@@ -301,19 +301,19 @@ def _find_smoothing(width: _Width | None, widths: _Widths) -> tuple[Array, Array
 def _describe_smoothing(
     names: Sequence[str], smoothing: Array, sd: Array, width: _Width | None
 ) -> tuple[str, ...]:
-    """Sentences on a narrower sign, and on uncertainty that is for the most part of smoothing."""
+    """Return sentences on a narrower sign, and on uncertainty mostly due to smoothing."""
     said = []
     if width is not None:
         said.append(
             f"The filter smooths the sign of the velocity over {significant(width.factor)} of the"
-            " device's `sign_width`, which makes the readings likelier."
+            " device's `sign_width`, which raises the likelihood of the readings."
         )
     most = smoothing**2 > _MOST * np.maximum(sd**2, np.finfo(float).tiny)
     if most.any():
         listed = [f"`{name}`" for name, here in zip(names, most, strict=True) if here]
         said.append(
-            f"Most of the uncertainty of {join_names(listed, _SHOWN)} is that the sign of the"
-            " velocity is smoothed, where a machine stands still."
+            f"Most of the uncertainty of {join_names(listed, _SHOWN)} comes from the smoothed sign"
+            " of the velocity, because a machine may stand still."
         )
     return tuple(said)
 

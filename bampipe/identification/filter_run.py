@@ -322,8 +322,8 @@ class TrialFilter:
             ratio = found.trials[worst].ratio
             axis = (*self.axes, *self.axes)[int(np.argmax(ratio))]
             why = (
-                f"the filter does not follow trial {self.names[found.order[worst]]}: its prediction"
-                f" of {axis} one sample ahead errs {ratio.max():.0f} times more than noise explains"
+                f"the filter does not follow trial {self.names[found.order[worst]]}: the error of"
+                f" its one-step prediction of {axis} is {ratio.max():.0f} times that of noise"
             )
         raise MotionLost(why, where=self.where, remedy=self.remedy)
 

@@ -204,19 +204,19 @@ def _fails(test: InnovationTest, limit: float) -> bool:
 
 
 def _sentence(own: InnovationTest | None, driven: InnovationTest | None) -> str:
-    """Say both outcomes in words."""
+    """Return both outcomes in words."""
     if own is None or driven is None:
         return "Too little motion to test the innovations."
-    past = f"{100.0 * own.share:.0f} % of their variance follows from their past"
-    force = f"{100.0 * driven.share:.0f} % from the inputs"
+    past = f"their past predicts {100.0 * own.share:.0f} % of their variance"
+    force = f"the inputs {100.0 * driven.share:.0f} %"
     if not _fails(own, WHITE_SHARE) and not _fails(driven, INPUT_SHARE):
-        return f"White and independent of the inputs: {past}, {force}; nothing points to a lack."
+        return f"White and independent of the inputs: {past}, {force}; no sign of a missing effect."
     if _fails(driven, INPUT_SHARE):
         return (
-            f"Not independent of the inputs: {force}, {past}. The model answers the force wrongly: "
-            "a delay, a gain, an inertia or what carries the load."
+            f"Not independent of the inputs: {past}, {force}. The model responds wrongly to the"
+            " force: look for a delay, a gain, an inertia or a load path."
         )
     return (
-        f"Not white: {past}, {force}. Something acts that the model lacks and that does not follow "
-        "the force, such as friction of another shape."
+        f"Not white: {past}, {force}. The model lacks an effect that does not follow the force,"
+        " such as another form of friction."
     )

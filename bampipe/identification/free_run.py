@@ -103,15 +103,15 @@ def free_runs(
                 runs.append(_open(system, motion, p))
             else:
                 return FreeRun(
-                    reason=f"{reason}, and driven by its recorded inputs alone the mechanism does "
-                    "not forget where it started."
+                    reason=f"{reason}, and under its recorded inputs alone the mechanism does not"
+                    " forget its initial position."
                 )
     except InputError as error:
         return FreeRun(reason=f"{mode.replace('_', ' ')}: {error}.")
     counted = [r for r, j in zip(runs, judged, strict=True) if j] or runs
     axes = _axes(system, counted)
     if any(axis.relative_error_percent > _RUN_AWAY_PERCENT for axis in axes.values()):
-        return FreeRun(reason="The simulated motion runs away.")
+        return FreeRun(reason="The simulated motion diverges.")
     given = np.concatenate([r.force for r in counted])
     off = np.concatenate([r.command for r in counted]) - given
     names = system.model.device.forces if mode == CLOSED else ()
@@ -129,7 +129,7 @@ def free_runs(
 
 
 def _lacks(run: RunFolder, system: System, law: ControlLaw) -> str:
-    """Why this session and model have no closed loop to run; "" where they have."""
+    """Return why this session and model have no closed loop to run, or ""."""
     recorded = run.read(IngestResult).channels
     missing = [n for n in law.inputs if n != "t" and n not in recorded]
     if missing:
@@ -249,14 +249,14 @@ def find_drift(
 
 
 def why_not_free(system: System, motions: Sequence[Motion], parameters: Sequence[Array]) -> str:
-    """Why a model does not run by the measured force alone; "" where it may."""
+    """Return why a model cannot run under the measured force alone, or ""."""
     if system.model.device.prescribed:
-        return "A machine prescribes the motion, and the force is what that takes."
+        return "A machine prescribes the motion, and the force follows from it."
     robot = system.model.device.robot is not None
     if not robot and is_stiff(system, parameters[0][: len(system.parameters)], motions[0]):
         return (
-            "Friction would stop the machine within a small part of a sample: its drive gives the"
-            " motion, and the force is what that takes."
+            "Friction would stop the machine within a fraction of a sample, so its drive"
+            " prescribes the motion, and the force follows from it."
         )
     return ""
 
@@ -318,17 +318,17 @@ def _simulate(
 def _drift(
     reached: Sequence[_Reach], axis: int, horizon: float, shorter: AxisDrift
 ) -> dict[str, object]:
-    """Return what a horizon, s, adds to what shorter ones say of one axis, or why it is absent."""
+    """Return the update of one axis' drift by a horizon, s, or why there is none."""
     used = [(error[axis], way[axis]) for error, way, moves in reached if moves[axis]]
     error = np.array([error for error, _ in used])
     if len(used) < _LEAST:
-        return {"reason": f"In {len(used)} windows of {horizon:g} s the axis moves: too few."}
+        return {"reason": f"The axis moves in only {len(used)} windows of {horizon:g} s."}
     if np.mean(np.isinf(error)) > _RUNS_AWAY:
-        return {"reason": f"Within {horizon:g} s the simulated motion runs away."}
+        return {"reason": f"The simulated motion diverges within {horizon:g} s."}
     median, most = np.quantile(error, [0.5, 0.9], method="inverted_cdf")
     displacement = float(np.median([way for _, way in used]))
     if median > displacement or not np.isfinite(most):
-        return {"reason": f"In {horizon:g} s the model drifts further than the axis moves."}
+        return {"reason": f"Within {horizon:g} s the model drifts farther than the axis moves."}
     drift = Drift(
         horizon_s=horizon, median=median, quantile_90=most, displacement=displacement,
         windows=len(used),

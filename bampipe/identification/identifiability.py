@@ -111,7 +111,7 @@ def assess_identifiability(
         sentences=(
             *(
                 f"{_list(group.members)} enter the equations only as {_list(group.combinations)}:"
-                " no motion tells the parts apart."
+                " no motion separates them."
                 for group in known.together
             ),
             *(_describe_weak(w, names, value, covariance) for w in parted),
@@ -240,7 +240,7 @@ def _describe_number(
 
 
 def _describe_weak(weak: Weak, names: Sequence[str], value: Array, covariance: Array) -> str:
-    """Say which parameters move together, and for a pair how well sum and difference are known."""
+    """Say which parameters move together; for a pair, how well sum and difference are known."""
     pair = list(weak.members)
     start = f"{_list([names[i] for i in pair])} move together here"
     if (
@@ -248,22 +248,25 @@ def _describe_weak(weak: Weak, names: Sequence[str], value: Array, covariance: A
         or np.any(value[pair] == 0.0)
         or not np.isfinite(covariance[pair, pair]).all()
     ):
-        return f"{start}: {100.0 * weak.strength:.2g} % of the information is left for that."
+        return (
+            f"{start}: the trials keep {100.0 * weak.strength:.2g} % of the information that"
+            " separates them."
+        )
     relative = covariance[np.ix_(pair, pair)] / np.outer(value[pair], value[pair])
     both = [0.5 * np.sqrt(np.array([1.0, s]) @ relative @ np.array([1.0, s])) for s in (1.0, -1.0)]
     better, worse = ("sum", "difference") if both[0] < both[1] else ("difference", "sum")
     return (
-        f"{start}: their {better}, each in per cent of itself, is known to "
-        f"{100.0 * min(both):.2g} % at best, their {worse} to {100.0 * max(both):.2g} %."
+        f"{start}: the {better} of their relative values is known to {100.0 * min(both):.2g} % at"
+        f" best, the {worse} to {100.0 * max(both):.2g} %."
     )
 
 
 def _describe_unsaid(names: Sequence[str], sd: Array, prior: Array) -> list[str]:
     return [
-        f"These trials say next to nothing of `{name}`: what was assumed of it stands."
+        f"These trials contain no information about `{name}`, which keeps its prior."
         if not np.isfinite(bound_sd)
-        else f"These trials say little of `{name}`: at best ± {bound_sd:.2g}, ± {assumed:.2g} was "
-        "assumed before."
+        else f"These trials contain little information about `{name}`: ± {bound_sd:.2g} at best,"
+        f" its prior is ± {assumed:.2g}."
         for name, bound_sd, assumed in zip(names, sd, prior, strict=True)
         if not bound_sd < _LITTLE * assumed
     ]
@@ -276,13 +279,13 @@ def _describe_idle(trials: Mapping[str, TrialGrowth]) -> list[str]:
     growth = max(trials[name].growth for name in idle)
     alone = f"no bound would grow by more than {100.0 * growth:.1g} %."
     if len(idle) == 1:
-        return [f"Trial {idle[0]} adds next to nothing: without it {alone}"]
+        return [f"Trial {idle[0]} adds almost nothing: without it {alone}"]
     which = join_names(idle, _LISTED)
-    return [f"Trials {which} add next to nothing: without any one of them {alone}"]
+    return [f"Trials {which} add almost nothing: without any one of them {alone}"]
 
 
 def _describe_leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
-    """Say which numbers of the device file the estimates rest on, and which they resemble."""
+    """Say on which numbers of the device file the estimates depend, and which they resemble."""
     sentences = []
     for number in numbers:
         moved = {name: size for name, size in number.moves_percent.items() if abs(size) >= _MOVES}
@@ -294,8 +297,8 @@ def _describe_leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
             sentences.append(f"An error of 1 % in `{number.name}` would move {join_names(shown)}.")
         if number.partner is not None and abs(number.correlation) > _CLOSE:
             sentences.append(
-                f"Were `{number.name}` estimated too, it and `{number.partner}` would move "
-                f"together (correlation {number.correlation:+.2f})."
+                f"If `{number.name}` were estimated too, it and `{number.partner}` would move"
+                f" together (correlation {number.correlation:+.2f})."
             )
     return sentences
 

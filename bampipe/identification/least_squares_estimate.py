@@ -365,13 +365,13 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
 
 
 def require_enough(squares: SquaresFit, where: str) -> None:
-    """Raise :class:`InputError` where fewer than two independent samples a number would count."""
+    """Raise :class:`InputError` if there are fewer than two independent samples per parameter."""
     samples = lay_out_samples(squares.fit.evidence, squares.block_s)
     moving = int(sum(here.independent for here in samples))
     if moving < 2 * squares.free.size:
         raise InputError(
-            f"of the free trials, {moving} independent samples are clear of standstill, fewer than"
-            f" twice the {squares.free.size} numbers to be found",
+            f"the free trials have {moving} independent samples in motion, fewer than twice the"
+            f" {squares.free.size} parameters",
             where=where,
             remedy="record faster motion at a higher rate, or more of it",
         )

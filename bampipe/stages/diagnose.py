@@ -79,8 +79,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     system = compile_model(model)
     if system.undriven:
         raise InputError(
-            f"no force acts on {system.undriven[0]}: with nothing measured to hold its equation"
-            " against, whatever makes all of it smaller would seem to explain it",
+            f"no force acts on {system.undriven[0]}, so its equation has no measured side, and any"
+            " effect that shrinks all terms would seem to explain it",
             where=f"device {model.device.name!r}",
             remedy="judge its models by validate and compare",
         )
@@ -104,15 +104,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         selection = select_effects(session, recipe, start, config.without, progress)
     except Runaway as error:
         raise NothingToDoError(
-            f"model {config.model!r} cannot be diagnosed, for it cannot be replayed and so has no"
-            f" noise to be held against: {error.what}",
+            f"model {config.model!r} cannot be diagnosed, because it cannot be simulated and so"
+            f" has no noise floor: {error.what}",
             where=str(run.root),
             remedy="judge it by validate and compare, and diagnose the model that it came from",
         ) from error
     given = selection.initial.evidence
     samples = _map_variables(given)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
-    progress(0.95, "the trial that would decide what these do not")
+    progress(0.95, "looking for a trial that would decide")
     result = _result(session, selection, recipe, config)
     result = result.model_copy(
         update={"suggested_trial": suggest_trial(session, selection.final, result)}
@@ -122,20 +122,20 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 
 
 def _require_known(names: Sequence[str], recipe: Recipe, setting: str) -> None:
-    """Refuse a name of no effect, which would change nothing."""
+    """Refuse an unknown effect, which would change nothing."""
     extra = [effect_from(effect) for effect in recipe.extra]
     known = list_candidates(recipe.model().device, (), extra, on_request=True)
     for name in names:
         if name not in known:
             raise InputError(
-                f"{name!r} is no effect of this device{did_you_mean(name, known)}",
+                f"this device has no effect {name!r}{did_you_mean(name, known)}",
                 where=f"diagnose.{setting}",
                 remedy="`bampipe effects` lists them",
             )
 
 
 def _require_sound_setup(run: RunFolder) -> None:
-    """Refuse to look for physics where the signals do not mean what is stated."""
+    """Refuse a diagnosis if the signals do not have their stated meaning."""
     setup = run.find(SetupResult)
     if setup is not None and setup.mistakes:
         mistakes = setup.mistakes
@@ -242,9 +242,9 @@ def _next(
     wrong = [axis for axis, a in zip(names, axes, strict=True) if a.verdict == "no_verdict"]
     if wrong:
         return (
-            f"{', '.join(wrong)} cannot be judged: hold the noise and resolution in session.toml"
-            " against what `bampipe ingest` measured"
+            f"{', '.join(wrong)} cannot be judged: compare the noise and resolution in"
+            " session.toml with those that `bampipe ingest` measured"
         )
     if any(a.verdict == "unknown_effect" for a in axes):
         return f"bampipe draft RUN --model {model}"
-    return "nothing to add; `bampipe report RUN` writes it up"
+    return "nothing to add; `bampipe report RUN` writes the report"

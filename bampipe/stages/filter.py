@@ -236,11 +236,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 def _nothing_to_differentiate(
     run: RunFolder, trials: pd.DataFrame, refused: Mapping[str, str]
 ) -> InputError:
-    """Say why no trial can be differentiated: the kinds that there are, or that all are short."""
+    """Say why no trial can be differentiated: none has the right kind, or all are short."""
     if refused:
         name, reason = next(iter(refused.items()))
         return InputError(
-            f"none of the {len(refused)} free and viscous trials is long enough: {name} holds"
+            f"none of the {len(refused)} free and viscous trials is long enough: {name} has"
             f" {reason}",
             where=str(run.root),
             remedy="record longer trials, or at a higher rate",
@@ -249,7 +249,8 @@ def _nothing_to_differentiate(
     if len(moving):
         first = moving.iloc[0]
         return InputError(
-            f"every free and viscous trial is set aside: {first['trial_id']}: {first['reason']}",
+            f"every free and viscous trial is set aside, such as {first['trial_id']}:"
+            f" {first['reason']}",
             where=str(run.root),
             remedy="the others are in the report, and in ingest/trials.parquet",
         )
@@ -281,8 +282,8 @@ def _write_motions(
                 position = trial.frame[f"q_{axis}"].to_numpy(dtype=np.float64)
                 if _outruns(position, one.noise_sd):
                     written.skipped[trial_id] = (
-                        f"{axis} moves faster than {kinematics.rate_hz:g} samples a second tell:"
-                        " log it faster"
+                        f"{axis} moves too fast for {kinematics.rate_hz:g} samples a second: log"
+                        " it at a higher rate"
                     )
             if trial_id in written.skipped:
                 continue
@@ -307,7 +308,7 @@ def _motions(
 def _describe_offsets(
     offsets: Mapping[str, Mapping[str, float]], session: IngestResult
 ) -> Iterator[str]:
-    """Say by force what each trial's zero is off."""
+    """Return a sentence on the offsets of each force."""
     force = session.force
     names = {name: None for by_force in offsets.values() for name in by_force}
     for name in names:
@@ -318,8 +319,8 @@ def _describe_offsets(
                 gain, unit = sum(row), force.raw_unit
         each = ", ".join(f"{trial} {by[name] / gain:+.3g}" for trial, by in offsets.items())
         yield (
-            f"{name} is zeroed anew in each trial: against their mean it reads {each} {unit} too"
-            " much, which is taken off; of held-out trials, too, by their own samples"
+            f"{name} is zeroed anew in each trial: its offsets from their mean ({each} {unit})"
+            " were subtracted; those of held-out trials come from their own samples"
         )
 
 
@@ -402,9 +403,9 @@ def _choose(
     fits = {k: found for k, found in fits.items() if np.isfinite(found.log_likelihood)}
     if not fits:
         raise InputError(
-            f"{axis} moves in no way that a filter could follow",
+            f"no filter can follow the motion of {axis}",
             where=f"encoders.{axis}",
-            remedy="is this the column of its position, in its unit?",
+            remedy="check that this is the column of its position, in the right unit",
         )
     order = max(fits, key=lambda k: fits[k].log_likelihood)
     best = fits[order].model
@@ -423,9 +424,9 @@ def _choose(
     if config.cutoff_hz:
         why = "set by the user"
     elif found < least:
-        why = f"the data ask for {found:.1f} Hz; held at the minimum bandwidth"
+        why = f"the data suggest {found:.1f} Hz; limited to the minimum bandwidth"
     elif found > most:
-        why = f"the data ask for {found:.1f} Hz; held at a fifth of the sampling rate"
+        why = f"the data suggest {found:.1f} Hz; limited to a fifth of the sampling rate"
     elif kalman:
         why = "maximum likelihood of the encoder samples"
     else:

@@ -290,23 +290,23 @@ def _find_timing(task: _Task, squares: SquaresFit, held: InputTiming | None) -> 
 
 
 def _describe_squares(task: _Task, squares: SquaresFit) -> list[str]:
-    """What to know of least squares: no replicates, an axis that nothing drives."""
+    """Return notes on least squares: no replicates, or an axis that nothing drives."""
     notes, system = [], task.system
     if task.config.remove_bias and not squares.replayed:
         notes.append(
-            "The model cannot be replayed along the trials: all samples weigh alike, and no bias of"
-            " filters was taken off."
+            "The model cannot be simulated on these trials, so all samples have equal weight and"
+            " the bias of filters was not removed."
         )
     if system.undriven:
         notes.append(
-            f"No force acts on {', '.join(system.undriven)}: least squares makes what stands in"
-            " such an equation too small, more so the more the model lacks."
+            f"No force acts on {', '.join(system.undriven)}: least squares underestimates the"
+            " terms of that equation, the more so the more the model lacks."
         )
     return notes
 
 
 def _start(task: _Task) -> Array:
-    """Priors of the device; of effects, what a diagnosis or a search over their range found."""
+    """Return the device's priors, and values of effects from a diagnosis or a search."""
     system, start = task.system, task.system.prior
     count = len(system.model.device.parameters)
     path = task.run.path(f"models/{task.config.model}/model.toml")
@@ -322,9 +322,9 @@ def _start(task: _Task) -> Array:
 
 
 def _choose_width(run: RunFolder, system: System, config: Config) -> SignWidth | None:
-    """The width of the smoothed sign that the trials ask for; None where the declared one stays.
+    """Return the width of the smoothed sign that the trials select; None for the declared one.
 
-    Where no test bench gives the motion it stays: filter and replays integrate along the sign.
+    Without a test bench it stays, because filter and replicates integrate along the sign.
     """
     if not (config.choose_sign_width and system.model.device.prescribed):
         return None
@@ -341,10 +341,10 @@ def _describe_width(system: System, width: SignWidth) -> list[str]:
     for i, axis in enumerate(system.model.device.coordinates):
         before, after = width.declared[i], width.chosen[i]
         said.append(
-            f"{axis.name}: the sign of the velocity is smoothed over {significant(axis.sign_width)}"
-            f" {axis.unit}/s, {significant(width.factor)} of the device's `sign_width`, for with"
-            f" that the error on trials left out falls from {significant(before)} to"
-            f" {significant(after)} {system.torque_units[i]}. `sign_width = {axis.sign_width:.2g}`"
-            " in a device file says so from the start."
+            f"{axis.name}: the sign of the velocity is smoothed over"
+            f" {significant(axis.sign_width)} {axis.unit}/s, {significant(width.factor)} of the"
+            " device's `sign_width`, because the held-out error then falls from"
+            f" {significant(before)} to {significant(after)} {system.torque_units[i]}. Put"
+            f" `sign_width = {axis.sign_width:.2g}` into the device file to start from it."
         )
     return said

@@ -92,7 +92,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     ]
     if device.robot is not None:
         notes += [
-            f"no body has what is drawn, and the nearest is taken: {line}"
+            f"physically impossible body replaced by the nearest possible one: {line}"
             for line in device.robot.impossible
         ]
     notes += [f"{place}: its source still says `fill in`" for place in description.placeholders]

@@ -53,7 +53,7 @@ from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials, trial_of_block
 from bampipe.trials.motion import Motion
 
-SUMMARY = "The trial to record next, and what it is expected to give"
+SUMMARY = "The trial to record next, and its expected gain"
 INPUTS = (
     *INGESTED,
     *FILTERED,
@@ -135,7 +135,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     forecast = _make_forecast(case, purpose, progress)
     space = _lay_out_designs(case, forecast)
     ranked = _rank(forecast, space, parameter, progress)
-    progress(0.9, "what they are expected to give")
+    progress(0.9, "forecasting their gain")
     result = _record(case, forecast, parameter, ranked)
     if config.trajectory:
         result = _write_trajectory(out, case, forecast.rehearsal, ranked[0], result)
@@ -180,16 +180,16 @@ def _read_case(
     diagnosed = run.find(DiagnoseResult, config.model)
     if diagnosed is None and purpose == "decision":
         raise InputError(
-            "what is to be decided is not known yet",
+            "there is no diagnosis yet, so nothing to decide is known",
             where=str(run.root),
             remedy=f"run `bampipe diagnose {run.root}{run.model_option(config.model)}` first",
         )
-    progress(0.0, "what the trials at hand say")
+    progress(0.0, "information in the present trials")
     trials = read_measured_trials(run, system, every_input=True, timing=found.input_timing)
     session = Session(trials, config, config.jobs or os.cpu_count() or 1, config.seed)
     seen = Envelope.of_trials(trials.motions, system, p)
     if not seen.moved_axes:
-        raise InputError("no axis moves in the trials at hand", where=str(run.root))
+        raise InputError("no axis moves in the present trials", where=str(run.root))
     limits = read_limits(model.device, seen) if config.trajectory else {}
     recipe = read_recipe(run, config.model, model)
     case = _Case(run, config, recipe, system, p, found, diagnosed, session, seen, limits)
@@ -197,7 +197,7 @@ def _read_case(
 
 
 def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Progress) -> Forecast:
-    """What is needed to forecast: what was asked for, else what the diagnosis left open or hid."""
+    """Prepare a forecast for the purpose asked for, or else for what the diagnosis left open."""
     trials, comparison, detectability = case.session.trials, None, None
     if asked in ("auto", "decision") and case.diagnosed is not None:
         comparison = _compare_alternatives(case, case.diagnosed)
@@ -211,7 +211,7 @@ def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Prog
         verdicts = {axis.verdict for axis in case.diagnosed.axes.values()}
         asked = "sensitivity" if verdicts == {"nothing_missing"} else "precision"
     if asked == "sensitivity":
-        progress(0.1, "what these trials would have shown of each effect")
+        progress(0.1, "smallest strength of each effect that these trials would show")
         detectability = _find_detectability(case)
     noise = sensor_noise(trials.sensors, case.system, case.fitted, case.p, FilterChoice())
     precision = Precision.of_trials(
@@ -365,20 +365,21 @@ def _write_trajectory(
 
 
 def _split(asked: str, names: Sequence[str]) -> tuple[Purpose | Literal["auto"], str]:
-    """The purpose that ``asked`` means, and the parameter where it is one of ``names``."""
+    """Return the purpose that ``asked`` means, and the parameter if it is one of ``names``."""
     if asked in names:
         return "precision", asked
     for purpose in ("auto", *get_args(Purpose)):
         if asked == purpose:
             return purpose, ""
     raise InputError(
-        f"nothing is called {asked!r} that a trial could be for",
+        f"there is no purpose or parameter {asked!r} for a trial",
         remedy=choose_from(asked, ["auto", *get_args(Purpose), *names]),
     )
 
 
 def _compare_alternatives(case: _Case, diagnosed: DiagnoseResult) -> Comparison | None:
-    """What a diagnosis left open; None where it decided, or no model of it can be replayed."""
+    """Return the alternatives that a diagnosis left open; None if it decided or cannot be
+    simulated."""
     asked = find_ambiguity(diagnosed, case.config)
     if asked is None:
         return None
@@ -391,12 +392,13 @@ def _compare_alternatives(case: _Case, diagnosed: DiagnoseResult) -> Comparison 
 
 
 def _find_detectability(case: _Case) -> Detectability:
-    """What the trials would have shown of each effect, were it beside the model as it is."""
+    """Return the smallest strength of each effect, beside the present model, that the trials
+    show."""
     try:
         fit = case.session.fit(case.recipe, case.p)
     except Runaway as error:
         raise NothingToDoError(
-            f"what these trials would have shown is not known, for the model cannot be replayed:"
+            "the sensitivity of these trials is not known, because the model cannot be simulated:"
             f" {error.what}",
             where="next",
             remedy="ask for precision or for a parameter by name",

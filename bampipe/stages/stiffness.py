@@ -288,15 +288,15 @@ def _axis(
     for trial in trials:
         if not trial.found.yielded:
             notes.append(
-                f"{trial.trial_id}: the slope of the loops still changes by "
-                f"{100.0 * trial.found.slope_change:.1f} % where they should be straight: load "
-                "the axis further; the stiffness is too high."
+                f"{trial.trial_id}: the slope of the loops changes by"
+                f" {100.0 * trial.found.slope_change:.1f} % over their straight part, so the"
+                " stiffness is too high: load the axis further."
             )
         drift = _drift(trial)
         if abs(drift) > config.largest_drift:
             notes.append(
-                f"{trial.trial_id}: the loops drift by {100.0 * drift:.1f} % of their range: the "
-                "brake slips."
+                f"{trial.trial_id}: the loops drift by {100.0 * drift:.1f} % of their range, so"
+                " the brake slips."
             )
     poses = _poses(system, trials[0].pose)
     bandwidths = {}

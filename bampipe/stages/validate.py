@@ -85,11 +85,14 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     notes = []
     if trials.blocks == len(trials.motions):
         notes.append(
-            f"One trial: it is predicted in {trials.blocks} blocks, each with the estimate that the"
-            " others give."
+            f"There is one trial: it is predicted in {trials.blocks} blocks, each with the"
+            " estimate from the others."
         )
     if trials.folds.nothing_held_out:
-        notes.append("One trial, or one group: nothing is held out; the error is that of the fit.")
+        notes.append(
+            "There is only one trial or group, so nothing is held out and the error is that of"
+            " the fit."
+        )
     floor: NoiseFloor | None = None
     if config.noise_floor:
         recipe = read_recipe(run, config.model, model)
@@ -147,9 +150,9 @@ def _noise_floor(
         if level > AT_FLOOR * creeps:
             unit = system.torque_units[i]
             notes.append(
-                f"{axis}: the noise floor of {significant(level)} {unit} is that of friction that"
-                " stops the machine where it turns; replays that creep there, as `sign_width`"
-                f" says, leave {significant(creeps)}."
+                f"{axis}: the noise floor of {significant(level)} {unit} assumes friction that"
+                " stops the machine at reversals; replicates that creep over `sign_width` have a"
+                f" floor of {significant(creeps)}."
             )
     return found.noise_floor, notes
 
@@ -162,7 +165,7 @@ def _run_freely(
     published: Array,
     unseen: Sequence[Array],
 ) -> FreeRun:
-    """Leave the model to itself, over whole trials and over short horizons."""
+    """Run the model freely, over whole trials and over short horizons."""
     if trials.blocks:  # of the only trial, which runs as a whole
         motions: Sequence[Motion] = read_motions(run, system, braked=True)
         held_out = held_out_trials(run)
@@ -179,18 +182,22 @@ def _run_freely(
 def _silent_joints(
     system: System, compared: Sequence[ComparedTrial], floor: NoiseFloor | None
 ) -> list[str]:
-    """Say which joints of a robot these trials do not identify, and why as far as it shows."""
+    """Say which joints of a robot these trials do not identify, and the likely reason."""
     found = []
     for i, (axis, entry) in enumerate(axis_errors(system, compared).items()):
         if entry.fit_percent is None or entry.fit_percent >= SILENT_PERCENT:
             continue
         size = rms((c.measured for c in compared), (c.used for c in compared))[i]
         buried = floor is not None and entry.held_out_rmse < 2.0 * floor.level[i]
-        why = "noise and friction bury it" if buried else "the model lacks what drives it"
+        why = (
+            "noise and friction mask it"
+            if buried
+            else ("the model lacks the effect that dominates it")
+        )
         share = max(entry.fit_percent, 0.0)
         found.append(
-            f"{axis}: of its torque of {size:.2g} {entry.unit} RMS {share:.0f} % is explained:"
-            f" these trials do not identify this joint; {why}."
+            f"{axis}: the model explains {share:.0f} % of its torque of {size:.2g} {entry.unit}"
+            f" RMS, so these trials do not identify this joint; {why}."
         )
     return found
 

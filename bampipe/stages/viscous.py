@@ -226,9 +226,9 @@ def _direction(
     ratios = [abs(value - command) / sd if sd > 0.0 else np.inf for value in (estimate, felt)]
     p, felt_p = (float(2.0 * stats.t.sf(ratio, max(blocks - 1, 1))) for ratio in ratios)
     what = (
-        f"differs from {command:.4g} commanded"
+        f"differs from the commanded {command:.4g}"
         if p < _SIGNIFICANT
-        else f"no difference from {command:.4g} commanded shown"
+        else f"no significant difference from the commanded {command:.4g}"
     )
     return found(
         commanded=command,
