@@ -38,8 +38,8 @@ def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list
     drawn = np.array([joint.inertial for joint in robot.joints])
     p = _find_nearest(system, squares, places.reshape(-1, INERTIAL), drawn)
     nearest = (
-        f"The best-fitting inertial parameters of {join_names(wrong)} are physically impossible:"
-        " the nearest"
+        f"The inertial parameters fitted to {join_names(wrong)} are physically impossible; the"
+        " nearest"
     )
     error, of_fit = (squares.held_out_rmse(values) for values in (p, squares.p))
     if worse := describe_worse(system, error, of_fit, "the fit"):

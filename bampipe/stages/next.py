@@ -378,8 +378,7 @@ def _split(asked: str, names: Sequence[str]) -> tuple[Purpose | Literal["auto"],
 
 
 def _compare_alternatives(case: _Case, diagnosed: DiagnoseResult) -> Comparison | None:
-    """Return the alternatives that a diagnosis left open; None if it decided or cannot be
-    simulated."""
+    """Return the alternatives that a diagnosis left open, None if there are none."""
     asked = find_ambiguity(diagnosed, case.config)
     if asked is None:
         return None
@@ -392,8 +391,7 @@ def _compare_alternatives(case: _Case, diagnosed: DiagnoseResult) -> Comparison 
 
 
 def _find_detectability(case: _Case) -> Detectability:
-    """Return the smallest strength of each effect, beside the present model, that the trials
-    show."""
+    """Return the smallest strength of each effect that the trials show."""
     try:
         fit = case.session.fit(case.recipe, case.p)
     except Runaway as error:
