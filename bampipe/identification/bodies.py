@@ -1,4 +1,4 @@
-"""The inertial numbers of a robot: possible ones, and the combinations that the trials show."""
+"""Inertial parameters of a robot: possible bodies and base parameters."""
 
 from dataclasses import replace
 
@@ -16,11 +16,11 @@ from bampipe.physics.newton_euler import INERTIAL
 from bampipe.results.identify import BaseEstimate
 
 _SHOWN = 0.5
-"""Share of the drawing's uncertainty below which the trials are said to show a combination."""
+"""The trials determine a base parameter if its uncertainty is below this share of the drawing's."""
 
 
 def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list[str]]:
-    """The fit with inertial numbers that some body can have, the nearest; and what to tell of it.
+    """Return the fit with the nearest possible bodies, and notes on the change.
 
     Distance is measured by the normal equations of the fit, drawing included, and all other
     parameters adapt. If the nearest possible bodies explain the trials far worse, the fit stays as
@@ -48,15 +48,15 @@ def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list
 
 
 def _find_nearest(system: System, squares: SquaresFit, places: Array, drawn: Array) -> Array:
-    """The nearest parameters (n_p + 1,) with possible bodies, whose numbers are at ``places``.
+    """Return the nearest parameters (n_p + 1,) with possible bodies at ``places``.
 
     ``places`` and the drawing's numbers, ``drawn``, are (b, 10).
     """
     count, unseen = squares.free.size, np.setdiff1d(places, squares.free)
-    # What no motion shows is weighed by the drawing.
+    # The drawing weighs combinations that no motion shows.
     of_drawing = [system.parameters[k].sd ** -2.0 for k in unseen]
     weight = block_diag(squares.information, np.diag(of_drawing))
-    at = np.full(len(weight), -1)  # nuisance parameters are none of the model's
+    at = np.full(len(weight), -1)  # without the nuisance parameters
     at[:count], at[len(at) - unseen.size :] = squares.free, unseen
     value, low, high = np.zeros(len(at)), np.full(len(at), -np.inf), np.full(len(at), np.inf)
     value[at >= 0] = squares.p[at[at >= 0]]
@@ -68,7 +68,7 @@ def _find_nearest(system: System, squares: SquaresFit, places: Array, drawn: Arr
 
 
 def base_estimates(system: System, p: Array, covariance: Array) -> tuple[BaseEstimate, ...] | None:
-    """The combinations that motion can show, with what the trials add to the drawing.
+    """Return the base parameters, by the drawing and by the trials.
 
     ``p`` (>= n_p,) are parameters of the model; ``covariance`` is that of those estimated.
     """
@@ -112,7 +112,5 @@ def summarise_bases(system: System, found: tuple[BaseEstimate, ...] | None) -> l
         " the values of the drawing."
     ]
     if silent:
-        lines.append(
-            f"These trials contain almost no information about the bodies of {join_names(silent)}."
-        )
+        lines.append(f"The trials determine no body of {join_names(silent)}.")
     return lines

@@ -1,19 +1,19 @@
-"""Which estimate ``--method auto`` publishes: one rule.
+"""The rule by which ``--method auto`` publishes an estimate.
 
-Least squares under the likelihood are always computed. They hold whatever the model lacks, for
-that stays in their residual. The unscented filter is the more precise where the model is right and
-the machine answers the measured forces. It is published where all of this is so:
+Least squares under the likelihood are always computed. They are consistent whatever the model
+lacks, because the missing force stays in the residual. The unscented filter is more precise if the
+model is right and the measured forces drive the machine. It is published if all of these hold:
 
-1. no test bench, and no controller of a robot, gives the motion, and the model is linear in its
-   parameters;
-2. to follow it takes at most `MOST_EVALUATIONS` evaluations of the model;
-3. it follows the motion, and its innovations have the size that it expects;
+1. neither a test bench nor a robot controller prescribes the motion, and the model is linear in its
+parameters;
+2. following it takes at most `MOST_EVALUATIONS` evaluations of the model;
+3. it follows the motion, and its innovations have their expected size;
 4. no parameter differs from that of least squares by more than chance (Hausman 1978,
    Econometrica 46, 1251: least squares are consistent either way, the filter is efficient);
-5. its standard deviations are the smaller ones, by their geometric mean;
-6. on no axis is its error on trials left out more than `_MOST_WORSE` times that of least squares.
+5. the geometric mean of its standard deviations is smaller;
+6. on no axis is its held-out error more than `_MOST_WORSE` times that of least squares.
 
-Else least squares are. `benchmarks/recovery.py` holds both against the truth.
+Otherwise least squares are published. `benchmarks/recovery.py` holds both against the truth.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,11 +33,11 @@ from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.replay import steps_to_follow
 
 MOST_EVALUATIONS = 2e7
-"""Of the model by all sigma points along all trials: some five seconds for each pass."""
+"""Most evaluations of the model by all sigma points on all trials: about five seconds per pass."""
 _CHANCE = 0.01
-"""Probability that the largest of the differences is by chance, below which two disagree."""
+"""Two estimates disagree if their largest difference has a lower probability by chance."""
 _MOST_WORSE = 1.2
-"""Error on trials left out, over that of another estimate at hand, up to which one is published."""
+"""An estimate is published if its held-out error is at most this multiple of the other's."""
 _SHOWN = 4
 
 

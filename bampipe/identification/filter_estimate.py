@@ -1,4 +1,4 @@
-"""The unscented filter's estimate: noise levels, convergence, all trials, honest intervals."""
+"""The unscented filter's estimate: noise levels, convergence, all trials, intervals."""
 
 from __future__ import annotations
 
@@ -59,19 +59,18 @@ from bampipe.trials.motion import Motion, trial_names, trial_sizes
 _RESTARTS = 3
 """Searches from least squares, each with four times the process noise of the one before."""
 _LEAST_REGION = 1e-3
-"""Least deviation of least squares of a nonlinear model, in standard deviations of the prior."""
+"""Least initial deviation of a nonlinear model from least squares, in prior standard deviations."""
 _AROUND = 10.0
-"""Standard deviations around an answer, from which on a start adds a hundredth to what is known."""
+"""Widening of the standard deviations around an answer: such a start adds 1 % of information."""
 _PARTS, _LIKELIER = (1, 2, 4), 30.0
-"""By what the Runge-Kutta step is divided, and what that must add to the logarithm of the
-likelihood: three times what it adds where friction is smooth on the scale of a step."""
+"""Division of the Runge-Kutta step, and the least gain of log likelihood by it: three times that
+with friction that is smooth on the scale of a step."""
 _NARROWER = (0.5, 0.25, 0.0625)
-"""Widths of the smoothed sign, times the device's, that are tried."""
+"""Widths of the smoothed sign that are tried, times the device's."""
 _MOVED_TRIALS, _MOVED_SAMPLES = 5, 10_000
-"""Trials, and samples of all, by which other equations move the answer or make it likelier."""
+"""Most trials, and samples of all, on which other widths and steps are compared."""
 _MOST, _SHOWN = 0.5, 6
-"""Share of the variance of a parameter from which on what the smoothing adds is said in words,
-and how many are named."""
+"""Smoothing is reported from this share of a parameter's variance on; most parameters named."""
 _SOUND_NIS = (0.5, 2.0)
 """Mean normalised innovation squared of a filter whose noise levels fit: 0.9 to 1.3 on sound
 sessions, 0.06 to 0.2 and 2.8 to 3.7 on those whose motion it lost."""
@@ -79,13 +78,13 @@ sessions, 0.06 to 0.2 and 2.8 to 3.7 on those whose motion it lost."""
 
 @dataclass(frozen=True)
 class FilterTask:
-    """What the filter is asked.
+    """A task for the filter.
 
     Attributes:
         recipe: the model as data; name: of it, for messages.
         start: (n_p,) starting values.
         squares: least squares, which give the region of the answer.
-        known: (n,) their standard deviations, of parameters that the trials leave open the prior's.
+        known: (n,) their standard deviations, those of the prior for undetermined parameters.
     """
 
     run: RunFolder
@@ -104,7 +103,7 @@ class FilterTask:
 
 
 class _Filtering:
-    """The trials as the filter reads them, its model and its noise levels.
+    """The trials, the model and the noise levels of the filter.
 
     Attributes:
         motions: parts of trials between disturbances; of_trial: the trial of each.
@@ -142,7 +141,7 @@ class _Filtering:
 
     @property
     def known(self) -> Array:
-        """(nt,) how well that is known."""
+        """(nt,) its standard deviations."""
         return np.append(self.task.known, self.late_sd)
 
     def clear(self, place: int) -> Flags:
@@ -166,10 +165,10 @@ class _Filtering:
 
     @property
     def attempts(self) -> list[Attempt]:
-        """Where to start: the prior, then least squares with more and more process noise.
+        """Return the starts: the prior, then least squares with increasing process noise.
 
         A model that is nonlinear in its parameters starts around least squares: a prior as wide as
-        a range leads such a filter astray.
+        a range would make it diverge.
         """
         task, count = self.task, self.count
         places, late = task.squares.free[:count], np.zeros(self.late_sd.size)
@@ -185,7 +184,7 @@ class _Filtering:
         return attempts + [(self.answer, around, 4.0**k) for k in range(_RESTARTS)]
 
     def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
-        """Filter all trials from the first of some starts that holds on to the motion."""
+        """Filter all trials from the first of some starts that follows the motion."""
         return TrialFilter(
             self.model,
             self.trials,
@@ -198,7 +197,7 @@ class _Filtering:
         ).run(attempts, settings)
 
     def find(self) -> tuple[FilterRun, _Width | None, _Widths]:
-        """The run that counts, the narrower width of the sign if readings ask for one, others."""
+        """Return the run that counts, the narrower width that readings favour, and others."""
         found = self.run(self.attempts, self.settings)
         widths = self._widths_around(found)
         width = None if self.task.system.model.device.prescribed else widths.choose()
@@ -208,7 +207,7 @@ class _Filtering:
         self.model = replace(self.model, functions=functions)
         value, slope = self.model.to_physical(found.theta)
         around = _AROUND * slope * np.sqrt(np.diag(found.covariance))
-        with suppress(MotionLost):  # a narrow sign may throw it off at one reversal of many
+        with suppress(MotionLost):  # a narrow sign may make it diverge at a single reversal
             settings = replace(found.settings, longest_step=widths.step / width.parts)
             again = self.run([(value, around, 1.0)], settings)
             if again.log_likelihood > found.log_likelihood + _LIKELIER:
@@ -333,10 +332,10 @@ def _some_of(trials: Sequence[Trial], found: FilterRun) -> tuple[list[Trial], Ar
 
 @dataclass(frozen=True)
 class _Width:
-    """Over which narrower width the filter smooths the sign of a velocity.
+    """The narrower width over which the filter smooths the sign of a velocity.
 
     Attributes:
-        factor: times the device's; parts: by which the Runge-Kutta step that suits is divided.
+        factor: times the device's; parts: division of the Runge-Kutta step.
         spread: (n,) how far parameters move between the widths and steps that are nearly as likely.
     """
 
@@ -347,13 +346,13 @@ class _Width:
 
 @dataclass(frozen=True)
 class _Widths:
-    """What narrower widths of the smoothed sign make of some trials, around an answer.
+    """Narrower widths of the smoothed sign on some trials, around an answer.
 
     Attributes:
         found: the answer; model, width: of the filter that found it.
         some: parts of trials, and the covariance (nt, nt) to start from, by `_some_of`.
-        narrowed: the system by its width, times the device's; step: the longest step, s.
-        filtered: log likelihood and answer by width and by what the step is divided.
+        narrowed: the system by its width, times the device's; step: the longest step, s. filtered:
+            log likelihood and answer by width and division of the step.
     """
 
     found: FilterRun
@@ -382,16 +381,16 @@ class _Widths:
         return self.filtered[width, parts]
 
     def choose(self) -> _Width | None:
-        """Return the width that makes readings likeliest; None where no narrower one is likelier.
+        """Return the width of the highest likelihood; None if no narrower one raises it.
 
-        Friction that stops a machine changes over less than the device says it does, and estimates
-        err in proportion to the rest.
+        Friction that stops a machine changes over less than the declared width, and estimates are
+        biased in proportion to the difference.
         """
         first, *others = (self.filter(width, _PARTS[1])[0] for width in (1.0, *_NARROWER[:2]))
-        if max(others) < first:  # this is the usual case, and what `_find_smoothing` needs as well
+        if max(others) < first:  # this is the usual case, and `_find_smoothing` needs it too
             return None
         declared = max(self.filter(1.0, parts)[0] for parts in _PARTS)
-        if not np.isfinite(declared):  # nothing to hold the others against
+        if not np.isfinite(declared):  # nothing to compare the others with
             return None
         best = [max(self.filter(width, parts)[0] for parts in _PARTS) for width in _NARROWER]
         if max(best[:2]) < declared + _LIKELIER:

@@ -1,11 +1,11 @@
-"""Free runs: the identified model left to itself, against the measured position.
+"""Free runs: the identified model simulated freely, against the measured position.
 
-Where the device declares its controller and the session recorded what that needs, machine and
-controller run together over whole trials from the reference (closed loop). Otherwise the recorded
-inputs drive the model alone (open loop), which says something of a whole trial only where the
-mechanism forgets where it started: without a restoring force any error of the force is integrated
-for ever. Over a tenth of a second to two seconds it always does (drift): from the filtered state at
-many moments, the model runs under the recorded inputs.
+If the device declares its controller and the session recorded its channels, machine and controller
+run together over whole trials from the reference (closed loop). Otherwise the recorded inputs alone
+drive the model (open loop). Over a whole trial this is meaningful only if the mechanism forgets its
+start: without a restoring force any error of the force is integrated for ever. Over a tenth of a
+second to two seconds it is always meaningful (drift): from the filtered state at many moments, the
+model runs under the recorded inputs.
 """
 
 import contextlib
@@ -31,32 +31,34 @@ from bampipe.trials.replay import is_stiff
 CLOSED: Final = "closed_loop"
 OPEN: Final = "open_loop"
 _PUSHED = 0.1
-"""How far the start is displaced to see whether it is forgotten, in spreads of the motion."""
+"""Displacement of the start that tests whether it is forgotten, in spreads of the motion."""
 _FORGOTTEN = 0.5
-"""Share of that which may be left over the last fifth of a trial."""
+"""Share of the displacement that may remain over the last fifth of a trial."""
 HORIZONS_S = (0.1, 0.5, 2.0)
 """A reversal, a movement, several movements of a hand."""
 _STARTS = 100
-"""Over all trials together; neighbours overlap, so that more would hardly say more."""
+"""Most starts over all trials; neighbours overlap, so that more add little."""
 _STARTS_OF_ROBOT = 20
-"""A robot's light joints stop and start a hundred times more slowly to integrate: 0.3 s a start."""
+"""Most starts of a robot, whose light joints take a hundred times longer to integrate: 0.3 s
+each."""
 _LEAST = 10
-"""Windows in which an axis moves, for quantiles that mean anything."""
+"""Fewest windows in which an axis moves, for meaningful quantiles."""
 _MARGIN_S = 0.2
 """Lost to the filters at both ends of a trial."""
 _MOVES = 0.01
 """Share of its range in the trial by which an axis must move within a window to count there."""
 _RUNS_AWAY = 0.1
-"""Share of windows that may run away."""
+"""Share of windows that may diverge."""
 _RUN_AWAY_PERCENT = 1000.0
-"""Error of a whole trial in relation to its motion from which a free run says nothing."""
+"""A free run is meaningless if its error exceeds this percentage of the motion."""
 _STEPS_S = (1e-3, 1e-4)
-"""Longest steps of integration, the next where a motion runs away with one: friction that builds up
-within micrometres is stiffer than an axis, and runs away by the step alone."""
+"""Longest integration steps; the next is tried if a motion diverges with one: friction that builds
+up within micrometres is stiffer than an axis, and diverges by the step alone."""
 
 
 _Reach = tuple[Array, Array, Flags]
-"""A run at one horizon: error, infinite if run away, displacement, is it a move, (n_q,) each."""
+"""A run at one horizon: error, infinite if diverged; displacement; whether it moves, (n_q,)
+each."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,8 @@ def free_runs(
 
     Args:
         run: the run folder, for the channels of the controller.
-        parameters: for each trial, (>= n_p,) parameters that have not seen it.
-        judged: which trials count for the whole; all where none does.
+        parameters: for each trial, (>= n_p,) parameters that have not seen it. judged: which trials
+        count; all if none does.
 
     Returns:
         Errors in closed loop, else in open loop; only a ``reason`` where no free run is possible
@@ -170,7 +172,7 @@ def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -
 
 
 def _forgets(system: System, motion: Motion, p: Array) -> bool:
-    """Whether the mechanism, driven by the recorded inputs, loses a displacement of its start."""
+    """Return whether the mechanism forgets a displaced start under the recorded inputs."""
     push = _PUSHED * motion.q.std(axis=0)
     n = len(push)
     near, far = _open(system, motion, p), _open(system, motion, p, push)
@@ -214,8 +216,8 @@ def find_drift(
     """Run the model from many starts of every trial and say how far it drifts.
 
     Args:
-        parameters: for each trial, (>= n_p,) parameters that have not seen it.
-        judged: which trials count; all where none does.
+        parameters: for each trial, (>= n_p,) parameters that have not seen it. judged: which trials
+        count; all if none does.
 
     Returns:
         By axis: the drift at each horizon, and why some horizons are absent.
@@ -239,7 +241,7 @@ def find_drift(
     found = {axis: AxisDrift(unit=unit, horizons=()) for axis, unit in axes}
     for horizon in HORIZONS_S:
         if all(entry.reason for entry in found.values()):
-            break  # the longest runs, which cost most, would say nothing of any axis
+            break  # the longest runs, which cost most, would be meaningless for every axis
         reached = [reach for run in runs for reach in next(run, [])]
         for i, (axis, _) in enumerate(axes):
             if not found[axis].reason:
@@ -264,7 +266,7 @@ def why_not_free(system: System, motions: Sequence[Motion], parameters: Sequence
 def _let_go(
     system: System, motions: Sequence[Motion], trial: int, p: Array, length: float, spacing: float
 ) -> Iterator[list[_Reach]]:
-    """Runs from many samples of a trial, by horizon; ``length``, ``spacing`` of the starts, s."""
+    """Run from many samples of a trial, by horizon; ``length``, ``spacing`` of the starts, s."""
     motion, p = motions[trial], np.ascontiguousarray(p[: len(system.parameters)])
     u, dt = motion.inputs(system.inputs), float(motion.t[1] - motion.t[0])
     true = motion.of_mechanism(system, u, p)
@@ -298,7 +300,7 @@ def _let_go(
 
 
 def _simulate_from(system: System, state: Array, u: Array, p: Array, dt: float) -> Array | None:
-    """The state (nx,) at the last of inputs (T, n_u), `read_finely`; None if it runs away."""
+    """Return the state (nx,) at the last of inputs (T, n_u), `read_finely`; None if it diverges."""
     for step in _STEPS_S:
         with contextlib.suppress(Runaway):
             return np.asarray(_simulate(system, state, u, p, dt, (), step)[-1])
@@ -308,7 +310,7 @@ def _simulate_from(system: System, state: Array, u: Array, p: Array, dt: float) 
 def _simulate(
     system: System, state: Array, u: Array, p: Array, dt: float, smooth: Sequence[int], step: float
 ) -> Array:
-    """States (T, nx) under the inputs (T, n_u) alone, from ``state`` on."""
+    """Return states (T, nx) under the inputs (T, n_u) alone, from ``state`` on."""
     return simulate(
         system.derivative, state, u, p[: len(system.parameters)], dt, width=system.sign_widths,
         n_noise=len(system.noise), smooth=smooth, max_step=step,

@@ -1,4 +1,4 @@
-"""What these trials can and cannot say of a model's numbers, in numbers and in words."""
+"""Identifiability of a model's numbers on these trials, in numbers and in words."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -32,34 +32,33 @@ from bampipe.trials.motion import Motion, trial_names
 _LISTED = 4
 """Trials named in a sentence."""
 _NOTHING = 0.01
-"""A trial without which no bound would grow by this share adds nothing."""
+"""A trial adds nothing if no bound would grow by this share without it."""
 _CLOSE = 0.9
-"""Correlation from which on two numbers are said to move together."""
+"""Numbers with a higher correlation are reported to move together."""
 _LITTLE = 0.5
-"""Share of the prior standard deviation above which the data are said to add little."""
+"""The data add little if they leave more than this share of the prior standard deviation."""
 _MOVES = 0.5
-"""Per cent by which an estimate moves for an error of one per cent, from which on it is said."""
+"""Change of an estimate by an error of one per cent, from which on it is reported, per cent."""
 _KNOWN = 0.1
-"""Standard deviation of an estimate over its size, at best, below which its moves are shares."""
+"""Changes are relative only if the least relative standard deviation of an estimate is lower."""
 _MOST_MOVED = 5
 """Estimates named for one number."""
 _SHIFT = 1e-6
-"""Of a position, rad or m, for the slope of a force."""
+"""Finite difference of a position, rad or m, for the slope of a force."""
 TIMING = "input_timing"
 
 
 def assess_identifiability(
     system: System, motions: Sequence[Motion], problem: Problem, p: Array, noise: Noise
 ) -> tuple[IdentifiabilityReport, Array]:
-    """Say what sensor noise alone leaves open about the parameters at ``p``.
+    """Return the uncertainty of the parameters at ``p`` by sensor noise alone.
 
     Args:
         problem: the inverse dynamics of the trials; p: (n_p + 1,) estimates, the timing of the
             inputs last.
 
-    Returns:
-        The report, and the covariance (n_parameters, n_parameters) that their priors leave where
-        the trials say nothing.
+    Returns: The report, and the covariance (n_parameters, n_parameters) of the priors in directions
+    without information.
     """
     known = structure(system)
     n_p = len(system.parameters)
@@ -75,7 +74,7 @@ def assess_identifiability(
     covariance = cramer_rao_bound(own)
     value = p[problem.free]
     estimated = [i for i, name in enumerate(names) if name != TIMING]
-    # Of inertial numbers, which all hide each other, see `BaseEstimate`.
+    # For inertial numbers, which all compensate each other, see `BaseEstimate`.
     drawn = set(np.flatnonzero(problem.precision))
     own_words = [i for i in estimated if i not in drawn]
     weak = [
@@ -91,7 +90,7 @@ def assess_identifiability(
         _describe_number(number, total, n, n + j, names, value, estimated)
         for j, number in enumerate(known.numbers)
     )
-    half = problem.upper[-1]  # of a sample: all that is assumed of the timing
+    half = problem.upper[-1]  # of a sample: the prior of the timing
     assumed = np.array([system.parameters[i].sd if i < n_p else half for i in problem.free])
     trials = {
         name: TrialGrowth(
@@ -170,7 +169,7 @@ def find_information(
 
 
 def _stiffness(system: System, motion: Motion, z: Array, u: Array, p: Array) -> Array:
-    """Return how the force that the motion needs changes with the position, RMS, (n_q,)."""
+    """Return the slope of the required force by the position, RMS, (n_q,)."""
     found = np.zeros(len(system.coordinates))
     here = system.required(*motion.kinematics, z, u, p)
     for i in range(len(found)):
@@ -182,7 +181,7 @@ def _stiffness(system: System, motion: Motion, z: Array, u: Array, p: Array) -> 
 
 
 def _describe_bound(own: Array, covariance: Array, i: int, names: Sequence[str]) -> ParameterBound:
-    """Return bound, bound were all others known, and the parameter that most looks alike."""
+    """Return bound, bound with all others known, and the parameter that is most similar."""
     partner, correlation = _partner(covariance, i, names)
     return ParameterBound(
         bound_sd=_finite_sd(covariance[i, i]),
@@ -197,7 +196,7 @@ def _finite_sd(variance: float) -> float | None:
 
 
 def _partner(covariance: Array, i: int, names: Sequence[str]) -> tuple[str | None, float]:
-    """Return the other number whose error goes most with that of ``i``, and the correlation."""
+    """Return the other number most correlated with ``i``, and the correlation."""
     sd = np.sqrt(np.diag(covariance))
     usable = np.isfinite(sd) & (sd > 0.0)
     if not usable[i] or usable.sum() < 2:
@@ -218,12 +217,12 @@ def _describe_number(
     value: Array,
     estimated: Sequence[int],
 ) -> DeviceNumber:
-    """Return what the trials say of one number of the device, were it estimated too."""
+    """Return the information on one number of the device if it were estimated too."""
     rows = [*range(n), place]
     covariance = cramer_rao_bound(total[np.ix_(rows, rows)])
     partner, correlation = _partner(covariance, n, names)
     shift = -np.linalg.lstsq(total[:n, :n], total[:n, place], rcond=1e-12)[0]
-    # A share of what may as well be zero would be large and mean nothing.
+    # A relative change of an estimate that may be zero would be large and meaningless.
     sd = np.sqrt(np.diag(cramer_rao_bound(total[:n, :n])))
     per_cent = {
         names[i]: float(shift[i] * number.value / value[i])

@@ -89,10 +89,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             " estimate from the others."
         )
     if trials.folds.nothing_held_out:
-        notes.append(
-            "There is only one trial or group, so nothing is held out and the error is that of"
-            " the fit."
-        )
+        notes.append("With one trial or group, nothing is held out: the error is that of the fit.")
     floor: NoiseFloor | None = None
     if config.noise_floor:
         recipe = read_recipe(run, config.model, model)
