@@ -71,11 +71,12 @@ def slow_noise_sd(record: Array, t: Array, step: float = 0.0) -> float:
 
 
 def without_feedback(records: Array, readings: Array) -> Array:
-    """Return the part of ``records`` (T, n) that does not follow encoder ``readings`` (T, n_q),
-    (T', n). A controller derives its force from the readings, rounding included, and that force
-    acts on the machine: it is no noise. The part linear in the last readings is found by least
-    squares on differences, which keep the rounding and remove the motion. At most 16,000 samples
-    from the middle are used.
+    """Return what in ``records`` (T, n) does not follow ``readings`` (T, n_q), (T', n).
+
+    A controller derives its force from the readings, rounding included, and that force acts on the
+    machine: it is no noise. The part linear in the last readings is found by least squares on
+    differences, which keep the rounding and remove the motion. At most 16,000 samples from the
+    middle are used.
     """
     first = max(0, (len(records) - _FEEDBACK_ROWS) // 2)
     part = slice(first, first + _FEEDBACK_ROWS)

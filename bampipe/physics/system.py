@@ -281,8 +281,9 @@ class System:
         return out
 
     def body_forces(self, q: Array, qd: Array, qdd: Array, p: Array) -> Array:
-        """Forces that a robot's bodies require along a motion, (T, joints); (T, 0) for other
-        devices. They depend only on the parameters of the bodies.
+        """Forces that a robot's bodies require along a motion, (T, joints); (T, 0) else.
+
+        They depend only on the parameters of the bodies.
         """
         count = self._whole.facts["bodies"]
         out = np.empty((len(q), count))

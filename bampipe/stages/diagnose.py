@@ -1,4 +1,4 @@
-"""Stage diagnose: what the model lacks, axis by axis, and how sure that is."""
+"""Stage diagnose: the effects that the model lacks, by axis, with probabilities."""
 
 import os
 from collections.abc import Sequence
@@ -47,13 +47,13 @@ OUTPUTS = ("models/{model}/diagnose.json", "models/{model}/map_variables.parquet
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config(Criteria):
-    """Settings of the stage; what each number decides is in docs/method_selection.md.
+    """Settings of the stage; docs/method_selection.md describes each number.
 
     Attributes:
         model: which model version to diagnose.
         jobs: number of worker processes; 0 means one for each processor, eight at most.
         seed: seed of the noise in the replicates.
-        trust_setup: whether to diagnose in spite of a mistake that was found in the set-up.
+        trust_setup: whether to diagnose in spite of a mistake in the set-up.
         without: effects that are not weighed, such as one that was added in vain.
         also: effects that are weighed on request only, such as loose_load:joint.
     """
@@ -67,7 +67,7 @@ class Config(Criteria):
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Diagnose one model; write what it lacks, and what its residual was mapped against.
+    """Diagnose one model; write its missing effects and the variables of the residual maps.
 
     Raises:
         InputError: fewer than two moving trials, a setting out of range, an axis that no force
@@ -148,7 +148,7 @@ def _require_sound_setup(run: RunFolder) -> None:
 
 
 def _summary(result: dict[str, Any], limits: str) -> dict[str, object]:
-    """What a person needs first: verdicts, the head of the ranking, what to record or do next."""
+    """Return the summary for a person: verdicts, the head of the ranking, the next step."""
     notes = [limits] if limits else []
     if result["suggested_trial"]:
         notes.append(result["suggested_trial"]["sentence"])

@@ -1,4 +1,4 @@
-"""Stage draft: a formula for what no effect explains, as an effect file, with its p-value."""
+"""Stage draft: a formula for an unexplained residual, as an effect file, with its p-value."""
 
 import os
 from dataclasses import replace
@@ -40,7 +40,7 @@ INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL, "models/{model}/diagnose.json
 OUTPUTS = ("models/{model}/draft.json", "models/{model}/drafts/*.toml")
 
 _NEAREST = 3
-"""Effects of the library that are held against a draft."""
+"""Effects of the library that are compared with a draft."""
 _MORE_FORMULAS = (
     f" Formulas in several quantities were not searched: pip install 'bampipe[{symbolic.EXTRA}]'"
     " brings pyoperon."
@@ -49,7 +49,7 @@ _MORE_FORMULAS = (
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config(Criteria):
-    """Settings of the stage, those by which a diagnosis decides among them.
+    """Settings of the stage, with the criteria of a diagnosis.
 
     Attributes:
         model: which model version to draft for.
@@ -178,7 +178,7 @@ def _axis(
     diagnosed: AxisVerdict,
     ranked: list[RankedEffect],
 ) -> AxisDraft:
-    """What was found on an axis; ``effects`` were drafted, ``ranked`` are those of the library."""
+    """Return the result of an axis: ``effects`` drafted, ``ranked`` those of the library."""
     fitted = len(found.options) > 1
     verdict: DraftVerdict = "drafted" if effects else "nothing_beyond_chance"
     if fitted and not effects:

@@ -53,18 +53,18 @@ OUTPUTS = (*FILTERED, "filter/setup.json")
 
 _FORCE_CUTOFF_HZ = 25.0
 _CUTOFF_OVER_BAND = 4.0
-"""At a quarter of their cut-off, derivatives of an input are 0.4 % too small. At two thirds, where
-a band of 17 Hz ended, they were 17 %: a delay of 2 ms came out 5 % too long, at 8.6 floors."""
+"""Least cut-off of an input's derivatives over the band: at a quarter of their cut-off they are 0.4
+% too small, at two thirds 17 %, which biases a delay of 2 ms by 5 %."""
 _HIGHEST_CUTOFF = 0.4
-"""Of the sampling rate: twice the highest frequency of a residual, where the filter takes 0.3 %."""
+"""Share of the sampling rate: twice the highest frequency of a residual, with a loss of 0.3 %."""
 _NO_NOISE, _UNFOLLOWED = 30.0, 0.1
-"""Times the noise of the quietest trial, and of the steps from sample to sample, beyond which what
-differences of a position show is motion that is too fast for the rate of the log."""
+"""A motion is too fast for the rate of the log if differences of position exceed so many times the
+noise of the quietest trial, and of the steps from sample to sample."""
 _SHORTEST = 32
-"""Samples of a trial, the least that can be differentiated."""
+"""Fewest samples of a trial that can be differentiated."""
 _INSPECTED, _TUNING_PART = 12_000, 2000
-"""Samples of all trials on which the set-up is judged; and least length of the parts that the
-bandwidth is chosen from, where trials are many."""
+"""Samples of all trials on which the set-up is judged; least length of the parts of many trials
+that determine the bandwidth."""
 _TRIALS_OF_BAND = 5
 
 
@@ -87,9 +87,9 @@ class Config:
             above 8 Hz: a delay is judged by these derivatives up to the end of the band.
         band_hz: upper end of the band in which residuals are compared, Hz, by every later stage; 0
             takes it from the data, axis by axis: where motion and force carry signal above noise.
-        tuning_samples: at most so many samples of each axis are used to choose the bandwidth,
-            in equal parts from all trials, or from some that are spread over the session where
-            there are very many.
+        tuning_samples: at most so many samples of each axis are used to choose the bandwidth, in
+            equal parts from all trials, or from some that are spread over the session if there are
+            very many.
     """
 
     method: Literal["auto", "kalman", "butterworth"] = "auto"
@@ -115,7 +115,7 @@ class _Trial:
 
 @dataclass(frozen=True)
 class _Written:
-    """What differentiating the trials gave.
+    """Results of differentiating the trials.
 
     Attributes:
         levels: by axis, for each trial: errors of position, velocity and acceleration.
@@ -165,7 +165,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.9, "the band of motion and force")
     system = compile_model(Model(load_device(run, session.device)))
     names = [k for k in ids if k in written.interpolated]
-    # Where residuals are compared, from some of the trials just written, spread over the session.
+    # The band of residuals, from some of the trials just written, spread over the session.
     sensors = Sensors.from_result(session, system.coordinates, system.model.device.forces)
     some = np.unique(np.linspace(0, len(names) - 1, min(len(names), _TRIALS_OF_BAND)).round())
     motions = _motions(path, [names[int(k)] for k in some], system, {})
@@ -333,7 +333,7 @@ def _inspect(
     bands: Mapping[str, ResidualBand],
     disturbances: Mapping[str, Sequence[Disturbance]],
 ) -> SetupResult:
-    """Hold the set-up against the trials ``ids``, those in ``free`` fitted."""
+    """Check the set-up on the trials ``ids``, fitting those in ``free``."""
     most = _INSPECTED // min(len(ids), MOST_TRIALS)
 
     def read(name: str) -> Motion:
@@ -341,7 +341,7 @@ def _inspect(
         return deepcopy(shorten([motion], most)[0])  # a view would keep the whole trial
 
     motions = KeptItems(map(read, ids), MOST_OF_TRIALS)
-    # What brakes do is no part of the bare device: it is judged by braked trials, not fitted.
+    # The bare device excludes brakes: braked trials judge it but are not fitted.
     folds = Folds.of_trials(ids, (), [name for name in ids if name in free])
     cutoffs = tuple(min(bands[axis].cutoff_hz, HIGHEST_HZ) for axis in system.coordinates)
     band = Band(session.sample_rate_hz, cutoffs)
@@ -445,9 +445,9 @@ def _choose(
 
 
 def _outruns(position: Array, noise_sd: float) -> bool:
-    """Whether an axis goes as far from one sample (T,) to the next one way as the other.
+    """Whether the differences of an axis' samples (T,) look random.
 
-    Such motion no filter follows at this rate; a likelihood would take it for noise.
+    No filter follows such motion at this rate; a likelihood would take it for noise.
     """
     shown = white_noise_sd(position)
     steps = float(np.sqrt(np.mean(np.diff(position) ** 2)))

@@ -1,4 +1,4 @@
-"""Stage next: the trial to record next, in one sentence, and what it is expected to give."""
+"""Stage next: the trial to record next, in one sentence, and its expected gain."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -74,7 +74,7 @@ _SHOWN = 3
 _WATCHED = 12
 """Hidden effects that designs are ranked for."""
 _LITTLE = 0.05
-"""Sum of log strengths by which a trial for hidden effects must lower what goes unnoticed."""
+"""Least fall of the log detection limits, summed, by a trial for hidden effects."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -84,8 +84,8 @@ class Config(Criteria):
     Attributes:
         model: which model version.
         purpose: ``precision`` of all parameters; ``decision`` between effects that the diagnosis
-            could not tell apart; ``sensitivity`` to effects that the trials at hand would not have
-            shown; the name of a parameter; or ``auto``: what the diagnosis asks for.
+            could not distinguish; ``sensitivity`` to effects that the present trials would not have
+            shown; the name of a parameter; or ``auto``: by the diagnosis.
         seconds: length of the trial.
         plan: whether to make a set of trials, and its protocol sheet.
         trajectory: ``csv``, ``json`` or ``yaml``: the trial is a trajectory that drives follow, in
@@ -109,7 +109,7 @@ class Config(Criteria):
 
 @dataclass(frozen=True)
 class _Case:
-    """An identified model with its parameters, its trials and diagnosis, and what is asked."""
+    """An identified model with its parameters, its trials and diagnosis, and the request."""
 
     run: RunFolder
     config: Config
@@ -164,7 +164,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 def _read_case(
     run: RunFolder, config: Config, progress: Progress
 ) -> tuple[_Case, Purpose | Literal["auto"], str]:
-    """What is known of the model; the purpose and the parameter that are asked for."""
+    """Return the model with its results, and the requested purpose and parameter."""
     model = load_model(run, config.model)
     if config.trajectory:
         require_limits(model.device, f"device {model.device.name!r}")
@@ -229,7 +229,7 @@ def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Prog
 
 
 def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
-    """The designs to try, trials at hand among them."""
+    """Return the designs to try, including the present trials."""
     seconds, brakes = case.config.seconds, case.system.model.device.brakes
     if case.limits:
         count = count_affordable(forecast.rehearsal, seconds)
@@ -241,7 +241,7 @@ def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
         if not any(motion.channels[n].any() for n in brakes.values() if n in motion.channels)
     ]
     examples, of_effects = imitate_trials(free, case.seen, seconds), forecast.purpose != "precision"
-    # No parameters are fitted to what has the brakes on, but for those of brakes.
+    # Only parameters of brakes are fitted to trials with the brakes on.
     brakes_on = of_effects or case.system.braked
     return DesignSpace(
         forecast.rehearsal, seconds, case.seen.moved_axes, examples, of_effects, brakes_on
@@ -251,7 +251,7 @@ def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
 def _rank(
     forecast: Forecast, space: DesignSpace, parameter: str, progress: Progress
 ) -> list[RankedDesign]:
-    """The designs that serve the purpose best."""
+    """Return the designs of the highest utility."""
 
     def report(first: float, fraction: float, message: str) -> None:
         progress(first + 0.3 * fraction, message)
@@ -270,7 +270,7 @@ def _rank(
         )
         if ranked and ranked[0].utility >= _LITTLE:
             return ranked
-        # Nothing that a person could do here shows more: then for the parameters.
+        # No motion would show more: propose for the parameters.
         space = replace(space, with_rests=False, with_brakes=forecast.rehearsal.system.braked)
     precision = forecast.precision
 
@@ -283,7 +283,7 @@ def _rank(
 def _record(
     case: _Case, forecast: Forecast, parameter: str, ranked: Sequence[RankedDesign]
 ) -> NextResult:
-    """What is proposed, why, and what it is expected to give."""
+    """Return the proposal, its reason and its expected gain."""
     proposals = tuple(forecast.proposal(one) for one in ranked)
     table: dict[str, Detectable] = {}
     unbraked: tuple[str, ...] = ()
@@ -321,13 +321,13 @@ def _plan(
     ranked: Sequence[RankedDesign],
     best: Proposal,
 ) -> Plan:
-    """A set of trials that reaches what is asked."""
+    """Return a set of trials that reaches the goal."""
     precision, config = forecast.precision, case.config
     estimates = np.array([case.identified.parameters[name].estimate for name in precision.names])
-    # Of a model that lacks something, no uncertainty of parameters is asked for.
+    # For a model that lacks something, the plan has no goal for uncertainties.
     is_asked = (forecast.comparison is None) & (estimates != 0.0)
     goal = Goal(np.where(is_asked, config.sd * np.abs(estimates), np.inf), config.confusion)
-    # What the best design for all leaves too uncertain gets a design of its own.
+    # Parameters that the best design for all leaves too uncertain get designs of their own.
     asked = dict(zip(precision.names, goal.sd, strict=True))
     utilities = [
         partial(precision.worth, seconds=config.seconds, parameter=name)
@@ -344,12 +344,12 @@ def _plan(
 def _write_trajectory(
     out: Path, case: _Case, rehearsal: Rehearsal, best: RankedDesign, result: NextResult
 ) -> NextResult:
-    """Write what drives follow in each trial of the best design, and record how far it goes."""
+    """Write the trajectory of each trial of the best design, and record its extent."""
     config, series = case.config, best.design.series
     assert config.trajectory and series is not None
     points = Points.of_series(series, rehearsal)
     file = f"models/{config.model}/trajectory.{config.trajectory}"
-    # Drives go by the names of the drawing, of which a coordinate's may be another spelling.
+    # Drives have the names of the drawing; a coordinate's name may be spelt differently.
     drawn = read_tree(case.run.path(DRAWING)).joints if case.run.exists(DRAWING) else ()
     names = {identifier(joint.name): joint.name for joint in drawn}
     write_text(out / file, points.text(config.trajectory, names, result.sentence))
@@ -413,7 +413,7 @@ def _find_lacking(case: _Case) -> list[str]:
 
 
 def _summary(result: NextResult) -> dict[str, object]:
-    """The sentence first, then why and what for; the runners-up beside their worth."""
+    """Return the sentence, reason and gain, then the runners-up with their utilities."""
     more = [f"plan: {result.plan.sentence}"] if result.plan is not None else []
     if result.trajectory is not None:
         more += say_trajectory(result.trajectory)

@@ -44,7 +44,7 @@ OUTPUTS = (
 )
 
 SILENT_PERCENT = 30.0
-"""Fit of a robot's joint below which its parameters say nothing of it."""
+"""Fit of a robot's joint below which its parameters are meaningless."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -75,7 +75,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = read_measured_trials(run, system, timing=estimates.input_timing)
     require_sound_motions(system, trials.motions)
     progress(0.1, "residuals")
-    # Parameters found with the inputs late are those of inputs that late.
+    # Parameters estimated with delayed inputs belong to inputs with that delay.
     published = np.append(p, estimates.input_timing.estimate - trials.late_s)
     names = trial_names(trials.motions)
     unseen = [_leave_out(system, published, estimates, name) for name in names]
@@ -127,12 +127,12 @@ def _noise_floor(
     config: Config,
     progress: Progress,
 ) -> tuple[NoiseFloor | None, list[str]]:
-    """The floor, None where the fitted model cannot be simulated, and what to say of it."""
+    """Return the floor, None if the fitted model cannot be simulated, and notes on it."""
     progress(0.4, "noise floor")
     count = config.repeats or floor_replays(trials.motions)
     if count == 1:
         raise InputError("one replicate has no scatter", where="validate.repeats", remedy="set 2")
-    # Where the session holds trials out, these are few, and all are needed to judge by.
+    # Held-out trials are few, and all are needed for the judgement.
     chosen: Sequence[int] = range(len(trials.motions))
     if all(trials.folds.judged):
         chosen = draw_trials(trial_sizes(trials.motions))
@@ -209,7 +209,7 @@ def _result(
     notes: Sequence[str],
     identified: IdentifyResult,
 ) -> ValidateResult:
-    """Return what validate.json says."""
+    """Return the content of validate.json."""
     axes = {}
     for i, (axis, found) in enumerate(axis_errors(system, compared).items()):
         level, scatter = (floor.level[i], floor.sd[i]) if floor else (None, 0.0)
