@@ -95,7 +95,10 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             f"physically impossible body replaced by the nearest possible one: {line}"
             for line in device.robot.impossible
         ]
-    notes += [f"{place}: its source still says `fill in`" for place in description.placeholders]
+    notes += [
+        (f"{place}: still a placeholder, with `fill in` as its source")
+        for place in description.placeholders
+    ]
     if every > 1:
         notes.append(
             f"logged at {session.sample_rate:g} Hz, thinned to {rate:g} Hz: inputs after a low-pass"
