@@ -1,4 +1,4 @@
-"""bampipe: from raw trial logs of a manipulator to a mechanical model that people trust.
+"""bampipe: from raw trial logs of a manipulator to a mechanical model.
 
 For notebooks and programs, see docs/api.md::
 

@@ -1,4 +1,4 @@
-"""Kinds of arrays, as signatures name them; docstrings say their shapes."""
+"""Kinds of arrays in signatures; docstrings state their shapes."""
 
 from typing import Any
 

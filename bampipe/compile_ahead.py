@@ -1,10 +1,9 @@
-"""On a cold start, code that later stages need is compiled by processes beside the run.
+"""Compilation ahead: on a cold start, processes beside the run compile code for later stages.
 
-Where nothing is compiled yet, the first stage that wants compiled code would wait for it, and the
-next one again. Instead, processes beside the run compile the longest functions and leave their code
-on disk. No function is compiled twice, for what one process is at, the others wait for
-(`bampipe.compiled`). A process that fails leaves its part to the run, which then says what is
-wrong.
+Otherwise the first stage that needs compiled code would wait for it, and the next one again.
+Instead, processes beside the run compile the longest functions and leave their code on disk. No
+function is compiled twice, because processes wait for each other (`bampipe.compiled`). A process
+that fails leaves its part to the run, which then reports the fault.
 """
 
 import os
@@ -21,7 +20,7 @@ _PARTS: tuple[tuple[str, ...], ...] = (
     ("simulation._count_steps", "simulation._run"),
     ("square_root.filter_square_root",),
 )
-"""Functions of `bampipe.estimate` by process, those that are waited for first in front."""
+"""Functions of `bampipe.estimate` by process, in the order in which stages need them."""
 
 _END_WITH_PARENT = (
     "import gc, os, sys, threading; gc.disable(); "
@@ -32,7 +31,7 @@ _END_WITH_PARENT = (
 
 @contextmanager
 def compiling_ahead(processes: int) -> Iterator[bool]:
-    """Compile ahead during the block, where nothing is compiled yet.
+    """Compile ahead during the block if nothing is compiled yet.
 
     Args:
         processes: how many cores may be used, 0 for all; with one, nothing is started.
@@ -42,7 +41,7 @@ def compiling_ahead(processes: int) -> Iterator[bool]:
     """
     running: list[subprocess.Popen[bytes]] = []
     cold = False
-    with suppress(InputError):  # no folder: the run itself says so, with what to do
+    with suppress(InputError):  # no folder: the run itself reports it with a remedy
         folder = compiled_folder(Path(__file__).with_name("estimate"))
         cold = not folder.exists()
         waiting = [part for part in _PARTS if not any(folder.glob(f"{part[-1]}-*.nbi"))]

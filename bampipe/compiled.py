@@ -24,7 +24,7 @@ from bampipe.errors import InputError
 from bampipe.generated_code import make_compiled_folder
 
 _PATIENCE_S = 60.0
-"""How long to wait for another process before compiling what it does not finish."""
+"""Time to wait for another process before compiling its function here."""
 
 
 def njit(*signatures: Any, **options: Any) -> Any:
@@ -59,7 +59,7 @@ def njit(*signatures: Any, **options: Any) -> Any:
 
 
 def _promise(dispatcher: Any, signatures: Sequence[Any]) -> None:
-    """Compile a function for its signatures when it is first called from Python."""
+    """Compile a function for its signatures at its first call from Python."""
 
     def compile_promised(*arguments: Any) -> Any:
         del dispatcher._compile_for_args
@@ -71,7 +71,7 @@ def _promise(dispatcher: Any, signatures: Sequence[Any]) -> None:
             for signature in signatures:
                 dispatcher.compile(signature)
         dispatcher.disable_compile()
-        return dispatcher  # what numba calls then
+        return dispatcher  # numba's hook
 
     dispatcher.compile_promised = dispatcher._compile_for_args = compile_promised
 
@@ -123,7 +123,7 @@ def _one_process_at_a_time(cache: Any) -> Iterator[None]:
 
 
 class _Locator(caching._CacheLocator):
-    """A folder for each content of the sources; generated code names those that it calls."""
+    """A folder for each content of the sources; generated code names its callees."""
 
     def __init__(self, function: Callable[..., Any], path: str) -> None:
         self._line, self._py_file = function.__code__.co_firstlineno, path
@@ -148,20 +148,20 @@ class _Code(caching.CompileResultCacheImpl):
 
 
 class _Cache(caching.FunctionCache):
-    """numba's cache of one function, which a damaged file or a full disk leaves without effect."""
+    """numba's cache of one function, disabled by a damaged file or a full disk."""
 
     _impl_class = _Code
 
     @property
     def index(self) -> Path:
-        """File that is there once the function is compiled."""
+        """A file that exists once the function is compiled."""
         return Path(self._cache_file._index_path)
 
     def load_overload(self, signature: Any, target: Any) -> Any:
-        """Return compiled code; None where there is none that can be read."""
+        """Return compiled code; None if none can be read."""
         try:
             return super().load_overload(signature, target)
-        except Exception:  # whatever pickle raises for a file that a loss of power cut off
+        except Exception:  # any exception of pickle for a truncated file
             with suppress(OSError):
                 self.flush()
             return None

@@ -25,7 +25,7 @@ def printable(text: str) -> str:
 
 
 class InputError(Exception):
-    """A mistake in what the user gave: shown as one line, exit code 2, no traceback.
+    """A mistake in the user's input: shown as one line, exit code 2, no traceback.
 
     Args:
         what: what is wrong, in the user's terms.
@@ -78,22 +78,22 @@ def located(place: str, joint: str = ", ") -> Iterator[None]:
 
 
 class MissingResultError(InputError):
-    """A result that is needed has not been made yet: a stage was asked for too early."""
+    """A required result does not exist yet: a stage was requested too early."""
 
 
 class NothingToDoError(InputError):
-    """A stage was asked for something that these results leave no room for."""
+    """These results leave the requested stage nothing to do."""
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """``, did you mean 'x'?`` for the closest of ``known``, or nothing where none is close."""
+    """Return ``, did you mean 'x'?`` for the closest of ``known``, or nothing if none is close."""
     lowered = {str(name).lower(): name for name in known}
     close = difflib.get_close_matches(word.lower(), lowered, n=1)
     return f", did you mean '{lowered[close[0]]}'?" if close else ""
 
 
 def choose_from(word: str, known: Iterable[str]) -> str:
-    """As a remedy: the closest of ``known``, or all of them where none is close."""
+    """Return as a remedy the closest of ``known``, or all of them if none is close."""
     names = sorted(known)
     nearest = did_you_mean(word, names).removeprefix(", ")
     return nearest or (f"choose from {', '.join(names)}" if names else "")

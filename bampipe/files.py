@@ -23,7 +23,7 @@ from bampipe.errors import InputError
 
 LARGEST_TOML_BYTES = 4_000_000
 LARGEST_JSON_BYTES = 100_000_000
-"""A file larger than this is taken for something else, and not parsed."""
+"""A larger file is not parsed."""
 
 DEEPEST = 40
 """Tables nested more deeply than this are refused (code that walks them may recurse)."""
@@ -40,7 +40,7 @@ STORAGE_FAULTS = {
     errno.EISDIR: "a folder is in the way of a file",
     errno.ENAMETOOLONG: "a name is too long",
 }
-"""What the disk may refuse, in words."""
+"""Refusals of the disk, in words."""
 
 _REMEDIES = {
     errno.ENOSPC: "free some space and run again",
@@ -177,7 +177,7 @@ def atomic_writer(path: Path, *, durable: bool = True) -> Iterator[BinaryIO]:
 
 @contextmanager
 def temporary_space() -> Iterator[None]:
-    """A block that writes temporary files: what their disk refuses is said of that disk.
+    """A block that writes temporary files, in which faults of their disk name that disk.
 
     Raises:
         InputError: there is no folder for temporary files, or its disk is full or the like.
@@ -265,10 +265,10 @@ def digest_content(content: object) -> str:
 
 
 def digest_input(path: Path) -> str:
-    """Return the hash of an input: a TOML file counts by what it says, others by their bytes.
+    """Return the hash of an input: a TOML file counts by its content, others by their bytes.
 
-    White space and comments in a TOML file therefore change nothing. A file that is not valid
-    TOML counts by its bytes: the stage that reads it says what is wrong with it.
+    White space and comments in a TOML file therefore change nothing. An invalid TOML file counts by
+    its bytes: the stage that reads it reports its faults.
     """
     if path.suffix == ".toml":
         with suppress(InputError):
@@ -277,7 +277,7 @@ def digest_input(path: Path) -> str:
 
 
 def cannot(verb: str, path: Path, error: OSError) -> InputError:
-    """Return what to tell the user of a file that cannot be read or written (``verb``)."""
+    """Return the error for a file that cannot be read or written (``verb``)."""
     reason = STORAGE_FAULTS.get(error.errno or 0) or (error.strerror or str(error)).lower()
     return InputError(
         f"cannot {verb}: {reason}", where=str(path), remedy=_REMEDIES.get(error.errno or 0, "")

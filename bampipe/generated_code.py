@@ -2,7 +2,7 @@
 
 All of it is in one folder of the user: the source of each model in one file, by the hash of what it
 depends on, and what is compiled in one folder for each content of the sources, wherever these are.
-Where the folder cannot be made, used or written, an `InputError` says so.
+If the folder cannot be made, used or written, an `InputError` is raised.
 """
 
 import hashlib
@@ -25,7 +25,7 @@ from bampipe.files import digest_bytes, write_text
 _SHARED = ("compiled.py", "model_functions.py")
 """Modules beside this one that all compiled code depends on."""
 _GENERATOR = Path(__file__).with_name("physics")
-"""What generates code, and whose functions that may call."""
+"""Packages that generate code, or whose functions it may call."""
 _LONGEST_UNUSED_S = 30 * 86400.0
 """Compiled code of other sources is removed after this time."""
 _REMEDY = "set BAMPIPE_CACHE_DIR to a folder of your own"
@@ -36,7 +36,7 @@ class Generated:
     """The generated code of one model.
 
     Attributes:
-        facts: what the generator says of the model; JSON can hold it.
+        facts: results of the generator that JSON can hold.
         sources: Python source of each module, by name.
     """
 
@@ -74,7 +74,7 @@ def module_title(name: str, source: str) -> str:
 
 
 def load(key: str, generate: Callable[[], tuple[dict[str, Any], Mapping[str, str]]]) -> Generated:
-    """Return the code under ``key``, generated and written where there is none that can be read.
+    """Return the code under ``key``, generated and written if none can be read.
 
     Args:
         key: hash of everything the code depends on.
@@ -112,9 +112,9 @@ def folder_of_user() -> Path:
 
 @cache
 def hash_sources(folder: Path) -> str:
-    """Hash of the Python sources in ``folder``, and of what all compiled code depends on.
+    """Return the hash of the Python sources in ``folder`` and of all that compiled code depends on.
 
-    Taken once a process, as modules are imported once.
+    It is computed once per process, as modules are imported once.
     """
     digest = hashlib.sha256()
     for path in [*sorted(folder.glob("*.py")), *(Path(__file__).with_name(n) for n in _SHARED)]:
@@ -123,7 +123,7 @@ def hash_sources(folder: Path) -> str:
 
 
 def compiled_folder(sources: Path) -> Path:
-    """Where that is which numba compiled from the modules in ``sources``, made or not."""
+    """Return the folder of numba's code for the modules in ``sources``, existing or not."""
     return folder_of_user() / f"numba_{hash_sources(sources)[:24]}"
 
 

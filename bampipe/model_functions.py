@@ -8,7 +8,7 @@ DERIVATIVE = types.FunctionType(types.void(*[_vector] * 5))
 """f(x, u, p, w, dx) -> None: state derivative written into dx."""
 
 MEASURE = types.FunctionType(types.void(*[_vector] * 4))
-"""h(x, u, p, y) -> None: what the encoders read, positions then velocities, written into y."""
+"""h(x, u, p, y) -> None: encoder readings, positions then velocities, written into y."""
 
 COMMAND = MEASURE
 """c(y, r, s, out) -> None: commands of a controller and rates of its states, from readings,

@@ -1,13 +1,13 @@
-"""How long work says how far it is."""
+"""Progress reports of long work."""
 
 from typing import Protocol
 
 
 class Progress(Protocol):
-    """Called by a stage to say how far it is."""
+    """A callback with which a stage reports its progress."""
 
     def __call__(self, fraction: float, message: str) -> None:
-        """Report that ``fraction`` (0 to 1) is done; ``message`` says what is under way."""
+        """Report that ``fraction`` (0 to 1) is done; ``message`` names the work in progress."""
 
 
 def silent(fraction: float, message: str) -> None:

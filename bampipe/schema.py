@@ -28,19 +28,19 @@ from pydantic_core import PydanticCustomError, core_schema
 from bampipe.errors import InputError, did_you_mean
 
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-"""Unknown keys are refused, and nothing is converted; of declarations and of stage settings."""
+"""Configuration of declarations and stage settings: no unknown keys, no conversion."""
 
 
 class Declaration(BaseModel):
     """A table of a file: unknown keys are refused, and nothing is converted but lists to tuples.
 
-    What is wrong between fields is found by `cross_faults`, once every field is right by itself.
+    Faults between fields are found by `cross_faults` once every field is valid by itself.
     """
 
     model_config = ConfigDict(**STRICT, frozen=True, arbitrary_types_allowed=True)
 
     def cross_faults(self) -> Iterator[InputError]:
-        """Everything wrong between the fields; ``where`` is a key below this table, or empty."""
+        """Yield every fault between the fields; ``where`` is a key below this table, or empty."""
         yield from ()
 
     @model_validator(mode="after")
@@ -66,7 +66,7 @@ T = TypeVar("T")
 
 
 def fault(what: str, remedy: str = "") -> PydanticCustomError:
-    """Return what the validator of a field raises: the words of an `InputError`."""
+    """Return the exception of a field's validator, with the words of an `InputError`."""
     return PydanticCustomError("faults", "faults", {"found": [InputError(what, remedy=remedy)]})
 
 
@@ -109,7 +109,7 @@ Distinct = Annotated[
 
 
 class ByName:
-    """Of ``Annotated[tuple[NamedDeclaration, ...], ByName(key)]``: a table of tables in the file.
+    """Annotation of ``tuple[NamedDeclaration, ...]``: a table of tables in the file.
 
     Args:
         key: type of the names.
@@ -138,8 +138,8 @@ def read(kind: type[D], content: object, where: str) -> D:
     """Check the ``content`` of the file ``where`` against its declaration.
 
     Raises:
-        InputError: names the file, the field (dotted), what was found, what is expected; and so
-            for every other field that is wrong.
+        InputError: names the file, the field (dotted), what was found, what is expected; and
+            likewise for every other wrong field.
     """
     try:
         return kind.model_validate(content)
@@ -150,13 +150,13 @@ def read(kind: type[D], content: object, where: str) -> D:
 def refusal(
     error: ValidationError, kind: type, where: str, inside: Sequence[str] = ()
 ) -> InputError:
-    """What `read` raises for an ``error`` of pydantic; ``inside``: the table that was checked."""
+    """Return the error of `read` for an ``error`` of pydantic; ``inside``: the checked table."""
     first, *others = _faults(error, kind, where, inside)
     return InputError(first.what, where=first.where, remedy=first.remedy, others=others)
 
 
 def faults(kind: type[Declaration], content: object, where: str) -> list[InputError]:
-    """Everything for which `read` refuses ``content``, one error a field; none where it fits."""
+    """Return every fault for which `read` refuses ``content``, one error per field."""
     try:
         kind.model_validate(content)
     except ValidationError as error:
@@ -165,7 +165,7 @@ def faults(kind: type[Declaration], content: object, where: str) -> list[InputEr
 
 
 class _Generator(GenerateJsonSchema):
-    """JSON Schema without titles of fields, defaults that JSON has not, keys of another form."""
+    """JSON Schema without titles of fields, defaults outside JSON, and keys of another form."""
 
     def dict_schema(self, schema: Any) -> dict[str, Any]:
         content = super().dict_schema(schema)
@@ -229,13 +229,13 @@ _EXPECTED = {
 def _faults(
     error: ValidationError, kind: type, where: str, inside: Sequence[str] = ()
 ) -> list[InputError]:
-    # A list is counted short where its entries are wrong: they are reported instead.
+    # A list with wrong entries counts as short: the entries are reported instead.
     found = [
         e
         for e in error.errors(include_url=False)
         if e["type"] != "too_short" or len(e["input"]) < e["ctx"]["min_length"]
     ]
-    # A key that is not known often is a missing one misspelt: it comes first.
+    # An unknown key is often a misspelt missing one: it comes first.
     keys = (*_UNKNOWN, "missing")
     found.sort(
         key=lambda e: (e["type"] not in keys or len(e["loc"]) > 1, e["type"] not in _UNKNOWN)
@@ -288,7 +288,7 @@ def _in_words(error: Any, path: list[Any], schema: Mapping[str, Any], where: str
 
 
 def _node(schema: Mapping[str, Any], path: Iterable[str | int]) -> Mapping[str, Any]:
-    """What ``schema`` says of the place ``path``; a part ``#Name`` chooses that definition."""
+    """Return the part of ``schema`` at ``path``; a part ``#Name`` chooses that definition."""
     node = schema
     for part in path:
         if str(part).startswith("#"):

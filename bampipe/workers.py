@@ -1,4 +1,4 @@
-"""Worker processes: they end with the process that started them, however that one ends."""
+"""Worker processes, which end with their parent, however it ends."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ Returned = TypeVar("Returned")
 def end_with_parent() -> None:
     """Tie this process to the one that started it; called first in every worker process.
 
-    A parent that is killed can tell nobody, but the system then closes the pipe between the two.
-    Ctrl-C reaches every process of a terminal: the parent answers it, and ends its workers.
+    If the parent is killed, the system closes the pipe between the two. Ctrl-C reaches every
+    process of a terminal: the parent handles it, and ends its workers.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -41,7 +41,7 @@ def end_with_parent() -> None:
 
 
 _parent: multiprocessing.connection.Connection | None = None
-"""In a worker process: the way to the one that started it."""
+"""In a worker process: the pipe to its parent."""
 
 
 def send_to_parent(message: object) -> None:
@@ -59,7 +59,7 @@ def process_pool(
     nested: bool = False,
     hear: Callable[[Any], None] = lambda message: None,
 ) -> Iterator[ProcessPool]:
-    """A pool of worker processes for the length of the block; what they are at then is given up.
+    """A pool of worker processes for the length of the block; unfinished tasks are then dropped.
 
     Args:
         initialize: called in each process before its first task, with ``arguments``.
@@ -86,8 +86,8 @@ def process_pool(
 class ProcessPool:
     """Deals tasks to worker processes.
 
-    The executor of the standard library does not do here: an exception in the block, such as that
-    of Ctrl-C, waits there for every task, or for ever if it comes while the processes start.
+    The executor of the standard library is unsuitable: an exception in the block, such as that of
+    Ctrl-C, waits for every task, or for ever while the processes start.
     """
 
     def __init__(
@@ -107,12 +107,13 @@ class ProcessPool:
         """Start ``function`` on every task, and return the results in the order of the tasks.
 
         Args:
-            function: of a module, what it takes and returns can be pickled; tasks: what it takes.
-            lost: gives the result of a task whose worker process was ended; another takes its
-                place.
+            function: of a module, with arguments and results that can be pickled; tasks: its
+            arguments.
+            lost: gives the result of a task whose worker process was killed; another process
+                replaces it.
 
         Raises:
-            InputError: a worker process was ended by another, and there is no ``lost``.
+            InputError: a worker process was killed, and there is no ``lost``.
             Exception: what ``function`` raised, with the traceback of the worker as a note.
         """
         first = self._number
@@ -168,7 +169,7 @@ class ProcessPool:
 
 @dataclass(frozen=True)
 class _Task:
-    """A call that a worker makes, and what stands for its result where the worker is ended."""
+    """A call in a worker, and the replacement of its result if the worker is killed."""
 
     number: int
     function: Callable[[Any], Any]
@@ -178,7 +179,7 @@ class _Task:
 
 @dataclass(frozen=True)
 class _Message:
-    """What a task sends before it is done."""
+    """A message of a task before its end."""
 
     content: object
 

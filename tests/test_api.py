@@ -87,8 +87,11 @@ def test_a_run_is_found_by_its_name(run, monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("ask", "said"),
     [
-        (lambda run: run.diagnosis(), "models/base/diagnose.json is not there yet.*bampipe diagno"),
-        (lambda run: run.stiffness, "stiffness.json is not there yet"),
+        (
+            lambda run: run.diagnosis(),
+            "models/base/diagnose.json does not exist yet.*bampipe diagno",
+        ),
+        (lambda run: run.stiffness, "stiffness.json does not exist yet"),
         (lambda run: run.parameters("bose"), "no results for model 'bose'; choose from base"),
         (lambda run: bampipe.open_run(run.root / "none"), "no run here; make one"),
         (lambda run: bampipe.run_session("nowhere"), "nowhere: no such session folder"),

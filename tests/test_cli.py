@@ -150,7 +150,7 @@ def test_sessions_of_one_id_and_settings_reach_the_run_once(toy: Toy, command: C
         (["--until", "ingest"], "no stage 'ingest'"),
         (["--set", "toy_double.factr=5"], "did you mean 'factor'"),
         (["--set", "toy_duble.factor=5"], "did you mean 'toy_double'"),
-        (["--set", "factor=5"], "does not say which stage"),
+        (["--set", "factor=5"], "names no stage"),
         (["--set", "nothing"], "write --set name=value"),
         (["--pipeline", "defualt"], "did you mean 'default'"),
         (["--pipeline", "absent.toml"], "no such pipeline file"),
@@ -518,7 +518,7 @@ def test_what_has_been_drafted_is_not_asked_for_again(ingested: Path) -> None:
 @pytest.mark.parametrize("option", [["--set", "sigmas=2"], ["--pipeline", "strict"], ["--force"]])
 def test_two_runs_are_compared_as_they_are(command: Command, option: list[str]) -> None:
     said = one_line_error(*command("compare", "s01", "s02", *option))
-    assert f"{option[0]} has no effect on two runs" in said
+    assert f"{option[0]} has no effect for two runs" in said
 
 
 def test_a_diagnosis_that_is_older_than_its_inputs_is_said(

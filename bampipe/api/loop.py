@@ -290,7 +290,7 @@ def _add(
     child = extend(options, model, effects)
     found = RunFolder(options.root).read(IdentifyResult, child).effects
     if weak := [name for name in effects if not found[name].has_strength]:
-        tell(f"{', '.join(weak)}: no strength beside the other parameters, removed")
+        tell(f"{', '.join(weak)}: strength not significantly different from zero, removed")
         effects = tuple(effect for effect in effects if effect not in weak)
         _remove(options, child)
         if not effects:

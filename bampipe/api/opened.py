@@ -175,7 +175,7 @@ class Run:
     def _require(self, found: T | None, relative: str, stage: str) -> T:
         if found is None:
             raise InputError(
-                f"{relative} is not there yet",
+                f"{relative} does not exist yet",
                 where=str(self.root),
                 remedy=f"`bampipe {stage} {self.root}` makes it, or bampipe.{stage}(run)",
             )

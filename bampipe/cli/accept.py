@@ -14,7 +14,7 @@ from bampipe.run import accepted, models
 def accept(
     run: RunArgument = None,
     model: BestModelOption = "",
-    force: Annotated[bool, typer.Option("--force", help="Even if a gate failed.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Accept even if a gate failed.")] = False,
     folder: Annotated[
         Path | None,
         typer.Option("--accepted", help="Folder to write to; accepted/ beside runs if omitted."),

@@ -21,8 +21,9 @@ from bampipe.errors import InputError
 
 app = typer.Typer(
     name="bampipe",
-    help="From raw trial logs of a manipulator to a mechanical model that says what it lacks.\n\n"
-    "Start with: bampipe run SESSION. Exit codes: 0 done, 1 a quality gate failed, 2 bad input.",
+    help="Identify a mechanical model of a manipulator from raw trial logs, and find the missing"
+    " effects.\n\nStart with: bampipe run SESSION. Exit codes: 0 done, 1 a quality gate failed,"
+    " 2 bad input.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -30,14 +30,14 @@ def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str],
     session = samples / "demo"
     root = runs / session_id(session)
     chosen = pipeline.load()
-    tell(f"1. {session}: an arm with something wrong that its model does not know.")
+    tell(f"1. {session}: an arm with a fault that its model lacks.")
     run_session(Request(root, chosen, session=session, force=force, judge=True), listen)
     for axis, error in RunFolder(root).read(ValidateResult, models.BASE).axes.items():
         tell(
             f"   {axis}: error on unseen trials {error.held_out_rmse:.3g} {error.unit}, "
             f"sensor noise alone would leave {error.noise_floor:.3g} {error.unit}"
         )
-    tell("2. Which effect is missing? The diagnosis, then the model extended, until nothing is.")
+    tell("2. Which effect is missing? Diagnose and extend the model until nothing is missing.")
     options = LoopOptions(root, chosen.with_every_stage(), force, True, listen)
     last = follow(options, models.BASE, lambda line: tell(f"   {line}"))
     tell("3. The error on unseen trials, model by model.")

@@ -10,7 +10,7 @@ from bampipe.cli import show
 from bampipe.cli.options import JsonOption
 from bampipe.errors import InputError
 
-SUMMARY = "The devices there are, their equations of motion, and device files checked."
+SUMMARY = "List devices, show their equations of motion, and check device files."
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -79,7 +79,7 @@ def check(
     picture: Annotated[
         Path | None,
         typer.Option(
-            help="Of a robot: draw its joints and bodies into this SVG file.", metavar="FILE"
+            help="For a robot: draw its joints and bodies into this SVG file.", metavar="FILE"
         ),
     ] = None,
     json: JsonOption = False,

@@ -10,16 +10,17 @@ from bampipe.cli.options import JsonOption, QuietOption
 
 
 def init(
-    folder: Annotated[Path, typer.Argument(help="Folder of logs; sub-folders are looked through.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of logs, with its sub-folders.")],
     device: Annotated[
         str,
         typer.Option(help="A built-in device, or a device file in the folder; guessed if omitted."),
     ] = "",
     names: Annotated[
-        str, typer.Option(help="Names of the columns of texts without a header, as t,q,tau_nm.")
+        str, typer.Option(help="Column names of text files without a header, such as t,q,tau_nm.")
     ] = "",
     episodes: Annotated[
-        str, typer.Option(help="Of a data set of LeRobot: those that become trials, as 0:20 or 7.")
+        str,
+        typer.Option(help="Episodes of a LeRobot data set to take as trials, such as 0:20 or 7."),
     ] = "",
     dry: Annotated[
         bool, typer.Option("--dry", help="Print the session file instead of writing it.")
@@ -56,7 +57,7 @@ def init(
     if quiet:
         return
     for title, lines in (
-        ("fill in, or the session is refused:", proposal.fill_in),
+        ("fill in these entries, or the session is refused:", proposal.fill_in),
         ("check, these are guesses:", proposal.check),
         ("left out:", proposal.passed),
     ):

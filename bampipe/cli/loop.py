@@ -79,13 +79,11 @@ def extend(
     ] = None,
     auto: Annotated[
         bool,
-        typer.Option(
-            "--auto", help="Add the effects that diagnoses find, until nothing is missing."
-        ),
+        typer.Option("--auto", help="Diagnose and add effects until nothing is missing."),
     ] = False,
     draft: Annotated[
         bool,
-        typer.Option("--draft", help="With --auto: draft a formula where no effect has a name."),
+        typer.Option("--draft", help="With --auto: draft a formula for an unexplained residual."),
     ] = False,
     model: BestModelOption = "",
     force: ForceOption = False,

@@ -42,18 +42,18 @@ def monitor(
     ] = "",
     session: Annotated[
         Path | None,
-        typer.Option("--session", help="Session folder whose raw-log columns FILE has."),
+        typer.Option("--session", help="Session folder whose raw logs have the columns of FILE."),
     ] = None,
     every: Annotated[float, typer.Option("--every", help="Seconds of data per line.")] = 1.0,
     window_s: Annotated[
         float, typer.Option("--window", help="Length of the windows that the alarm judges, s.")
     ] = 1.0,
     false_alarms: Annotated[
-        float, typer.Option("--false-alarms", help="Of a consistent filter, per hour.")
+        float, typer.Option("--false-alarms", help="False alarms of a consistent filter, per hour.")
     ] = 1.0,
     memory_s: Annotated[
         float,
-        typer.Option("--memory", help="Time over which parameters may wander by their sd, s."),
+        typer.Option("--memory", help="Time in which parameters may drift by their sd, s."),
     ] = 60.0,
     once: Annotated[
         bool, typer.Option("--once", help="Stop at the end of the file; do not wait for more.")
@@ -134,7 +134,7 @@ def follow(stream: SampleStream, watch: Monitor, output: _Output, wait: bool) ->
 
 
 class _Output:
-    """JSON lines, one an interval of data; on a terminal a table drawn a few times a second."""
+    """Write a JSON line per interval of data, or on a terminal a table a few times a second."""
 
     def __init__(self, screen: Live | None, every: float) -> None:
         self._every, self._next, self._drawn = every, -float("inf"), 0.0

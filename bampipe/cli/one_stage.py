@@ -84,7 +84,7 @@ def run_stage(
     Args:
         session: the session folder, of a stage that reads it.
         model: the only model to run; all that the pipeline names, if empty.
-        more: settings from options that only this stage has; what is empty was not given.
+        more: settings from options that only this stage has; empty ones were not given.
     """
     batch.limit_threads(1)
     settings = parse_settings(options.settings)
@@ -121,8 +121,8 @@ def _say_if_outdated(root: Path, pipeline: Pipeline, model: str) -> None:
         # Settings that differ from the pipeline's do not make it wrong; other inputs do.
         if step.step == f"diagnose:{model}" and step.state == "stale" and "/" in step.reason:
             show.say(
-                f"note: the diagnosis of {model} is older than what it was made from"
-                f" ({step.reason}): run `bampipe diagnose {root} --model {model}`, and this again."
+                f"note: the diagnosis of {model} is older than its inputs ({step.reason}): run"
+                f" `bampipe diagnose {root} --model {model}`, and this again."
             )
 
 

@@ -13,7 +13,7 @@ RunArgument = Annotated[
     str | None,
     typer.Argument(
         metavar="[RUN]",
-        help="A run by its name in --runs, or by its path or session; the latest if omitted.",
+        help="Name of a run in --runs, or its path or session; the latest if omitted.",
     ),
 ]
 RunsOption = Annotated[

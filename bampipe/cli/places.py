@@ -1,4 +1,4 @@
-"""Which session and which run an argument means."""
+"""Resolution of arguments to sessions and runs."""
 
 import glob
 from collections.abc import Sequence

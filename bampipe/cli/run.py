@@ -44,7 +44,8 @@ def run(
         str, typer.Option(help="Address of the Dask scheduler, tcp://host:port.")
     ] = "",
     first: Annotated[
-        str, typer.Option("--from", metavar="STAGE", help="Take earlier stages as they stand.")
+        str,
+        typer.Option("--from", metavar="STAGE", help="First stage to run."),
     ] = "",
     last: Annotated[
         str, typer.Option("--until", metavar="STAGE", help="Stop after this stage.")
@@ -145,7 +146,7 @@ def _make_requests(common: Request, folders: Sequence[Path]) -> tuple[list[Reque
             root = common.root / session_id(folder)
             if root in requests:
                 raise InputError(
-                    f"session_id {root.name!r} is that of {requests[root].session} too",
+                    f"session_id {root.name!r} is also that of {requests[root].session}",
                     where=str(folder),
                     remedy="give each session an id of its own",
                 )
@@ -163,9 +164,7 @@ def _split_settings(given: Sequence[str] | None) -> dict[str, dict[str, object]]
     for name, value in parse_settings(given).items():
         stage, dot, setting = name.partition(".")
         if not dot:
-            raise InputError(
-                f"{name!r} does not say which stage", remedy=f"write --set STAGE.{name}=..."
-            )
+            raise InputError(f"{name!r} names no stage", remedy=f"write --set STAGE.{name}=...")
         base.check_stage_name(stage)
         found.setdefault(stage, {})[setting] = value
     return found

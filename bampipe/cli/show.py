@@ -33,7 +33,7 @@ FIRST_COLUMNS = (
     *("effect", "axis", "held_out_rmse_before", "held_out_rmse_after"),
     *("probability", "p_value"),
 )
-"""In this order, whether a summary has just been made or is read from the run folder."""
+"""Order of the tables, for a new summary and for one read from the run folder."""
 
 
 def format_cell(value: object) -> str:
@@ -52,7 +52,7 @@ def format_cell(value: object) -> str:
 
 
 class OutputClosedError(Exception):
-    """The reader of our output has closed it; not an OSError, which typer makes a failed gate."""
+    """The reader has closed the output; no OSError, which typer would make a failed gate."""
 
 
 def write_line(line: str) -> None:
@@ -83,7 +83,7 @@ def print_json(content: object) -> None:
 
 
 def page(path: Path) -> None:
-    """Open a page in the user's browser; InputError where none can be started."""
+    """Open a page in the user's browser; InputError if none can be started."""
     import webbrowser
 
     if not webbrowser.open(path.resolve().as_uri()):
@@ -276,7 +276,7 @@ def print_advice(command: str, quiet: bool = False, json: bool = False) -> None:
 
 
 def _print_model(model: str) -> None:
-    say(f"\nmodel that counts: {model}; --model takes another")
+    say(f"\nmodel that counts: {model}; --model selects another")
 
 
 class _Line:
@@ -356,7 +356,7 @@ class Watcher:
             self._draw(event, name)
 
     def follow(self, run: str, step: str) -> Progress:
-        """Return what a step calls to say how far it is."""
+        """Return the progress callback of a step."""
         return lambda fraction, message: self(Event(run, step, "progress", fraction, message))
 
     def _write(self, event: Event, name: str) -> None:
@@ -373,7 +373,7 @@ class Watcher:
         self.write_late_lines()
 
     def write_late_lines(self) -> None:
-        """Write a line on each step about which none was written for some time."""
+        """Write a line on each step that has had none for some time."""
         with self.lock:
             for name, line in self.lines.items():
                 now = time.monotonic()

@@ -93,7 +93,7 @@ performance = _command_of_models(
     "performance", "Compute workspace, stiffness, friction, inertia and force at the handle."
 )
 validate = _command_of_models(
-    "validate", "Compare predicted with measured force, on trials the parameters never saw."
+    "validate", "Compare predicted and measured force on trials that the parameters have not seen."
 )
 
 
@@ -111,7 +111,7 @@ def next_(
         float, typer.Option(help="Length of the trial; 20 if omitted.", show_default=False)
     ] = 0.0,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Also plan a set of trials, as a sheet to print.")
+        bool, typer.Option("--plan", help="Also plan a set of trials, with a sheet to print.")
     ] = False,
     sd: Annotated[
         str,
@@ -122,7 +122,7 @@ def next_(
     ] = "",
     form: Annotated[
         str,
-        typer.Option("--as", help="trajectory: a file that motors follow, for robots and axes."),
+        typer.Option("--as", help="trajectory: a file for motors to follow, for robots and axes."),
     ] = "",
     out: Annotated[
         Path | None,
@@ -130,7 +130,7 @@ def next_(
     ] = None,
     options: StageOptions = DEFAULTS,
 ) -> None:
-    """Propose the trial to record next, in one sentence, with its expected result.
+    """Propose the trial to record next, in one sentence, with its expected gain.
 
     Example: bampipe next 2026-10-03_s01
 
@@ -196,21 +196,21 @@ def compare(
     run: RunArgument = None,
     other: Annotated[
         str | None,
-        typer.Argument(metavar="[RUN_B]", help="A second session of the device: what changed?"),
+        typer.Argument(metavar="[RUN_B]", help="A second session of the device, to be compared."),
     ] = None,
     model: Annotated[
-        str, typer.Option(help="Of two runs: the model of both; else the best of each.")
+        str, typer.Option(help="For two runs: the model of both; otherwise the best of each.")
     ] = "",
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Of two runs: a page to write, as HTML.")
+        Path | None, typer.Option("--out", "-o", help="For two runs: HTML page to write.")
     ] = None,
     options: StageOptions = DEFAULTS,
 ) -> None:
     """Print the ladder of a run's models; of two runs, what changed between the sessions.
 
-    Two sessions of one device are compared by parameters, verdicts and residuals, and by what the
-    model of each predicts for the trials of the other. A model that does not travel is refitted in
-    one parameter after another, and else diagnosed on those trials.
+    Two sessions of one device are compared by parameters, verdicts and residuals, and by the
+    predictions of each model for the trials of the other. A model that does not travel is refitted
+    in one parameter after another, and else diagnosed on those trials.
 
     Example: bampipe compare 2026-10-03_s01
 
@@ -222,8 +222,8 @@ def compare(
     given = {"--set": options.settings, "--pipeline": options.pipeline, "--force": options.force}
     if useless := [name for name, value in given.items() if value]:
         raise InputError(
-            f"{useless[0]} has no effect on two runs, which are compared as they are",
-            remedy=f"leave {useless[0]} out, or run the stage that it is for",
+            f"{useless[0]} has no effect for two runs, which are compared as they are",
+            remedy=f"omit {useless[0]}, or run its stage",
         )
     from bampipe.api.session_pair import compare_runs
     from bampipe.report.pair_page import build_page, tabulate_pair
@@ -256,7 +256,7 @@ def report(
         str,
         typer.Option(
             metavar="RUN",
-            help="Another run of the device, on one page for exploring with this one.",
+            help="Another run of the device, shown with this one on the page for exploring.",
         ),
     ] = "",
     options: StageOptions = DEFAULTS,

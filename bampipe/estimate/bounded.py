@@ -19,19 +19,19 @@ from scipy.optimize import lsq_linear
 from bampipe.arrays import Array, Flags
 
 _RANK_TOLERANCE = 1e-12
-"""Of the largest eigenvalue, at unit diagonal: what lies below is rounding."""
+"""Eigenvalues below this share of the largest, at unit diagonal, are rounding errors."""
 _DETERMINED = 1e-6
-"""Least squared pivot of a Cholesky factor, at unit diagonal, of what is surely determined."""
+"""A Cholesky factor whose squared pivots exceed this, at unit diagonal, is well determined."""
 _MOST_CHANGES = 20
-"""Of the set of coefficients at a bound, before the method that always ends is taken."""
+"""Changes of the active set before the method that always terminates takes over."""
 _SMALLEST_SHARE = 1e-3
-"""Of a Gauss-Newton step, after which halving it ends."""
+"""Halving of a Gauss-Newton step ends at this share of it."""
 
 
 def scaled_eigenbasis(matrix: Array) -> tuple[Array, Array, Array, Flags]:
-    """Eigenvectors of normal equations in coefficients that make their diagonal one.
+    """Return the eigenvectors of normal equations, scaled to a unit diagonal.
 
-    A coefficient that nothing is known of keeps its scale and is a null vector by itself.
+    A coefficient without any information keeps its scale and is a null vector by itself.
 
     Args:
         matrix: (n, n) symmetric, not negative.
@@ -48,7 +48,7 @@ def scaled_eigenbasis(matrix: Array) -> tuple[Array, Array, Array, Flags]:
 def invert_scaled(matrix: Array) -> Array:
     """Pseudo-inverse of normal equations, whatever the units of the coefficients.
 
-    Inverted as they are, a stiffness in N/m beside a position in m would pass for not determined.
+    Without scaling, a stiffness in N/m beside a position in m would seem undetermined.
 
     Args:
         matrix: (n, n) symmetric, not negative.
@@ -67,7 +67,7 @@ def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> A
 
     Args:
         normal: (n, n) slope^T slope; moment: (n,) slope^T measured, whatever the weights.
-        lower, upper: (n,), infinite where there is no bound; equal where a coefficient is given.
+        lower, upper: (n,), infinite without a bound, equal for a given coefficient.
     """
     quick = _solve_definite(normal, moment, lower, upper)
     if quick is not None:
@@ -83,7 +83,7 @@ def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> A
 
 
 def _solve_within(normal: Array, moment: Array, lower: Array, upper: Array) -> Array:
-    """`solve_bounded` where directions may be undetermined and no coefficient is given, (n,)."""
+    """Solve as `solve_bounded` does, allowing undetermined directions, (n,)."""
     basis = scaled_eigenbasis(normal)
     x = _least_norm(basis, moment)
     if np.all((x >= lower) & (x <= upper)):
@@ -94,7 +94,7 @@ def _solve_within(normal: Array, moment: Array, lower: Array, upper: Array) -> A
     range_ = lower * scale, upper * scale
     at = lsq_linear(root, target, range_, method="bvls", max_iter=10 * lower.size).active_mask
     x = np.where(at < 0, lower, upper)
-    # Only which are at a bound: along undetermined directions the coefficients inside reach 1e12.
+    # Take only the active set: along undetermined directions, free coefficients reach 1e12.
     inside = at == 0
     rest = (moment - normal[:, ~inside] @ x[~inside])[inside]
     x[inside] = _least_norm(scaled_eigenbasis(normal[np.ix_(inside, inside)]), rest)
@@ -102,7 +102,7 @@ def _solve_within(normal: Array, moment: Array, lower: Array, upper: Array) -> A
 
 
 def _least_norm(basis: tuple[Array, Array, Array, Flags], moment: Array) -> Array:
-    """Solution without bounds, (n,), zero along directions that are undetermined.
+    """Return the solution without bounds, (n,), zero along undetermined directions.
 
     Args:
         basis: of the normal equations, see `scaled_eigenbasis`; moment: (n,) their right side.
@@ -113,11 +113,10 @@ def _least_norm(basis: tuple[Array, Array, Array, Flags], moment: Array) -> Arra
 
 
 def _solve_definite(normal: Array, moment: Array, lower: Array, upper: Array) -> Array | None:
-    """`solve_bounded` where all is determined, by Cholesky factors of the unbounded part.
+    """Solve a determined problem by Cholesky factors of the unbounded part.
 
-    Coefficients beyond a bound are put there, and released where the slope leads back inside, until
-    neither happens: that is the solution. None where a direction is undetermined, or this does not
-    come to rest.
+    Coefficients beyond a bound are put on it, and released if the slope leads back inside, until
+    neither happens. Returns None if a direction is undetermined or the active set does not settle.
     """
     diagonal = np.diag(normal)
     if not (diagonal > 0.0).all():
@@ -156,7 +155,7 @@ class Iterate(Protocol):
 
     @property
     def cost(self) -> float:
-        """What is minimised; not finite where the model fails."""
+        """The cost; not finite if the model fails."""
 
     def normal_equations(self) -> tuple[Array, Array]:
         """Return slope^T slope (n, n) and minus slope^T residual (n,), linearised here."""

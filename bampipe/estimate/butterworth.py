@@ -1,4 +1,4 @@
-"""Butterworth filter without phase, and central differences."""
+"""Zero-phase Butterworth filter and central differences."""
 
 from functools import lru_cache
 
@@ -10,7 +10,7 @@ from bampipe.estimate.differentiation import Derivatives, extend
 from bampipe.estimate.low_pass import low_pass_at
 
 _REACH = 6
-"""Samples on either side that a derivative of an input is made of."""
+"""Samples on either side that a derivative of an input uses."""
 
 
 def zero_phase(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, Array, Array]:
@@ -82,10 +82,10 @@ def _low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array,
 def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -> Derivatives:
     """Return the motion behind ``position`` (T,), with error bands of white noise of ``noise_sd``.
 
-    Motion above the cut-off is lost and is not in them.
+    They do not cover motion above the cut-off, which is lost.
     """
     length = len(position)
-    # Noise passes otherwise near either end than in the middle.
+    # Near the ends the noise gain differs from that in the middle.
     edge = min(int(np.ceil(1.5 * rate_hz / cutoff_hz)), (length + 1) // 2)
     window = min(length, 4 * edge + 1)
     squares = sum(np.square(zero_phase(impulse, rate_hz, cutoff_hz)) for impulse in np.eye(window))

@@ -21,7 +21,7 @@ class _Controller(NamedTuple):
 
     Attributes:
         columns: of the inputs that it commands; ticks: how often it acts in a sample.
-        states: (n_s,) what it integrates; limits: (n_s, 2) of these.
+        states: (n_s,) its integrals; limits: (n_s, 2) of these.
     """
 
     columns: Indices
@@ -112,8 +112,8 @@ def simulate_controlled(
 ) -> tuple[Array, Array, Array]:
     """Integrate machine and controller together from ``x0``: a free run in closed loop.
 
-    The controller reads the encoders, computes its command and holds it until it acts again. What
-    it integrates starts where its first command is nearest to the recorded one.
+    The controller reads the encoders, computes its command and holds it until it acts again. Its
+    integrals start where its first command is nearest to the recorded one.
 
     Args:
         derivative, x0, p, dt, width, n_noise: as in `simulate`.
@@ -154,10 +154,10 @@ def simulate_controlled(
 
 
 def _first_states(command: Any, y: Array, r: Array, recorded: Array, limits: Array) -> Array:
-    """States (n_s,) of the controller at which it commands what was recorded, within ``limits``.
+    """Return states (n_s,) of the controller that give the recorded command, within ``limits``.
 
-    By one step of Newton's method from zero, which is exact where the command is linear in them;
-    of several that will do, the smallest.
+    One step of Newton's method from zero, exact for a command linear in them; the smallest solution
+    if there are several.
     """
     count, nf = len(limits), len(recorded)
     states, out = np.clip(np.zeros(count), *limits.T), np.zeros(nf + count)

@@ -1,10 +1,10 @@
-"""Is a filter still consistent with its model? A test on windows of normalised innovations.
+"""Test whether a filter is consistent with its model, on windows of normalised innovations.
 
-Over a window the normalised innovation squared (NIS) of a consistent filter averages the number
-of readings, and with white Gaussian noise its sum follows the chi-squared law (Bar-Shalom, Li and
-Kirubarajan 2001, section 5.4). Encoder steps are not Gaussian and model errors not white, so where
-there are windows known to be good, the law is a gamma distribution with their mean and variance,
-of which chi-squared is the special case.
+Over a window the normalised innovation squared (NIS) of a consistent filter averages the number of
+readings, and with white Gaussian noise its sum follows the chi-squared law (Bar-Shalom, Li and
+Kirubarajan 2001, section 5.4). Encoder steps are not Gaussian and model errors not white, so if
+there are windows known to be good, the law is a gamma distribution with their mean and variance, of
+which chi-squared is a special case.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from scipy.special import gammaincinv
 from bampipe.arrays import Array, Flags
 
 FEWEST_READINGS = 0.1
-"""Share of a window below which a reading is of no use; a slow sensor leaves cells empty too."""
+"""A reading in less than this share of a window is useless; slow sensors leave gaps too."""
 
 FEWEST_WINDOWS = 10
-"""Good windows from which on their scatter is believed."""
+"""Fewest good windows whose scatter is used."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Reference:
         return Reference(mean**2 / variance, variance / mean)
 
     def threshold(self, probability: float) -> float:
-        """What a consistent window exceeds with ``probability``."""
+        """Return the threshold that a consistent window exceeds with ``probability``."""
         return float(self.scale * gammaincinv(self.shape, 1.0 - probability))
 
 

@@ -1,4 +1,4 @@
-"""What every way to differentiate a sampled motion has in common.
+"""Common parts of all methods that differentiate a sampled motion.
 
 A method takes positions on a uniform grid and returns position, velocity and acceleration with
 their standard deviations. Two are implemented: a zero-phase Butterworth filter followed by central
@@ -16,7 +16,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from bampipe.arrays import Array, Flags
 
 _GAP = 2.5
-"""Factor on the usual sampling interval from which on a spline does not bridge it."""
+"""Splines do not bridge gaps of more than so many usual sampling intervals."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class UniformGrid:
     source: Array
 
     def hold(self, values: Array) -> Array:
-        """Return ``values`` (N,) on the grid (T,): the last one given, as of a command."""
+        """Return ``values`` (N,) on the grid (T,), each held until the next, as commands are."""
         if self.exact:
             return np.array(values, dtype=np.float64)
         last = np.searchsorted(self.source, self.t + 1e-9, side="right") - 1
@@ -62,7 +62,7 @@ class UniformGrid:
     def resample(self, values: Array) -> Array:
         """Return ``values`` (N,) on the grid (T,).
 
-        By a cubic spline, whose error falls with the fourth power of the sampling interval (de
+        A cubic spline is used, whose error falls with the fourth power of the sampling interval (de
         Boor 1978, A Practical Guide to Splines); across gaps by monotone cubic interpolation
         (Fritsch and Butland 1984), which does not overshoot.
         """
@@ -96,9 +96,9 @@ def spline_curvature(t: Array, values: Array) -> Array:
 
 
 def _well_apart(t: Array, values: Array, closest: float) -> tuple[Array, Array]:
-    """Stamps (N,) and values (N,), those of stamps closer to each other than ``closest`` averaged.
+    """Return stamps (N,) and values (N,), averaging those closer together than ``closest``.
 
-    A spline follows noise along the slope between two stamps, which has no bound as they approach.
+    Otherwise a spline would follow the slope of noise between close stamps, which is unbounded.
     """
     group = np.concatenate(([0], np.cumsum(np.diff(t) >= closest)))
     if group[-1] == 0 or group[-1] == len(t) - 1:
@@ -152,7 +152,7 @@ def extend(values: Array, reach: int, fit: int) -> Array:
 
 @lru_cache(maxsize=64)
 def _end_weights(fit: int, degree: int) -> Array:
-    """Value and second derivative, at the first of ``fit`` samples, of a polynomial fitted to them.
+    """Weights for value and second derivative of a fit at the first of ``fit`` samples.
 
     Returns:
         (2, fit) weights of the samples, which are not to be written to.

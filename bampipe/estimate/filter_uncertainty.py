@@ -1,9 +1,9 @@
-"""How far to believe a filter: covariance from its own increments, noise from its likelihood.
+"""Uncertainty of a filter: covariance from its own increments, noise from its likelihood.
 
-A filter's covariance is right only if its noise is white and of the size that it was given. What
-each stretch of time added to the estimate can be read back from the filter in information form;
-how much those stretches disagree, beside how much they should, is the sandwich covariance, which
-holds whatever the noise is, as long as stretches are independent of each other.
+A filter's covariance is right only if its noise is white and of the size that it was given. In
+information form, the filter shows the contribution of each stretch of time to the estimate. Their
+scatter, relative to the expected one, gives the sandwich covariance, which holds for any noise as
+long as the stretches are independent of each other.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ from bampipe.arrays import Array
 from bampipe.estimate.unscented import Stored
 
 _BLOCKS = 3
-"""Least blocks for each parameter: fewer hardly scatter, for their scores add up to nothing."""
+"""Fewest blocks per parameter: the scores of fewer hardly scatter, because they add up to zero."""
 _ROUNDS, _STEPS = 2, 12
 """Most passes of a search over all noise levels, and steps of one level in one pass."""
 _SILENT = 1e-20
@@ -29,9 +29,9 @@ def sandwich_covariance(
 
     With information matrix ``L = P^-1`` and vector ``e = L theta`` at both ends of a block, the
     block alone contributes ``dL`` and ``de`` and its score at the final estimate is ``de - dL
-    theta``. The meat of the sandwich is the sum of their squares. Where the result claims less
-    than the filter does, the filter's standard deviation is kept, as it is for a parameter of
-    which no block says anything.
+    theta``. The meat of the sandwich is the sum of their squares. If the result is smaller than the
+    filter's standard deviation, the latter is kept, as for a parameter about which no block has
+    information.
 
     Args:
         trials: filtered trials in order, at the ends of blocks, parameters not walking.
@@ -69,12 +69,11 @@ def sandwich_covariance(
 
 
 def choose_block(seconds: Sequence[float], parameters: int, longest_s: float) -> float:
-    """Return the shortest length of blocks, s, of which trials hold enough for a sandwich.
+    """Return the shortest block length, s, that gives enough blocks for a sandwich.
 
     Args:
         seconds: length of each trial, of which the last block takes what is left over.
-        parameters: number of those estimated.
-        longest_s: what is taken where the trials are long.
+        parameters: number of those estimated. longest_s: the length for long trials.
     """
     return min(longest_s, sum(seconds) / (_BLOCKS * parameters + len(seconds)))
 
@@ -97,7 +96,7 @@ def climb(
     """Maximise a likelihood over a few noise levels, one at a time, by doubling steps.
 
     Noise levels matter by their order of magnitude, so a coarse grid is enough: every coordinate
-    moves by its step as long as that pays, first up, then down.
+    moves by its step while the likelihood rises, first up, then down.
 
     Args:
         log_likelihood: of the logarithms of the levels (k,); minus infinity where it fails.

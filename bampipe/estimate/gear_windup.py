@@ -9,13 +9,13 @@ from bampipe.arrays import Array
 from bampipe.errors import InputError
 
 _BLOCKS = 20
-"""Stretches of the record that err independently: their scatter gives the uncertainties."""
+"""Stretches of the record with independent errors, whose scatter gives the uncertainties."""
 _EITHER_SIGN = 0.05
-"""Share of the samples with load of either sign from which on the play is crossed."""
+"""The play counts as crossed if loads of either sign have this share of the samples."""
 _CLOSING = 0.02
-"""Of the largest load: a gap is closed at a few times this share of it."""
+"""A gap is closed at a few times this share of the largest load."""
 _TURNING = 0.01
-"""Of the largest velocity: dry friction is all there at a few times this share of it."""
+"""Dry friction is fully developed at a few times this share of the largest velocity."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Windup:
         play, play_sd: rad or m; None where the load never changes sign.
         late_s, late_sd: by how much the second encoder is read after the first; viscous friction of
             the drive adds a little.
-        explained: by compliance and play, of the difference's variance that timing and the drive's
-            own losses leave.
+        explained: share, by compliance and play, of the difference's variance that remains after
+        timing and the drive's own losses.
     """
 
     compliance: float
@@ -50,19 +50,17 @@ def find_windup(
     """Regress the difference of two encoders on the drive's load.
 
     The inertia and friction of the drive itself do not pass the gear: terms with acceleration,
-    velocity and its sign take them off. An encoder that is read late, too, adds a difference in
-    proportion to the velocity. Each trial has its own offset, since the zeros of two
-    encoders differ.
+    velocity and its sign take them off. A late encoder adds a difference in proportion to the
+    velocity. Each trial has its own offset, since the zeros of two encoders differ.
 
     Args:
         difference: by trial, (T,), second reading minus first, rad or m.
         load: generalised force of the drive; rate: velocity of the axis at the same samples, which
             are evenly spaced.
-        rotor_known: whether ``load`` is without what the drive's inertia takes; else that is
-            estimated, which leaves little of an axis that carries no weight.
+        rotor_known: whether ``load`` excludes the force on the drive's inertia; otherwise that is
+            estimated, which leaves little information on an axis without weight.
 
-    Raises:
-        InputError: there is no load that changes.
+    Raises: InputError: the load does not change.
     """
     largest = max(float(np.abs(x).max(initial=0.0)) for x in load)
     if not largest > 0.0 or max(float(np.ptp(x)) for x in load) < 1e-9 * largest:

@@ -30,10 +30,10 @@ _PROMINENCE = 0.3
 _LEFTOVER = 0.01
 """Post-yield: the fitted transition changes the slope by less than this share."""
 _LATEST_START = 0.6
-"""Share of a branch after which the rest is taken as post-yield at the latest: the exponential
-is a poor likeness of a long transition with a sharp end, and the slope needs a range."""
+"""The rest of a branch counts as post-yield after this share at the latest: the exponential fits a
+long transition with a sharp end poorly, and the slope needs a range."""
 _LARGEST_SLOPE_CHANGE = 0.02
-"""Post-yield at all: the slopes of the first and second half of what is used differ by less."""
+"""A loop is post-yield if the slopes of the two halves of the used part differ by less."""
 
 _SYSTEMATIC = 0.25
 """Share of the change of the slope by which the stiffness may be off: with it, 95 to 100 % of the
@@ -86,7 +86,7 @@ class Cycle:
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """What the loops of one axis give.
+    """The results of the loops of one axis.
 
     Attributes:
         stiffness: of all post-yield parts together, N.m/rad or N/m.
@@ -98,8 +98,8 @@ class Hysteresis:
         cycles: cycle by cycle.
         branches: all whole branches.
         transition: torque after a reversal from which the loop is taken as post-yield, N.m or N.
-        slope_change: by how much the slope still changes in what is taken as post-yield:
-            stiffness of its first half over that of its second, less one.
+        slope_change: change of the slope within the post-yield part: stiffness of its first half
+            over that of its second, less one.
         yielded: whether ``slope_change`` is small (2 %, or three of its standard errors): if not,
             the load was too small to overcome the friction, and the stiffness is too high.
     """

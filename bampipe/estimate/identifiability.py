@@ -1,4 +1,4 @@
-"""What data can say of parameters at best: information, its weak directions, its share by trial.
+"""The best information that data can give on parameters, its weak directions and its trials.
 
 The residual of the inverse dynamics, e = D(theta) y - B u, is linear in what the sensors add to
 the motion y and the force u. With white sensor noise its spectrum is known, and the information on
@@ -32,7 +32,7 @@ def residual_spectrum(
     reading_sd: Array,
     force_sd: Array,
 ) -> Array:
-    """Spectrum of what sensor noise puts into the residual, (count // 2 + 1, n_q).
+    """Return the spectrum of sensor noise in the residual, (count // 2 + 1, n_q).
 
     In squared units of the residual a sample, at the frequencies of a real discrete Fourier
     transform of ``count`` samples.
@@ -47,7 +47,7 @@ def residual_spectrum(
     omega = 2.0 * np.pi * np.fft.rfftfreq(count, 1.0 / rate_hz)[:, None]
     gain = (inertia * omega**2) ** 2 + (damping * omega) ** 2 + stiffness**2
     spectrum = force_sd**2 + reading_sd**2 * gain
-    # An axis with neither force nor stiffness would seem to be free of noise at rest.
+    # Without force and stiffness, an axis would seem noise-free at rest.
     return np.asarray(np.maximum(spectrum, _LEAST_NOISE * spectrum.mean(axis=0)))
 
 
@@ -65,13 +65,13 @@ def information(slope: Array, spectrum: Array) -> Array:
         weight[-1] = 1.0
     scaled = transformed * np.sqrt(weight[:, None] / spectrum)[:, :, None]
     flat = scaled.reshape(-1, slope.shape[2])
-    # As real numbers: of the complex product, nothing but the real part is wanted.
+    # Real arithmetic suffices, because only the real part of the complex product is needed.
     parts = [np.ascontiguousarray(part) for part in (flat.real, flat.imag)]
     return np.asarray(parts[0].T @ parts[0] + parts[1].T @ parts[1])
 
 
 def cramer_rao_bound(matrix: Array) -> Array:
-    """Cramér-Rao bound: inverse of the information, infinite for what it says nothing of.
+    """Return the Cramér-Rao bound, the inverse of the information; infinite in its null space.
 
     Args:
         matrix: (n, n), symmetric, not negative.
@@ -88,9 +88,9 @@ def cramer_rao_bound(matrix: Array) -> Array:
 
 
 def undetermined_covariance(matrix: Array, prior_sd: Array) -> Array:
-    """What stays open of a prior where the information says nothing, (n, n) covariance.
+    """Return the prior covariance (n, n) given all combinations that the data determine.
 
-    That is the prior, its parameters independent, given all combinations that the data fix.
+    The parameters are independent in the prior.
 
     Args:
         matrix: (n, n) information, symmetric, not negative.
@@ -103,7 +103,7 @@ def undetermined_covariance(matrix: Array, prior_sd: Array) -> Array:
 
 @dataclass(frozen=True)
 class Weak:
-    """A direction in which parameters can move at little cost, as they hide each other.
+    """A direction in which parameters can move at little cost, because their effects cancel.
 
     Attributes:
         members: places of the parameters that move, largest part first.
@@ -118,7 +118,7 @@ class Weak:
 
 
 def weak_directions(matrix: Array) -> list[Weak]:
-    """Directions of information (n, n) that hold little of what each parameter alone would."""
+    """Return directions with much less information (n, n) than each parameter alone would have."""
     _, value, vector, _ = scaled_eigenbasis(matrix)
     found = []
     for k in np.flatnonzero(value < _WEAK):
@@ -131,9 +131,7 @@ def weak_directions(matrix: Array) -> list[Weak]:
 
 
 def growth_without(parts: Sequence[Array]) -> Array:
-    """By how much each parameter's bound would grow without one of the trials, (trials, n).
-
-    0.1 stands for ten per cent; infinite where the others say nothing of it.
+    """Return the relative growth of each parameter's bound without each trial, (trials, n).
 
     Args:
         parts: by trial, (n, n) information.

@@ -8,18 +8,18 @@ import numpy as np
 from bampipe.arrays import Array, Indices
 
 _SD_OF_MEDIAN = 1.4826
-"""Standard deviation over median size, of a Gaussian."""
+"""Standard deviation of a Gaussian over its median absolute value."""
 
 
 @dataclass(frozen=True)
 class RemovedStretch:
-    """A stretch of a trial and what the fit would be without it.
+    """A stretch of a trial, and the change of the fit without it.
 
     Attributes:
         trial: its number among those fitted; start_s: since the start of the trial, s.
         move: (n,) change of the parameters without it, in the standard deviations that the rest
             leaves them.
-        typical: (n,) what a stretch changes that tells as much, by the median over all.
+        typical: (n,) median change by stretches with as much information.
     """
 
     trial: int
@@ -37,8 +37,8 @@ def find_worst_stretch(
     """Return the stretch without which some parameter would move most.
 
     To first order: the inverse of all information times the score of the stretch (Cook 1977). A
-    stretch that alone makes the scatter of a sandwich would hide in it, and moves by no more than
-    one of its deviations; so its own part is taken off, down to what typical stretches scatter.
+    stretch that dominates a sandwich would be hidden by it, since it moves by at most one of its
+    deviations; so its own part is subtracted, down to the scatter of typical stretches.
 
     Args:
         rows: by axis, (n, k) how far the parameters move by each weighted sample, and the weighted
@@ -51,7 +51,7 @@ def find_worst_stretch(
     for (move, left), number in zip(rows, stretches, strict=True):
         np.add.at(parts, number, move * left[:, None])
         np.add.at(shares, number, move**2)
-    # What white noise of its size would make of each stretch, as the typical one scatters.
+    # The effect of white noise of its size on each stretch, scaled to the typical scatter.
     with np.errstate(divide="ignore", invalid="ignore"):
         moves = np.nan_to_num(parts / sd, posinf=0.0, neginf=0.0)
         expected = np.nan_to_num(np.sqrt(shares) / sd, posinf=0.0)

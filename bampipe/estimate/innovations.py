@@ -1,4 +1,4 @@
-"""Are a filter's innovations white, and do they know nothing of the inputs? Two separate tests.
+"""Tests whether a filter's innovations are white, and whether they are independent of the inputs.
 
 A filter that has the right model leaves innovations that neither their own past nor any input
 predicts (Kailath 1968; Mehra 1970). With tens of thousands of samples a test of significance
@@ -14,7 +14,7 @@ from scipy import stats
 from bampipe.arrays import Array
 
 _LAGS = 20
-"""How far back the test of whiteness looks."""
+"""Lags of the whiteness test."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class InnovationTest:
     """Outcome of one test.
 
     Attributes:
-        statistic: Ljung-Box Q, or F of the regression; degrees: of freedom.
-        p_value: chance of as much by chance.
+        statistic: Ljung-Box Q, or F of the regression; degrees: of freedom. p_value: probability of
+        a statistic as large by chance.
         share: of the variance that is predictable, beyond what chance alone would give.
     """
 
@@ -77,8 +77,8 @@ def check_independence(
 ) -> InnovationTest | None:
     """Regress innovations on present and past inputs; None where there is nothing to regress on.
 
-    Inputs of a hand change slowly, so that a correlation at one lag is one at all: a regression
-    on a few lags at once counts it once, which a table of cross-correlations would not.
+    Inputs of a hand change slowly, so that a correlation at one lag appears at all lags. A joint
+    regression on a few lags counts it once, unlike a table of cross-correlations.
 
     Args:
         records: (K,) each, NaN at gaps.
@@ -88,14 +88,14 @@ def check_independence(
     reach = max(lags)
 
     def tables() -> Iterator[Array]:
-        """By record: the inputs at each lag and the innovation, (K', m + 1)."""
+        """Yield, by record, the inputs at each lag and the innovation, (K', m + 1)."""
         for record, given in zip(records, inputs, strict=True):
             if len(record) > reach:
                 shifted = [given[reach - lag : len(given) - lag] for lag in lags]
                 table = np.concatenate([*shifted, record[reach:, None]], axis=1)
                 yield table[np.isfinite(record[reach:])]
 
-    # Sums, not samples: of a long session all tables together would be the largest thing in memory.
+    # Keep sums instead of samples: the tables of a long session would dominate memory.
     count = sum(len(table) for table in tables())
     if count == 0:
         return None

@@ -27,7 +27,7 @@ from bampipe.estimate.differentiation import Derivatives
 ORDERS = (3, 4)
 _SETTLED = 1e-10
 _WIDE = 1e8
-"""Variance of a first state of which nothing is known, over what is known of it later."""
+"""Prior variance of an unknown first state over its later variance."""
 
 _V = float64[::1]
 _M = float64[:, ::1]
@@ -121,8 +121,8 @@ def _update(x, p, y, gain):  # type: ignore[no-untyped-def]
 
 
 _PASS = types.Tuple((_M, float64[:, :, ::1], _M, _V, _V))
-"""What the filter leaves for the smoother, by sample: states (T, n), their covariances, gains
-(T, n), innovations (T,) and their variances (T,)."""
+"""The filter's results for the smoother, by sample: states (T, n), their covariances, gains (T, n),
+innovations (T,) and their variances (T,)."""
 
 
 @njit(_PASS(_V, _FLAGS, _M, _M, _V, _M), cache=True)
@@ -134,7 +134,7 @@ def _filter(y, present, step, noise, x, p):  # type: ignore[no-untyped-def]
     settled = False
     for t in range(count):
         if settled and present[t]:
-            # Bit by bit as after the last sample: nothing that follows differs, either.
+            # Bitwise as after the last sample, so all that follows is equal.
             _advance(x, step)
             innovations[t], spreads[t] = y[t] - x[0], spreads[t - 1]
             for i in range(n):
@@ -307,9 +307,10 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
 
 @njit(_M(_V, _M, _M, float64[:, :, ::1], _V), cache=True)
 def _smooth_mean(y, step, gains, covariances, spreads):  # type: ignore[no-untyped-def]
-    """Smoothed states (T, n) of samples that are all there.
+    """Return smoothed states (T, n) of complete samples.
 
-    The same recursions as `_filter` and `_smooth`, without what is the same for all samples.
+    The recursions are those of `_filter` and `_smooth`, without the parts that are equal for all
+    samples.
     """
     count, n, last = y.shape[0], step.shape[0], spreads.shape[0] - 1
     states, innovations, adjoint = np.empty((count, n)), np.empty(count), np.zeros(n)
@@ -338,7 +339,7 @@ def _smooth_mean(y, step, gains, covariances, spreads):  # type: ignore[no-untyp
 def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
     """Gains (K, n), covariances (K, n, n) and variances (K,) of ``most`` samples until they settle.
 
-    They do not depend on the samples. Of the first state nothing is known.
+    They do not depend on the samples. Nothing is known about the first state.
     """
     step, noise = transition(order)
     # A state settles at about the cut-off, in rad a sample, to the power of its order.
@@ -346,7 +347,7 @@ def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
     there = np.ones(most, dtype=bool)
     passed = _filter(np.zeros(most), there, step, ratio * noise, np.zeros(order), wide)
     _, covariances, gains, _, spreads = passed
-    # They swing as they settle: one that stands still for a moment says nothing.
+    # They oscillate as they settle, so a momentary rest is not enough.
     change = np.abs(np.diff(gains, axis=0))
     settled = np.flatnonzero((change < _SETTLED * gains[1:]).all(axis=1))
     count = int(settled[0]) + 2 if settled.size else most
@@ -354,9 +355,9 @@ def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
 
 
 def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]:
-    """What `smooth` makes of a signal in the samples: position, rate and acceleration, each (T,).
+    """Apply `smooth` to a signal in the samples: position, rate and acceleration, each (T,).
 
-    A tenth of its time, for no variances are found.
+    This takes a tenth of the time, because no variances are computed.
 
     Args:
         signal: (T,) on the uniform grid of ``model.rate_hz``, all of it there.
@@ -382,7 +383,7 @@ class Fit:
 
 
 _FINEST = 1e-8
-"""Of the travel: noise below it leaves the variances of a filter to rounding."""
+"""Noise below this share of the travel would leave the variances of a filter to rounding."""
 
 
 def maximum_likelihood(
@@ -395,9 +396,9 @@ def maximum_likelihood(
 ) -> Fit:
     """Choose process and measurement noise of one axis by maximum likelihood.
 
-    The measurement noise is at least that of quantisation, resolution²/12 (Widrow 1956), and
-    larger where the innovations ask for it: for each ratio its best value is known in closed
-    form, so that one search over the ratio finds both.
+    The measurement noise is at least that of quantisation, resolution²/12 (Widrow 1956), and larger
+    if the innovations require it: for each ratio its best value is known in closed form, so that
+    one search over the ratio finds both.
 
     Args:
         records: positions (T,) on the uniform grid and flags (T,) of the samples there are, of
@@ -408,7 +409,7 @@ def maximum_likelihood(
         bandwidth_limits_hz: range of the smoother's bandwidth that is searched.
     """
     step, noise = transition(order)
-    # A log of a machine at rest may seem free of noise: finer than this no number here is.
+    # The log of a machine at rest may seem noise-free; this is the resolution of the numbers.
     travel = max((float(np.ptp(position)) for position, _ in records), default=0.0)
     quantum = max(resolution / np.sqrt(12.0), _FINEST * travel) if resolution > 0.0 else 0.0
     unit = quantum if quantum > 0.0 else float(np.std(np.diff(records[0][0]))) or 1.0

@@ -22,16 +22,16 @@ from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
 
 BLOCKS_A_PARAMETER = 3
-"""Fewer blocks a parameter, and their scatter knows a standard deviation to a third only. Of 320
-parameters of a joint (five trials of 1.2 s, `benchmarks/independent`, seeds 9931 to 9942) their
-intervals held 89 %; with this, of 163 on seeds that did not choose it (9971 to 9982), 93 %."""
+"""Fewest blocks per parameter: with fewer, their scatter gives a standard deviation only to a
+third, and 95 % intervals covered 89 % of 320 parameters of independently simulated joints; with
+this number, 93 % of 163 on other seeds."""
 _LEAST_STEP = 1e-8
-"""Of a difference, as a share of the parameter: half the digits of a number."""
+"""Finite difference as a share of the parameter: half the digits of a number."""
 Residual = Callable[[int, Array], Array]
 """residual(trial, p) -> (T, n_q): unfiltered residual of one trial for parameters p (np,)."""
 Slopes = Callable[[int, Array, Sequence[int]], tuple[Sequence[int], Array]]
-"""slopes(trial, p, wanted) -> some of the free parameters in wanted, by their place there, and the
-unfiltered slopes of the residual by them (T, n_q, n): those that need no difference."""
+"""slopes(trial, p, wanted) -> free parameters of ``wanted`` whose slopes need no difference, by
+their place there, and the unfiltered slopes of the residual by them (T, n_q, n)."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Stacked:
 
 @dataclass(frozen=True)
 class KnownSlopes:
-    """Slopes of the residual that have been taken before, and hold for another fit, too.
+    """Slopes of the residual from an earlier fit that remain valid.
 
     Attributes:
         take: gives those of a trial, low-passed and thinned, (K, n_q, n_free); the columns that
@@ -83,9 +83,9 @@ class Problem:
         slopes: those by some of the parameters, where they are known; see `Slopes`.
         keep: holds trials that are linearised, of which a long session has more than memory.
         multiplied: (n_free,) axis whose measured force a parameter multiplies, as a current by a
-            torque constant, an axis for one parameter only; -1 of others, and of all by default.
-            Small, such a factor leaves a small residual and explains nothing: the likelihood is
-            that of what is measured.
+            torque constant, an axis for one parameter only; -1 of others, and of all by default. A
+            small factor would leave a small residual and explain nothing: the likelihood is that of
+            the measured force.
         parts: rows between which the low-pass begins anew, where a trial stands for several.
     """
 
@@ -112,7 +112,7 @@ def residual_and_slopes(
 ) -> tuple[Array, Array]:
     """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n).
 
-    By differences where nothing gives the slopes.
+    Slopes that the model does not supply are finite differences.
 
     Args:
         problem: the model as residuals.
@@ -133,7 +133,7 @@ def residual_and_slopes(
     for column in sorted(set(range(len(chosen))) - set(given)):
         k = chosen[column]
         index, moved = problem.free[k], p.copy()
-        # A replay of a model that lacks much can run far from any prior, where a step is rounding.
+        # A replicate of an incomplete model can run far from any prior, where a step is rounding.
         step = max(problem.step[k], _LEAST_STEP * abs(p[index]))
         moved[index] += step
         if moved[index] > problem.upper[k]:
@@ -156,7 +156,7 @@ def stacked_residual(
     fresh = np.arange(problem.free.size) if known is None else np.flatnonzero(~known.holds)
     base, slopes = residual_and_slopes(problem, trial, p, [int(k) for k in fresh])
     count, n_q, n_free = slopes.shape
-    # No body of a robot acts on a joint behind it: half of its columns are empty.
+    # A body of a robot does not act on joints behind it: half of the columns are empty.
     axes, numbers = np.nonzero(slopes.any(axis=0))
     columns = np.empty((count, n_q + axes.size))
     columns[:, :n_q], columns[:, n_q:] = base, slopes[:, axes, numbers]
@@ -183,7 +183,7 @@ def minimise(
     known: KnownSlopes | None = None,
     tolerance: float = 1e-10,
 ) -> Linearised:
-    """Find the free parameters that leave the least squares, weighted by axis, within their bounds.
+    """Find the free parameters within their bounds with the least squares, weighted by axis.
 
     Each axis is weighted by the scatter of its own residual, which is iterated; parameters in
     which the residual is not linear are found by Gauss-Newton with halved steps.
@@ -232,12 +232,12 @@ class Linearised:
 
     @property
     def cost(self) -> float:
-        """Negative log likelihood a sample where each axis has its own unknown scatter."""
+        """Return the negative log likelihood per sample, with an unknown scatter of each axis."""
         count = np.sum([np.sum(s.used, axis=0) for s in self.stacked], axis=0)
         scatter = np.log(np.maximum(_scatter(self.stacked), 1e-300))
         off = self.value - self.problem.known
         prior = 0.5 * float(self.problem.precision @ off**2)
-        # A change of variables, from what is measured to the residual, once a sample.
+        # The change of variables from the measured force to the residual, once per sample.
         volume = sum(
             float(count[axis]) * np.log(max(abs(self.value[k]), 1e-300))
             for k, axis in _factors(self.problem)
@@ -281,9 +281,9 @@ def _factors(problem: Problem) -> list[tuple[int, int]]:
 
 
 def as_measured(problem: Problem, p: Array, stacked: Iterable[Stacked]) -> Iterator[Stacked]:
-    """Trials with the slopes that the residual over the factors of its axes has, times these.
+    """Return trials with the slopes of the residual over the factors of its axes, times these.
 
-    Along a change of all parameters of an axis in proportion that is zero: nothing tells its scale.
+    They are zero along a proportional change of all parameters of an axis, whose scale is unknown.
 
     Args:
         problem: says which parameters are factors; p: (np,) where it is linearised.
@@ -299,7 +299,7 @@ def as_measured(problem: Problem, p: Array, stacked: Iterable[Stacked]) -> Itera
 
 
 def _require_finite(problem: Problem, trial: int, stacked: Stacked, p: Array) -> None:
-    """Say which parameter makes the residual of a trial no number where the fit starts."""
+    """Say which parameter makes the residual of a trial not a number at the start of the fit."""
     if not np.isfinite(stacked.residual).all():
         culprit = "with the parameters that the fit starts from"
     elif not np.isfinite(stacked.slope).all():
@@ -329,9 +329,9 @@ def covariance_by_blocks(
 ) -> Array:
     """Covariance (P, P) by the scatter of the scores of blocks of time (White; Newey and West).
 
-    At the minimum the scores of all blocks add up to nothing: beside as many parameters as blocks,
-    some combination of them does not scatter at all. So of few blocks it is no less than what
-    independent samples give.
+    At the minimum the scores of all blocks add up to zero; with as many parameters as blocks, some
+    combination does not scatter at all. With few blocks, the covariance is therefore at least that
+    of independent samples.
 
     Args:
         rows: by axis, slopes (n, P) and residual (n,), in standard deviations of that.
@@ -350,7 +350,7 @@ def covariance_by_blocks(
     normal = precision + products
     inverse = invert_scaled(normal)
     fitted = float(np.trace(inverse @ (normal - precision)))
-    # Priors and bounds pull at the fit: what all blocks have in common is no scatter.
+    # Priors and bounds pull at the fit: the common part of all blocks is no scatter.
     scores -= scores.sum(axis=0) * size / size.sum()
     filled = int(np.count_nonzero(size))
     meat = scores.T @ scores * (filled / max(filled - fitted, 1.0)) + precision

@@ -93,7 +93,7 @@ class Band:
         rate_hz: sampling rate of what comes in.
         cutoff_hz: half-power frequency of each of the two passes, by axis, (n_q,), Hz; a fifth of
             the sampling rate where that is lower.
-        margin_s: left out at both ends of a trial, where the filter has no past or future.
+        margin_s: left out at both ends of a trial, where the filter lacks past or future.
     """
 
     rate_hz: float
@@ -119,7 +119,7 @@ class Band:
         return np.minimum(1.0, spacing)
 
     def passed_power(self, count: int) -> Array:
-        """Share of the power that is left at ``count`` frequencies, (count, n_q).
+        """Return the transmitted share of the power at ``count`` frequencies, (count, n_q).
 
         They are evenly spaced below half the rate of the thinned samples.
         """
@@ -153,9 +153,9 @@ class Band:
         return out
 
     def thin_trials(self, trials: Iterable[Array], axes: Sequence[int]) -> list[Array]:
-        """`thin` for the same columns, each (T, k), of several trials.
+        """Apply `thin` to the same columns, each (T, k), of several trials.
 
-        Few that follow each other and have one length go through the filter side by side.
+        Consecutive trials of one length and few columns go through the filter side by side.
         """
         found: list[Array] = []
         for _, alike in groupby(trials, key=len):
@@ -165,6 +165,6 @@ class Band:
         return found
 
     def thin_input(self, values: Array) -> Array:
-        """`thin` for columns (T, k) that belong to no axis: with the highest cut-off."""
+        """Apply `thin` with the highest cut-off to columns (T, k) that belong to no axis."""
         widest = int(np.argmax(self.cutoff_hz))
         return self.thin(values, [widest] * values.shape[1])

@@ -24,9 +24,8 @@ class NormalEquations:
         xy: -X'r, (K, n_q, P).
         yy: r'r, (K, n_q).
         count: samples that they are of, (K, n_q).
-        precision: of what is known of the coefficients beforehand, one over its variance, (P,);
-            zero where nothing is.
-        known: that, (P,), measured from the point where the residual was linearised.
+        precision: of the priors, one over their variances, (P,); zero without a prior. known: their
+            means, (P,), measured from the point where the residual was linearised.
     """
 
     xx: Array
@@ -51,7 +50,7 @@ class NormalEquations:
             slopes: X by trial, each (T, n_q, P), zero where a sample is not used.
             residuals: r by trial, each (T, n_q), zero where a sample is not used.
             used: which samples count, by trial, each (T, n_q).
-            precision, known: of the first coefficients, (<= P,); nothing is known of others.
+            precision, known: of the first coefficients, (<= P,); the others have no priors.
         """
         xx, xy, yy = [], [], []
         for slope, residual in zip(slopes, residuals, strict=True):
@@ -92,7 +91,7 @@ class NormalEquations:
     def mean_square(self, values: Array) -> Array:
         """Mean squared residual over all trials with coefficients ``values`` (P,), (n_q,).
 
-        At least what rounding may leave of it: the difference of large sums is never zero.
+        It is at least the rounding error, since it is a difference of large sums.
         """
         left = self.yy - 2.0 * self.xy @ values + (self.xx @ values) @ values
         least = np.finfo(float).eps * self.yy

@@ -19,8 +19,8 @@ class OnlineFilter:
     """A filter of `unscented` that takes samples as they come.
 
     However they are cut into portions, the estimates are those of `filter_trials` on all of them:
-    the same compiled function carries mean and root on. Inputs run straight between samples, for
-    how they curve takes samples to come.
+    the same compiled function carries mean and root on. Inputs are linear between samples, because
+    their curvature would need later samples.
 
     Attributes:
         mean: (n,) state and parameters on the scale of estimation.

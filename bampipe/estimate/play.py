@@ -1,7 +1,7 @@
-"""The play operator: what a point does that a loose coupling drags along.
+"""The play operator: the motion of a point that a loose coupling drags along.
 
-After Krasnosel'skii and Pokrovskii 1989, Systems with Hysteresis. What it leaves of its input is
-the stop operator: an ideal spring that slips.
+After Krasnosel'skii and Pokrovskii 1989, Systems with Hysteresis. Input minus output is the stop
+operator, an ideal spring that slips.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from bampipe.compiled import njit
 
 @njit("float64[:, ::1](float64[::1], float64[::1])", cache=True)
 def drag_along(x: Array, play: Array) -> Array:
-    """Where each point is that stays within ``play`` (G,) of ``x`` (T,), (T, G); at x first."""
+    """Return positions (T, G) of points that stay within ``play`` (G,) of ``x`` (T,)."""
     out = np.empty((x.shape[0], play.shape[0]))
     for g in range(play.shape[0]):
         at = x[0]

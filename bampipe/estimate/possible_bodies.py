@@ -1,4 +1,4 @@
-"""Inertial numbers that some body can have, and the nearest ones to an estimate.
+"""Physically possible inertial parameters, and the nearest ones to an estimate.
 
 A body's mass, first moment and inertia are those of some distribution of mass exactly where its
 pseudo-inertia, a symmetric 4 by 4 matrix linear in the ten numbers, has no negative eigenvalue
@@ -12,22 +12,21 @@ from bampipe.arrays import Array, Indices
 from bampipe.estimate.bounded import invert_scaled
 
 _SMALLEST = 1e-3
-"""Least eigenvalue of a pseudo-inertia that a search starts from, of the largest."""
+"""Least eigenvalue of the pseudo-inertia at the start of a search, as a share of the largest."""
 _ROUNDING = 1e-9
-"""Of the largest eigenvalue: a negative one beyond it is no rounding."""
+"""Negative eigenvalues within this share of the largest are rounding errors."""
 _ANCHOR = 1e-4
-"""Of the weight of each number, by which the estimate holds it where the others leave it open."""
+"""Share of each number's weight that holds it to the estimate if the others leave it open."""
 _FIRST, _SHARPER, _GAP = 1e-6, 10.0, 1e-6
-"""Weight of the cost over the barrier at first, its growth, and the cost by which the end may be
-above the least."""
+"""First weight of the cost over the barrier, its growth, and the excess cost allowed at the end."""
 _STEPS, _CENTRED, _SHORTEST = 50, 1e-6, 1e-9
-"""Most steps at one weight, the fall of a step that ends them, and the least share of a step."""
+"""Most steps at one weight, the decrease that ends them, and the least share of a step."""
 _AT_BOUND = 1e-2
-"""Standard deviations beside a bound from which on a number lies at it."""
+"""A number within so many standard deviations of a bound is at the bound."""
 
 
 def pseudo_inertia(numbers: Array) -> Array:
-    """Pseudo-inertia (4, 4) of mass, first moment x y z, inertia xx xy xz yy yz zz, ten numbers."""
+    """Return the pseudo-inertia (4, 4) of mass, first moment x y z, inertia xx xy xz yy yz zz."""
     mass, x, y, z, xx, xy, xz, yy, yz, zz = numbers
     half = 0.5 * (xx + yy + zz)
     return np.array(
@@ -54,15 +53,15 @@ def nearest_possible(
 ) -> Array:
     """Return the numbers nearest to an estimate that are possible, (n,).
 
-    Minimises ``(x - value)^T weight (x - value)`` where bodies can have their numbers and the
-    others are within their bounds: a convex problem, solved by Newton's method with a logarithmic
-    barrier (Boyd and Vandenberghe 2004, Convex Optimization, 11.3).
+    Minimises ``(x - value)^T weight (x - value)`` over possible bodies, the others within their
+    bounds: a convex problem, solved by Newton's method with a logarithmic barrier (Boyd and
+    Vandenberghe 2004, Convex Optimization, 11.3).
 
     Args:
         value: (n,), the estimate; weight: (n, n), such as the inverse of its covariance.
         bodies: (bodies, 10) places of the numbers of each body.
-        start: (bodies, 10), where these start, possible or not, such as a drawing's.
-        bounds: least and largest values, (n,) each, of what is no number of a body.
+        start: (bodies, 10), starting values, possible or not, such as a drawing's.
+        bounds: least and largest values, (n,) each, of the other parameters.
     """
     size = np.diag(weight)
     weight = weight + np.diag(np.where(size > 0.0, _ANCHOR * size, 1.0))
@@ -117,7 +116,7 @@ def nearest_possible(
 
 
 def _inside(numbers: Array) -> Array:
-    """Numbers near to these of a body that is not flat."""
+    """Return nearby numbers of a body that is not flat."""
     values, vectors = np.linalg.eigh(pseudo_inertia(numbers))
     least = _SMALLEST * max(values[-1], 1e-12)
     matrix = (vectors * np.maximum(values, least)) @ vectors.T

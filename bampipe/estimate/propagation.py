@@ -14,7 +14,7 @@ _M = float64[:, ::1]
 
 
 class Estimated(NamedTuple):
-    """What is estimated of a model and what of it is measured, as kernels take it.
+    """Estimated parameters and measured outputs of a model, as kernels take them.
 
     Attributes:
         n_states: length nx of the state.
@@ -45,7 +45,7 @@ ESTIMATED = record_type(
 X, PROBE, TOTAL, RATE, U, START, P, W, SLOPE, CURVE = range(10)
 """Rows of the workspace of sigma points: states, where the derivative is taken, the Runge-Kutta
 sum, the derivative; inputs, and those at the start of the interval; all parameters; process noise;
-and, once for all points, what the input gains over the interval and a sixth of its second
+and, once for all points, the increase of the input over the interval and a sixth of its second
 derivatives at both ends, those at the start first, in units of the interval. In the others,
 quantity i of point r is at [i*ROWS + r]. One matrix, because of separate arrays the compiler cannot
 know how far apart they are, and checks it in every loop."""
@@ -161,8 +161,7 @@ def propagate_points(  # type: ignore[no-untyped-def]
     """Draw the sigma points of (state, parameters, process noise) and carry each over ``dt``.
 
     Args:
-        derivative: f(count, x, u, p, w, dx).
-        estimated: what of the model is estimated.
+        derivative: f(count, x, u, p, w, dx). estimated: see `Estimated`.
         mean: (n,) state then free parameters; factor: (n, n) lower root of their covariance.
         reach: distance of the points, in standard deviations.
         noise_sd: (nw,) of the process noise, independent of the state: its root is diagonal,

@@ -29,14 +29,14 @@ _MOST_STEPS = 4000
 MAX_STEP_S = 2.5e-4
 """Longest integration step by default."""
 _BRAKES_S = 0.01
-"""Over which a controller of brakes averages the speed."""
+"""Time over which a controller of brakes averages the speed."""
 _WIDEST_GRID_S = 1e-3
-"""Longest time over which a continuous force may run straight: at a hundred samples a second, a
-straight line takes 3 % off what acts at 10 Hz, and at a thousand 0.03 %."""
+"""Longest interval for linear interpolation of a continuous force: at a hundred samples a second, a
+straight line takes 3 % off a component at 10 Hz, and at a thousand 0.03 %."""
 
 
 class Runaway(InputError):
-    """A simulated motion grows without bounds: such a model cannot be moved."""
+    """A simulated motion grows without bounds."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Impedance:
 
 
 class Plant(NamedTuple):
-    """What kernels simulate besides the derivative.
+    """Data that kernels need besides the derivative.
 
     Attributes:
         p: (np,) parameters; w: (nw,) process noise, zeros.
@@ -78,7 +78,8 @@ class _Arm(NamedTuple):
     """The arm: columns of the inputs with its force and derivatives, and its `Impedance`.
 
     Attributes:
-        at, moving: (n,) places in the state of what it moves by each coordinate, and of its rate.
+        at, moving: (n,) places in the state of the positions that it moves, by coordinate, and of
+            their rates.
     """
 
     at: Indices
@@ -183,7 +184,7 @@ def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, out):  # type: igno
     for j in range(nf):  # keeps the solution finite where a force moves nothing
         normal[j, j] += 1e-12 * trace + 1e-300
     if not (np.isfinite(trace) and cholesky(normal, factor)):
-        for j in range(nf):  # the motion has run away: the caller says so
+        for j in range(nf):  # the motion has diverged: the caller reports it
             out[j] = np.nan
         return
     forward_substitute(factor, nf, out)
@@ -300,9 +301,9 @@ def simulate_tracking(
 ) -> tuple[Array, Array]:
     """Integrate the model under given inputs plus an arm that holds it near a given motion.
 
-    Replays a recording with the friction, sticking included, of a fitted model: the recorded
-    forces act, and the arm adds what keeps the motion from drifting away. The arm's share is in
-    the returned inputs, so these with the returned motion are one consistent recording.
+    Simulates a recording with the friction, sticking included, of a fitted model: the recorded
+    forces act, and the arm adds what keeps the motion from drifting away. The arm's share is in the
+    returned inputs, so these with the returned motion are one consistent recording.
 
     Args:
         derivative, x0, p, dt, width, n_noise, smooth, max_step: as in `simulate`.
@@ -376,7 +377,7 @@ def _read_between(values: Array, finer: int, smooth: Sequence[int] = ()) -> Arra
 
 
 def make_plant(p: Array, n_noise: int, width: Array, max_step: float) -> Plant:
-    """Return what is simulated as kernels take it; without process noise."""
+    """Return the plant as kernels take it, without process noise."""
     return Plant(
         np.ascontiguousarray(p, dtype=np.float64), np.zeros(n_noise),
         np.ascontiguousarray(width, dtype=np.float64), max_step,

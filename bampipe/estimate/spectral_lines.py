@@ -1,4 +1,4 @@
-"""Sines that stand far above what is around them in the spectrum of a record: mains hum, mostly.
+"""Spectral lines far above their surroundings, mostly mains hum.
 
 Second differences keep a signal that is smooth over a few samples out of their fits; those of a
 sine are taken at the time stamps as they are, so that uneven stamps tell it from its aliases.
@@ -15,20 +15,19 @@ from scipy.optimize import minimize_scalar
 from bampipe.arrays import Array, Flags
 
 LOWEST_LINE = 0.1
-"""Cycles a sample from which on a sine counts: below, differences take it out themselves."""
+"""Lowest frequency of a line, cycles a sample: differences remove slower sines."""
 
 _JUMP = 10.0
-"""Second difference, over the median one, from which on it is no part of a sine in noise."""
+"""A second difference of so many medians is no part of a sine in noise."""
 _UNEVEN = 1e-3
-"""Range of the time between samples, as a share of it, from which on aliases differ."""
+"""Aliases differ if the time between samples varies by this share of it."""
 _MOST, _ABOVE, _BESIDE = 6, 40.0, 31
-"""At most so many sines. One stands so far above the typical power of so many frequencies around
-it, which chance reaches once in 10^17 of them."""
+"""Most lines; least power over the typical one nearby, by chance once in 10^17; its frequencies."""
 _FOLDS = 4
 """Below so many times the rate, uneven stamps tell a sine from its aliases."""
 _ALONE, _ALONE_HZ, _LEAKAGE = 4.0, 12.0, 3
-"""A hum has so many times the power of all else within so many Hz, but for what leaks to so many
-bins beside it: what repeats itself has lines at every multiple of its own frequency."""
+"""A hum has so many times the power of all else within so many Hz, without leakage to so many bins
+beside it: a periodic motion has lines at every multiple of its own frequency."""
 _MAINS_HZ, _HARMONICS, _OFF = (50.0, 60.0), 5, 0.002
 """Frequencies of mains and how many harmonics of them are looked for; how far off they may be, as a
 share: the grid keeps to half a thousandth, the clock of a recorder may be worse."""
@@ -36,7 +35,7 @@ _STRETCH, _STRETCH_S, _STRETCHES = 2000, 4.0, 8
 """Mains drift in phase: they are fitted by stretches of at least so many samples and seconds, and
 looked for in at most so many."""
 _FEWEST = 200
-"""Samples below which nothing is looked for."""
+"""Fewest samples of a search."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class Line:
 def find_lines(
     record: Array, t: Array, lowest: float, highest: float = 0.5, lag: int = 1
 ) -> list[Line]:
-    """The sines on a record (T,) with time stamps ``t`` (T,), the clearest first.
+    """Find sines on a record (T,) with time stamps ``t`` (T,), the clearest first.
 
     Args:
         lowest, highest: frequencies between which they appear at this rate, in cycles a sample; at
@@ -94,7 +93,7 @@ def find_lines(
 def remove_mains(
     record: Array, t: Array, moving: Sequence[Array] = ()
 ) -> tuple[Array, dict[float, float]]:
-    """Take the hum of mains off a record (T,) with time stamps ``t`` (T,), s.
+    """Subtract the mains hum of a record (T,) with time stamps ``t`` (T,), s.
 
     Args:
         moving: other records (T,) at the same stamps, which mains do not reach, as of positions: a
@@ -128,7 +127,7 @@ def remove_mains(
 
 
 def _find_mains(record: Array, t: Array) -> dict[float, float]:
-    """Where a record (T,) shows mains: nominal frequencies, Hz, and those found for them."""
+    """Return nominal mains frequencies, Hz, that a record (T,) shows, and those found for them."""
     rate = _mean_rate(t)
 
     def apparent(hz: float) -> float:
@@ -150,24 +149,24 @@ def _mean_rate(t: Array) -> float:
 
 
 def _lag(t: Array) -> int:
-    """Samples in which mains turn by an eighth of a cycle; one at a low rate."""
+    """Return the samples in an eighth of a mains cycle; one at a low rate."""
     return max(1, int(0.125 * _mean_rate(t) / min(_MAINS_HZ)))
 
 
 def _is_uniform(t: Array) -> bool:
-    """Whether stamps (T,) are so even that a sine and its aliases are one."""
+    """Return whether stamps (T,) are too even to distinguish a sine from its aliases."""
     steps = np.diff(t)
     return float(np.ptp(steps)) < _UNEVEN * float(np.mean(steps))
 
 
 def _second_differences(record: Array, lag: int) -> tuple[Array, Flags]:
-    """Of a record (T,), and which are no jump of the signal, as where friction turns over."""
+    """Return second differences of a record (T,), and which are no jumps of friction."""
     wanted = record[2 * lag :] - 2.0 * record[lag:-lag] + record[: -2 * lag]
     return wanted, np.abs(wanted) <= _JUMP * float(np.median(np.abs(wanted)))
 
 
 def _fit(record: Array, t: Array, hz: float, within: float, lag: int) -> tuple[float, Array, float]:
-    """Frequency and values (T,) of the sine that fits a record (T,) best, and squares it leaves.
+    """Return frequency and values (T,) of the best-fitting sine of a record (T,), and its misfit.
 
     Args:
         hz, within: where it is looked for; lag: see `find_lines`.

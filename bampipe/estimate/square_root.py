@@ -38,7 +38,7 @@ _M = float64[:, ::1]
 
 
 class Samples(NamedTuple):
-    """Samples that follow each other.
+    """Consecutive samples.
 
     Attributes:
         t: (T,) s; u: (T, nu) inputs; curvature: (T, nu) their second time derivatives.
@@ -127,10 +127,10 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     # States of the sigma points after an interval, and measurements of points drawn afresh.
     images, readings = np.empty((nx, 1 + 2 * pairs)), np.empty((ny, 1 + 2 * n))
     points = allocate_points(nx, u.shape[1], p, nw)
-    # root is R = L^T, so that what is rotated together is contiguous; columns are deviations.
+    # root is R = L^T, so that the rotated elements are contiguous; columns are deviations.
     root, columns = np.zeros((n, wide)), np.zeros((n, padded(pairs + nw)))
     reading_columns, gain = np.zeros((ny, wide)), np.empty((ny, wide))
-    # What the state leaves open of the readings (a lower root), and readings along R^T.
+    # Noise of the readings given the state (a lower root), and readings along R^T.
     noise, cross = np.empty((ny, ny)), np.empty((ny, n))
     cosine, sine, single, whitened = np.empty((4, n + ny + 1))
     centre_image = 2 * nw * other

@@ -1,4 +1,4 @@
-"""Where an axis stands still, and which samples therefore tell nothing about friction.
+"""Detection of standstill, where samples contain no information about friction.
 
 At standstill Coulomb friction is whatever balances the load, and the sign of the velocity is noise.
 """
@@ -9,24 +9,24 @@ from bampipe.arrays import Array, Flags
 from bampipe.estimate.low_pass import Band
 
 REST_S = 0.03
-"""A rest is longer than this, s, beyond what a change of direction takes by itself."""
+"""A rest lasts longer than a change of direction by this time, s."""
 REST_SPEED = 5.0
 """Speed below which an axis may rest, in standard deviations of the velocity."""
 _RINGING_SPEED = 10.0
-"""The same where a smoothed velocity rings, as it does at a stop: to and fro, where a machine that
-turns round does so once. So does one whose brake is commanded, however shortly: the brake may hold
-the axis for a moment at each reversal, and what it holds then is a hundred times the friction."""
+"""The same for a smoothed velocity that rings, as it does at a stop: it changes sign several times,
+at a reversal once. It also applies under a commanded brake, however shortly: the brake may hold the
+axis for a moment at each reversal, with a hundred times the friction."""
 _REACH = 0.02
-"""Share that a rest may have in a low-passed sample before the sample is left out."""
+"""A low-passed sample is left out if a rest has a larger share in it."""
 
 
 def find_standstill(qd: Array, qd_sd: Array, rate_hz: float, braked: Flags | None = None) -> Flags:
     """Tell where an axis stands still.
 
-    An axis rests where its velocity stays within five of its standard deviations, where its sign
-    is noise, for longer than 0.03 s beyond what it takes to turn round; from the first to the last
-    of several changes of sign within ten, for as long; where its brake is on, within ten, however
-    shortly. How friction builds up in a slow turn is seen nowhere else.
+    An axis rests while its velocity stays within five of its standard deviations, where its sign is
+    noise, for longer than 0.03 s beyond what it takes to turn round; from the first to the last of
+    several changes of sign within ten, for as long; where its brake is on, within ten, however
+    shortly. Slow reversals are kept, because only they show how friction builds up.
 
     Args:
         qd: (T, n_q) velocity; qd_sd: (T, n_q) or (n_q,) its standard deviation; rate_hz: of the
@@ -72,10 +72,7 @@ def find_runs(chosen: Flags) -> list[tuple[int, int]]:
 
 
 def _ringing(v: Array, limit: Array) -> list[tuple[int, int]]:
-    """Where a velocity (T,) within a limit (T,) goes to and fro.
-
-    From the sample before the first change of sign to the one after the last.
-    """
+    """Tell where a velocity (T,) within a limit (T,) oscillates, sign changes included."""
     found = []
     for start, end in find_runs(np.abs(v) < limit):
         turns = start + np.flatnonzero(np.diff(np.sign(v[start:end])))
@@ -85,10 +82,10 @@ def _ringing(v: Array, limit: Array) -> list[tuple[int, int]]:
 
 
 def _turning(v: Array, limit: Array, start: int, end: int) -> float:
-    """Samples that a change of direction takes from ``-limit`` to ``limit``, of ``start:end``.
+    """Return the samples of ``start:end`` that a reversal takes from ``-limit`` to ``limit``.
 
-    At the acceleration of the same time before and after; zero where the velocity (T,) does not
-    change its sign, where it is not known well enough to say so, or where the trial begins or ends.
+    It is taken at the acceleration of the same time before and after; zero if the velocity (T,) has
+    no known change of sign, or at the ends of a trial.
     """
     length = end - start
     before, after = start - 1 - length, end + length
@@ -103,7 +100,7 @@ def _turning(v: Array, limit: Array, start: int, end: int) -> float:
 
 
 def find_moving_samples(rest: Flags, band: Band) -> Flags:
-    """Tell which low-passed, thinned samples no rest reaches into.
+    """Tell which low-passed, thinned samples no rest affects.
 
     Args:
         rest: (T, n_q) from `find_standstill`; band: the low-pass.

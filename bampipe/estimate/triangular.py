@@ -60,7 +60,7 @@ def cholesky(covariance, factor):  # type: ignore[no-untyped-def]
 def append_rows(upper, n, columns, n_rows):  # type: ignore[no-untyped-def]
     """Replace the triangular R by that of R^T R + A^T A, by Householder reflections.
 
-    Each reflection touches one row of R and the rows of A: what is zero in R stays out of it.
+    Each reflection touches one row of R and the rows of A; zeros in R stay zero.
 
     Args:
         upper: (>= n, >= n) R, upper triangular; its leading (n, n) block is replaced, diagonal
@@ -108,8 +108,8 @@ def condition(upper, noise, cross, gain, cosine, sine):  # type: ignore[no-untyp
     Args:
         upper: (n, width) R with R^T R the covariance of the state, in and out; zeros below the
             diagonal and beyond column n (`padded`).
-        noise: (ny, ny) lower root of what the state leaves open of the readings; becomes the
-            lower root of the innovation's covariance.
+        noise: (ny, ny) lower root of the readings' covariance given the state; becomes the lower
+            root of the innovation's covariance.
         cross: (ny, n) readings along the columns of R^T; destroyed.
         gain: (ny, width) result: transposed gain for the innovation divided by its root.
         cosine, sine: (n + 1,) scratch.

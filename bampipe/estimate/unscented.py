@@ -65,16 +65,16 @@ class FilterFailure(ArithmeticError):
 
 @dataclass(frozen=True)
 class FilterModel:
-    """What the filter must know of a model.
+    """A model as the filter takes it.
 
     Attributes:
         functions: with the compiled functions ``derivative_rows`` and ``measure_rows``, of the
             kinds in `bampipe.model_functions`; for filterpy also ``derivative`` and ``measure``.
         n_states: length of x.
-        parameters: (np + 1,) values of all parameters, then the timing of the inputs: the time
-            by which they were sampled after the positions, s. Channels of one sample are never
-            taken at one instant; unmodelled, 0.1 ms already biases a damping by ten of its
-            standard deviations. What is not estimated stays as given.
+        parameters: (np + 1,) values of all parameters, then the timing of the inputs: the time by
+            which they were sampled after the positions, s. Channels of one sample are never read at
+            the same instant; unmodelled, 0.1 ms already biases a damping by ten of its standard
+            deviations. Parameters that are not estimated stay as given.
         free: (nt,) places of the estimated parameters in ``parameters``.
         lower, upper: (nt,) physical range of the estimated parameters; infinite where none; see
             the module docstring on when it is kept.
@@ -123,7 +123,7 @@ class FilterModel:
         p[self.free] = value
 
     def to_physical(self, mean: Array) -> tuple[Array, Array]:
-        """Return physical parameters and their slope for ``mean`` (..., nt) as estimated."""
+        """Return physical parameters and slopes of ``mean`` (..., nt), as estimated."""
         value, slope = np.array(mean, dtype=float), np.ones_like(mean)
         log = self.logarithmic
         # A filter that has lost the motion may be anywhere.
@@ -189,7 +189,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Stored:
-    """What the filter believed at some times of one trial.
+    """The filter's distribution at some times of one trial.
 
     Attributes:
         t: (R,) times, s: every ``stride``-th sample.
@@ -203,7 +203,7 @@ class Stored:
 
 @dataclass(frozen=True)
 class FilteredTrial(Stored):
-    """What the filter found in one trial.
+    """The filter's results on one trial.
 
     Attributes:
         innovation: (T, ny) reading minus prediction, NaN at the first sample and at gaps.
@@ -220,11 +220,10 @@ class FilteredTrial(Stored):
 
 @dataclass(frozen=True)
 class FilterOutcome:
-    """What the filter found in all trials.
+    """The filter's results on all trials.
 
     Attributes:
-        theta: (nt,) parameters on the scale of estimation; covariance: (nt, nt) as the filter
-            believes.
+        theta: (nt,) parameters on the scale of estimation; covariance: (nt, nt) by the filter.
         trials: one entry for each trial, in order.
     """
 
@@ -299,7 +298,7 @@ def run_kernel(
     root: Array,
     stride: int,
 ) -> FilteredTrial:
-    """Filter samples that follow each other, from the distribution at the first one.
+    """Filter consecutive samples, from the distribution at the first one.
 
     Args:
         model, settings: as in `filter_trials`.
@@ -358,7 +357,7 @@ def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
 
 
 def _array(values: Any, kind: type = np.float64) -> NDArray[Any]:
-    """``values`` as compiled code takes them: table columns, for one, are read-only."""
+    """Return ``values`` as compiled code takes them: table columns, for example, are read-only."""
     return np.require(values, dtype=kind, requirements=["C", "W"])
 
 

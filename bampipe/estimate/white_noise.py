@@ -3,8 +3,8 @@
 A difference of order k, divided by the root of its squared weights, has the standard deviation of
 white noise, while that of a smooth signal falls with every order. The least over several orders
 therefore bounds the noise from above, and is the noise wherever the signal is smooth over a few
-samples. A hum is neither: where the sampling is slow, no difference takes it out, and it has next
-to nothing at the frequencies of the motion. It is fitted and taken off first.
+samples. Hum is neither: at a low sampling rate no difference removes it, and it has almost no power
+at the frequencies of the motion. It is fitted and subtracted first.
 """
 
 import numpy as np
@@ -14,21 +14,21 @@ from bampipe.estimate.spectral_lines import LOWEST_LINE, find_lines
 
 _LOWEST_ORDER, _HIGHEST_ORDER = 2, 6
 _SLOWEST_HZ = 100.0
-"""A sensor's own low-pass keeps noise out of neighbouring samples that acts at the frequencies of
-the motion all the same. Thinned to this rate, a record shows that noise."""
+"""A sensor's own low-pass correlates the noise of neighbouring samples, which still acts at the
+frequencies of the motion. A record thinned to this rate shows that noise."""
 _NORMAL_MEDIAN = 0.6744897501960817
 _CUT = 2.0
 """Multiple of the magnitude below which nine in ten differences lie at which larger ones are cut:
 3.3 standard deviations of a normal distribution."""
 _FEWEST = 200
-"""Samples below which noise is not measured."""
+"""Fewest samples to measure noise."""
 _STRETCHES, _STRETCH = 8, 2000
-"""A longer record is looked at in so many stretches of so many samples: enough for 1 %."""
+"""A longer record is sampled in so many stretches of so many samples: enough for 1 %."""
 _LAGS = range(-1, 16)
-"""Samples by which a controller may be behind the readings that it acts on; or the log ahead."""
+"""Samples by which a controller may lag the readings that it acts on, or the log lead them."""
 _FEEDBACK_ORDER, _FEEDBACK_ROWS = 3, 16000
 _REACHES, _OFF_GRID = (1.5, 10.0, 100.0), 0.05
-"""Multiples of a step up to which it is found ever more exactly; how far off values may be."""
+"""Multiples of a step up to which it is refined, and the tolerance of values."""
 
 
 def white_noise_sd(
@@ -36,15 +36,15 @@ def white_noise_sd(
 ) -> float:
     """Standard deviation of the white noise on a record (T,) of a signal that is otherwise smooth.
 
-    From the median absolute difference, which resists spikes and steps; NaN for records too short
-    to tell.
+    It comes from the median absolute difference, which is robust against spikes and steps; NaN for
+    records that are too short.
 
     Args:
         record: samples.
         t: (T,) their time stamps, s, which need not be uniform; a uniform record needs none.
         step: of its counts, 0.0 where its values lie on no grid.
-        pulsed: whether the noise comes in pulses, as a controller makes them of counts: a median
-            sees next to nothing of those, and their mean square counts, single spikes cut.
+        pulsed: whether the noise comes in pulses, as a controller makes them of counts: the median
+            misses those, so that the mean square counts, without single spikes.
     """
     return _without_dither(_difference_noise(_dithered(record, step), t, pulsed), step)
 
@@ -52,9 +52,9 @@ def white_noise_sd(
 def slow_noise_sd(record: Array, t: Array, step: float = 0.0) -> float:
     """The same of a record (T,) at stamps ``t`` (T,), thinned to `_SLOWEST_HZ`.
 
-    It shows noise that a sensor's own low-pass keeps out of neighbouring samples, and takes a
-    signal for noise that is not smooth from one kept sample to the next. Sines that the whole
-    record shows are taken off. NaN where the record is too short, or no faster.
+    It includes noise that a sensor's own low-pass correlates between neighbouring samples, and any
+    signal that is not smooth from one kept sample to the next. Sines of the whole record are
+    subtracted. NaN if the record is too short or no faster.
     """
     every = round(1.0 / (_SLOWEST_HZ * float(np.median(np.diff(t))))) if t.size > _FEWEST else 0
     if every < 2:
@@ -71,12 +71,12 @@ def slow_noise_sd(record: Array, t: Array, step: float = 0.0) -> float:
 
 
 def without_feedback(records: Array, readings: Array) -> Array:
-    """What in ``records`` (T, n) does not follow ``readings`` of encoders (T, n_q), (T', n).
+    """Return what in ``records`` (T, n) does not follow ``readings`` (T, n_q), (T', n).
 
-    A controller makes its force of the readings, their rounding included, and that acts on the
-    machine: it is no noise. What is linear in the last readings is found by least squares on
-    differences, in which the rounding stands and the motion does not. At most 16,000 samples from
-    the middle are looked at.
+    A controller derives its force from the readings, rounding included, and that force acts on the
+    machine: it is no noise. The part linear in the last readings is found by least squares on
+    differences, which keep the rounding and remove the motion. At most 16,000 samples from the
+    middle are used.
     """
     first = max(0, (len(records) - _FEEDBACK_ROWS) // 2)
     part = slice(first, first + _FEEDBACK_ROWS)
@@ -94,17 +94,17 @@ def without_feedback(records: Array, readings: Array) -> Array:
 
 
 def _dithered(record: Array, step: float) -> Array:
-    """A record (T,) spread evenly over its counts: a median of whole counts is a whole count."""
+    """Dither a record (T,) over its counts: the median of whole counts is a whole count."""
     return record + step * np.random.default_rng(0).uniform(-0.5, 0.5, record.size)
 
 
 def _without_dither(noise: float, step: float) -> float:
-    """The noise of a record, from that of the dithered one."""
+    """Return the noise of a record from that of the dithered one."""
     return float(np.sqrt(np.maximum(noise**2 - step**2 / 12.0, 0.0)))
 
 
 def _difference_noise(record: Array, t: Array | None, pulsed: bool = False) -> float:
-    """Least over several orders of the noise that differences of a record show."""
+    """Return the least noise, over several orders, that differences of a record show."""
     if record.size < _FEWEST:
         return float("nan")
     if record.size > _STRETCHES * _STRETCH:
@@ -115,8 +115,8 @@ def _difference_noise(record: Array, t: Array | None, pulsed: bool = False) -> f
     stamps = np.arange(record.size, dtype=float) if t is None else t / float(np.median(np.diff(t)))
     record = _without_lines(record, stamps, LOWEST_LINE)
     found = []
-    # Divided differences take every polynomial of lower degree out, whatever the spacing; each
-    # order follows from the one before, and so do its weights of the samples.
+    # Divided differences remove every polynomial of lower degree, whatever the spacing; each order
+    # follows from the one before, and so do its weights of the samples.
     differences, weights = record, np.ones((1, record.size))
     for order in range(1, _HIGHEST_ORDER + 1):
         gap = stamps[order:] - stamps[:-order]
@@ -135,13 +135,13 @@ def _difference_noise(record: Array, t: Array | None, pulsed: bool = False) -> f
 
 
 def _cut_rms(size: Array) -> float:
-    """Root mean square of magnitudes (n,), those far beyond nine in ten of them cut."""
+    """Return the root mean square of magnitudes (n,), clipped far beyond nine in ten of them."""
     most = _CUT * float(np.quantile(size, 0.9))
     return float(np.sqrt(np.mean(np.square(np.minimum(size, most)))))
 
 
 def _without_lines(record: Array, t: Array, lowest: float) -> Array:
-    """Take its sines off a record (T,) at stamps ``t`` (T,): see `find_lines`."""
+    """Subtract the sines of a record (T,) at stamps ``t`` (T,): see `find_lines`."""
     for line in find_lines(record, t, lowest):
         record = record - line.values
     return record
@@ -156,7 +156,7 @@ def counting_step(record: Array) -> float:
     smallest = float(np.quantile(steps, 0.02))
     for guess in (float(steps.min()), smallest):
         step = guess
-        for reach in _REACHES:  # a log rounds its counts: larger multiples say more of the step
+        for reach in _REACHES:  # a log rounds its counts: larger multiples are more exact
             near = steps[steps < reach * step]
             step = float(near.sum() / np.round(near / step).sum())
         off = np.abs(steps - step * np.round(steps / step))

@@ -1,4 +1,4 @@
-"""The inertial numbers of a robot: possible ones, and the combinations that the trials show."""
+"""Inertial parameters of a robot: possible bodies and base parameters."""
 
 from dataclasses import replace
 
@@ -16,15 +16,15 @@ from bampipe.physics.newton_euler import INERTIAL
 from bampipe.results.identify import BaseEstimate
 
 _SHOWN = 0.5
-"""Share of the drawing's uncertainty below which the trials are said to show a combination."""
+"""The trials determine a base parameter if its uncertainty is below this share of the drawing's."""
 
 
 def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list[str]]:
-    """The fit with inertial numbers that some body can have, the nearest; and what to tell of it.
+    """Return the fit with the nearest possible bodies, and notes on the change.
 
-    Nearest is what explains the trials and the drawing least badly: the normal equations of the fit
-    weigh, and what is no inertial number follows. Where the nearest explain the trials far worse,
-    the fit stays as it is: the model lacks something, such as a counterbalance.
+    Distance is measured by the normal equations of the fit, drawing included, and all other
+    parameters adapt. If the nearest possible bodies explain the trials far worse, the fit stays as
+    it is: the model lacks something, such as a counterbalance.
     """
     robot = system.model.device.robot
     if robot is None:
@@ -37,23 +37,26 @@ def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list
         return squares, []
     drawn = np.array([joint.inertial for joint in robot.joints])
     p = _find_nearest(system, squares, places.reshape(-1, INERTIAL), drawn)
-    nearest = f"No body has the inertial numbers that fit {join_names(wrong)} best: the nearest"
+    nearest = (
+        f"The inertial parameters fitted to {join_names(wrong)} are physically impossible; the"
+        " nearest"
+    )
     error, of_fit = (squares.held_out_rmse(values) for values in (p, squares.p))
     if worse := describe_worse(system, error, of_fit, "the fit"):
-        return squares, [f"{nearest} possible ones are not given, for they {worse}."]
-    return replace(squares, p=p), [f"{nearest} possible ones are given."]
+        return squares, [f"{nearest} possible ones were rejected, because they {worse}."]
+    return replace(squares, p=p), [f"{nearest} possible ones are published."]
 
 
 def _find_nearest(system: System, squares: SquaresFit, places: Array, drawn: Array) -> Array:
-    """The nearest parameters (n_p + 1,) with possible bodies, whose numbers are at ``places``.
+    """Return the nearest parameters (n_p + 1,) with possible bodies at ``places``.
 
     ``places`` and the drawing's numbers, ``drawn``, are (b, 10).
     """
     count, unseen = squares.free.size, np.setdiff1d(places, squares.free)
-    # What no motion shows is weighed by the drawing.
+    # The drawing weighs combinations that no motion shows.
     of_drawing = [system.parameters[k].sd ** -2.0 for k in unseen]
     weight = block_diag(squares.information, np.diag(of_drawing))
-    at = np.full(len(weight), -1)  # nuisance parameters are none of the model's
+    at = np.full(len(weight), -1)  # without the nuisance parameters
     at[:count], at[len(at) - unseen.size :] = squares.free, unseen
     value, low, high = np.zeros(len(at)), np.full(len(at), -np.inf), np.full(len(at), np.inf)
     value[at >= 0] = squares.p[at[at >= 0]]
@@ -65,7 +68,7 @@ def _find_nearest(system: System, squares: SquaresFit, places: Array, drawn: Arr
 
 
 def base_estimates(system: System, p: Array, covariance: Array) -> tuple[BaseEstimate, ...] | None:
-    """The combinations that motion can show, with what the trials add to the drawing.
+    """Return the base parameters, by the drawing and by the trials.
 
     ``p`` (>= n_p,) are parameters of the model; ``covariance`` is that of those estimated.
     """
@@ -97,7 +100,7 @@ def base_estimates(system: System, p: Array, covariance: Array) -> tuple[BaseEst
 
 
 def summarise_bases(system: System, found: tuple[BaseEstimate, ...] | None) -> list[str]:
-    """Say how many combinations the trials show, and of which joints none."""
+    """Say how many base parameters the trials determine, and for which joints none."""
     robot = system.model.device.robot
     if robot is None or found is None:
         return []
@@ -105,9 +108,9 @@ def summarise_bases(system: System, found: tuple[BaseEstimate, ...] | None) -> l
     seen = {name.rpartition(".")[2] for entry in shown for name in entry.members}
     silent = [joint.name for joint in robot.joints if joint.name not in seen]
     lines = [
-        f"Of the {len(found)} combinations of inertial numbers that motion can show, these trials"
-        f" show {len(shown)}; of the others the drawing stands."
+        f"These trials determine {len(shown)} of the {len(found)} base parameters; the others keep"
+        " the values of the drawing."
     ]
     if silent:
-        lines.append(f"Of the bodies of {join_names(silent)} the trials say next to nothing.")
+        lines.append(f"The trials determine no body of {join_names(silent)}.")
     return lines

@@ -1,4 +1,4 @@
-"""What the uncertainty of sensors and drawings adds to parameters, source by source."""
+"""Contribution of uncertain sensors and drawings to the uncertainty of parameters, by source."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
@@ -18,7 +18,7 @@ from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.signals import ZERO_OF, Signals, calibration_changes
 
 _Source = tuple[str, System, Callable[[Motion], Motion]]
-"""Name of what is uncertain; model and motion as one standard uncertainty of it makes them."""
+"""Name of a source; model and motion changed by one standard uncertainty of it."""
 
 
 def propagate_calibration(
@@ -28,12 +28,12 @@ def propagate_calibration(
     motions: Sequence[Motion],
     squares: SquaresFit,
 ) -> Mapping[str, Array]:
-    """Return by how much one standard uncertainty of each source moves the estimates, (n,) each.
+    """Return the changes of the estimates, (n,), by one standard uncertainty of each source.
 
     Sources are gains and cross-talk of sensors and scales of encoders and channels as the session
     file states them, zeros of encoders, and constants of the device file with an ``sd``; they are
-    independent. A parameter moves as least squares do (law of propagation of uncertainty, JCGM
-    100:2008, 5.1), whichever method made it; one at its bound stays. The motions that were fitted
+    independent. Changes are those of least squares (law of propagation of uncertainty, JCGM
+    100:2008, 5.1) for either method; a parameter at its bound stays. The motions that were fitted
     have every input of the device.
     """
     count = int(np.sum(squares.free < len(system.parameters)))
@@ -46,7 +46,7 @@ def propagate_calibration(
 
 
 def _residual(system: System, motion: Motion, squares: SquaresFit) -> Array:
-    """Residual (T, n_q) of a trial, of functions that are not compiled: they serve once."""
+    """Return the residual (T, n_q) of a trial by uncompiled functions, which serve once."""
     p = squares.fit.evidence.p
     here = ModelOnTrial(system, p, [motion.with_input_timing(squares.trials.late_s)])
     at = here.mechanism.kinematics
@@ -54,7 +54,7 @@ def _residual(system: System, motion: Motion, squares: SquaresFit) -> Array:
 
 
 def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate:
-    """Return the estimate with what calibration adds in its covariance, and said apart."""
+    """Return the estimate with the calibration in its covariance, and as a separate term."""
     if not moved:
         return estimate
     added = sum(
@@ -81,14 +81,12 @@ def _sources(system: System, recipe: Recipe, session: IngestResult) -> Iterator[
 
 
 def describe_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> tuple[str, ...]:
-    """A sentence on what calibration adds, or that it is not stated."""
+    """Say what calibration adds to the intervals, or that no uncertainty is stated."""
     if all(name.startswith(ZERO_OF) for name in moved):
-        return (
-            "No uncertainty of gains, scales and constants is stated: the intervals hold none.",
-        )
+        return ("No uncertainty of gains, scales and constants is stated or included.",)
     sd = np.maximum(estimate.sd, np.finfo(float).tiny)
     largest = max(moved, key=lambda name: float(np.max(np.abs(moved[name]) / sd)))
     return (
-        f"The uncertainty of the calibration is in the intervals ({len(moved)} sources); most of it"
-        f" comes from {largest}.",
+        f"The intervals include the uncertainty of the calibration ({len(moved)} sources); most of"
+        f" it comes from {largest}.",
     )

@@ -1,19 +1,19 @@
-"""Which estimate ``--method auto`` publishes: one rule.
+"""The rule by which ``--method auto`` publishes an estimate.
 
-Least squares under the likelihood are always computed. They hold whatever the model lacks, for
-that stays in their residual. The unscented filter is the more precise where the model is right and
-the machine answers the measured forces. It is published where all of this is so:
+Least squares under the likelihood are always computed. They are consistent whatever the model
+lacks, because the missing force stays in the residual. The unscented filter is more precise if the
+model is right and the measured forces drive the machine. It is published if all of these hold:
 
-1. no test bench, and no controller of a robot, gives the motion, and the model is linear in its
-   parameters;
-2. to follow it takes at most `MOST_EVALUATIONS` evaluations of the model;
-3. it follows the motion, and its innovations have the size that it expects;
+1. neither a test bench nor a robot controller prescribes the motion, and the model is linear in its
+parameters;
+2. following it takes at most `MOST_EVALUATIONS` evaluations of the model;
+3. it follows the motion, and its innovations have their expected size;
 4. no parameter differs from that of least squares by more than chance (Hausman 1978,
    Econometrica 46, 1251: least squares are consistent either way, the filter is efficient);
-5. its standard deviations are the smaller ones, by their geometric mean;
-6. on no axis is its error on trials left out more than `_MOST_WORSE` times that of least squares.
+5. the geometric mean of its standard deviations is smaller;
+6. on no axis is its held-out error more than `_MOST_WORSE` times that of least squares.
 
-Else least squares are. `benchmarks/recovery.py` holds both against the truth.
+Otherwise least squares are published. `benchmarks/recovery.py` holds both against the truth.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,16 +33,16 @@ from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.replay import steps_to_follow
 
 MOST_EVALUATIONS = 2e7
-"""Of the model by all sigma points along all trials: some five seconds for each pass."""
+"""Most evaluations of the model by all sigma points on all trials: about five seconds per pass."""
 _CHANCE = 0.01
-"""Probability that the largest of the differences is by chance, below which two disagree."""
+"""Two estimates disagree if their largest difference has a lower probability by chance."""
 _MOST_WORSE = 1.2
-"""Error on trials left out, over that of another estimate at hand, up to which one is published."""
+"""An estimate is published if its held-out error is at most this multiple of the other's."""
 _SHOWN = 4
 
 
 def why_not_filtered(system: System, squares: SquaresFit, longest_step_s: float) -> str | None:
-    """Why the filter is not run: "" where there is nothing to say of it; None where it is run."""
+    """Return why the filter is not run: "" if no reason is worth a note, None if it is run."""
     device = system.model.device
     if device.prescribed or device.robot is not None or not squares.problem.linear:
         return ""
@@ -52,11 +52,11 @@ def why_not_filtered(system: System, squares: SquaresFit, longest_step_s: float)
     points = 2 * (len(system.states) + squares.free.size + len(system.noise)) + 1
     if steps * points <= MOST_EVALUATIONS:
         return None
-    return f"to follow the motion it would take {steps:.1g} steps of {points} points each"
+    return f"following the motion would take {steps:.1g} steps of {points} points each"
 
 
 def find_objections(system: System, by_filter: Estimate, by_squares: Estimate) -> tuple[str, ...]:
-    """What speaks against publishing the filter's estimate, a clause each."""
+    """Return the objections to publishing the filter's estimate, a clause each."""
     apart = np.abs(by_filter.value - by_squares.value)
     chance = stats.norm.isf(0.5 * _CHANCE / max(len(apart), 1))
     far = apart > chance * np.hypot(by_filter.sd, by_squares.sd)
@@ -67,22 +67,20 @@ def find_objections(system: System, by_filter: Estimate, by_squares: Estimate) -
             f"`{system.parameters[place].name}` at {round_with_sd(value, sd)}"
             for place, value, sd in triples
         ]
-        found.append(f"the latter puts {join_names(shown, _SHOWN)}, farther away than by chance")
+        found.append(f"it estimates {join_names(shown, _SHOWN)}, which differs by more than chance")
     if worse := describe_worse(system, by_filter.held_out_rmse, by_squares.held_out_rmse):
         found.append(f"its parameters {worse}")
     least = np.finfo(float).tiny
     ratio = np.maximum(by_filter.sd, least) / np.maximum(by_squares.sd, least)
     if (looser := float(np.exp(np.mean(np.log(ratio))))) > 1.0:
-        found.append(
-            f"the latter's standard deviations are {significant(looser)} times the former's"
-        )
+        found.append(f"its standard deviations are {significant(looser)} times as large")
     return tuple(found)
 
 
 def describe_worse(
     system: System, error: Array, other: Array, name: str = METHODS["least-squares"]
 ) -> str:
-    """Say that parameters err by far more on trials left out than those by ``name``, "" else.
+    """Say that parameters have a far larger held-out error than those by ``name``, or return "".
 
     ``error`` and ``other`` are theirs by axis, (n_q,).
     """
@@ -91,17 +89,17 @@ def describe_worse(
     if ratio[axis] <= _MOST_WORSE:
         return ""
     return (
-        f"err by {significant(error[axis])} {system.torque_units[axis]} on trials left out"
-        f" ({system.coordinates[axis]}), those of {name} by {significant(other[axis])}"
+        f"have a held-out error of {significant(error[axis])} {system.torque_units[axis]} on"
+        f" {system.coordinates[axis]}, those of {name} {significant(other[axis])}"
     )
 
 
 def tabulate_methods(
     system: System, published: Estimate, others: Sequence[Estimate], lost: str
 ) -> dict[Method, MethodTried]:
-    """What identify.json says of each method, the published one first.
+    """Return the entries of identify.json on each method, the published one first.
 
-    ``lost`` says why there is no estimate of the filter, "" where there is one or none was sought.
+    ``lost`` says why the filter gave no estimate; "" if it gave one or was not run.
     """
     found = dict[Method, MethodTried]()
     for each in (published, *others):
@@ -123,7 +121,7 @@ def tabulate_methods(
 
 
 def describe_methods(methods: Mapping[Method, MethodTried]) -> list[str]:
-    """Say what a method that is not published has against it, and what the published one has."""
+    """State the objections to each method, the published one included."""
     published, *others = methods
     words = METHODS[published]
     return [f"Published by {words}, although {doubt}." for doubt in methods[published].doubts] + [

@@ -1,4 +1,4 @@
-"""An estimate of a model's parameters, whatever method made it, and what identify.json says."""
+"""An estimate of a model's parameters by any method, and its record in identify.json."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,14 +32,14 @@ from bampipe.results.rounding import round_with_sd
 MOST_SHOWN = 24
 """Parameters that a headline lists."""
 _MOVES, _OUTLYING = 2.0, 15.0
-"""Standard deviations by which the worst second moves a parameter, and times what noise makes of a
-second that tells as much, from which on it is said. Of 32 sound sessions none reaches the first,
-where friction turns round 1.9 at most; a second in which the sensor is dead reaches 3.5 and 35."""
+"""The worst second is reported if it moves a parameter by so many standard deviations, and by so
+many times the effect of noise. In 32 sound sessions no second reached the first limit (1.9 at
+friction reversals); a second with a dead sensor reached 3.5 and 35."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Parameters with what belongs to them, physical units, those estimated in order.
+    """Parameters in physical units, and the quantities of the estimated ones, in their order.
 
     Attributes:
         p: (n_p + 1,) all parameters, the timing of the inputs last.
@@ -47,14 +47,14 @@ class Estimate:
             where it was.
         method: that made it.
         covariance: (n, n) of the estimated parameters of the model.
-        at_bound: (n,) which lie at the limit of their range.
-        held_out_rmse: error on trials that it is left without, by axis, (n_q,), N.m or N.
+        at_bound: (n,) which are at the limit of their range.
+        held_out_rmse: held-out error by axis, (n_q,), N.m or N.
         details: by parameter, further fields of its record.
         report: further fields of the result.
         tabulate: makes the tables of the states, trial by trial or all in one, and the table of the
             parameters along the data.
-        doubts: why it may not be believed, a clause each; none where nothing speaks against it.
-        notes: what else to know before believing it, a sentence each.
+        doubts: objections to it, a clause each.
+        notes: other reservations, a sentence each.
     """
 
     method: Method
@@ -71,7 +71,7 @@ class Estimate:
 
     @property
     def evidence(self) -> dict[str, Any]:
-        """What a filter says of the model and the noise, whatever becomes of its parameters."""
+        """Return the filter's results on model and noise, published or not."""
         return {key: self.report[key] for key in ("nis", "innovations", "noise")}
 
     @property
@@ -114,13 +114,13 @@ def collect_result(
     late: tuple[float, float],
     **further: Any,
 ) -> IdentifyResult:
-    """Return what identify.json says.
+    """Return the content of identify.json.
 
     Args:
         estimate: the published one; trials: names of the trials.
         moves: (n_free,) change of what is estimated, the timing last where it is, without each
             trial, or block of a single one, by name.
-        worst: the second that moves least squares most.
+        worst: the second with the largest influence on least squares.
         late: timing of the inputs that residuals go by, and its standard deviation, s.
         further: fields of the result as they are; notes among them on how it came about.
     """
@@ -144,7 +144,7 @@ def collect_result(
     unknown = [name for name, found in effects.items() if not found.identified]
     warning = f"not identified: {', '.join(unknown)}; " if unknown else ""
     timing = estimate.report["input_timing"]
-    # Nothing is taken off the trials where that may as well be none.
+    # The trials are not shifted if the timing may be zero.
     taken = 0.0
     if timing.limit > 0.0 and abs(late[0]) >= NORMAL_95 * late[1]:
         taken = float(np.clip(late[0], -timing.limit, timing.limit))
@@ -167,7 +167,7 @@ def collect_result(
             *notes,
             *identifiability.sentences,
             *(
-                f"`{name}` lies at the limit of its range: its interval is no guide."
+                f"`{name}` is at the limit of its range, so its interval is not valid."
                 for name, there in zip(names, estimate.at_bound, strict=True)
                 if there
             ),
@@ -177,7 +177,7 @@ def collect_result(
 
 
 def _headline(parameters: Mapping[str, ParameterEstimate]) -> str:
-    """The parameters in one line; of a robot's many, the first."""
+    """Return the parameters in one line; only the first of many."""
     shown = [
         f"{name} {round_with_sd(entry.estimate, entry.sd)} {entry.unit}".rstrip()
         for name, entry in parameters.items()
@@ -215,9 +215,9 @@ def _assess_influence(
             start_s=worst.start_s,
             parameter=names[place],
             move=move,
-            sentence=f"The second from {worst.start_s:.1f} s of trial {trial} on moves"
-            f" `{names[place]}` by {abs(move):.1f} standard deviations that the rest leaves it, a"
-            f" typical one by {worst.typical[place]:.2g}: look there for a transient or an outlier."
+            sentence=f"Without the second from {worst.start_s:.1f} s of trial {trial} on,"
+            f" `{names[place]}` changes by {abs(move):.1f} standard deviations, without a typical"
+            f" one by {worst.typical[place]:.2g}: look there for a transient or an outlier."
             if stands_out
             else "",
         ),
@@ -227,10 +227,10 @@ def _assess_influence(
 def _judge_effect(
     effect: BoundEffect, parameters: Mapping[str, ParameterEstimate], covariance: Array
 ) -> EffectEstimate:
-    """Say whether an effect is determined: a strength that is not nothing, and all of its shape.
+    """Say whether an effect is determined: its strength differs from zero, and its shape is known.
 
-    Several strengths, such as those of sine and cosine, are taken together: their errors may be
-    correlated so that none is determined alone. A shape that cannot be negative needs an interval
+    Several strengths, such as those of sine and cosine, are tested jointly, because correlated
+    errors may leave none determined alone. A shape that cannot be negative needs an interval
     smaller than itself. ``covariance`` is (n, n), of all ``parameters`` in their order.
     """
     free = [(item, parameters[item.name]) for item in effect.parameters if item.name in parameters]
@@ -260,9 +260,9 @@ def _differs_from_zero(value: Array, covariance: Array) -> bool:
 
 
 def _fault(name: str, entry: ParameterEstimate) -> str:
-    """Return why a parameter is not determined, "" where it is."""
+    """Return why a parameter is not determined, or ""."""
     if entry.at_bound:
-        return f"`{name}` lies at the limit of its range"
+        return f"`{name}` is at the limit of its range"
     if NORMAL_95 * entry.sd >= abs(entry.estimate):
         half = NORMAL_95 * entry.sd
         return (
@@ -276,11 +276,11 @@ def _describe_limit(timing: InputTiming) -> str:
     way = "later" if timing.estimate > 0.0 else "earlier"
     if abs(timing.estimate) < NORMAL_95 * timing.sd:
         return (
-            f"The timing of the force lies at its limit, {1e3 * timing.limit:.3g} ms {way} than"
-            f" logged, half a sample, and is uncertain by {1e3 * timing.sd:.2g} ms: these trials do"
-            f" not determine it, or {TIMING_AT_LIMIT}."
+            f"The input delay is at its limit of half a sample ({1e3 * timing.limit:.3g} ms {way}"
+            f" than logged, ± {1e3 * timing.sd:.2g} ms): these trials do not determine it, or"
+            f" {TIMING_AT_LIMIT}."
         )
     return (
-        f"The force acts {1e3 * timing.limit:.3g} ms or more {way} than logged, half a sample, all"
-        f" that the timing of the samples may be: {TIMING_AT_LIMIT}."
+        f"The force acts at least {1e3 * timing.limit:.3g} ms {way} than logged, the limit of half"
+        f" a sample: {TIMING_AT_LIMIT}."
     )

@@ -1,4 +1,4 @@
-"""The unscented filter's estimate: noise levels, convergence, all trials, honest intervals."""
+"""The unscented filter's estimate: noise levels, convergence, all trials, intervals."""
 
 from __future__ import annotations
 
@@ -59,19 +59,18 @@ from bampipe.trials.motion import Motion, trial_names, trial_sizes
 _RESTARTS = 3
 """Searches from least squares, each with four times the process noise of the one before."""
 _LEAST_REGION = 1e-3
-"""Least deviation of least squares of a nonlinear model, in standard deviations of the prior."""
+"""Least initial deviation of a nonlinear model from least squares, in prior standard deviations."""
 _AROUND = 10.0
-"""Standard deviations around an answer, from which on a start adds a hundredth to what is known."""
+"""Widening of the standard deviations around an answer: such a start adds 1 % of information."""
 _PARTS, _LIKELIER = (1, 2, 4), 30.0
-"""By what the Runge-Kutta step is divided, and what that must add to the logarithm of the
-likelihood: three times what it adds where friction is smooth on the scale of a step."""
+"""Division of the Runge-Kutta step, and the least gain of log likelihood by it: three times that
+with friction that is smooth on the scale of a step."""
 _NARROWER = (0.5, 0.25, 0.0625)
-"""Widths of the smoothed sign, times the device's, that are tried."""
+"""Widths of the smoothed sign that are tried, times the device's."""
 _MOVED_TRIALS, _MOVED_SAMPLES = 5, 10_000
-"""Trials, and samples of all, by which other equations move the answer or make it likelier."""
+"""Most trials, and samples of all, on which other widths and steps are compared."""
 _MOST, _SHOWN = 0.5, 6
-"""Share of the variance of a parameter from which on what the smoothing adds is said in words,
-and how many are named."""
+"""Smoothing is reported from this share of a parameter's variance on; most parameters named."""
 _SOUND_NIS = (0.5, 2.0)
 """Mean normalised innovation squared of a filter whose noise levels fit: 0.9 to 1.3 on sound
 sessions, 0.06 to 0.2 and 2.8 to 3.7 on those whose motion it lost."""
@@ -79,13 +78,13 @@ sessions, 0.06 to 0.2 and 2.8 to 3.7 on those whose motion it lost."""
 
 @dataclass(frozen=True)
 class FilterTask:
-    """What the filter is asked.
+    """A task for the filter.
 
     Attributes:
         recipe: the model as data; name: of it, for messages.
         start: (n_p,) starting values.
         squares: least squares, which give the region of the answer.
-        known: (n,) their standard deviations, of parameters that the trials leave open the prior's.
+        known: (n,) their standard deviations, those of the prior for undetermined parameters.
     """
 
     run: RunFolder
@@ -104,7 +103,7 @@ class FilterTask:
 
 
 class _Filtering:
-    """The trials as the filter reads them, its model and its noise levels.
+    """The trials, the model and the noise levels of the filter.
 
     Attributes:
         motions: parts of trials between disturbances; of_trial: the trial of each.
@@ -142,7 +141,7 @@ class _Filtering:
 
     @property
     def known(self) -> Array:
-        """(nt,) how well that is known."""
+        """(nt,) its standard deviations."""
         return np.append(self.task.known, self.late_sd)
 
     def clear(self, place: int) -> Flags:
@@ -166,10 +165,10 @@ class _Filtering:
 
     @property
     def attempts(self) -> list[Attempt]:
-        """Where to start: the prior, then least squares with more and more process noise.
+        """Return the starts: the prior, then least squares with increasing process noise.
 
         A model that is nonlinear in its parameters starts around least squares: a prior as wide as
-        a range leads such a filter astray.
+        a range would make it diverge.
         """
         task, count = self.task, self.count
         places, late = task.squares.free[:count], np.zeros(self.late_sd.size)
@@ -185,7 +184,7 @@ class _Filtering:
         return attempts + [(self.answer, around, 4.0**k) for k in range(_RESTARTS)]
 
     def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
-        """Filter all trials from the first of some starts that holds on to the motion."""
+        """Filter all trials from the first of some starts that follows the motion."""
         return TrialFilter(
             self.model,
             self.trials,
@@ -198,7 +197,7 @@ class _Filtering:
         ).run(attempts, settings)
 
     def find(self) -> tuple[FilterRun, _Width | None, _Widths]:
-        """The run that counts, the narrower width of the sign if readings ask for one, others."""
+        """Return the run that counts, the narrower width that readings favour, and others."""
         found = self.run(self.attempts, self.settings)
         widths = self._widths_around(found)
         width = None if self.task.system.model.device.prescribed else widths.choose()
@@ -208,7 +207,7 @@ class _Filtering:
         self.model = replace(self.model, functions=functions)
         value, slope = self.model.to_physical(found.theta)
         around = _AROUND * slope * np.sqrt(np.diag(found.covariance))
-        with suppress(MotionLost):  # a narrow sign may throw it off at one reversal of many
+        with suppress(MotionLost):  # a narrow sign may make it diverge at a single reversal
             settings = replace(found.settings, longest_step=widths.step / width.parts)
             again = self.run([(value, around, 1.0)], settings)
             if again.log_likelihood > found.log_likelihood + _LIKELIER:
@@ -260,8 +259,8 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
     smoothing = np.hypot(off, spread)[:count]
     rows = filtering.choice.trace_rows
     doubt = (
-        f"its normalised innovations squared are {nis.mean:.2g} on average, 1 where its noise"
-        " levels are right"
+        f"its mean normalised innovation squared is {nis.mean:.2g}; it is 1 if the noise levels"
+        " are right"
     )
     return Estimate(
         method="ukf",
@@ -282,14 +281,14 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
 
 
 def _find_smoothing(width: _Width | None, widths: _Widths) -> tuple[Array, Array]:
-    """How far the answer is from that without smoothing, and between likely widths, both (nt,).
+    """Return the bias by smoothing, and the spread between likely widths, both (nt,).
 
-    A machine with dry friction truly stands still, where the model creeps within the width of its
-    smoothed sign. The filter errs in proportion to that width: it is off by twice what half the
-    width that it took moves it. A machine that does creep shows that by readings that the narrower
-    sign makes less likely; there, and where that fails, nothing is off. Both are filtered around
-    the answer, over some of the trials and in finer steps, for the narrower one may be stiffer.
-    What widths that are nearly as likely disagree on is as uncertain.
+    A machine with dry friction truly stands still, whereas the model creeps within the width of its
+    smoothed sign. The error of the filter is proportional to that width: it is twice the change at
+    half the chosen width. If the narrower sign makes the readings less likely, or fails, the
+    machine creeps and the bias is zero. Both widths are filtered around the answer, over some of
+    the trials and in finer steps, because the narrower one may be stiffer. The spread is the
+    disagreement of widths that are nearly as likely.
     """
     factor, parts = (1.0, 1) if width is None else (width.factor, width.parts)
     likely, value = widths.filter(factor, 2 * parts)
@@ -301,19 +300,19 @@ def _find_smoothing(width: _Width | None, widths: _Widths) -> tuple[Array, Array
 def _describe_smoothing(
     names: Sequence[str], smoothing: Array, sd: Array, width: _Width | None
 ) -> tuple[str, ...]:
-    """Sentences on a narrower sign, and on uncertainty that is for the most part of smoothing."""
+    """Return sentences on a narrower sign, and on uncertainty mostly due to smoothing."""
     said = []
     if width is not None:
         said.append(
             f"The filter smooths the sign of the velocity over {significant(width.factor)} of the"
-            " device's `sign_width`, which makes the readings likelier."
+            " device's `sign_width`, which raises the likelihood of the readings."
         )
     most = smoothing**2 > _MOST * np.maximum(sd**2, np.finfo(float).tiny)
     if most.any():
         listed = [f"`{name}`" for name, here in zip(names, most, strict=True) if here]
         said.append(
-            f"Most of the uncertainty of {join_names(listed, _SHOWN)} is that the sign of the"
-            " velocity is smoothed, where a machine stands still."
+            f"Most of the uncertainty of {join_names(listed, _SHOWN)} comes from the smoothed sign"
+            " of the velocity, because a machine may stand still."
         )
     return tuple(said)
 
@@ -333,10 +332,10 @@ def _some_of(trials: Sequence[Trial], found: FilterRun) -> tuple[list[Trial], Ar
 
 @dataclass(frozen=True)
 class _Width:
-    """Over which narrower width the filter smooths the sign of a velocity.
+    """The narrower width over which the filter smooths the sign of a velocity.
 
     Attributes:
-        factor: times the device's; parts: by which the Runge-Kutta step that suits is divided.
+        factor: times the device's; parts: division of the Runge-Kutta step.
         spread: (n,) how far parameters move between the widths and steps that are nearly as likely.
     """
 
@@ -347,13 +346,13 @@ class _Width:
 
 @dataclass(frozen=True)
 class _Widths:
-    """What narrower widths of the smoothed sign make of some trials, around an answer.
+    """Narrower widths of the smoothed sign on some trials, around an answer.
 
     Attributes:
         found: the answer; model, width: of the filter that found it.
         some: parts of trials, and the covariance (nt, nt) to start from, by `_some_of`.
-        narrowed: the system by its width, times the device's; step: the longest step, s.
-        filtered: log likelihood and answer by width and by what the step is divided.
+        narrowed: the system by its width, times the device's; step: the longest step, s. filtered:
+            log likelihood and answer by width and division of the step.
     """
 
     found: FilterRun
@@ -382,16 +381,16 @@ class _Widths:
         return self.filtered[width, parts]
 
     def choose(self) -> _Width | None:
-        """Return the width that makes readings likeliest; None where no narrower one is likelier.
+        """Return the width of the highest likelihood; None if no narrower one raises it.
 
-        Friction that stops a machine changes over less than the device says it does, and estimates
-        err in proportion to the rest.
+        Friction that stops a machine changes over less than the declared width, and estimates are
+        biased in proportion to the difference.
         """
         first, *others = (self.filter(width, _PARTS[1])[0] for width in (1.0, *_NARROWER[:2]))
-        if max(others) < first:  # this is the usual case, and what `_find_smoothing` needs as well
+        if max(others) < first:  # this is the usual case, and `_find_smoothing` needs it too
             return None
         declared = max(self.filter(1.0, parts)[0] for parts in _PARTS)
-        if not np.isfinite(declared):  # nothing to hold the others against
+        if not np.isfinite(declared):  # nothing to compare the others with
             return None
         best = [max(self.filter(width, parts)[0] for parts in _PARTS) for width in _NARROWER]
         if max(best[:2]) < declared + _LIKELIER:

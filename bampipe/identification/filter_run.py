@@ -31,21 +31,21 @@ _STORED, _STORED_IN_ALL = 20_000, 100_000
 _COARSE = 300.0
 """Factor on the process noise of the search for the region of the answer."""
 _LARGEST_NIS = 10.0
-"""Mean normalised innovation squared from which on the filter is taken to have lost the motion."""
+"""The filter has lost the motion if its mean normalised innovation squared exceeds this."""
 
 STRETCH_S = 0.05
-"""Innovations are averaged over this long: from sample to sample the counts of an encoder are no
-noise, and what a model lacks acts at the pace of a hand."""
+"""Averaging time of innovations: encoder counts are no noise from sample to sample, and missing
+effects act at the pace of a hand."""
 _SHIFT_KNOWN = 0.1
-"""Share of the way between encoder and mechanism to which that way is known at the start."""
+"""Relative uncertainty of the initial displacement between encoder and mechanism."""
 _REVERSAL_WIDTHS = 5.0
 """Widths of the smoothed sign of the velocity within which an axis counts as reversing."""
 _REVERSAL_MARGIN_S = 0.02
-"""Time around that, s, which counts too."""
+"""Time around a reversal that counts too, s."""
 
 
 class MotionLost(InputError):
-    """The filter does not follow the measured motion, from wherever it starts."""
+    """The filter does not follow the measured motion from any start."""
 
 
 Attempt = tuple[Array, Array, float]
@@ -93,7 +93,7 @@ class FilterRun:
         settings: noise levels of the main pass.
         order: indices of ``trials`` in the session.
         restarts: attempts that failed before.
-        repeats: how often it was begun again around its own answer.
+        repeats: how often it was restarted around its own answer.
         first: passes before that, of the run from the real start; empty where there is one run.
     """
 
@@ -131,7 +131,7 @@ class FilterRun:
 
 
 def choose_stride(motions: Sequence[Motion]) -> int:
-    """Return every how many samples the filter stores its distribution."""
+    """Return the number of samples between stored distributions."""
     sizes = trial_sizes(motions)
     return max(-(-max(sizes) // _STORED), -(-sum(sizes) // _STORED_IN_ALL))
 
@@ -147,8 +147,8 @@ def load_filter_trial(
 ) -> Trial:
     """Return the raw samples of one trial, or of a part of it, as the filter reads them.
 
-    The state is that of the mechanism, which is not where its encoders are once a model has
-    something between the two.
+    The state is that of the mechanism, which may be displaced from its encoders by elements between
+    the two.
 
     Args:
         p: (n_p,) parameters near the answer, for the state at the first sample.
@@ -192,7 +192,7 @@ def load_filter_trial(
 def infer_initial_state(
     system: System, p: Array, q: Array, qd: Array, u: Array, reading_sd: Array, speed_sd: Array
 ) -> tuple[Array, Array]:
-    """Return the state (nx,) of the mechanism whose encoders read this, and its sd (nx,).
+    """Return the state (nx,) of the mechanism for these readings, and its sd (nx,).
 
     Args:
         p: (n_p,) parameters; u: (n_u,) inputs; reading_sd: (n_q,) of a position.
@@ -209,8 +209,8 @@ def clear_of_reversal_mask(motion: Motion, system: System, t: Array) -> Flags:
     """Tell where each axis moves well clear of standstill and reversal, (T, n_q).
 
     Within a few widths of the smoothed sign, friction changes faster than the spread of the state,
-    and no Gaussian describes what an encoder reads of an axis that stands still: there the filter
-    makes no claim that its innovations could be tested against.
+    and no Gaussian describes the readings of an axis at rest, so that innovations cannot be tested
+    there.
 
     Args:
         t: (T,) times at which it is wanted, s since the start of the trial.
@@ -227,14 +227,13 @@ def clear_of_reversal_mask(motion: Motion, system: System, t: Array) -> Flags:
 def build_filter_model(
     system: System, trials: Sequence[Trial], start: Array, timing: bool, late_s: float = 0.0
 ) -> FilterModel:
-    """Return the model as the filter wants it.
+    """Return the filter's model.
 
     Args:
         trials: whose sampling interval bounds the timing.
         start: (n_p,) values of the parameters, those that are not estimated included.
-        timing: whether the timing of the inputs is estimated, as the last parameter. A model
-            that has a delay of its own cannot tell the two apart.
-        late_s: the timing where it is not estimated.
+        timing: whether the timing of the inputs is estimated, as the last parameter. A model with a
+            delay of its own cannot separate the two. late_s: the timing if it is not estimated.
     """
     places = [i for i, item in enumerate(system.parameters) if not item.fixed]
     lower = [system.parameters[i].lower for i in places]
@@ -258,8 +257,8 @@ class TrialFilter:
     """The filter over all trials of a session.
 
     Attributes:
-        model, trials, choice: of the filter; names: of the trials; axes: of the readings.
-        where, remedy: said where the motion is lost.
+        model, trials, choice: of the filter; names: of the trials; axes: of the readings. where,
+        remedy: of the error if the motion is lost.
         report_progress: called with the share of the trials that is done and the next one's name.
     """
 
@@ -275,12 +274,12 @@ class TrialFilter:
     def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
         """Converge on the first trial, then filter all trials; the first attempt that holds counts.
 
-        A filter that trusts its model far from the truth does not find back. The first trial is
-        filtered with much process noise, which adds next to no information, and filtered again at
-        the end in its own right.
+        A filter that trusts its model far from the truth does not recover. The first trial is
+        therefore filtered with high process noise, which adds almost no information, and again at
+        the end.
 
         Args:
-            attempts: where to start, one after the other.
+            attempts: starts, tried in order.
 
         Raises:
             MotionLost: no attempt followed the motion.
@@ -322,8 +321,8 @@ class TrialFilter:
             ratio = found.trials[worst].ratio
             axis = (*self.axes, *self.axes)[int(np.argmax(ratio))]
             why = (
-                f"the filter does not follow trial {self.names[found.order[worst]]}: its prediction"
-                f" of {axis} one sample ahead errs {ratio.max():.0f} times more than noise explains"
+                f"the filter does not follow trial {self.names[found.order[worst]]}: the error of"
+                f" its one-step prediction of {axis} is {ratio.max():.0f} times that of noise"
             )
         raise MotionLost(why, where=self.where, remedy=self.remedy)
 
@@ -331,7 +330,7 @@ class TrialFilter:
         self.report_progress(done / (len(self.names) + 1), self.names[place])
 
     def _summarise(self, filtered: FilterOutcome, place: int) -> Pass:
-        """What later steps need of the one trial that was filtered, the trial of that place."""
+        """Return the summary of a filtered trial for later steps; ``place`` is its number."""
         one, trial = filtered.trials[0], self.trials[place]
         size = np.asarray(one.innovation / one.innovation_sd)
         present = ~np.isnan(one.nis)

@@ -1,4 +1,4 @@
-"""What a filter found, as tables and summaries: states, convergence, consistency, innovations."""
+"""Tables and summaries of a filter's results: states, convergence, consistency, innovations."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -29,14 +29,14 @@ from bampipe.trials.residuals import ModelOnTrial
 _LAGS_S = (0.0, 0.25, 0.5)
 """Lags at which inputs are taken."""
 WHITE_SHARE = 0.2
-"""Share predictable from the past below which a channel counts as white."""
+"""A channel is white if the past predicts less than this share."""
 INPUT_SHARE = 0.05
-"""Share predictable from the inputs below which a channel counts as independent of them."""
+"""A channel is independent of the inputs if they predict less than this share."""
 _SIGNIFICANT = 0.01
 
 
 def tabulate_nis(found: FilterRun, motions: Sequence[Motion]) -> Consistency:
-    """Return the normalised innovation squared: near 1 where the noise levels are right."""
+    """Return the normalised innovation squared, near 1 if the noise levels are right."""
     names, of_parts = trial_names(motions), dict[str, list[Pass]]()
     for place, trial in zip(found.order, found.trials, strict=True):
         of_parts.setdefault(names[place], []).append(trial)
@@ -63,9 +63,9 @@ def state_3sigma(system: System, trials: Sequence[Pass]) -> dict[str, StateBound
 def convergence(
     names: Sequence[str], model: FilterModel, found: FilterRun, covariance: Array
 ) -> Convergence:
-    """Say from when on every estimate stays within 2 % or 3 sd of its final value.
+    """Return the time after which every estimate stays within 2 % or 3 sd of its final value.
 
-    Time counts from the real start. Whether they have converged is asked of the last run.
+    Time counts from the real start. Convergence is judged by the last run.
     """
     nx = model.n_states
     value, slope = model.to_physical(np.concatenate([p.mean[:, nx:] for p in found.passes]))
@@ -137,7 +137,7 @@ def with_torques(
 
 
 def as_filtered(system: System, motion: Motion, p: Array) -> pd.DataFrame:
-    """The states of a trial where the estimate, ``p`` (n_p,), leaves its motion as it was."""
+    """Return the states of a trial whose motion the estimate, ``p`` (n_p,), does not change."""
     columns = {}
     for i, axis in enumerate(system.coordinates):
         columns[f"q_{axis}"], columns[f"qd_{axis}"] = motion.q[:, i], motion.qd[:, i]
@@ -204,19 +204,19 @@ def _fails(test: InnovationTest, limit: float) -> bool:
 
 
 def _sentence(own: InnovationTest | None, driven: InnovationTest | None) -> str:
-    """Say both outcomes in words."""
+    """Return both outcomes in words."""
     if own is None or driven is None:
         return "Too little motion to test the innovations."
-    past = f"{100.0 * own.share:.0f} % of their variance follows from their past"
-    force = f"{100.0 * driven.share:.0f} % from the inputs"
+    past = f"their past predicts {100.0 * own.share:.0f} % of their variance"
+    force = f"the inputs {100.0 * driven.share:.0f} %"
     if not _fails(own, WHITE_SHARE) and not _fails(driven, INPUT_SHARE):
-        return f"White and independent of the inputs: {past}, {force}; nothing points to a lack."
+        return f"White and independent of the inputs: {past}, {force}; no sign of a missing effect."
     if _fails(driven, INPUT_SHARE):
         return (
-            f"Not independent of the inputs: {force}, {past}. The model answers the force wrongly: "
-            "a delay, a gain, an inertia or what carries the load."
+            f"Not independent of the inputs: {past}, {force}. The model responds wrongly to the"
+            " force: look for a delay, a gain, an inertia or a load path."
         )
     return (
-        f"Not white: {past}, {force}. Something acts that the model lacks and that does not follow "
-        "the force, such as friction of another shape."
+        f"Not white: {past}, {force}. The model lacks an effect that does not follow the force,"
+        " such as another form of friction."
     )

@@ -1,11 +1,11 @@
-"""Free runs: the identified model left to itself, against the measured position.
+"""Free runs: the identified model simulated freely, against the measured position.
 
-Where the device declares its controller and the session recorded what that needs, machine and
-controller run together over whole trials from the reference (closed loop). Otherwise the recorded
-inputs drive the model alone (open loop), which says something of a whole trial only where the
-mechanism forgets where it started: without a restoring force any error of the force is integrated
-for ever. Over a tenth of a second to two seconds it always does (drift): from the filtered state at
-many moments, the model runs under the recorded inputs.
+If the device declares its controller and the session recorded its channels, machine and controller
+run together over whole trials from the reference (closed loop). Otherwise the recorded inputs alone
+drive the model (open loop). Over a whole trial this is meaningful only if the mechanism forgets its
+start: without a restoring force any error of the force is integrated for ever. Over a tenth of a
+second to two seconds it is always meaningful (drift): from the filtered state at many moments, the
+model runs under the recorded inputs.
 """
 
 import contextlib
@@ -31,32 +31,34 @@ from bampipe.trials.replay import is_stiff
 CLOSED: Final = "closed_loop"
 OPEN: Final = "open_loop"
 _PUSHED = 0.1
-"""How far the start is displaced to see whether it is forgotten, in spreads of the motion."""
+"""Displacement of the start that tests whether it is forgotten, in spreads of the motion."""
 _FORGOTTEN = 0.5
-"""Share of that which may be left over the last fifth of a trial."""
+"""Share of the displacement that may remain over the last fifth of a trial."""
 HORIZONS_S = (0.1, 0.5, 2.0)
 """A reversal, a movement, several movements of a hand."""
 _STARTS = 100
-"""Over all trials together; neighbours overlap, so that more would hardly say more."""
+"""Most starts over all trials; neighbours overlap, so that more add little."""
 _STARTS_OF_ROBOT = 20
-"""A robot's light joints stop and start a hundred times more slowly to integrate: 0.3 s a start."""
+"""Most starts of a robot, whose light joints take a hundred times longer to integrate: 0.3 s
+each."""
 _LEAST = 10
-"""Windows in which an axis moves, for quantiles that mean anything."""
+"""Fewest windows in which an axis moves, for meaningful quantiles."""
 _MARGIN_S = 0.2
 """Lost to the filters at both ends of a trial."""
 _MOVES = 0.01
 """Share of its range in the trial by which an axis must move within a window to count there."""
 _RUNS_AWAY = 0.1
-"""Share of windows that may run away."""
+"""Share of windows that may diverge."""
 _RUN_AWAY_PERCENT = 1000.0
-"""Error of a whole trial in relation to its motion from which a free run says nothing."""
+"""A free run is meaningless if its error exceeds this percentage of the motion."""
 _STEPS_S = (1e-3, 1e-4)
-"""Longest steps of integration, the next where a motion runs away with one: friction that builds up
-within micrometres is stiffer than an axis, and runs away by the step alone."""
+"""Longest integration steps; the next is tried if a motion diverges with one: friction that builds
+up within micrometres is stiffer than an axis, and diverges by the step alone."""
 
 
 _Reach = tuple[Array, Array, Flags]
-"""A run at one horizon: error, infinite if run away, displacement, is it a move, (n_q,) each."""
+"""A run at one horizon: error, infinite if diverged; displacement; whether it moves, (n_q,)
+each."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,8 @@ def free_runs(
 
     Args:
         run: the run folder, for the channels of the controller.
-        parameters: for each trial, (>= n_p,) parameters that have not seen it.
-        judged: which trials count for the whole; all where none does.
+        parameters: for each trial, (>= n_p,) parameters that have not seen it. judged: which trials
+        count; all if none does.
 
     Returns:
         Errors in closed loop, else in open loop; only a ``reason`` where no free run is possible
@@ -103,15 +105,15 @@ def free_runs(
                 runs.append(_open(system, motion, p))
             else:
                 return FreeRun(
-                    reason=f"{reason}, and driven by its recorded inputs alone the mechanism does "
-                    "not forget where it started."
+                    reason=f"{reason}, and under its recorded inputs alone the mechanism does not"
+                    " forget its initial position."
                 )
     except InputError as error:
         return FreeRun(reason=f"{mode.replace('_', ' ')}: {error}.")
     counted = [r for r, j in zip(runs, judged, strict=True) if j] or runs
     axes = _axes(system, counted)
     if any(axis.relative_error_percent > _RUN_AWAY_PERCENT for axis in axes.values()):
-        return FreeRun(reason="The simulated motion runs away.")
+        return FreeRun(reason="The simulated motion diverges.")
     given = np.concatenate([r.force for r in counted])
     off = np.concatenate([r.command for r in counted]) - given
     names = system.model.device.forces if mode == CLOSED else ()
@@ -129,7 +131,7 @@ def free_runs(
 
 
 def _lacks(run: RunFolder, system: System, law: ControlLaw) -> str:
-    """Why this session and model have no closed loop to run; "" where they have."""
+    """Return why this session and model have no closed loop to run, or ""."""
     recorded = run.read(IngestResult).channels
     missing = [n for n in law.inputs if n != "t" and n not in recorded]
     if missing:
@@ -170,7 +172,7 @@ def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -
 
 
 def _forgets(system: System, motion: Motion, p: Array) -> bool:
-    """Whether the mechanism, driven by the recorded inputs, loses a displacement of its start."""
+    """Return whether the mechanism forgets a displaced start under the recorded inputs."""
     push = _PUSHED * motion.q.std(axis=0)
     n = len(push)
     near, far = _open(system, motion, p), _open(system, motion, p, push)
@@ -214,8 +216,8 @@ def find_drift(
     """Run the model from many starts of every trial and say how far it drifts.
 
     Args:
-        parameters: for each trial, (>= n_p,) parameters that have not seen it.
-        judged: which trials count; all where none does.
+        parameters: for each trial, (>= n_p,) parameters that have not seen it. judged: which trials
+        count; all if none does.
 
     Returns:
         By axis: the drift at each horizon, and why some horizons are absent.
@@ -239,7 +241,7 @@ def find_drift(
     found = {axis: AxisDrift(unit=unit, horizons=()) for axis, unit in axes}
     for horizon in HORIZONS_S:
         if all(entry.reason for entry in found.values()):
-            break  # the longest runs, which cost most, would say nothing of any axis
+            break  # the longest runs, which cost most, would be meaningless for every axis
         reached = [reach for run in runs for reach in next(run, [])]
         for i, (axis, _) in enumerate(axes):
             if not found[axis].reason:
@@ -249,14 +251,14 @@ def find_drift(
 
 
 def why_not_free(system: System, motions: Sequence[Motion], parameters: Sequence[Array]) -> str:
-    """Why a model does not run by the measured force alone; "" where it may."""
+    """Return why a model cannot run under the measured force alone, or ""."""
     if system.model.device.prescribed:
-        return "A machine prescribes the motion, and the force is what that takes."
+        return "A machine prescribes the motion, and the force follows from it."
     robot = system.model.device.robot is not None
     if not robot and is_stiff(system, parameters[0][: len(system.parameters)], motions[0]):
         return (
-            "Friction would stop the machine within a small part of a sample: its drive gives the"
-            " motion, and the force is what that takes."
+            "Friction would stop the machine within a fraction of a sample, so its drive"
+            " prescribes the motion, and the force follows from it."
         )
     return ""
 
@@ -264,7 +266,7 @@ def why_not_free(system: System, motions: Sequence[Motion], parameters: Sequence
 def _let_go(
     system: System, motions: Sequence[Motion], trial: int, p: Array, length: float, spacing: float
 ) -> Iterator[list[_Reach]]:
-    """Runs from many samples of a trial, by horizon; ``length``, ``spacing`` of the starts, s."""
+    """Run from many samples of a trial, by horizon; ``length``, ``spacing`` of the starts, s."""
     motion, p = motions[trial], np.ascontiguousarray(p[: len(system.parameters)])
     u, dt = motion.inputs(system.inputs), float(motion.t[1] - motion.t[0])
     true = motion.of_mechanism(system, u, p)
@@ -298,7 +300,7 @@ def _let_go(
 
 
 def _simulate_from(system: System, state: Array, u: Array, p: Array, dt: float) -> Array | None:
-    """The state (nx,) at the last of inputs (T, n_u), `read_finely`; None if it runs away."""
+    """Return the state (nx,) at the last of inputs (T, n_u), `read_finely`; None if it diverges."""
     for step in _STEPS_S:
         with contextlib.suppress(Runaway):
             return np.asarray(_simulate(system, state, u, p, dt, (), step)[-1])
@@ -308,7 +310,7 @@ def _simulate_from(system: System, state: Array, u: Array, p: Array, dt: float) 
 def _simulate(
     system: System, state: Array, u: Array, p: Array, dt: float, smooth: Sequence[int], step: float
 ) -> Array:
-    """States (T, nx) under the inputs (T, n_u) alone, from ``state`` on."""
+    """Return states (T, nx) under the inputs (T, n_u) alone, from ``state`` on."""
     return simulate(
         system.derivative, state, u, p[: len(system.parameters)], dt, width=system.sign_widths,
         n_noise=len(system.noise), smooth=smooth, max_step=step,
@@ -318,17 +320,17 @@ def _simulate(
 def _drift(
     reached: Sequence[_Reach], axis: int, horizon: float, shorter: AxisDrift
 ) -> dict[str, object]:
-    """Return what a horizon, s, adds to what shorter ones say of one axis, or why it is absent."""
+    """Return the update of one axis' drift by a horizon, s, or why there is none."""
     used = [(error[axis], way[axis]) for error, way, moves in reached if moves[axis]]
     error = np.array([error for error, _ in used])
     if len(used) < _LEAST:
-        return {"reason": f"In {len(used)} windows of {horizon:g} s the axis moves: too few."}
+        return {"reason": f"The axis moves in only {len(used)} windows of {horizon:g} s."}
     if np.mean(np.isinf(error)) > _RUNS_AWAY:
-        return {"reason": f"Within {horizon:g} s the simulated motion runs away."}
+        return {"reason": f"The simulated motion diverges within {horizon:g} s."}
     median, most = np.quantile(error, [0.5, 0.9], method="inverted_cdf")
     displacement = float(np.median([way for _, way in used]))
     if median > displacement or not np.isfinite(most):
-        return {"reason": f"In {horizon:g} s the model drifts further than the axis moves."}
+        return {"reason": f"Within {horizon:g} s the model drifts farther than the axis moves."}
     drift = Drift(
         horizon_s=horizon, median=median, quantile_90=most, displacement=displacement,
         windows=len(used),

@@ -1,4 +1,4 @@
-"""What these trials can and cannot say of a model's numbers, in numbers and in words."""
+"""Identifiability of a model's numbers on these trials, in numbers and in words."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -32,34 +32,33 @@ from bampipe.trials.motion import Motion, trial_names
 _LISTED = 4
 """Trials named in a sentence."""
 _NOTHING = 0.01
-"""A trial without which no bound would grow by this share adds nothing."""
+"""A trial adds nothing if no bound would grow by this share without it."""
 _CLOSE = 0.9
-"""Correlation from which on two numbers are said to move together."""
+"""Numbers with a higher correlation are reported to move together."""
 _LITTLE = 0.5
-"""Share of the prior standard deviation above which the data are said to add little."""
+"""The data add little if they leave more than this share of the prior standard deviation."""
 _MOVES = 0.5
-"""Per cent by which an estimate moves for an error of one per cent, from which on it is said."""
+"""Change of an estimate by an error of one per cent, from which on it is reported, per cent."""
 _KNOWN = 0.1
-"""Standard deviation of an estimate over its size, at best, below which its moves are shares."""
+"""Changes are relative only if the least relative standard deviation of an estimate is lower."""
 _MOST_MOVED = 5
 """Estimates named for one number."""
 _SHIFT = 1e-6
-"""Of a position, rad or m, for the slope of a force."""
+"""Finite difference of a position, rad or m, for the slope of a force."""
 TIMING = "input_timing"
 
 
 def assess_identifiability(
     system: System, motions: Sequence[Motion], problem: Problem, p: Array, noise: Noise
 ) -> tuple[IdentifiabilityReport, Array]:
-    """Say what sensor noise alone leaves open about the parameters at ``p``.
+    """Return the uncertainty of the parameters at ``p`` by sensor noise alone.
 
     Args:
         problem: the inverse dynamics of the trials; p: (n_p + 1,) estimates, the timing of the
             inputs last.
 
-    Returns:
-        The report, and the covariance (n_parameters, n_parameters) that their priors leave where
-        the trials say nothing.
+    Returns: The report, and the covariance (n_parameters, n_parameters) of the priors in directions
+    without information.
     """
     known = structure(system)
     n_p = len(system.parameters)
@@ -75,7 +74,7 @@ def assess_identifiability(
     covariance = cramer_rao_bound(own)
     value = p[problem.free]
     estimated = [i for i, name in enumerate(names) if name != TIMING]
-    # Of inertial numbers, which all hide each other, see `BaseEstimate`.
+    # For inertial numbers, which all compensate each other, see `BaseEstimate`.
     drawn = set(np.flatnonzero(problem.precision))
     own_words = [i for i in estimated if i not in drawn]
     weak = [
@@ -91,7 +90,7 @@ def assess_identifiability(
         _describe_number(number, total, n, n + j, names, value, estimated)
         for j, number in enumerate(known.numbers)
     )
-    half = problem.upper[-1]  # of a sample: all that is assumed of the timing
+    half = problem.upper[-1]  # of a sample: the prior of the timing
     assumed = np.array([system.parameters[i].sd if i < n_p else half for i in problem.free])
     trials = {
         name: TrialGrowth(
@@ -111,7 +110,7 @@ def assess_identifiability(
         sentences=(
             *(
                 f"{_list(group.members)} enter the equations only as {_list(group.combinations)}:"
-                " no motion tells the parts apart."
+                " no motion separates them."
                 for group in known.together
             ),
             *(_describe_weak(w, names, value, covariance) for w in parted),
@@ -170,7 +169,7 @@ def find_information(
 
 
 def _stiffness(system: System, motion: Motion, z: Array, u: Array, p: Array) -> Array:
-    """Return how the force that the motion needs changes with the position, RMS, (n_q,)."""
+    """Return the slope of the required force by the position, RMS, (n_q,)."""
     found = np.zeros(len(system.coordinates))
     here = system.required(*motion.kinematics, z, u, p)
     for i in range(len(found)):
@@ -182,7 +181,7 @@ def _stiffness(system: System, motion: Motion, z: Array, u: Array, p: Array) -> 
 
 
 def _describe_bound(own: Array, covariance: Array, i: int, names: Sequence[str]) -> ParameterBound:
-    """Return bound, bound were all others known, and the parameter that most looks alike."""
+    """Return bound, bound with all others known, and the parameter that is most similar."""
     partner, correlation = _partner(covariance, i, names)
     return ParameterBound(
         bound_sd=_finite_sd(covariance[i, i]),
@@ -197,7 +196,7 @@ def _finite_sd(variance: float) -> float | None:
 
 
 def _partner(covariance: Array, i: int, names: Sequence[str]) -> tuple[str | None, float]:
-    """Return the other number whose error goes most with that of ``i``, and the correlation."""
+    """Return the other number most correlated with ``i``, and the correlation."""
     sd = np.sqrt(np.diag(covariance))
     usable = np.isfinite(sd) & (sd > 0.0)
     if not usable[i] or usable.sum() < 2:
@@ -218,12 +217,12 @@ def _describe_number(
     value: Array,
     estimated: Sequence[int],
 ) -> DeviceNumber:
-    """Return what the trials say of one number of the device, were it estimated too."""
+    """Return the information on one number of the device if it were estimated too."""
     rows = [*range(n), place]
     covariance = cramer_rao_bound(total[np.ix_(rows, rows)])
     partner, correlation = _partner(covariance, n, names)
     shift = -np.linalg.lstsq(total[:n, :n], total[:n, place], rcond=1e-12)[0]
-    # A share of what may as well be zero would be large and mean nothing.
+    # A relative change of an estimate that may be zero would be large and meaningless.
     sd = np.sqrt(np.diag(cramer_rao_bound(total[:n, :n])))
     per_cent = {
         names[i]: float(shift[i] * number.value / value[i])
@@ -240,7 +239,7 @@ def _describe_number(
 
 
 def _describe_weak(weak: Weak, names: Sequence[str], value: Array, covariance: Array) -> str:
-    """Say which parameters move together, and for a pair how well sum and difference are known."""
+    """Say which parameters move together; for a pair, how well sum and difference are known."""
     pair = list(weak.members)
     start = f"{_list([names[i] for i in pair])} move together here"
     if (
@@ -248,22 +247,25 @@ def _describe_weak(weak: Weak, names: Sequence[str], value: Array, covariance: A
         or np.any(value[pair] == 0.0)
         or not np.isfinite(covariance[pair, pair]).all()
     ):
-        return f"{start}: {100.0 * weak.strength:.2g} % of the information is left for that."
+        return (
+            f"{start}: the trials keep {100.0 * weak.strength:.2g} % of the information that"
+            " separates them."
+        )
     relative = covariance[np.ix_(pair, pair)] / np.outer(value[pair], value[pair])
     both = [0.5 * np.sqrt(np.array([1.0, s]) @ relative @ np.array([1.0, s])) for s in (1.0, -1.0)]
     better, worse = ("sum", "difference") if both[0] < both[1] else ("difference", "sum")
     return (
-        f"{start}: their {better}, each in per cent of itself, is known to "
-        f"{100.0 * min(both):.2g} % at best, their {worse} to {100.0 * max(both):.2g} %."
+        f"{start}: the {better} of their relative values is known to {100.0 * min(both):.2g} % at"
+        f" best, the {worse} to {100.0 * max(both):.2g} %."
     )
 
 
 def _describe_unsaid(names: Sequence[str], sd: Array, prior: Array) -> list[str]:
     return [
-        f"These trials say next to nothing of `{name}`: what was assumed of it stands."
+        f"These trials contain no information about `{name}`, which keeps its prior."
         if not np.isfinite(bound_sd)
-        else f"These trials say little of `{name}`: at best ± {bound_sd:.2g}, ± {assumed:.2g} was "
-        "assumed before."
+        else f"These trials contain little information about `{name}`: ± {bound_sd:.2g} at best,"
+        f" its prior is ± {assumed:.2g}."
         for name, bound_sd, assumed in zip(names, sd, prior, strict=True)
         if not bound_sd < _LITTLE * assumed
     ]
@@ -276,13 +278,13 @@ def _describe_idle(trials: Mapping[str, TrialGrowth]) -> list[str]:
     growth = max(trials[name].growth for name in idle)
     alone = f"no bound would grow by more than {100.0 * growth:.1g} %."
     if len(idle) == 1:
-        return [f"Trial {idle[0]} adds next to nothing: without it {alone}"]
+        return [f"Trial {idle[0]} adds almost nothing: without it {alone}"]
     which = join_names(idle, _LISTED)
-    return [f"Trials {which} add next to nothing: without any one of them {alone}"]
+    return [f"Trials {which} add almost nothing: without any one of them {alone}"]
 
 
 def _describe_leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
-    """Say which numbers of the device file the estimates rest on, and which they resemble."""
+    """Say on which numbers of the device file the estimates depend, and which they resemble."""
     sentences = []
     for number in numbers:
         moved = {name: size for name, size in number.moves_percent.items() if abs(size) >= _MOVES}
@@ -294,8 +296,8 @@ def _describe_leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
             sentences.append(f"An error of 1 % in `{number.name}` would move {join_names(shown)}.")
         if number.partner is not None and abs(number.correlation) > _CLOSE:
             sentences.append(
-                f"Were `{number.name}` estimated too, it and `{number.partner}` would move "
-                f"together (correlation {number.correlation:+.2f})."
+                f"If `{number.name}` were estimated too, it and `{number.partner}` would move"
+                f" together (correlation {number.correlation:+.2f})."
             )
     return sentences
 

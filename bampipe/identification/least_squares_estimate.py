@@ -1,7 +1,7 @@
 """Least squares on the inverse dynamics under the likelihood by which models are judged.
 
-Weights of samples, the bias of filters and of friction that stops, and the timing of the inputs
-are those of `bampipe.trials.likelihood`: what is a nuisance there is one here.
+Weights of samples, the bias of filters and of stopping friction, and the timing of the inputs are
+those of `bampipe.trials.likelihood`, with the same nuisance parameters.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -39,22 +39,22 @@ from bampipe.trials.residuals import problem_of, rms
 
 _REPLICATES = 6
 _LACKING = 3.0
-"""What is left over what sensors, filters and the discrepancy explain, from which on weights by
-these say nothing: a verdict has it that something unknown remains there."""
+"""Weights are meaningless if the residual exceeds the part of sensors, filters and discrepancy by
+this factor: by the verdict, something unknown then remains."""
 _PASSES = 6
 """Most fits of a model that is nonlinear in its parameters, each with replicates of the last."""
 _SETTLED = 1.0
-"""Gain of log likelihood, nats, below which such a fit is the last; the most likely one counts."""
+"""Such a fit is the last if it gains fewer nats of log likelihood; the most likely one counts."""
 _FARTHEST = 3.0
-"""Standard deviations that a nonlinear fit moves at most where a trial is left out."""
+"""Largest change of a nonlinear fit without a trial, in standard deviations."""
 _PERIODS = 10
-"""Periods of the band in the shortest block that is taken as independent of the next."""
+"""Periods of the band in the shortest independent block."""
 _TAILED = 0.75
-"""Slope of the score of a sample under Student's t distribution over its weight, on average over
-normal errors, four degrees of freedom: as weights follow the errors, they overstate information."""
+"""Mean slope of a sample's score under Student's t distribution over its weight, for normal errors
+and four degrees of freedom: weights that follow the errors overstate the information."""
 _STRETCH_S = 1.0
 _STATES = 500_000
-"""Samples, spread over all, that the typical uncertainty of a state is taken from."""
+"""Number of samples, spread over all, that give the typical uncertainty of a state."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,9 @@ class SquaresFit:
 
     Attributes:
         fit: the fit; trials: fitted; problem: their inverse dynamics, for other estimators.
-        replayed: whether the model could be replayed; else its samples weigh alike.
+        replayed: whether the model could be simulated; otherwise all samples have equal weight.
         p: (n_p + 1,) parameters, the timing of the inputs last, s, from what ``trials`` have.
-        block_s: longest of the blocks of time that are taken as independent, s.
+        block_s: longest independent block of time, s.
     """
 
     fit: Fit
@@ -77,12 +77,12 @@ class SquaresFit:
 
     @property
     def free(self) -> Indices:
-        """(n,) places in ``p`` of what is estimated, the timing last where it is."""
+        """(n,) places in ``p`` of the estimated parameters, the timing last if estimated."""
         return self.problem.free
 
     @property
     def at_bound(self) -> Flags:
-        """(n,) which of them lie at the limit of their range."""
+        """(n,) which of them are at the limit of their range."""
         value, slack = self.p[self.free], 1e-9 * (self.problem.upper - self.problem.lower)
         slack = np.where(np.isfinite(slack), slack, 0.0)
         low, high = self.problem.lower + slack, self.problem.upper - slack
@@ -90,7 +90,7 @@ class SquaresFit:
 
     @cached_property
     def _left(self) -> Sequence[tuple[Array, float]]:
-        """By axis: what is left, (n,), and its root mean square."""
+        """By axis: the residual, (n,), and its root mean square."""
         pairs = zip(self.fit.problem.y, self.fit.problem.base, strict=True)
         every = (y + x @ self.fit.solved.base for y, x in pairs)
         return KeptItems(
@@ -100,9 +100,10 @@ class SquaresFit:
 
     @property
     def rows(self) -> Iterator[tuple[Array, Array]]:
-        """By axis: slopes (n, P) by the determined unknowns, what is left (n,); both weighted.
+        """By axis: slopes (n, P) by the determined unknowns, and residual (n,); both weighted.
 
-        Made anew each time: kept, they would double the memory of the problem.
+        They are computed anew each time, because keeping them would double the memory of the
+        problem.
         """
         pairs = zip(self.fit.problem.base, self._left, strict=True)
         return ((x / scale, left / scale) for x, (left, scale) in pairs)
@@ -120,7 +121,7 @@ class SquaresFit:
         return np.asarray(back.T @ self.normal @ back)
 
     def respond(self, changes: Sequence[Array], held: Iterable[int] = ()) -> Array:
-        """How far the parameters (n,) follow changes of what was measured, to first order.
+        """Return the first-order change of the parameters (n,) by changes of the measurement.
 
         Args:
             changes: of the residual, by axis, each (n,), N.m or N.
@@ -134,7 +135,7 @@ class SquaresFit:
         return np.asarray(-(to @ step)[:count])
 
     def residual_change(self, residual: Iterable[Array]) -> list[Array]:
-        """What unfiltered residuals (T, n_q) of the trials add to its own, by axis, each (n,)."""
+        """Return the additions of unfiltered residuals (T, n_q) to its own, by axis, each (n,)."""
         evidence, samples = self.fit.evidence, self.fit.likelihood.samples
         thin = evidence.band.thin_trials(residual, range(len(samples)))
         change = [there - here for there, here in zip(thin, evidence.residual, strict=True)]
@@ -146,7 +147,7 @@ class SquaresFit:
         pose = self.fit.problem
         inverse = invert_scaled(self.normal)
         fitted = float(np.trace(inverse @ (self.normal - pose.precision)))
-        # Shorter blocks where there are fewer than three a parameter.
+        # Shorter blocks if there are fewer than three per parameter.
         band, seconds = self.trials.band, sum(self.fit.evidence.sizes) / self.trials.band.rate_hz
         most = max(
             seconds / (BLOCKS_A_PARAMETER * max(fitted, 1.0)), _PERIODS / min(band.cutoff_hz)
@@ -171,7 +172,7 @@ class SquaresFit:
         return self.fit.problem.sums_of(trials, len(self.trials.motions))
 
     def refit(self, xx: Array, xy: Array, yy: Array) -> Array:
-        """Parameters (n_p + 1,) by sums of some samples, to first order in bounds."""
+        """Return parameters (n_p + 1,) from sums of some samples, to first order."""
         pose, count = self.fit.problem, self.free.size
         lower, upper = pose.lower.copy(), pose.upper.copy()
         if not self.problem.linear:
@@ -189,15 +190,15 @@ class SquaresFit:
 
     @cached_property
     def parts(self) -> Sequence[Motion]:
-        """What is left out in turn: trials, or blocks of a single one."""
+        """The parts left out in turn: trials, or blocks of a single one."""
         motions: Sequence[Motion] = self.trials.motions
         return motions if len(motions) > 1 else cut_blocks(motions[0], self.trials.band)
 
     @cached_property
     def moves(self) -> list[Array]:
-        """Change of what is estimated, (n,), without each part; see `Influence`.
+        """Change of the estimates, (n,), without each part; see `Influence`.
 
-        Of a single trial a period of the band on either side is left out, too.
+        In a single trial a period of the band on either side is left out, too.
         """
         band, groups = self.trials.band, self.trials.folds.groups
         if len(self.parts) == 1:
@@ -222,9 +223,9 @@ class SquaresFit:
         return np.asarray((self.refit(*sums) - self.p)[self.free])
 
     def held_out_rmse(self, p: Array) -> Array:
-        """Error of an estimate on each part that it is left without, by axis, (n_q,), N.m or N.
+        """Return the error of an estimate on each part held out, by axis, (n_q,), N.m or N.
 
-        ``p`` (n_p + 1,) is the estimate, whichever method made it; it moves as least squares do.
+        ``p`` (n_p + 1,) is the estimate, by any method; it changes as least squares do.
         """
         trials, limits = self.trials, (self.problem.lower, self.problem.upper)
         problem = problem_of(self.fit.evidence.system, self.parts, trials.band, timing=trials.timed)
@@ -238,7 +239,7 @@ class SquaresFit:
         return rms(map(residual, range(problem.n_trials)), used)
 
     def find_worst_second(self) -> RemovedStretch:
-        """The second of a trial without which some parameter would move most."""
+        """Return the second of a trial without which some parameter would change most."""
         evidence = self.fit.evidence
         samples = lay_out_samples(evidence, _STRETCH_S)
         to = self.fit.problem.to_parameters[: self.free.size] @ invert_scaled(self.normal)
@@ -256,7 +257,7 @@ class SquaresFit:
 
     @property
     def bias(self) -> Array:
-        """What filters and friction that stops would move the parameters by, (n,), if left in."""
+        """Return the bias of the parameters, (n,), by filters and stopping friction."""
         unknowns = self.fit.problem.to_parameters.shape[0]
         factors = range(unknowns - 2 * len(self._left), unknowns)
         return self.respond(self.fit.bias, factors)
@@ -282,7 +283,7 @@ def fit_squares(
     """
     session = Session(trials, Criteria(replicates=_REPLICATES))
     problem = problem_of(system, trials.motions, trials.band, timing=trials.timed)
-    # Effects with a shape stay as they were searched: friction that stops would bend them.
+    # Shapes of effects keep their searched values, which stopping friction would bias.
     effects = () if problem.linear else system.model.effects
     plain = problem_of(
         system, trials.motions, trials.band, held=[q.name for e in effects for q in e.parameters]
@@ -294,7 +295,7 @@ def fit_squares(
             again = _with_values(
                 session.fit(recipe, at, lacking=_LACKING), trials, problem, block_s
             )
-            # Replicates of a model that is off one way put the fit off the other way.
+            # Replicates of a model with an error one way push the fit the other way.
             there = again.fit.evidence.p
             at = there if found is None else 0.5 * (at + there)
             gain = again.fit.log_likelihood - found.fit.log_likelihood if found else np.inf
@@ -308,7 +309,7 @@ def fit_squares(
 
 
 def _with_values(fit: Fit, trials: MeasuredTrials, problem: Problem, block_s: float) -> SquaresFit:
-    """The fit with its parameters, the last small step of its linear problem among them."""
+    """Return the fit with its parameters, including the last small step of its linear problem."""
     change = (fit.problem.to_parameters @ fit.solved.base)[: problem.free.size]
     p = np.append(fit.evidence.p, 0.0)
     p[problem.free] = np.clip(p[problem.free] + change, problem.lower, problem.upper)
@@ -365,13 +366,13 @@ def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
 
 
 def require_enough(squares: SquaresFit, where: str) -> None:
-    """Raise :class:`InputError` where fewer than two independent samples a number would count."""
+    """Raise :class:`InputError` if there are fewer than two independent samples per parameter."""
     samples = lay_out_samples(squares.fit.evidence, squares.block_s)
     moving = int(sum(here.independent for here in samples))
     if moving < 2 * squares.free.size:
         raise InputError(
-            f"of the free trials, {moving} independent samples are clear of standstill, fewer than"
-            f" twice the {squares.free.size} numbers to be found",
+            f"the free trials have {moving} independent samples in motion, fewer than twice the"
+            f" {squares.free.size} parameters",
             where=where,
             remedy="record faster motion at a higher rate, or more of it",
         )

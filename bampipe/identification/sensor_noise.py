@@ -1,4 +1,4 @@
-"""Settings of the filter, noise of the sensors, and the levels that suit it best (likelihood)."""
+"""Settings of the filter, noise of the sensors, and the noise levels of the highest likelihood."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,9 +26,9 @@ from bampipe.trials.sensors import Sensors
 TUNING_SAMPLES = 3000
 """Samples on which the noise levels are tuned."""
 _TUNING_TRIALS = 6
-"""Trials that they are taken from: what a model lacks may be small in one alone."""
+"""Trials that they are taken from: in a single one, the missing effect may be small."""
 _TUNING_STEP_S = 2e-3
-"""Longest Runge-Kutta step while tuning, s: noise levels need no more."""
+"""Longest Runge-Kutta step while tuning, s: sufficient for noise levels."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -79,11 +79,11 @@ class Noise:
 def sensor_noise(
     sensors: Sensors, system: System, motions: Sequence[Motion], p: Array, choice: FilterChoice
 ) -> Noise:
-    """Noise of the session's sensors as the filter wants it.
+    """Return the noise of the session's sensors for the filter.
 
-    Process noise that is no force starts as the torque of the smallest force noise at an arm of
-    1 m. Where the load moves the encoder against the handle, the noise of a force adds to what
-    the model says that the encoder reads.
+    Process noise other than of a force starts as the torque of the smallest force noise at an arm
+    of 1 m. If the load moves the encoder against the handle, the noise of a force adds to the
+    modelled reading.
 
     ``p`` (n_p,) are parameters near the answer; ``choice`` may fix levels.
     """
@@ -109,7 +109,7 @@ def sensor_noise(
 
 
 def _force_in_positions(system: System, motions: Sequence[Motion], p: Array, noise: Noise) -> Array:
-    """Return how far the noise of the forces moves the encoders in the model, RMS, (n_q,)."""
+    """Return the motion of the encoders by the noise of the forces in the model, RMS, (n_q,)."""
     square, count = np.zeros(len(system.coordinates)), 0
     for motion in motions:
         given = motion.inputs(system.inputs)
@@ -123,7 +123,7 @@ def _force_in_positions(system: System, motions: Sequence[Motion], p: Array, noi
 
 
 def untuned_settings(system: System, noise: Noise, choice: FilterChoice) -> FilterSettings:
-    """Return the settings of the filter with the noise of the sensors as it is stated."""
+    """Return the settings of the filter with the stated noise of the sensors."""
     n = len(system.coordinates)
     free = [item for item in system.parameters if not item.fixed]
     return FilterSettings(
@@ -138,8 +138,8 @@ def untuned_settings(system: System, noise: Noise, choice: FilterChoice) -> Filt
 def choose_tuning_trials(sizes: Sequence[int]) -> tuple[list[int], int]:
     """Choose trials on whose beginnings the noise levels are tuned, `TUNING_SAMPLES` together.
 
-    A filter can start where a trial does, at rest and cold; in the middle of one, nobody knows the
-    internal states of friction.
+    A filter can start at the beginning of a trial, at rest and cold; in its middle, the internal
+    states of friction are unknown.
 
     Returns:
         Numbers of the trials, spread over all, and how many samples of each.
@@ -161,15 +161,15 @@ def tune_noise(
 ) -> FilterSettings:
     """Set the noise levels at the maximum of the filter's likelihood on parts of trials.
 
-    The noise of a measured force is at least that of its sensor: what is more is model error.
-    Reversals are left out: there the filter's Gaussian fits whatever the noise, and noise of
-    twice its size would pay for them everywhere else.
+    The noise of a measured force is at least that of its sensor; the excess is model error.
+    Reversals are left out: there the filter's Gaussian fits at no noise level, and the tuning would
+    double the noise everywhere else.
 
     Args:
         settings: with the levels to start from; records: the beginnings of trials.
         clear: (T,) of each, its samples at which no axis reverses; all count where none is clear.
-        near: (nt,) parameters near the answer, physical, and (nt,) how well they are known.
-        choice: fixes levels that are not to be found.
+        near: (nt,) parameters near the answer, physical, and (nt,) their sd. choice: fixes some
+        levels.
     """
     longest = max(settings.longest_step, _TUNING_STEP_S)
     quick = replace(settings, longest_step=longest, stride=TUNING_SAMPLES)  # no distributions

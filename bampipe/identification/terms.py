@@ -1,4 +1,4 @@
-"""What each term of an identified model contributes to the force, sample by sample and in bins."""
+"""Contribution of each term of an identified model to the force, by sample and in bins."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,13 +23,13 @@ _BINS = 24
 _FEWEST = 8
 """Samples of a bin."""
 _LEAST_SHARE = 0.02
-"""Of the force of a term over the axis' own error, below which its curve says nothing."""
+"""A curve is meaningless if the force of its term over the axis' error is below this."""
 _STEP = 1e-4
-"""Of a parameter's size, for its derivative."""
+"""Finite difference as a share of a parameter's size."""
 
 
 class _Part(NamedTuple):
-    """Some parameters by number, of which ``strengths`` at 0 take the term out of the model."""
+    """Some parameters by number; with ``strengths`` at 0 the term is absent from the model."""
 
     name: str
     text: EffectText
@@ -52,7 +52,7 @@ class _Samples:
     error: Array
 
     def residual(self, p: Array) -> Array:
-        """The residual with other parameters, (n_p,), thinned but not low-passed, (K, n_q)."""
+        """Return the unfiltered, thinned residual (K, n_q) with other parameters, (n_p,)."""
         found = (replace(one, p=p).residual for one in self.fitted)
         return np.concatenate([one[self.band.thinned_rows(len(one))] for one in found])
 

@@ -61,7 +61,7 @@ def collect(runs: Path, folder: Path, *, report: bool = True, progress: Progress
         except InputError as error:
             skipped.append(f"{root.name}: {error}")
     if not found:
-        raise InputError(f"no run in {runs} has got as far as ingest", remedy=skipped[0])
+        raise InputError(f"no run in {runs} has completed ingest", remedy=skipped[0])
     found.sort(key=lambda one: (one.key["recorded_at"] or _EARLIEST, one.key["session_id"]))
     tables = {
         name: [row for one in found for row in one.tables.get(name, ())]

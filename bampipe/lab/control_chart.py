@@ -20,13 +20,13 @@ from bampipe.arrays import Array
 from bampipe.results.lab import ChartPoint, ControlChart
 
 FEWEST_SESSIONS = 6
-"""With fewer sessions their scatter is not known well enough for limits."""
+"""Fewest sessions whose scatter is known well enough for limits."""
 
 RUN_LENGTH = 9
-"""So many sessions in a row on one side of the centre are a shift (Nelson 1984, test 2)."""
+"""Consecutive sessions on one side of the centre that are a shift (Nelson 1984, test 2)."""
 
 FALSE_ALARM = 0.0027
-"""Share of sessions beyond the limits where nothing has changed: that of three sigma."""
+"""Share of sessions of an unchanged device beyond the limits: that of three sigma."""
 
 MEDIAN_RANGE = 0.9539
 """Median of the range of two standard normal numbers, sqrt(2) * 0.6745."""
@@ -76,7 +76,7 @@ def make_chart(
         between_sd=between,
         slope_per_session=slope,
         slope_p=slope_p,
-        # Less likely by chance than a point beyond the limits.
+        # This is less likely by chance than a point beyond the limits.
         drifts=slope_p is not None and slope_p < FALSE_ALARM,
         run=None if run is None else (sessions[run[0]], sessions[run[1]]),
         points=tuple(

@@ -20,7 +20,7 @@ from bampipe.run import models, record
 
 _OF_SESSION = ("ingest/session.json", "ingest/trials.parquet", "stiffness/stiffness.json")
 _OF_MODELS = ("identify.json", "validate.json", "diagnose.json")
-"""Files that are read of a run, and of each of its models."""
+"""Files read from a run, and from each of its models."""
 
 
 @dataclass
@@ -55,7 +55,7 @@ def read_run(root: Path) -> SessionRows:
         recorded = lab_tables.moment(session.recorded_at)
     except ValueError as error:
         raise InputError(
-            f"recorded_at is no moment ({error})",
+            f"recorded_at is not a time ({error})",
             where=str(run.path(IngestResult.FILE)),
             remedy="make it again (--force)",
         ) from error

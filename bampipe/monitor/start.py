@@ -115,7 +115,7 @@ def list_layouts(system: System, session: Session | None) -> tuple[StreamLayout,
     derived = [name for name in system.inputs if name not in given]
     if derived:
         raise InputError(
-            f"the model needs {derived[0]}, which is known only afterwards",
+            f"the model needs {derived[0]}, which is not known in real time",
             where="bampipe monitor",
             remedy="monitor a model without this effect",
         )

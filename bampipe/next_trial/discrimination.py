@@ -149,11 +149,11 @@ class Comparison:
         return self._sums_of(self.fit.evidence, self.fit.likelihood)
 
     def sums(self, motions: Sequence[Motion]) -> Sums:
-        """Return the sums over ``motions``, replays of the model through the sensors."""
+        """Return the sums over ``motions``, replicates of the model."""
         return reduce(add, (self._sums_of(*self._observe(motion)) for motion in motions))
 
     def _observe(self, motion: Motion) -> tuple[Evidence, Likelihood]:
-        """Return the model on a replay, with the noise that the trials show at each speed."""
+        """Return the model on a replicate, with the noise of the trials at each speed."""
         e, c = self.fit.evidence, self.session.criteria
         name = motion.trial_id
         seen = gather_evidence(
@@ -164,7 +164,7 @@ class Comparison:
         speed = [np.abs(motion.qd[e.band.thinned_rows(len(motion.t))])]
         bias, variance, classes = [], [], []
         for axis, here in enumerate(samples):
-            # A single replay is its own bias, with the noise of one replay.
+            # A single replicate is its own bias, with the noise of one replicate.
             bias.append(take_samples(seen.residual, here, axis))
             speeds, variances, numbers = self._noise_by_speed[axis]
             at = np.searchsorted(speeds[:-1], take_samples(speed, here, axis))
@@ -177,7 +177,7 @@ class Comparison:
 
     @cached_property
     def _noise_by_speed(self) -> list[tuple[Array, Array, Indices]]:
-        """By axis: speeds at hand in order, the variance of replays there, and their classes."""
+        """By axis: sorted speeds of the trials, variance of replicates there, and their classes."""
         e, likelihood, found = self.fit.evidence, self.fit.likelihood, []
         speeds = [np.abs(m.qd[e.band.thinned_rows(len(m.t))]) for m in e.motions]
         for axis, here in enumerate(likelihood.samples):

@@ -205,11 +205,11 @@ def _say_plan(found: TrialPlan, seconds: float, what: str) -> str:
     count = sum(design.parts for design in found.designs)
     asked = "chance of confusing two effects is expected to fall below the limit"
     if what == "uncertainties":
-        asked = "uncertainty is expected to fall below the limit asked for"
+        asked = "uncertainty is expected to fall below the requested limit"
     if not count:
         if found.is_enough:
-            return "The trials at hand are enough: nothing needs to be recorded."
-        return f"No trial that could be recorded here brings the {what} nearer to the limit."
+            return "The present trials suffice: nothing needs to be recorded."
+        return f"No further trial would bring the {what} nearer to the limit."
     head = f"With {'one trial' if count == 1 else f'{count} trials'}, {seconds:.0f} s in all,"
     if found.is_enough:
         return f"{head} every {asked}."

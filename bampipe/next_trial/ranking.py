@@ -142,7 +142,7 @@ def rank_designs(
         chosen[-1] = inside
     ranked = []
     for k, design in enumerate(chosen):
-        progress(0.75 + 0.25 * k / finalists, "following the best ones roughly")
+        progress(0.75 + 0.25 * k / finalists, "simulating people who follow the best ones roughly")
         motions = space.follow(design)
         ranked.append(RankedDesign(design, _take_low([utility(m) for m in motions]), motions))
     best_utility = max(one.utility for one in ranked)

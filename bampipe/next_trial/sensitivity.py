@@ -225,7 +225,7 @@ def find_detectability(
 ) -> Detectability:
     """Return the detection limits of every effect of the library that the model lacks.
 
-    ``by_chance`` are the largest gains of any candidate on each replay, nats.
+    ``by_chance`` are the largest gains of any candidate on each replicate, nats.
     """
     scale, names = MachineScale.of_trials(fit.evidence), session.candidate_names(fit.recipe)
     typical = (make_typical_alternative(item, scale) for item in candidates_of(fit.recipe, names))

@@ -28,8 +28,8 @@ TIMING_AT_LIMIT = (
 def describe_hum(hum: MainsHum) -> str:
     """Return channel, amplitude and frequency of a mains hum."""
     return (
-        f"{hum.channel}: mains hum of {hum.amplitude:.2g} {hum.unit} at {hum.hz:g} Hz"
-        f" taken off (trials with it: {hum.trials})"
+        f"{hum.channel}: mains hum of {hum.amplitude:.2g} {hum.unit} at {hum.hz:g} Hz subtracted"
+        f" (trials with it: {hum.trials})"
     )
 
 
@@ -38,12 +38,12 @@ def describe_dead_stretch(stretch: DeadStretch) -> str:
     if stretch.missing:
         return f"'{stretch.column}' has no readings"
     if stretch.rail is not None:
-        return f"'{stretch.column}' reads the end of its range"
-    return f"'{stretch.column}' reads one and the same value while the machine moves"
+        return f"'{stretch.column}' is at the end of its range"
+    return f"'{stretch.column}' is stuck at one value while the machine moves"
 
 
 def describe_unidentified(name: str, effect: EffectEstimate) -> str:
-    """Return that an effect does not count as identified, and why; "" where it does."""
+    """Return that an effect does not count as identified, and why; "" if it does."""
     if effect.identified:
         return ""
     return f"`{name}` does not count as identified: {'; '.join(effect.reasons)}."
@@ -63,7 +63,7 @@ def find_failed_checks(
 ) -> Iterator[str]:
     """Yield a sentence on every check that a model fails, whose ``errors`` are by axis."""
     for place in session.placeholders:
-        yield f"{place}: a placeholder, its source still says `fill in`"
+        yield f"{place}: still a placeholder, with `fill in` as its source"
     for axis, channel in session.axes.items():
         if channel.resolution == 0.0:
             yield f"{axis}: resolution and noise of the encoder are not known"
@@ -71,7 +71,10 @@ def find_failed_checks(
         if sd == 0.0:
             yield f"{name}: the noise of its samples is not known"
     for name in session.force.look_like_counts:
-        yield f"{name}: its readings look like counts of a converter, not like {session.force.unit}"
+        yield (
+            f"{name}: its readings look like raw counts of a converter, not like"
+            f" {session.force.unit}"
+        )
     published = identified.methods.get(identified.method)
     doubts = published.doubts if published else ()
     yield from (f"estimate by {METHODS[identified.method]}: {doubt}" for doubt in doubts)

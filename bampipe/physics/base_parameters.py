@@ -1,7 +1,7 @@
-"""Which combinations of a robot's inertial numbers motion can show (Gautier and Khalil 1990).
+"""Base parameters of a robot (Gautier and Khalil 1990).
 
-Found numerically: along a rich motion the columns of all numbers are taken one after the other,
-from the base to the tip, and each that depends on those before it is joined to them.
+They are found numerically: the columns of all inertial numbers along a rich motion are taken in
+order, from the base to the tip, and a column that depends on earlier ones is joined to them.
 """
 
 from collections.abc import Mapping
@@ -12,14 +12,14 @@ import numpy as np
 from bampipe.physics.robot import Robot
 
 _DEPENDENT = 1e-7
-"""Share of a column that those before it leave, below which it depends on them."""
+"""A column depends on earlier ones if they leave less than this share of it."""
 _NOTHING = 1e-6
-"""Of the largest coefficient: less is rounding."""
+"""Coefficients below this share of the largest are rounding errors."""
 
 
 @dataclass(frozen=True)
 class BaseParameter:
-    """A combination of inertial numbers that motion shows, and no part of it alone.
+    """A base parameter: a combination of inertial numbers that motion determines only as a whole.
 
     Attributes:
         name: of the number that stands for it; terms: coefficient by number, its own 1.
@@ -40,7 +40,7 @@ class BaseParameter:
 
 
 def base_parameters(robot: Robot) -> list[BaseParameter]:
-    """Return the combinations that motion can show, from the base to the tip."""
+    """Return the base parameters, from the base to the tip."""
     names = [p.name for p in robot.parameters]
     columns = robot.regressor
     size = np.linalg.norm(columns, axis=0)

@@ -19,8 +19,8 @@ class ControlLaw:
         inputs: names of the columns of r: the controller's channels, the device's other
             channels, time.
         forces: force channels in the order of the commands.
-        rate_hz: how often the controller acts; 0 where that is not known.
-        states: names of what the controller remembers; limits: (n_s, 2) between which.
+        rate_hz: how often the controller acts; 0 if unknown. states: names of the controller's
+        states; limits: (n_s, 2) of these.
         command: c(y, r, s, out), numba-compiled: y are measured positions then rates (2 n_q,),
             s (n_s,) the states, out (n_f + n_s,) receives the commands in the units of the
             channels and the rates of the states.
@@ -35,7 +35,7 @@ class ControlLaw:
 
 
 def compile_law(device: Device) -> ControlLaw | None:
-    """The control law of ``device``, compiled once and kept on disk; None where it has none.
+    """Return the control law of ``device``, compiled once and kept on disk; None if it has none.
 
     Raises:
         InputError: an expression uses a name that a controller cannot know.

@@ -18,7 +18,9 @@ class Integral(Declaration):
 
     unit: str = Field(description="Coherent SI")
     rate: Expression = Field(
-        description="Its rate of change, of what a command may use; its unit per second"
+        description=(
+            "Its rate of change, in the quantities that a command may use; its unit per second"
+        )
     )
     lower: float = Field(default=-math.inf, allow_inf_nan=True, description="Where it stops")
     upper: float = Field(default=math.inf, allow_inf_nan=True, description="Where it stops")
@@ -34,13 +36,11 @@ class Controller(Declaration):
     channels: dict[Name, str] = Field(
         default={}, description="Recorded references and gains, name = unit"
     )
-    rate_hz: float = Field(
-        default=0.0, ge=0, le=1e6, description="How often it acts; 0 where that is not known"
-    )
+    rate_hz: float = Field(default=0.0, ge=0, le=1e6, description="How often it acts; 0 if unknown")
     states: dict[Name, Integral] = Field(
-        default={}, description="What it remembers, such as the integral of its error"
+        default={}, description="Its states, such as the integral of its error"
     )
     command: dict[Name, Expression] = Field(
-        description="The law, by force channel, of measured motion, channels and constants"
+        description="The command, by force channel, from measured motion, channels and constants"
     )
-    source: str = Field(default="", description="Where the law comes from")
+    source: str = Field(default="", description="Source of the law")

@@ -39,7 +39,7 @@ LONGEST_S = 60.0
 """Processor time that a derivation may take: the BAM takes 1 s, a planar arm with four links 23 s.
 Sympy's simplification has no bound of its own: 17 operations can take it an hour."""
 _LARGE = 100
-"""Operations of a slope that is not differentiated again."""
+"""A slope with more operations than this is not differentiated again."""
 
 
 def derive(model: Model, named_constants: bool = False) -> Equations:
@@ -99,12 +99,12 @@ def _collect_symbols(expressions: Iterable[Any]) -> set[Any]:
 
 @dataclass(frozen=True)
 class _Forces:
-    """Generalised forces of the inputs, one expression an axis.
+    """Generalised forces of the inputs, one expression per axis.
 
     Attributes:
-        logged: of the inputs as they are logged; side: their load across the motion.
-        signals: what acts of each logged input.
-        applied: of what acts; noisy: the same with the noise ``w`` on each measured force.
+        logged: of the inputs as they are logged; side: their load across the motion. signals: the
+        acting part of each logged input. applied: of the acting inputs; noisy: the same with the
+        noise ``w`` on each measured force.
         input_map: d logged / d force.
         noise, w: names and symbols of the process noise, that of the forces first.
     """
@@ -141,7 +141,7 @@ def _map_inputs(d: Vocabulary) -> _Forces:
 
 
 class _Energy(NamedTuple):
-    """One contribution to the energies, and the expression that declares it, for messages."""
+    """A contribution to the energies, and its declared expression, for messages."""
 
     label: str
     tree: ast.expr
@@ -151,7 +151,7 @@ class _Energy(NamedTuple):
 
 @dataclass(frozen=True)
 class _Terms:
-    """What device and effects put into the equations beside the applied force and bodies.
+    """Terms of device and effects in the equations beside the applied force and bodies.
 
     Attributes:
         energies: contributions to the energies.
@@ -176,7 +176,7 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
     other, offset = _build_device_torque(d, forces.w), [sp.S.Zero for _ in d.axes]
     measures = any(e.effect.kind == "measurement" for e in acting)
     prompt_force = _find_prompt_forces(d, forces) if measures else []
-    # Up to where the logged inputs are replaced by what acts of them, all is in terms of these.
+    # All is in terms of the logged inputs until they are replaced by their acting parts.
     delivered_force, pull = list(forces.logged), [sp.S.Zero for _ in d.axes]
     states = {z: (rate, signals.initial[z]) for z, rate in signals.rates.items()}
     for item in acting:
@@ -223,7 +223,7 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
 
 
 def _move_bias(d: Vocabulary, item: BoundEffect, ahead: Ahead, symbols: Symbols) -> list[Any]:
-    """Put the bias where the mechanism is, ahead of an encoder; return what that adds, by axis."""
+    """Evaluate the bias at the mechanism, ahead of an encoder; return the added terms, by axis."""
     i = d.axes.index(item.target)
     position = d.rebuild_for(item, ahead.position, symbols, "ahead.position")
     rate = d.rebuild_for(item, ahead.rate, symbols, "ahead.rate")
@@ -237,9 +237,9 @@ def _move_bias(d: Vocabulary, item: BoundEffect, ahead: Ahead, symbols: Symbols)
 def _find_prompt_forces(d: Vocabulary, forces: _Forces) -> list[Any]:
     """Generalised forces that an offset may follow, by axis.
 
-    An offset is differentiated. It cannot follow the rates, so what a motor's back EMF takes off
-    is left out of its load; nor states, so a lagging force counts as logged; and a delayed force
-    is delayed to one order less in it.
+    An offset is differentiated. It cannot follow the rates, so its load excludes a motor's back
+    EMF; nor states, so a lagging force counts as logged; and a delayed force is delayed to one
+    order less in it.
     """
     memoryless = [e for e in d.model.effects if not e.effect.states]
     signals = ActingInputs(d, memoryless, forces.logged, forces.side)
@@ -249,7 +249,7 @@ def _find_prompt_forces(d: Vocabulary, forces: _Forces) -> list[Any]:
 
 
 def _build_device_torque(d: Vocabulary, w: Sequence[Any]) -> list[Any]:
-    """Q_other of the device without effects: its own torques, friction, brakes, process noise."""
+    """Q_other of the device without effects: its own torques, friction, brakes, noise."""
     device = d.model.device
     other = d.table(device.torque, "torque")
     for i, c in enumerate(device.coordinates):
@@ -265,18 +265,18 @@ def _build_device_torque(d: Vocabulary, w: Sequence[Any]) -> list[Any]:
 
 
 def _find_dry_friction(d: Vocabulary, other: Sequence[Any]) -> list[Any]:
-    """What of ``other`` turns with the sign of the motion, by axis: half of what both differ by."""
+    """Return the part of ``other`` that changes sign with the motion, by axis."""
     signs = [d.sgn(rate) for rate in d.qd]
     return [(e.subs(s, -1) - e.subs(s, 1)) / 2 for e, s in zip(other, signs, strict=True)]
 
 
 def _constants(d: Vocabulary) -> list[Any]:
-    """Symbols of the device's constants, where they are not put in as numbers."""
+    """Symbols of the device's constants, unless numbers replace them."""
     return [constant_symbol(c) for c in d.model.device.constants if d.named_constants]
 
 
 def _check_dependence(d: Vocabulary, forces: _Forces, terms: _Terms) -> None:
-    """Refuse expressions that depend on what their place in the equations does not allow."""
+    """Refuse expressions with names that their place in the equations does not allow."""
     device = d.model.device
     others = [d.channel[c] for c in device.channels]
     prompt_force = [d.channel[derivative(f, k)] for f in device.forces for k in range(LAST_ORDER)]
@@ -310,7 +310,7 @@ class _Motion(NamedTuple):
 
 
 def _combine_motion(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
-    """Put together what the energies require and, of a robot, what its bodies require."""
+    """Add the terms of the energies and of a robot's bodies."""
     energy_motion, robot = _apply_lagrange(d, energies), d.model.device.robot
     if robot is None:
         check_inertia(d.model, energy_motion.mass, [*d.q, *_constants(d)])
@@ -326,7 +326,7 @@ def _combine_motion(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
 
 
 def _take_inertia(d: Vocabulary, other: list[Any]) -> list[Any]:
-    """Take what effects have per acceleration of their own axis out of Q_other; by axis."""
+    """Remove the effects' coefficients of their own axis' acceleration from Q_other; by axis."""
     found: list[Any] = [sp.S.Zero for _ in d.axes]
     for i in {d.axes.index(e.target) for e in d.model.effects if "qdd" in e.effect.names}:
         found[i], other[i] = sp.diff(other[i], d.qdd[i]), other[i].subs(d.qdd[i], 0)
@@ -336,7 +336,7 @@ def _take_inertia(d: Vocabulary, other: list[Any]) -> list[Any]:
 
 
 def _add_inertia(d: Vocabulary, motion: _Motion, taken: Sequence[Any]) -> _Motion:
-    """Put into the mass matrix what `_take_inertia` has found."""
+    """Add the result of `_take_inertia` to the mass matrix."""
     mass = [
         [m - (taken[i] if i == j else 0) for j, m in enumerate(row)]
         for i, row in enumerate(motion.mass)
@@ -387,7 +387,7 @@ def _apply_newton_euler(
     algebra = Algebra.symbols(text)
     inertial = [numbers[k : k + INERTIAL] for k in range(0, len(numbers), INERTIAL)]
     zeros = [0] * len(q)
-    # Names for all of it: one compiled function gives them to every model of this robot.
+    # Everything has a name: one compiled function serves every model of this robot.
     mass = [[text.name(m) for m in row] for row in mass_matrix(algebra, links, inertial, q)]
     bias, dynamics = (
         [text.name(f) for f in joint_forces(algebra, links, inertial, q, qd, a, gravity)]
@@ -416,7 +416,7 @@ def _find_dependence(
 
     Args:
         residual: one expression an axis; beside: other expressions of the model, in which a
-            parameter makes it nonlinear; steps: that stand in the residual by name; w: the noise,
+            parameter makes it nonlinear; steps: named intermediates in the residual; w: the noise,
             which slopes leave out.
     """
     step_names, numbers = {name for name, _ in steps}, _collect_symbols(v for _, v in steps)
@@ -434,7 +434,8 @@ def _find_dependence(
         candidates = slope_symbols.intersection(p[: i + 1])
         sized = [(slope, slope.count_ops() > _LARGE) for slope in slopes]
         small = [slope for slope, is_large in sized if not is_large]
-        # A large slope is taken to vary with every symbol in it: terms cancel in small ones only.
+        # A large slope is assumed to vary with every symbol in it: only in small ones do terms
+        # cancel.
         curving = candidates & _collect_symbols(slope for slope, is_large in sized if is_large)
         curving |= {s for s in candidates - curving if any(_slope(e, s) != 0 for e in small)}
         linear = symbol not in curving and symbol not in elsewhere

@@ -29,7 +29,7 @@ from bampipe.schema import (
 KINDS: Mapping[str, tuple[Literal["rad", "m"], str, float]] = MappingProxyType(
     {"rotary": ("rad", "N.m", 1e-3), "linear": ("m", "N", 2.5e-4)}
 )
-"""By kind of coordinate: its unit, that of its generalised force, usual width of a sign."""
+"""By kind of coordinate: its unit, that of its generalised force, default sign width."""
 
 
 class Coordinate(NamedDeclaration):
@@ -37,7 +37,7 @@ class Coordinate(NamedDeclaration):
 
     kind: Literal["rotary", "linear"] = Field(description='"rotary" (rad, N.m) or "linear" (m, N)')
     given_symbol: Text | None = Field(
-        default=None, alias="symbol", description="As a person writes it"
+        default=None, alias="symbol", description="Symbol in printed equations"
     )
     given_sign_width: Annotated[float, Field(gt=0, lt=1000)] | None = Field(
         default=None,
@@ -47,7 +47,7 @@ class Coordinate(NamedDeclaration):
 
     @property
     def symbol(self) -> str:
-        """How a person writes it."""
+        """Symbol in printed equations."""
         return self.given_symbol or self.name
 
     @property
@@ -73,7 +73,7 @@ class Constant(Declaration):
     unit: str = Field(default="", description="Coherent SI; empty for a pure number")
     source: str = Field(default="", description="Where it comes from")
     sd: NotNegative | None = Field(default=None, description="Its standard uncertainty")
-    description: str = Field(default="", description="What it is, in a few words")
+    description: str = Field(default="", description="Meaning, in a few words")
 
 
 class Energy(Declaration):
@@ -101,8 +101,8 @@ class Inputs(Declaration):
     )
     prescribed: bool = Field(
         default=False,
-        description="Whether a machine prescribes the motion and the force is what that takes:"
-        " replays keep the motion as measured",
+        description="Whether a machine prescribes the motion, from which the force follows:"
+        " replicates keep the motion as measured",
     )
     brakes: dict[Name, Name] = Field(
         default={}, description="Channel of the commanded brake, by coordinate"
@@ -117,14 +117,14 @@ class ProcessNoise(Declaration):
 
     unit: str = Field(default="", description="Coherent SI, of the noise")
     torque: dict[Name, Expression] = Field(description="Per coordinate: gain of the noise")
-    description: str = Field(default="", description="What it is, in a few words")
+    description: str = Field(default="", description="Meaning, in a few words")
 
 
 class Friction(Declaration):
     """Friction along one coordinate."""
 
     viscous: Parameter = Field(description="Force by velocity")
-    coulomb: Parameter = Field(description="Force of sliding, whatever the velocity")
+    coulomb: Parameter = Field(description="Sliding friction, independent of the speed")
 
 
 class Limits(Declaration):
@@ -148,7 +148,7 @@ _NEEDED = ("coordinates", "inputs", "applied")
 
 
 class DeclaredFile(Declaration):
-    """What one TOML file declares, with the parsed file."""
+    """The declarations of one TOML file, with the parsed file."""
 
     _declaration: Mapping[str, Any] = PrivateAttr({})
 
@@ -174,10 +174,10 @@ class Device(DeclaredFile):
 
     schema_: Literal["bampipe.device/1"] = Field(default="bampipe.device/1", alias="schema")
     name: Text = Field(max_length=60, description="Name of the device")
-    summary: str = Field(default="", description="What it is, in one sentence")
-    source: str = Field(default="", description="Where its equations and numbers come from")
+    summary: str = Field(default="", description="Meaning, in one sentence")
+    source: str = Field(default="", description="Source of its equations and numbers")
     coordinates: Annotated[tuple[Coordinate, ...], ByName(Name, least=1)] = Field(
-        default=(), description="One table a coordinate; of a robot, its joints by default"
+        default=(), description="One table per coordinate; for a robot, its joints by default"
     )
     constants: dict[Name, Constant] = Field(
         default={}, description="Numbers from drawings and data sheets"
@@ -186,7 +186,7 @@ class Device(DeclaredFile):
         default={}, description="Named expressions, in order; each may use those before it"
     )
     energy: Energy | None = Field(
-        default=None, description="Its energies; beside [robot], what is added to its bodies'"
+        default=None, description="Its energies; beside [robot], added to those of its bodies"
     )
     robot: Robot | None = Field(
         default=None, description="Rigid bodies on joints, in place of [energy]"
@@ -196,12 +196,12 @@ class Device(DeclaredFile):
         description="Per coordinate: generalised force beside friction, brakes and the input",
     )
     inputs: Inputs = Field(
-        default=Inputs(), description="What drives it; a torque a joint or motor of a robot"
+        default=Inputs(), description="Its inputs; for a robot, one torque per joint or motor"
     )
     applied: dict[Name, Expression] = Field(
         default={},
         min_length=1,
-        description="Per coordinate: generalised force of the channels; by its motors of a robot",
+        description="Per coordinate: generalised force of the channels; for a robot, by its motors",
     )
     side_load: dict[Name, Expression] = Field(
         default={}, description="Per coordinate: load across the motion"
@@ -229,12 +229,12 @@ class Device(DeclaredFile):
 
     @property
     def kinetic(self) -> ast.expr:
-        """Kinetic energy, J; of a robot, what is added to that of its bodies."""
+        """Kinetic energy, J; for a robot, added to that of its bodies."""
         return self.energy.kinetic if self.energy else ast.Constant(0)
 
     @property
     def potential(self) -> ast.expr:
-        """Potential energy, J; of a robot, what is added to that of its bodies."""
+        """Potential energy, J; for a robot, added to that of its bodies."""
         return self.energy.potential if self.energy else ast.Constant(0)
 
     @property
@@ -284,19 +284,19 @@ class Device(DeclaredFile):
 
     @property
     def speed_limits(self) -> Mapping[str, float]:
-        """Highest speed of each coordinate of which one is known, rad/s or m/s."""
+        """Highest speed of each coordinate, if known, rad/s or m/s."""
         drawn = {j.name: j.velocity for j in self.robot.moving if j.velocity} if self.robot else {}
         return drawn | {axis: e.speed for axis, e in self.ranges.items() if e.speed is not None}
 
     @property
     def acceleration_limits(self) -> Mapping[str, float]:
-        """Highest acceleration of each coordinate of which one is stated, rad/s2 or m/s2."""
+        """Highest acceleration of each coordinate, if stated, rad/s2 or m/s2."""
         stated = {axis: entry.acceleration for axis, entry in self.ranges.items()}
         return {axis: value for axis, value in stated.items() if value is not None}
 
     @property
     def effort_limits(self) -> Mapping[str, float]:
-        """Largest effort of each coordinate's drive of which one is known, N.m or N."""
+        """Largest effort of each coordinate's drive, if known, N.m or N."""
         drawn = {j.name: j.effort for j in self.robot.moving if j.effort} if self.robot else {}
         return drawn | {axis: e.effort for axis, e in self.ranges.items() if e.effort is not None}
 
@@ -340,11 +340,13 @@ class Device(DeclaredFile):
         for label, names in own.items():
             for name in names:
                 if name in taken:
-                    yield InputError(f"{name!r} is the name of {taken[name]} already", where=label)
+                    yield InputError(
+                        f"the name {name!r} is already taken by {taken[name]}", where=label
+                    )
                 taken[name] = f"one of {label}"
 
     def _faults_of_bodies(self) -> Iterator[InputError]:
-        """Whether there is what moves: energies, or joints, one a coordinate."""
+        """Require energies, or one joint per coordinate."""
         if self.robot is None:
             if self.energy is None:
                 yield InputError("'energy' is missing", remedy="give [energy], or [robot]")
@@ -359,10 +361,10 @@ class Device(DeclaredFile):
         joints = [(joint.name, kinds[joint.kind]) for joint in self.robot.moving]
         if joints != [(c.name, c.kind) for c in self.coordinates]:
             yield InputError(
-                "the joints that follow no other are not the coordinates",
+                "the joints that do not follow another one are not the coordinates",
                 where="robot.joints",
-                remedy="one coordinate a joint, of its name, in its order: rotary for revolute,"
-                " linear for prismatic",
+                remedy="give one coordinate per joint, with its name and in its order: rotary for"
+                " revolute, linear for prismatic",
             )
 
     def coordinate(self, name: str) -> Coordinate:

@@ -16,7 +16,7 @@ from bampipe.physics.expression import Expression, Name
 from bampipe.physics.parameter import Parameter
 from bampipe.schema import ByName, Declaration, Distinct, NamedDeclaration, Text
 
-# What an effect of each kind must give, where it may apply.
+# Required expressions and permitted scopes of each kind of effect.
 _EXPRESSIONS = {
     "torque": (("torque",), ("axis", "axis_pair", "device")),
     "input": (("input",), ("force_component", "force_pair", "channel", "device")),
@@ -24,15 +24,15 @@ _EXPRESSIONS = {
     "measurement": (("offset",), ("axis", "device")),
 }
 Link = Literal["timing", "zero", "scale", "delay", "lag", "saturation", "lever"]
-"""Links between what is logged and what acts, from the log on: when a sensor reads, its zero and
-its scale; delay, lag and saturation of what drives; the lever at which it acts."""
+"""Links between log and mechanism, in order: timing, zero and scale of a sensor; delay, lag and
+saturation of the drive; the lever at which the force acts."""
 Scope = Literal["axis", "axis_pair", "force_component", "force_pair", "channel", "device"]
 _PLACED = ("axis_pair", "device")
-"""Scopes in which an expression is a table, one a place."""
+"""Scopes in which an expression is a table, one entry per place."""
 PAIR = ("a", "b")
 """Places of an effect on a pair of axes."""
 _FARTHEST = 2
-"""Of the axes of a pair, in the order of the coordinates: more lie apart in the machine, too."""
+"""Largest distance of the axes of a pair, in the order of the coordinates."""
 EACH = "each"
 """Place of a device-wide input effect that stands for every force channel."""
 
@@ -42,7 +42,7 @@ class ParameterByKind(Declaration):
 
     rotary: Parameter | None = Field(default=None, description="On a rotary axis")
     linear: Parameter | None = Field(default=None, description="On a linear axis")
-    description: str = Field(default="", description="What it is, in a few words")
+    description: str = Field(default="", description="Meaning, in a few words")
 
 
 def _shape_of_parameter(entry: object) -> str:
@@ -72,24 +72,24 @@ class Unit(Declaration):
 
 
 class State(NamedDeclaration):
-    """An internal state of an effect, where it has memory."""
+    """An internal state of an effect with memory."""
 
     rate: Expression = Field(description="Its rate of change")
     initial: Expression = Field(
         default="0",
         validate_default=True,
-        description="Value at the start of a trial; 0 where left out",
+        description="Value at the start of a trial; 0 if left out",
     )
-    unit: str = Field(default="", description="Coherent SI, where it is the same on every axis")
+    unit: str = Field(default="", description="Coherent SI, if it is the same on every axis")
     rotary: Unit | None = Field(default=None, description="On a rotary axis")
     linear: Unit | None = Field(default=None, description="On a linear axis")
-    description: str = Field(default="", description="What it is, in a few words")
+    description: str = Field(default="", description="Meaning, in a few words")
 
 
 class Ahead(Declaration):
-    """Where the mechanism is that hand and gravity act on, beside what the encoder says."""
+    """Position of the mechanism that hand and gravity act on, relative to the encoder."""
 
-    share: Expression = Field(description="What part of it is there, 0 to 1")
+    share: Expression = Field(description="Share of the mechanism there, 0 to 1")
     position: Expression = Field(description="How far it is ahead of the encoder")
     rate: Expression = Field(description="How much faster it moves")
 
@@ -103,12 +103,12 @@ class Effect(DeclaredFile):
         StringConstraints(pattern="^[A-Za-z_][A-Za-z0-9_]*$", max_length=60),
         Field(description="an identifier, such as magnetic_detent"),
     ]
-    summary: Text = Field(description="What it is, in one sentence")
+    summary: Text = Field(description="Meaning, in one sentence")
     scope: Scope = Field(
-        description="axis: one coordinate; axis_pair: one and another (q_a, qd_a, q_b, qd_b), of a"
-        " robot two neighbouring joints, a nearer to the base where it acts on both;"
-        " force_component: one reading; force_pair: a reading that leaks into another; channel: an"
-        " input that is no force; device: the whole device"
+        description="axis: one coordinate; axis_pair: one and another (q_a, qd_a, q_b, qd_b), for"
+        " a robot two neighbouring joints, a nearer to the base if it acts on both;"
+        " force_component: one reading; force_pair: a reading that leaks into another; channel:"
+        " an input other than a force; device: the whole device"
     )
     kind: Literal["torque", "input", "energy", "measurement"] = Field(
         description="torque: acts on the joints; input: maps the measured force to the true one;"
@@ -116,12 +116,12 @@ class Effect(DeclaredFile):
     )
     torque: Expressions | None = Field(
         default=None,
-        description="Generalised force added to the joints; per axis where the scope is device",
+        description="Generalised force added to the joints; per axis for the scope device",
     )
     input: Expressions | None = Field(
         default=None,
-        description="True force from the measured one (f, f_rate, to f_sixth; g for the other"
-        " of a pair); per channel where the scope is device",
+        description="True force from the measured one (f, f_rate, to f_sixth; g for the other of"
+        " a pair); per channel for the scope device",
     )
     offset: Expressions | None = Field(
         default=None, description="True position minus measured position"
@@ -130,52 +130,48 @@ class Effect(DeclaredFile):
     potential: Expression | None = Field(default=None, description="Potential energy added, J")
     dissipative: bool = Field(
         default=False,
-        description="Whether the effect takes energy out of the motion for all parameters within"
-        " their bounds",
+        description="Whether the effect dissipates energy for all parameters within their bounds",
     )
     drive: bool = Field(
         default=False,
-        description="Whether it is one of motors only: offered where the device says drive = true",
+        description="Whether it applies to motors only: offered if the device has drive = true",
     )
     link: Link | None = Field(
         default=None,
-        description="Where it acts between what is logged and the mechanism: links act in this"
-        " order, each on what the one before it leaves. scale where left out, lever for a"
-        " measurement; a torque with a link is part of the drive, and of the load of what follows",
+        description="Where it acts between log and mechanism: links act in this order, each on"
+        " the output of the previous one. Default: scale, or lever for a measurement; a torque"
+        " with a link is part of the drive, and of the load of the later links",
     )
     robot: bool | None = Field(
         default=None,
-        description="true: offered for robots only, devices of joints and bodies; false: for all"
-        " others only",
+        description="true: offered for robots only; false: for other devices only",
     )
     devices: Distinct[Text] = Field(
-        default=(), description="Devices that it makes sense for; all where left out"
+        default=(), description="Devices that it suits; all if left out"
     )
     on_request: bool = Field(
         default=False,
         description="Whether a diagnosis weighs it only where its setting `also` names it",
     )
-    looks_like: Text = Field(description="How it shows in a residual")
-    on_the_machine: str = Field(
-        default="", description="What to do on the machine about it, in one sentence"
-    )
+    looks_like: Text = Field(description="Its trace in the residual")
+    on_the_machine: str = Field(default="", description="Remedy on the machine, in one sentence")
     source: Text = Field(description="Literature, with year")
     parameters: dict[Name, EffectParameter] = Field(
-        min_length=1, description="Its numbers, by name; each the same for all axes, or by kind"
+        min_length=1, description="Its parameters, by name; each for all axes, or by kind of axis"
     )
     states: Annotated[tuple[State, ...], ByName(Name)] = Field(
-        default=(), description="Internal states, by name, where it has memory"
+        default=(), description="Internal states, by name, if it has memory"
     )
 
     ahead: Ahead | None = Field(
         default=None,
-        description="Of a torque on an axis: where the mechanism behind its encoder is, for the"
-        " gravity, Coriolis and centrifugal forces on every axis",
+        description="For a torque on an axis: position of the mechanism relative to its encoder,"
+        " for the gravity, Coriolis and centrifugal forces on every axis",
     )
 
     @cached_property
     def expressions(self) -> Mapping[str, ast.expr]:
-        """Its expressions: ``torque``, or ``torque.<place>`` where there is one a place."""
+        """Its expressions: ``torque``, or ``torque.<place>`` if there is one per place."""
         results: dict[str, ast.expr] = {}
         for key in _EXPRESSIONS[self.kind][0]:
             value = getattr(self, key)
@@ -200,7 +196,7 @@ class Effect(DeclaredFile):
 
     @property
     def is_dry_friction(self) -> bool:
-        """Whether it is a torque on axes that turns with the sign of their motion."""
+        """Whether it is a torque on axes that changes sign with their motion."""
         on_axes = self.kind == "torque" and self.scope in ("axis", "axis_pair")
         return on_axes and expression.calls(self.expressions.values(), "sgn")
 
@@ -220,16 +216,16 @@ class Effect(DeclaredFile):
         for key in (key for keys, _ in _EXPRESSIONS.values() for key in keys):
             value, placed = getattr(self, key), self.scope in _PLACED and self.kind != "energy"
             if value is not None and key not in main:
-                yield InputError(f"{key!r} has no meaning for kind {self.kind!r}")
+                yield InputError(f"{key!r} does not apply to kind {self.kind!r}")
             elif value is not None and isinstance(value, Mapping) != placed:
-                form = "a table, one expression a place" if placed else "one expression"
+                form = "give a table, one expression per place" if placed else "one expression"
                 yield InputError(f"{key!r} must be {form}")
             elif self.scope == "axis_pair" and placed and value and not set(value) <= set(PAIR):
                 yield InputError(f"the places of {key!r} are {' and '.join(PAIR)}")
         if self.ahead and (self.kind, self.scope) != ("torque", "axis"):
-            yield InputError("'ahead' has a meaning for a torque on an axis only")
+            yield InputError("'ahead' applies only to a torque on an axis")
         if self.link and self.kind == "energy":
-            yield InputError("'link' has no meaning for kind 'energy'")
+            yield InputError("'link' does not apply to kind 'energy'")
         if not self.expressions:
             yield InputError(f"an effect of kind {self.kind!r} needs {' or '.join(main)}")
         for state in self.states:
@@ -330,7 +326,7 @@ class Effect(DeclaredFile):
 
 
 def force_pairs(device: Device) -> dict[str, tuple[str, str]]:
-    """A force channel and one that may leak into it, by what follows the colon.
+    """Pairs of a force channel and one that may leak into it, by the text after the colon.
 
     The drives of a robot may share a gear with their neighbours, not with all others.
     """
@@ -345,7 +341,7 @@ def force_pairs(device: Device) -> dict[str, tuple[str, str]]:
 
 
 def _list_neighbours(device: Device) -> dict[str, tuple[str, str]]:
-    """Pairs of neighbouring joints of one kind, by what follows the colon: ``wrist-hand``."""
+    """Pairs of neighbouring joints of one kind, by the text after the colon: ``wrist-hand``."""
     if device.robot is None:
         return {}
     kinds = {c.name: c.kind for c in device.coordinates}
@@ -358,12 +354,12 @@ def _list_neighbours(device: Device) -> dict[str, tuple[str, str]]:
 
 @dataclass(frozen=True)
 class BoundEffect:
-    """An effect at its target: what a model is made of.
+    """An effect at its target, as a part of a model.
 
     Attributes:
-        effect, target: what it is, and where: the text after the colon.
+        effect, target: the effect and its place, the text after the colon.
         parameters: its parameters with their full names.
-        axes: the axis or the two that it acts on, where its scope says so.
+        axes: the one or two axes that it acts on, if its scope has any.
     """
 
     effect: Effect
@@ -438,7 +434,7 @@ def bind(effect: Effect, target: str, device: Device, pulled: Collection[str] = 
             )
         unit = unit_of(chosen.unit, effect, target, device)
         about = chosen.description or entry.description
-        # What a robot's bodies pull is not among what an effect can tell apart from the rest.
+        # The weight of a robot's bodies is excluded, since no effect can be separated from it.
         others = pulled if device.robot is None else ()
         held = chosen.needs_pull and not any(device.has_weight(a) or a in others for a in axes)
         bound.append(

@@ -2,9 +2,9 @@
 
 The C library's functions take one number at a time; a loop that calls them cannot be vectorised.
 These are rational and polynomial approximations on a reduced argument (coefficients: Moshier,
-Cephes Mathematical Library, 1992), right to 1e-15 of the value; beyond 1e5 rad, sine and cosine
-lose as much as rounding the argument itself does. Infinite arguments give the limit or NaN as
-the C library does; NaN stays NaN.
+Cephes Mathematical Library, 1992), correct to 1e-15 of the value; beyond 1e5 rad, sine and cosine
+lose as much as by rounding the argument. Infinite arguments give the limit or NaN as the C library
+does; NaN stays NaN.
 """
 
 from math import inf
@@ -82,7 +82,7 @@ def tanh(x):  # type: ignore[no-untyped-def]
 
 @part(fastmath=_FUSED, error_model="numpy", forceinline=True)
 def _circle(x):  # type: ignore[no-untyped-def]
-    """Sine and cosine of what x leaves beside a multiple of a quarter turn; the multiple's bits."""
+    """Sine and cosine of x modulo a quarter turn, and the bits of the quotient."""
     shifted = x * 0.63661977236758134308 + _ROUND
     k = shifted - _ROUND
     r = x - k * _HALF_PI_HIGH

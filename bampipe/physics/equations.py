@@ -1,4 +1,4 @@
-"""The equations of motion of a model as symbols, and what its effects add to them."""
+"""The symbolic equations of motion of a model, and the terms of its effects."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +15,8 @@ class Dependence:
         products: pairs of parameters of which it has a product.
         constant: whether its slope depends on no parameter and no internal state; unforced: and on
             no input either.
-        lasting: that slope by axis, None where there is none such or bodies in
-            `Equations.steps` take part in it.
-        of_bodies: parameters that stand in those steps alone.
+        lasting: that slope by axis, None if it is not constant or involves `Equations.steps`.
+        of_bodies: parameters that appear in those steps alone.
     """
 
     linear: list[bool]
@@ -36,9 +35,9 @@ class Equations:
         q, qd, qdd: coordinates and their rates.
         z, z_names: internal states of effects.
         u, inputs: input symbols that the model uses, and their channel names.
-        p, w, noise: parameters; additive process noise and its names.
-        steps: named intermediates of a robot's bodies, and what each stands for; each may use
-            those before it, and everything below may use them.
+        p, w, noise: parameters; additive process noise and its names. steps: named intermediates of
+        a robot's bodies, and their values; each may use earlier ones, and everything below may use
+        them.
         mass: mass matrix, n by n.
         bias: h(q, qd): Coriolis, centrifugal and potential terms.
         dynamics: mass times acceleration plus bias.
@@ -50,7 +49,7 @@ class Equations:
         kinetic, potential: energies, as declared, definitions put in.
         dependence: of the residual on each parameter.
         compensation: per coordinate, the part of Q_other that balances gravity there: see
-            `roles.find_compensation`; zero where nothing does.
+            `roles.find_compensation`; zero without one.
         delays: parameters that shift measured forces in time: see `roles.find_delays`.
     """
 
@@ -84,7 +83,7 @@ class Equations:
 
 
 def contribution(full: Equations, bare: Equations) -> list[Any]:
-    """What the effects in ``full`` add to the residual of ``bare``, one expression an axis."""
+    """Return the terms of the effects in ``full`` beyond the residual of ``bare``, by axis."""
     quiet = dict.fromkeys(full.w, 0)
     added = []
     for i in range(len(full.q)):

@@ -155,14 +155,14 @@ def reached_names(trees: Iterable[ast.expr], definitions: Mapping[str, ast.expr]
 
 
 def expanded_size(tree: ast.AST, sizes: Mapping[str, int]) -> int:
-    """Parts of ``tree`` once every name is replaced by what it stands for, ``sizes`` parts."""
+    """Return the parts of ``tree`` with names replaced by their definitions, of ``sizes`` parts."""
     return sum(
         sizes.get(node.id, 1) if isinstance(node, ast.Name) else 1 for node in ast.walk(tree)
     )
 
 
 def check_name(name: object, where: str) -> str:
-    """``name``, if an expression can use it as the name of a quantity.
+    """Return ``name`` if an expression can use it as the name of a quantity.
 
     Raises:
         InputError: it is not a plain ASCII identifier, or it is the name of a function.

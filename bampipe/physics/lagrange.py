@@ -1,4 +1,4 @@
-"""Lagrange's equation on energies (eqs 9-14), and what may stand in a mechanical model."""
+"""Lagrange's equation on energies (eqs 9-14), and checks of a mechanical model."""
 
 from functools import cache
 from itertools import combinations_with_replacement
@@ -29,7 +29,7 @@ def allow(what: str, exprs: list[Any], allowed: list[Any], words: str) -> None:
 
 
 def check_inertia(model: Model, mass: list[list[Any]], symbols: list[Any]) -> None:
-    """Raise InputError where no pose gives every coordinate an inertia."""
+    """Raise InputError if no pose gives every coordinate an inertia."""
     numbers = {s: 0.37 * (i + 1) % 1.3 for i, s in enumerate(symbols)}
     numbers |= {
         sp.Symbol(f"p{i}", real=True): p.prior or 1.0 for i, p in enumerate(model.parameters)

@@ -1,4 +1,4 @@
-"""The internal states of effects along a motion: which steps generated code takes, and how many."""
+"""Integration of the internal states of effects along a motion: kind and number of steps."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,13 +9,14 @@ import numpy as np
 from bampipe.arrays import Array, Flags
 
 _STEPS = (1, 3, 12, 48, 192)
-"""Steps a sample tried in turn, until a stiff state is integrated without running away."""
+"""Steps per sample, tried in turn until a stiff state does not diverge."""
 ACCURATE = 0.25
-"""Largest product of a step and a state's rate for which a single step a sample will do: what RK4
-leaves out of it is its fifth power over 120, 8e-6."""
+"""Largest product of a step and a state's rate for a single step per sample: the error of RK4 is
+its fifth power over 120, 8e-6."""
 STIFF_STEPS = 24
-"""Exponential steps a sample, stable ones, in place of more than these, where no state depends on
-another. A hysteresis passed 600 times between two samples is 1 % off, 60 times 0.1 %."""
+"""Beyond so many steps per sample, exponential steps, which are stable, replace them if no state
+depends on another. The error of a hysteresis passed 600 times between two samples is 1 %, 60 times
+0.1 %."""
 STABLE = 2.5
 """Largest product of a step and the rate at which a state decays for which RK4 is stable, with a
 margin: it is up to 2.78 (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.2)."""
@@ -27,15 +28,15 @@ reading makes neighbours large."""
 _STEP_SHARE = 0.02
 """Least share of the command's range that counts as switching: not a quantised slow change."""
 _KEPT = 16
-"""Results kept for the next time: of two models on the same motion most states are the same."""
+"""Number of results kept: two models on the same motion share most states."""
 
 StateKey = tuple[str, tuple[str, ...], tuple[bytes, ...]]
-"""All that states along a motion depend on: module, names of the inputs, and other numbers."""
+"""Key of states along a motion: module, names of the inputs, and other numbers."""
 
 
 @dataclass(frozen=True)
 class StateGroup:
-    """Internal states of effects whose rates depend on no internal state outside of it.
+    """A group of internal states whose rates depend on no other internal state.
 
     Attributes:
         module: name of the generated module that follows them; see `memory_code`.
@@ -63,7 +64,8 @@ class StateGroup:
         Args:
             module: the generated code; along: q, qd, qdd, u, p and t of the motion.
             z0: the states at the start of each part, (parts, n); inputs: names of the columns of u.
-            parts: where they begin anew; known: along this very motion, to which these are added.
+            parts: rows at which they restart; known: states along this very motion, to which these
+                are added.
         """
         q, qd, qdd, u, p, t = along
         uses, p = self.uses, p[self.uses["p"]]
@@ -103,7 +105,7 @@ def _integrate(module: ModuleType, commands: Sequence[int], arrays: Sequence[Arr
             continue
         fastest = module.memory(q, qd, qdd, u, p, t, z0, steps, out)
         enough = STABLE if steps > 1 else ACCURATE
-        # What grows without bounds at a stable step does so with any number of them.
+        # A state that diverges at a stable step does so with any number of steps.
         if fastest < enough and (steps > 1 or np.all(np.abs(out) < _RUNAWAY)):
             break
         least = steps * fastest / STABLE

@@ -10,11 +10,11 @@ from bampipe.physics.equations import Equations
 from bampipe.physics.memory import ACCURATE, STABLE, STIFF_STEPS
 
 _FEWEST = 3
-"""Exponential steps a sample where the decay of a state follows the motion."""
+"""Exponential steps per sample if the decay of a state depends on the motion."""
 
 # Positions and inputs are linear between samples, rates are not: of a motion with eight samples a
 # period a straight line takes a twentieth off the distance between them. Without a signature it is
-# compiled where what calls it is, and not again by every process that finds that in the cache.
+# compiled with its caller, and not again by every process that finds that in the cache.
 BETWEEN = '''
 
 @part()
@@ -87,10 +87,10 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
 '''
 
 
-# Where no state's rate depends on another state: steps that are exact for the rate at the middle of
-# a step, linearised in its state (exponential Rosenbrock-Euler, Hochbruck and Ostermann 2010, Acta
-# Numerica 19). However stiff, it stays stable: a hysteresis over micrometres is passed many times
-# between two samples.
+# If no state's rate depends on another state, steps are exact for the rate at the middle of a step,
+# linearised in its state (exponential Rosenbrock-Euler, Hochbruck and Ostermann 2010, Acta Numerica
+# 19). However stiff, it stays stable: a hysteresis over micrometres is passed many times between
+# two samples.
 STIFF_MEMORY_LOOP = '''
 
 @njit(types.float64(M, M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
@@ -118,8 +118,9 @@ def stiff_memory(q, qd, qdd, u, p, t, z0, steps, out):
 '''
 
 
-# A state whose rate is c + b*z, with b of motion and inputs: exact for c and b constant in a step,
-# and for c changing linearly where b depends on parameters alone. However stiff, it stays stable.
+# For a state whose rate is c + b*z, with b of motion and inputs, steps are exact for c and b
+# constant in a step, and for linear c if b depends on parameters alone. However stiff, it stays
+# stable.
 LINEAR_MEMORY_LOOP = '''
 
 @njit(types.float64(M, M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
@@ -156,9 +157,9 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
 
 
 def group_states(e: Equations) -> list[list[int]]:
-    """Numbers of the internal states, those together whose rates depend on each other.
+    """Return the numbers of the internal states, in groups whose rates depend on each other.
 
-    And those of one effect, which are followed in one loop.
+    States of one effect share a group, which is integrated in one loop.
     """
     groups: list[set[int]] = []
     effects = [name.rpartition(".")[0] for name in e.z_names]

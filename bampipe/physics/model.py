@@ -1,4 +1,4 @@
-"""A model: a device plus the effects that it is taken to have."""
+"""A model: a device plus its assumed effects."""
 
 import hashlib
 import json
@@ -56,7 +56,7 @@ class Model:
         for effect, target in wanted:
             item = bind(effect, target, device, pulled)
             if item.name in [b.name for b in bound]:
-                raise InputError(f"effect {item.name!r} is in the model already")
+                raise InputError(f"effect {item.name!r} is already in the model")
             bound.append(item)
         object.__setattr__(self, "device", device)
         object.__setattr__(self, "effects", tuple(bound))

@@ -1,6 +1,6 @@
-"""What is generated of a model: facts about its equations, and the source of its functions.
+"""Generated parts of a model: facts about its equations, and the source of its functions.
 
-In two parts, for of most candidates for an effect that a model lacks only the first is needed.
+The source has two parts, because most candidates of a diagnosis need only the first.
 """
 
 from typing import Any
@@ -29,7 +29,7 @@ Generation = tuple[dict[str, Any], dict[str, str]]
 
 
 def effects_code(model: Model) -> Generation:
-    """What the generator says of a model, and the source of what effects add to a residual."""
+    """Return the facts of a model, and the source of its effects' terms in the residual."""
     equations = _derive_once(model)
     bare = _derive_once(Model(model.device)) if model.effects else equations
     added = contribution(equations, bare)
@@ -91,9 +91,9 @@ def whole_code(model: Model) -> Generation:
 
 
 def moved_first(e: Equations, forces: list[Any]) -> list[list[int]]:
-    """By axis, the places in a state of the position and rate that a force there acts on first.
+    """Return, by axis, the places in a state of the position and rate that a force acts on first.
 
-    Those of the axis itself, or internal states: of a motor that moves the axis through play.
+    They are those of the axis, or internal states of a motor that moves the axis through play.
     """
     n, found = len(e.q), []
     for i, other in enumerate(e.other):
@@ -110,7 +110,8 @@ def moved_first(e: Equations, forces: list[Any]) -> list[list[int]]:
 _derived: dict[str, Equations] = {}
 """By `Model.key`, the last used last."""
 _MOST_DERIVED = 4
-"""The device without effects, which every candidate wants, and those at hand."""
+"""Number of models kept: the device without effects, which every candidate needs, and recent
+ones."""
 
 
 def _derive_once(model: Model) -> Equations:

@@ -48,7 +48,7 @@ class Link:
 
 @dataclass
 class Text:
-    """Names of intermediates and what they stand for, in the order in which they are needed."""
+    """Names of intermediates and their values, in the order in which they are needed."""
 
     steps: list[tuple[Any, Any]] = field(default_factory=list)
     _known: dict[Any, Any] = field(default_factory=dict)
@@ -69,7 +69,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Algebra:
-    """What the equations are written in.
+    """The algebra of the equations: symbols or numbers.
 
     Attributes:
         sin, cos: of a joint's position.
@@ -100,8 +100,8 @@ class _LinkMotion:
     Attributes:
         into_parent: vector of this frame into the frame before; from_parent: the reverse.
         offset: from the joint before to this one, in the frame before.
-        acceleration: of the joint, gravity in it.
-        change: matrix W with W r the acceleration that rotation gives a point at r.
+        acceleration: of the joint, gravity in it. change: matrix W; W r is the acceleration of a
+        point at r by rotation.
         rate, rate_change: angular velocity and acceleration.
     """
 
@@ -165,7 +165,7 @@ def joint_forces(
 
 
 def _list_turned_links(links: Sequence[Link]) -> list[list[tuple[int, float]]]:
-    """By joint that follows no other, the links that it moves, itself first, and how far."""
+    """By joint that follows no other: the links that it moves, itself first, with their ratios."""
     return [
         [(i, 1.0), *((k, link.ratio) for k, link in enumerate(links) if link.follows == i)]
         for i, own in enumerate(links)
@@ -201,7 +201,7 @@ def columns(
     results: list[list[list[Any]]] = [[[0] * INERTIAL for _ in links] for _ in links]
     felt: list[dict[int, tuple[Vector, Vector]]] = []
     for i, (link, at) in enumerate(zip(links, moving, strict=True)):
-        # What a moment and a force at this joint are to each joint before it, in this frame.
+        # Effect of a moment and a force at this joint on each joint before it, in this frame.
         here: dict[int, tuple[Vector, Vector]] = {}
         for j, (turn, push) in felt[link.parent].items() if link.parent >= 0 else ():
             onward = _add(push, _cross(turn, at.offset))
@@ -341,7 +341,7 @@ def _joint_rotation(a: Algebra, link: Link, x: Any) -> tuple[Vector, Vector, Vec
         row = []
         for j in range(3):
             square = k[i] * k[j]
-            # Of an axis along x, y or z nothing but 0, 1, s and c remains.
+            # For an axis along x, y or z only 0, 1, s and c remain.
             value = square if square in (0, 1) else square * (1 - c)
             if i == j and square != 1:
                 value = value + c

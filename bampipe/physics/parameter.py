@@ -12,14 +12,14 @@ from bampipe.errors import InputError
 from bampipe.schema import NamedDeclaration, fault
 
 LARGEST = 1e12
-"""Of a prior, its sd or a bound: beyond, squares beside those of sensor noise lose all digits."""
+"""Largest prior, sd or bound: larger squares would lose all digits of those of sensor noise."""
 
 
 def _refuse_huge(value: Any) -> Any:
     if isinstance(value, int | float) and LARGEST < abs(value) != math.inf:
         raise fault(
             f"beyond what can be computed with, {LARGEST:.0e}",
-            remedy="give what is physically possible, in SI units",
+            remedy="give a physically possible value in SI units",
         )
     return value
 
@@ -39,28 +39,26 @@ class Parameter(NamedDeclaration):
     upper: PhysicalNumber = Field(
         default=math.inf, allow_inf_nan=True, description="Physical bound"
     )
-    strength: bool = Field(default=False, description="The effect is absent where this is 0")
-    offset: bool = Field(
-        default=False, description="Where it is all that an effect adds, that is a mere constant"
-    )
+    strength: bool = Field(default=False, description="The effect is absent if this is 0")
+    offset: bool = Field(default=False, description="Marks a strength that adds a mere constant")
     fixed: bool = Field(default=False, description="Held at its prior, never estimated")
     needs_pull: bool = Field(
         default=False, description="Held at its prior on an axis that nothing pulls by its position"
     )
     weighed: bool = Field(
         default=False,
-        description="Whether least squares weighs the prior beside the data, as a drawing's number",
+        description="Whether least squares weighs the prior like data, as for numbers of a drawing",
     )
     typical: PhysicalNumber | None = Field(
         default=None,
-        description="Size at which the effect is clearly there; strength 1 of the simulator",
+        description="Size at which the effect is clearly visible; strength 1 of the simulator",
     )
     within: Literal["travel", "upper half", "lower half", "beyond"] | None = Field(
         default=None,
         description="For a position on the axis: the part of the travel where the diagnosis looks;"
         " beyond: outside of it, on either side",
     )
-    description: str = Field(default="", description="What it is, in a few words")
+    description: str = Field(default="", description="Meaning, in a few words")
 
     def cross_faults(self) -> Iterator[InputError]:
         if not self.lower <= self.prior <= self.upper:

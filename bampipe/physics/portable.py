@@ -79,10 +79,10 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
     for item in model.effects:
         what = "has internal states" if item.effect.states else ""
         if item.effect.kind == "measurement":
-            what = "acts on what encoders read"
+            what = "acts on encoder readings"
         if what:
             raise InputError(
-                f"effect {item.name!r} {what}: it is no function of motion alone",
+                f"effect {item.name!r} {what}: the force is not a function of motion alone",
                 remedy="export a model without it",
             )
     e = derive(model)
@@ -105,7 +105,7 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
     )
     about = f"Coordinates: {of}." + (f" Inputs u: {', '.join(names)}." if names else "")
     if logged:
-        about += f" Forces are those that act; what is logged differs by {logged}."
+        about += f" Forces are those that act; logged values differ by {logged}."
     if language == "c":
         lines = [f"const double {line};" for line in lines]
         values = [f"force[{i}] = {v};" for i, v in enumerate(values)]
@@ -113,7 +113,7 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
     return (_PYTHON if python else _C).format(
         title=f"{model.device.name}{f' with {effects}' if effects else ''}, identified by bampipe.",
         about=about,
-        summary="Generalised forces that the motion requires, N.m or N, one a coordinate.",
+        summary="Generalised forces that the motion requires, N.m or N, one per coordinate.",
         coordinates=tuple(c.name for c in axes),
         inputs=tuple(names),
         more="" if not names else ", u" if python else ", const double *u",

@@ -1,4 +1,4 @@
-"""A device's equations of motion as a person would write them."""
+"""A device's equations of motion in readable form."""
 
 import re
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -92,7 +92,7 @@ def _print_equations(model: Model, values: Mapping[str, float]) -> tuple[str, tu
 
     def fill_template(template: str) -> str:
         text = re.sub(r"#(\d+)#", lambda found: labels[int(found[1])], template)
-        # Else two numbers would read as one.
+        # Otherwise two numbers would read as one.
         return re.sub(r"(?<=[\w)]) (?=\d)", " · ", _join_signs(text))
 
     lines = (left + fill_template(right) for left, right in code.facts["lines"])
@@ -120,7 +120,7 @@ def _print_templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
 
     def text(expr: Any) -> str:
         plain = sp.sympify(expr, strict=True).subs(quiet)
-        # A factor of 1.0 says nothing, and 2.0 no more than 2.
+        # A factor of 1.0 is redundant, and 2.0 is 2.
         plain = plain.xreplace({f: sp.Integer(f) for f in plain.atoms(sp.Float) if f == int(f)})
         for rate in e.qd:
             plain = plain.replace(
@@ -164,7 +164,7 @@ _HEAD += ["mass, kg", "centre, m", "moments, kg.m2"]
 
 
 def _describe_robot(device: Device, robot: Robot) -> str:
-    """The chain as a table, one line a joint, then what is known of it before any data."""
+    """Return the chain as a table, one line per joint, then its prior information."""
     rows = [_HEAD]
     for joint in robot.joints:
         unit = "rad" if joint.kind == "revolute" else "m"
@@ -184,7 +184,7 @@ def _describe_robot(device: Device, robot: Robot) -> str:
         lines += [f"Source: {device.source}", ""]
     count, combined = len(robot.parameters), len(base_parameters(robot))
     lines += [f"Of {count} inertial numbers {free} act on some joint, in {combined} combinations."]
-    lines += [f"No body has this: {line}." for line in robot.impossible]
+    lines += [f"Physically impossible: {line}." for line in robot.impossible]
     own = {p.name for p in robot.parameters}
     lines += ["", "Numbers", *_list_numbers(device, own)]
     return "\n".join(lines) + "\n"

@@ -28,7 +28,8 @@ from bampipe.schema import (
 )
 
 _LARGEST = 1e9
-"""Of a drawn body, kg, m or kg.m2: sums over the bodies stay below what a parameter can be."""
+"""Largest number of a drawn body, kg, m or kg.m2: sums over bodies stay below a parameter's
+limit."""
 Triple = Annotated[Several[Number], Field(min_length=3, max_length=3)]
 Sextuple = Annotated[Several[Number], Field(min_length=6, max_length=6)]
 INERTIAL_NAMES = (
@@ -41,12 +42,12 @@ _UNITS = ("kg", *("kg.m",) * 3, *("kg.m2",) * 6)
 _ROUNDING = 1e-10
 """Rotations by quarter turns, written with eleven digits, leave less than this beside 0 and 1."""
 _NO_EFFECT = 1e-9
-"""Of the largest column: an inertial number below it changes no joint's force."""
+"""An inertial number with a column below this share of the largest changes no joint's force."""
 _LEAST_SHARE, _UNDRAWN_SHARE = 0.01, 0.1
-"""Of the robot's mass and length: uncertainty is at least that of a link of this size, and that of
-one whose mass is not drawn."""
+"""Share of the robot's mass and length: the uncertainty of a body is at least that of a link of
+this size, as for a link whose mass is not drawn."""
 _TRIANGLE = 1e-6
-"""Share by which a principal moment may exceed the sum of the other two: rounding of drawings."""
+"""Relative excess of a principal moment over the sum of the other two by rounding of drawings."""
 
 
 class Joint(NamedDeclaration):
@@ -85,15 +86,15 @@ class Joint(NamedDeclaration):
         if not largest <= _LARGEST:
             yield InputError(
                 f"a body beyond what can be computed with, {_LARGEST:.0e} in SI units",
-                remedy="give what is physically possible",
+                remedy="give physically possible numbers",
             )
 
     @property
     def inertial(self) -> Array:
         """The ten numbers of the body, about the joint; see `INERTIAL_NAMES`.
 
-        Of numbers that no body has, those of the nearest that one can have: nothing where the mass
-        is negative, and no negative spread of mass along a principal axis.
+        Impossible numbers become the nearest possible ones: zero for a negative mass, and no
+        negative spread of mass along a principal axis.
         """
         if self.mass < 0.0:
             return np.zeros(INERTIAL)
@@ -113,7 +114,7 @@ class Joint(NamedDeclaration):
 
     @property
     def impossible(self) -> list[str]:
-        """What no body can have among its drawn numbers, one sentence each."""
+        """Physically impossible drawn numbers, one sentence each."""
         faults = [f"a mass of {self.mass:g} kg"] if self.mass < 0.0 else []
         moments = self.principal_moments
         shown = f"(principal moments {', '.join(f'{m:.3g}' for m in moments)} kg.m2)"
@@ -127,7 +128,7 @@ class Joint(NamedDeclaration):
 
     @property
     def size(self) -> float:
-        """Distance from the joint at which the body's mass would have its inertia, m."""
+        """Radius of gyration of the body about the joint, m."""
         if not self.mass > 0.0:
             return 0.0
         numbers = self.inertial
@@ -141,11 +142,10 @@ class Motor(Declaration):
         min_length=1, description="Turns of the motor for one of each joint, rad/rad or rad/m"
     )
     rotor_inertia: Positive | None = Field(default=None, description="At the motor, kg.m2")
-    torque_constant: Number | None = Field(
-        default=None, description="Where its current is logged, N.m/A"
-    )
+    torque_constant: Number | None = Field(default=None, description="For a logged current, N.m/A")
     torque_constant_sd: Positive | None = Field(
-        default=None, description="Its standard uncertainty; it is estimated where given"
+        default=None,
+        description=("Its standard uncertainty; the constant is estimated if this is given"),
     )
 
 
@@ -175,7 +175,7 @@ class Payload(Declaration):
 
 
 class Robot(Declaration):
-    """Rigid bodies on joints; what stands in [energy] beside it is added."""
+    """Rigid bodies on joints; energies in [energy] are added."""
 
     urdf: Text | None = Field(
         default=None, description="URDF or MJCF file beside this one that the joints are read from"
@@ -183,19 +183,19 @@ class Robot(Declaration):
     base: str = Field(default="", description="Link that stands still; the URDF's root by default")
     tip: str = Field(default="", description="Last link of the chain; the URDF's only end")
     dh: Annotated[tuple[Row, ...], ByName(Name)] = Field(
-        default=(), description="One table a joint, in place of a URDF"
+        default=(), description="One table per joint, in place of a URDF"
     )
     payload: Payload | None = Field(default=None, description="A body held by the last link")
     motors: dict[Name, Motor] = Field(
         default={},
-        description="One table a motor; without, a drive at each joint whose torque is logged",
+        description="One table per motor; otherwise a drive at each joint whose torque is logged",
     )
     gravity: Triple = Field(default=(0.0, 0.0, -9.81), description="m/s2, in the base's frame")
     uncertainty: Positive = Field(
         default=0.3, description="Relative standard uncertainty of the drawn inertial numbers"
     )
     joints: Annotated[tuple[Joint, ...], ByName(Name)] = Field(
-        default=(), description="One table a joint, parents first; read from the URDF where given"
+        default=(), description="One table per joint, parents first; read from the URDF if given"
     )
 
     def cross_faults(self) -> Iterator[InputError]:
@@ -227,16 +227,16 @@ class Robot(Declaration):
         by_current = {motor.torque_constant is not None for motor in self.motors.values()}
         if len(by_current) > 1:
             yield InputError(
-                "some motors have a torque_constant and some have none",
+                "some motors have a torque_constant, others do not",
                 where="motors",
                 remedy="log the current of all, or the torque of all",
             )
         motors = self.motors.values()
         if motors and all(motor.torque_constant_sd is not None for motor in motors):
             yield InputError(
-                "every torque constant is estimated, which leaves the scale of all masses open",
+                "every torque constant is estimated, so the scale of all masses is undetermined",
                 where="motors",
-                remedy="leave out torque_constant_sd where the constant is known best",
+                remedy="leave out torque_constant_sd for the best-known constant",
             )
 
     @property
@@ -261,7 +261,7 @@ class Robot(Declaration):
 
     @cached_property
     def matters(self) -> Flags:
-        """Which inertial numbers change the force of some joint, (joints, 10)."""
+        """Return which inertial numbers change the force of some joint, (joints, 10)."""
         size = np.abs(self.regressor)
         largest = max(float(size.max(initial=0.0)), 1.0)
         return size.max(axis=0).reshape(-1, INERTIAL) > _NO_EFFECT * largest
@@ -277,9 +277,9 @@ class Robot(Declaration):
         return np.ascontiguousarray(table.transpose(0, 2, 1).reshape(-1, INERTIAL * n))
 
     def describe_mass(self, place: int, factor: float) -> str:
-        """Say that the drives ask for ``factor`` times the mass of a body as drawn, and what to do.
+        """Say that the drives suggest ``factor`` times the drawn mass of a body, and the remedy.
 
-        Of the last body, which may hold a tool, without its numbers as ``[robot.payload]``.
+        For the last body, which may hold a tool, the remedy is ``[robot.payload]``.
         """
         joint = self.joints[place]
         said = (
@@ -287,12 +287,12 @@ class Robot(Declaration):
             f" ({joint.mass:.3g} kg), by all drives together"
         )
         if joint is not self.joints[-1] or self.payload is not None:
-            return f"{said}: is that what is mounted there? put its mass, centre and inertia in"
+            return f"{said}: if that is the mounted body, enter its mass, centre and inertia"
         more = (factor - 1.0) * joint.mass
         return f"{said}: a tool of about {more:.2g} kg? put it into [robot.payload]"
 
     def columns(self, q: Array, qd: Array, qdd: Array) -> list[list[list[Any]]]:
-        """What one of each inertial number adds to the joints' forces: [joint][link][number].
+        """Forces of the joints by one unit of each inertial number: [joint][link][number].
 
         Args:
             q, qd, qdd: a motion of `moving`, (T, joints), rad or m and derivatives.
@@ -310,8 +310,8 @@ class Robot(Declaration):
 
         Args:
             q, qd, qdd: a motion, (T, n), rad or m and derivatives.
-            gravity: in the frame of the base, m/s2, (3,), or (3, T) where it differs.
-            only: number of the body that alone is there; None for all.
+            gravity: in the frame of the base, m/s2, (3,), or (3, T) where it differs. only: number
+            of the only body; None for all.
         """
         bodies = [
             list(joint.inertial) if only in (None, k) else [0.0] * INERTIAL
@@ -324,7 +324,7 @@ class Robot(Declaration):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The inertial numbers of all bodies, those fixed that no motion of the joints shows."""
+        """The inertial numbers of all bodies; those that no motion shows are fixed."""
         heaviest = max(sum(max(joint.mass, 0.0) for joint in self.joints), 1e-3)
         longest = max((joint.size for joint in self.joints), default=0.0) or 0.1
         entries = []
@@ -346,7 +346,7 @@ class Robot(Declaration):
 
     @property
     def rotors_at_joints(self) -> dict[str, float]:
-        """Inertia of the rotor that alone drives a joint, there, kg.m2 or kg, where it is given."""
+        """Inertia at a joint of the rotor that alone drives it, kg.m2 or kg, if given."""
         alone = {next(iter(m.turns)): m for m in self.motors.values() if len(m.turns) == 1}
         return {
             joint: motor.rotor_inertia * motor.turns[joint] ** 2
@@ -356,12 +356,12 @@ class Robot(Declaration):
 
     @property
     def impossible(self) -> list[str]:
-        """What no body can have among the drawn numbers, one sentence each."""
+        """Physically impossible drawn numbers, one sentence each."""
         return [line for joint in self.joints for line in joint.impossible]
 
     @property
     def undrawn(self) -> list[str]:
-        """The joints behind which neither mass nor inertia is drawn."""
+        """Joints whose body has neither mass nor inertia in the drawing."""
         return [j.name for j in self.joints if j.mass == 0.0 and not any(j.inertia)]
 
 

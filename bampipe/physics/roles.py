@@ -1,4 +1,4 @@
-"""What parts of a model are for: what balances gravity, and what shifts a force in time."""
+"""Roles of parts of a model: compensation of gravity, and delays of a force."""
 
 from typing import Any
 
@@ -12,11 +12,11 @@ from bampipe.physics.vocabulary import Vocabulary
 def find_compensation(
     d: Vocabulary, potential: Any, logged: list[Any], side: list[Any]
 ) -> list[Any]:
-    """Generalised force of what the device has against gravity, one expression a coordinate.
+    """Return the generalised force of a gravity compensator, one expression per coordinate.
 
     That is a torque of the device's own table, on a coordinate that the potential energy depends
-    on, that itself depends on the pose; with the effects that name it, or a constant or
-    definition that nothing but that torque uses (a compensator that lags or is mistuned).
+    on, that itself depends on the pose; with the effects that name it, or a constant or definition
+    that nothing but that torque uses (a compensator that lags or is mistuned).
 
     Args:
         potential: energy of the model; logged, side: generalised force and side load of the
@@ -44,7 +44,7 @@ def find_compensation(
 
 
 def find_delays(d: Vocabulary, applied: list[Any]) -> list[str]:
-    """Parameters that shift a measured force in time: small, they add its rate times themselves.
+    """Return parameters that shift a measured force in time, adding its rate times a small shift.
 
     To first order a shift by p seconds adds +-p times the rate of each force that it shifts,
     mapped to the joints as the force itself is.

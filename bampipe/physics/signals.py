@@ -1,4 +1,4 @@
-"""What acts of each logged input, after the effects that stand between log and mechanism."""
+"""The acting part of each logged input, after the effects between log and mechanism."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _ORDER = {link: number for number, link in enumerate(get_args(Link))}
 def order_of_action(effects: Iterable[BoundEffect]) -> list[BoundEffect]:
     """Effects in the order in which they act, whatever the order in which they were added.
 
-    Link by link, then what acts on the mechanism itself, last what acts on all dry friction or on
-    all weights or inertia; among those alike, names decide.
+    The order is link by link, then effects on the mechanism itself, last those on all dry friction,
+    weights or inertia; ties go by name.
     """
 
     def order_key(item: BoundEffect) -> tuple[int, bool, str]:
@@ -32,10 +32,10 @@ def order_of_action(effects: Iterable[BoundEffect]) -> list[BoundEffect]:
 
 
 def follows(item: BoundEffect, earlier: BoundEffect, device: Device) -> bool:
-    """Whether what ``item`` does changes, beyond first order, with ``earlier`` in the model.
+    """Whether the action of ``item`` changes, beyond first order, with ``earlier`` in the model.
 
-    So it is behind a lag or a saturation of an input that it uses, behind what acts on the same
-    dry friction, behind springs where it acts on what pulls, and for two effects of positions.
+    That holds behind a lag or a saturation of an input that it uses, behind effects on the same dry
+    friction, behind springs if it acts on the pull, and for two effects of positions.
     """
     if item.effect.kind == "measurement" or earlier.effect.kind == "measurement":
         return item.effect.kind == earlier.effect.kind
@@ -58,7 +58,7 @@ class ActingInputs:
     """The inputs that act, as expressions of the logged ones, and the internal states between.
 
     Attributes:
-        acting: by the symbol of a logged force or channel, what acts of it, where that differs.
+        acting: by the symbol of a logged force or channel, its acting part, if that differs.
         rates, initial: of the internal states of the effects between, by symbol.
     """
 
@@ -100,10 +100,10 @@ class ActingInputs:
         self.acting |= found
 
     def put_in(self, expr: Any) -> Any:
-        """``expr`` of logged inputs and their derivatives, with what acts of them in their place.
+        """Return ``expr`` with the acting parts of logged inputs and derivatives in their place.
 
         Raises:
-            InputError: it needs a derivative of what follows the rates, whose own is not known.
+            InputError: it needs a derivative of an input that depends on the rates.
         """
         d, present = self._d, expr.free_symbols
         values = {symbol: value for symbol, value in self.acting.items() if symbol in present}
@@ -119,5 +119,5 @@ class ActingInputs:
         return expr.subs(values, simultaneous=True) if values else expr
 
     def put_in_initial(self, expr: Any) -> Any:
-        """The same of an initial value: states between log and mechanism are at theirs."""
+        """Return the same for an initial value, with initial states between log and mechanism."""
         return self.put_in(expr).subs(self.initial, simultaneous=True)

@@ -1,4 +1,4 @@
-"""Whether a model has numbers to give along a motion, and if not, why, in physical words."""
+"""Checks whether a model is finite along a motion, and the physical reason if it is not."""
 
 import numpy as np
 
@@ -18,8 +18,8 @@ def require_sound(
 
     Args:
         q, qd, qdd: motion of the mechanism, (T, n_q), rad or m and derivatives.
-        u: inputs, (T, n_u); p: parameters, (n_p,); t: time, (T,), s.
-        where: what to call the motion in messages.
+        u: inputs, (T, n_u); p: parameters, (n_p,); t: time, (T,), s. where: name of the motion in
+        messages.
 
     Raises:
         InputError: the mass matrix is singular at a pose of the motion, or a force is no number
@@ -62,7 +62,7 @@ def _require_inertia(system: System, q: Array, mass: Array, t: Array, where: str
 def _find_culprit(
     system: System, q: Array, qd: Array, qdd: Array, u: Array, p: Array, t: Array
 ) -> str:
-    """The effect without which the others have numbers to give; else the device itself."""
+    """Return the effect without which the model is finite, or else the device."""
     model = system.model
     for bound in model.effects:
         alone = compile_model(Model(model.device, (bound.name,), (bound.effect,)))

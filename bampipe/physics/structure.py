@@ -1,4 +1,4 @@
-"""Which numbers of a model no motion can tell apart, and what each number does to the residual.
+"""Structural identifiability: numbers that no motion separates, and slopes of the residual.
 
 The kinetic and potential energy and the other generalised forces are sums of terms: a function of
 the motion and the inputs, times a factor made of constants and parameters. Data can determine the
@@ -45,12 +45,11 @@ class DeterminableNumber:
 
 @dataclass(frozen=True)
 class Structure:
-    """What the equations alone say of the numbers in them.
+    """Structural identifiability of the numbers in the equations.
 
     Attributes:
-        together: groups whose members no data of any kind can tell apart.
-        numbers: constants that enter on their own, in the order of the device file, then the
-            sums of those that do not.
+        together: groups whose members no data can separate. numbers: constants that enter on their
+        own, in the order of the device file, then the sums of the others.
     """
 
     together: tuple[Combination, ...]

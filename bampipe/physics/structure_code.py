@@ -1,4 +1,4 @@
-"""Derivation of which numbers of a model no motion can tell apart; see `structure`."""
+"""Derivation of the numbers of a model that no motion separates; see `structure`."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -32,7 +32,7 @@ def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any],
     motion = {*e.q, *e.qd, *e.z, *e.u}
     factors: list[Any] = []
     no_noise = dict.fromkeys(e.w, 0)
-    # Where no motion is, there is no force. Of a robot's bodies, see `base_parameters`.
+    # Without motion there is no force. For a robot's bodies, see `base_parameters`.
     for expr in (e.kinetic, e.potential) if model.device.robot is None else ():
         factors += _collect_factors(expr - expr.subs(dict.fromkeys(motion, 0)), motion, set(names))
     for expr in (*e.applied, *e.other, *e.rates, *e.offset):
@@ -68,7 +68,7 @@ def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any],
 
 
 def _find_determined(factors: Sequence[Any]) -> set[Any]:
-    """Return the symbols that all factors together determine: no change of the others hides one."""
+    """Return the symbols that all factors together determine, whatever the others are."""
     symbols = sorted(set().union(*(f.free_symbols for f in factors)), key=sp.default_sort_key)
     if not symbols:
         return set()

@@ -1,4 +1,4 @@
-"""The compiled model: generated functions, loaded from a cache on disk where they exist already."""
+"""The compiled model: generated functions, loaded from a cache on disk if they exist."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # it brings sympy, which few need
     from bampipe.physics.model_code import Generation
 
 _TOGETHER = 1024
-"""Samples whose slopes by a robot's bodies are taken at once: as many as a processor keeps near."""
+"""Samples whose slopes by a robot's bodies are computed at once, to fit the processor's cache."""
 
 
 class System:
@@ -32,22 +32,21 @@ class System:
         model: what it was made from.
         coordinates, coordinate_units, torque_units: per generalised coordinate.
         states: names of the full state x: positions, rates, internal states.
-        inputs: names of the columns of u.
-        parameters: what p holds, in order.
+        inputs: names of the columns of u. parameters: those in p, in order.
         noise: names of the additive process noise w.
         linear: per parameter, whether the residual is linear in it; of several, see `is_linear_in`.
-        constant: per parameter, whether the slope of the residual by it is the same for all
-            parameters along the mechanism's true motion; unforced: and whatever the inputs.
+        constant: per parameter, whether the slope of the residual by it depends on no parameter
+            along the mechanism's true motion; unforced: and on no input.
         touched: axes whose equation the effects change, measurement effects aside.
         moves_sensors: whether an effect of kind ``measurement`` is present.
         moved_by: numbers of the parameters of its `offset`.
-        driven: whether what the effects add to the residual depends on the measured force of
-            the same moment; force_fed: whether the rate of an internal state does.
+        driven: whether the effects' terms in the residual depend on the measured force of the same
+            moment; force_fed: whether the rate of an internal state does.
         moved_first: by axis, the places among `states` of the position and rate that a force there
             acts on first, (n_q, 2).
-        compensated: axes on which the device has something against gravity; see `compensation`.
-        delays: names of the parameters that shift measured forces in time.
-        braked: whether what the effects add depends on a brake's command.
+        compensated: axes with a gravity compensator; see `compensation`.
+        delays: names of the parameters that shift measured forces in time. braked: whether the
+        effects' terms depend on a brake's command.
     """
 
     def __init__(self, model: Model, code: generated_code.Generated) -> None:
@@ -162,7 +161,7 @@ class System:
 
     @cached_property
     def _whole(self) -> generated_code.Generated:
-        """Functions of the whole mechanism, which of most candidates for an effect nobody asks."""
+        """Functions of the whole mechanism, which most candidates of a diagnosis never need."""
 
         def generate() -> Generation:
             from bampipe.physics.model_code import whole_code
@@ -203,7 +202,7 @@ class System:
         return self._whole.module("measure_rows").measure_rows
 
     def encoder_readings(self, x: Array, u: Array, p: Array) -> Array:
-        """What the encoders read of states ``x`` (T, n_x): positions, then rates, (T, 2 n_q).
+        """Return encoder readings of states ``x`` (T, n_x): positions, then rates, (T, 2 n_q).
 
         Args:
             x: states, columns as in `states`; u: inputs, (T, n_u); p: parameters, (n_p,).
@@ -226,10 +225,10 @@ class System:
         return results
 
     def offset(self, q: Array, u: Array, p: Array) -> Array:
-        """How far the mechanism is from what the encoders read, (T, n_q), rad or m.
+        """Return true minus measured position, (T, n_q), rad or m.
 
         Args:
-            q: what they read, (T, n_q); u: inputs, (T, n_u); p: parameters, (n_p,).
+            q: readings, (T, n_q); u: inputs, (T, n_u); p: parameters, (n_p,).
         """
         return _stack(self._arrays.offset(q.T, u.T, p), len(q))
 
@@ -240,8 +239,8 @@ class System:
         inverse dynamics of the model.
 
         Args:
-            q, qd, qdd: motion of the mechanism, (T, n_q), rad or m and derivatives; it is
-                `offset` from what the encoders read.
+            q, qd, qdd: motion of the mechanism, (T, n_q), rad or m and derivatives; it is `offset`
+                from the encoder readings.
             z: internal states, (T, n_z), from `memory`.
             u: inputs, (T, n_u), columns as in `inputs`.
             p: parameters, (n_p,).
@@ -271,8 +270,8 @@ class System:
     ) -> Array:
         """``applied - required``, compiled; (T, n_q), N.m or N.
 
-        Arguments as in `required`; ``bodies`` is what `body_forces` returns of the same, where that
-        is known.
+        Arguments as in `required`; ``bodies`` is the result of `body_forces` for the same, if
+        known.
         """
         if bodies is None:
             bodies = self.body_forces(q, qd, qdd, p)
@@ -282,9 +281,9 @@ class System:
         return out
 
     def body_forces(self, q: Array, qd: Array, qdd: Array, p: Array) -> Array:
-        """What a robot's bodies require along a motion, (T, joints); (T, 0) of other devices.
+        """Forces that a robot's bodies require along a motion, (T, joints); (T, 0) else.
 
-        It changes with those of the parameters alone that are numbers of the bodies.
+        They depend only on the parameters of the bodies.
         """
         count = self._whole.facts["bodies"]
         out = np.empty((len(q), count))
@@ -300,7 +299,7 @@ class System:
 
     @cached_property
     def of_bodies(self) -> dict[int, int]:
-        """By number of a parameter, which of all inertial numbers of a robot's bodies it is."""
+        """Places of parameters among all inertial numbers of a robot's bodies, by number."""
         robot = self.model.device.robot
         place = {p.name: k for k, p in enumerate(robot.parameters)} if robot else {}
         return {i: place[self.parameters[i].name] for i in self._whole.facts["of_bodies"]}
@@ -333,7 +332,7 @@ class System:
         return results
 
     def contribution(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
-        """What the model's effects add to the residual of the bare device, (T, n_q).
+        """Return the effects' terms in the residual, beyond the bare device, (T, n_q).
 
         Arguments as in `required`. Effects of kind ``measurement`` change the motion instead; see
         `offset`. Columns of axes that no effect touches are zero.
@@ -372,7 +371,8 @@ class System:
         """
         map_ = self.input_map(q, u, p)
         if map_.shape[1] == map_.shape[2]:
-            # Some ten times as fast; a pose in which a force does nothing has no solution.
+            # About ten times as fast; there is no solution at a pose in which a force has no
+            # effect.
             with suppress(np.linalg.LinAlgError):
                 return np.asarray(np.linalg.solve(map_, load[..., None])[..., 0])
         return np.asarray(np.einsum("tfq,tq->tf", np.linalg.pinv(map_), load))
@@ -388,7 +388,7 @@ class System:
         return both[:, 0], both[:, 1]
 
     def compensation(self, q: Array, qd: Array, z: Array, u: Array, p: Array) -> Array:
-        """Generalised force of what the device has against gravity (eq 16), (T, n_q), N.m or N.
+        """Generalised force of the gravity compensator (eq 16), (T, n_q), N.m or N.
 
         Effects that change it (a carriage that lags) are included. Arguments as in `required`;
         columns of axes not in `compensated` are zero.
@@ -407,9 +407,9 @@ class System:
         """Internal states along the motion of one trial, (T, n_z).
 
         Integrated by RK4, or by exponential steps where its rate is linear in the state, along
-        rates that are cubic between samples and inputs that are linear, in finer steps where a
-        state would run away. A command or channel that is switched holds until the sample that
-        first shows its new value.
+        rates that are cubic between samples and inputs that are linear, in finer steps if a state
+        would diverge. A command or channel that is switched holds until the sample that first shows
+        its new value.
 
         Args:
             q, qd, qdd, u, p: as in `required`.

@@ -93,7 +93,7 @@ def parse_unit(text: str, where: str) -> Dimension:
     return total
 
 
-# A dimension, or None where a number might carry any.
+# A dimension, or None if a number might carry any.
 Found = Dimension | None
 
 
@@ -171,7 +171,7 @@ def _quote(node: ast.expr) -> str:
 
 
 class _Findings:
-    """Sentences about one file, collected while its expressions are gone through."""
+    """Sentences about one file, collected while its expressions are checked."""
 
     def __init__(self) -> None:
         self.found: list[str] = []
@@ -235,10 +235,9 @@ def _device_symbols(device: Device, check: _Findings) -> dict[str, Found]:
 
 
 def check_device(device: Device) -> list[str]:
-    """What is inconsistent in the units and symbols of a device file; empty if nothing is.
+    """Return the inconsistent units and symbols of a device file.
 
-    Returns:
-        One plain sentence a finding, the field first.
+    Returns: One sentence per finding, the field first; empty if all is consistent.
     """
     check, joule = _Findings(), _UNITS["J"]
     symbols = _device_symbols(device, check)
@@ -316,13 +315,12 @@ def _effect_symbols(item: BoundEffect, device: Device, check: _Findings) -> dict
 
 
 def check_effect(effect: Effect, device: Device, target: str = "") -> list[str]:
-    """What is inconsistent in the units and symbols of an effect at ``target`` of ``device``.
+    """Return the inconsistent units and symbols of an effect at ``target`` of ``device``.
 
     Args:
         target: axis, force component or pair; empty for an effect of scope ``device``.
 
-    Returns:
-        One plain sentence a finding, the field first; empty if all is consistent.
+    Returns: One sentence per finding, the field first; empty if all is consistent.
 
     Raises:
         InputError: the target does not exist.

@@ -1,4 +1,4 @@
-"""From names in declarations to symbols: what an expression of a device or an effect may say."""
+"""From names in declarations to symbols: the vocabulary of devices and effects."""
 
 import ast
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ Symbols = dict[str, Any]
 
 
 def constant_symbol(name: str) -> Any:
-    """Symbol that stands for a constant where its number is not put in."""
+    """Symbol of a constant that its number does not replace."""
     return sp.Symbol(f"constant {name}", real=True)
 
 
@@ -35,9 +35,8 @@ class Vocabulary:
         weight: by coordinate, slope of the potential energy; filled like `dry`.
         pull: by coordinate, the same less the torque of springs and the like; filled like `dry`.
         inertia: by coordinate, its entry on the diagonal of the mass matrix; filled like `dry`.
-        bias: by coordinate, what of the energies does not depend on acceleration, less the device's
-            own torques; filled like `dry`.
-        base: what every expression of the device may use.
+        bias: by coordinate, the energies' terms without acceleration, less the device's own
+            torques; filled like `dry`. base: names that every expression of the device may use.
     """
 
     def __init__(self, model: Model, named_constants: bool = False) -> None:
@@ -93,15 +92,15 @@ class Vocabulary:
                 raise self.too_long(tree, where) from None
         if size > expression.MAX_EXPANDED:
             raise InputError(
-                f"more than {expression.MAX_EXPANDED} operations once definitions are put in and "
-                "rates are taken",
+                f"more than {expression.MAX_EXPANDED} operations after definitions and rates are"
+                " expanded",
                 where=where,
                 remedy=self._shorten(tree),
             )
         return value
 
     def too_long(self, tree: ast.expr, where: str) -> InputError:
-        """What to say where deriving equations from the expression ``tree`` exceeds its limit."""
+        """Return the error if deriving equations from the expression ``tree`` exceeds its limit."""
         return InputError(
             "deriving the equations of motion takes too long: "
             f"{expression.expanded_size(tree, self.sizes)} operations with definitions put in",
@@ -143,7 +142,7 @@ class Vocabulary:
         return self.rate_along(expr, {}).replace(sp.DiracDelta, lambda *_: sp.S.Zero)
 
     def rate_along(self, expr: Any, further: Mapping[Any, Any]) -> Any:
-        """Time derivative along the motion; a series in the derivatives of a force ends there.
+        """Return the time derivative along the motion, to the last known derivative of a force.
 
         Args:
             expr: of motion, inputs and time; further: rates of other symbols in it.

@@ -204,7 +204,7 @@ class Results:
         return read_model_file(path).effects if path.is_file() else ()
 
     def list_effects(self) -> str:
-        """Return " with ..." and the effects of the model shown; "" where it has none."""
+        """Return " with ..." and the effects of the model shown; "" without effects."""
         names = join_names(f"`{name}`" for name in self.effects(self.model))
         return f" with {names}" if names else ""
 
@@ -215,5 +215,5 @@ class Results:
         return read_toml(path) if path.is_file() else None
 
     def cite_paper(self, item: str) -> str:
-        """Return " (the paper's <item>)" where the device has a paper, else ""."""
+        """Return " (the paper's <item>)" if the device has a paper, else ""."""
         return f" (the paper's {item})" if self.paper else ""

@@ -35,7 +35,7 @@ _LABEL = 30
 _HEADING = 70
 """Letters of a heading across the whole width."""
 _LETTER, _HANDLE = 0.058, 0.42
-"""Widths in a legend, inches: of a letter on average, and of what stands before the words."""
+"""Widths in a legend, inches: of an average letter, and of the symbol before the words."""
 _MOST_LEGEND_COLUMNS = 4
 _FEW_DECADES = 300.0
 """Ratio of values up to which a logarithmic axis has room for labels within a decade."""

@@ -19,11 +19,11 @@ def describe_held_out(validated: ValidateResult) -> str:
     """Return the trials that were held out of the fit, in words."""
     names = [name for name, trial in validated.trials.items() if trial.held_out]
     if not names:
-        return "nothing could be held out, so that the error is that of the fit"
+        return "nothing could be held out, so the error is that of the fit"
     if len(validated.trials) == 1:
-        return "each part of the trial predicted with the estimate that its other parts give"
+        return "each part of the trial predicted with the estimate from its other parts"
     if len(names) == len(validated.trials):
-        return "each trial predicted with the estimate that the others give"
+        return "each trial predicted with the estimate from the others"
     if len(names) > _MOST_NAMED:
         return f"{len(names)} of the {len(validated.trials)} trials, which no parameter has seen"
     trials = "trial" if len(names) == 1 else "trials"
@@ -31,7 +31,7 @@ def describe_held_out(validated: ValidateResult) -> str:
 
 
 def judge_session(results: Results) -> Callout:
-    """Return the verdict on the session: good where no check failed and nothing is outdated."""
+    """Return the verdict on the session: good if no check failed and nothing is outdated."""
     validated = results.read(ValidateResult, results.model)
     failed = validated.failed_checks if validated else ()
     found = _judge_model(results, validated)
@@ -72,8 +72,8 @@ def _judge_model(results: Results, validated: ValidateResult | None) -> Callout:
         return Callout(
             "note",
             "No held-out error",
-            "The parameters have seen every trial, or no noise floor could be computed, so that "
-            "the error of the model on a new trial is not known.",
+            "The parameters have seen every trial, or no noise floor could be computed, so the"
+            " error of the model on a new trial is not known.",
         )
     high = {a: r for a, r in ratios.items() if axes[a].standing == "above_floor"}
     parts = join_names(f"{a} {format_digits(r)} ×" for a, r in (high or ratios).items())
@@ -81,15 +81,15 @@ def _judge_model(results: Results, validated: ValidateResult | None) -> Callout:
         return Callout(
             "good",
             "The model explains this session down to its noise floor",
-            "On trials that the parameters never saw, the error is what sensor noise, quantisation "
-            f"and filtering alone would leave ({parts} the noise floor). "
-            f"`{results.diagnose_command}` tests whether a smaller effect hides below it.",
+            "On held-out trials, the error is that of sensor noise, quantisation and filtering"
+            f" alone ({parts} the noise floor). `{results.diagnose_command}` tests whether a"
+            " smaller effect hides below it.",
         )
     return Callout(
         "attention",
         f"The model leaves something unexplained on {join_names(high)}",
-        f"Error on trials that the parameters never saw: {parts} the noise floor. "
-        f"`{results.diagnose_command}` finds which effect is missing.",
+        f"Error on held-out trials: {parts} the noise floor. `{results.diagnose_command}` finds"
+        " which effect is missing.",
     )
 
 

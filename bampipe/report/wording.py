@@ -16,7 +16,7 @@ _MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.])")
 _POWER = re.compile(r"(?<![\w.])(\d+(?:\.\d+)?)e([+-]\d+)\b")
 _BASE_PARAMETERS = {"viscous": "viscous damping", "coulomb": "Coulomb friction"}
 NONE = "–"
-"""Shown in place of an unknown number."""
+"""Placeholder of an unknown number."""
 
 
 def format_unit(text: str) -> str:
@@ -61,7 +61,7 @@ def format_scaled(value: float | None, base: str, digits: int = 2, sd: float | N
 
 
 def format_decimals(value: float, decimals: int, power: int = 0) -> str:
-    """Return ``value`` with so many decimals, that power of ten taken out."""
+    """Return ``value`` with so many decimals, without that power of ten."""
     text = f"{value / 10.0**power:.{decimals}f}"
     if float(text) == 0.0:
         text = text.removeprefix("-")

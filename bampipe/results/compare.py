@@ -13,7 +13,8 @@ from bampipe.results.record import Names, Record, Result, Size
 from bampipe.results.validate import AxisDrift, FreeRunError
 
 NOTICEABLE = 0.01
-"""Least fall of the held-out error that confirms a model; a superfluous effect has less."""
+"""Least relative fall of the held-out error that confirms a model; superfluous effects give
+less."""
 
 
 class Rung(Record):
@@ -24,12 +25,11 @@ class Rung(Record):
     added: str | None = Field(description="Effects that the parent lacks")
     effects: Names
     held_out_rmse: dict[str, Size]
-    noise_floor: dict[str, Size | None] = Field(description="null where none was computed")
+    noise_floor: dict[str, Size | None] = Field(description="null if none was computed")
     standing: dict[str, FloorStatus]
     confirmed: bool = Field(
-        description="A model without a parent; or one whose parent is confirmed and whose "
-        "held-out error is lower than its parent's; not one without a "
-        "noise floor where its parent has one"
+        description="A model without a parent, or one with a confirmed parent and a lower"
+        " held-out error than that; not a model without a noise floor if its parent has one"
     )
     unit: dict[str, str]
     free_run_mode: Literal["closed_loop", "open_loop"] | None = None
@@ -40,15 +40,15 @@ class Rung(Record):
     drift: dict[str, AxisDrift] = Field(default={}, description="By axis: short free runs")
 
     def median_drift(self, axis: str) -> dict[float, float]:
-        """Median drift of one axis, rad or m, by horizon in s; empty where there is none."""
+        """Return the median drift of one axis, rad or m, by horizon in s."""
         found = self.drift.get(axis)
         return {h.horizon_s: h.median for h in found.horizons} if found else {}
 
     def improves_on(self, other: Rung) -> bool:
         """Return whether its held-out error is lower and can still be judged.
 
-        A version that has lost its noise floor is no better, whatever its error: its replicates run
-        away, or it fits far below what sensors alone leave, by making both sides small.
+        A version that has lost its noise floor is no better, whatever its error: its replicates
+        diverge, or its error is far below the sensor noise, because both sides are small.
         """
         return self.has_lower_error_than(other) and not self.has_lost_its_floor(other)
 
@@ -58,7 +58,7 @@ class Rung(Record):
         return math.prod(ratios) < 1.0 - NOTICEABLE
 
     def has_lost_its_floor(self, other: Rung) -> bool:
-        """Whether no floor judges its error on an axis where one judges that of ``other``."""
+        """Whether its error has no floor on an axis where that of ``other`` has one."""
         axes = other.noise_floor
         return any(self._floor_is_wrong(a) and not other._floor_is_wrong(a) for a in axes)
 
@@ -100,8 +100,7 @@ class CompareResult(Result):
     STAGE: ClassVar[str] = "compare"
 
     best: str = Field(
-        description="The model used where a command names none: the confirmed one with the lowest "
-        "held-out error"
+        description="The model used by default: the confirmed one with the lowest held-out error"
     )
     ladder: tuple[Rung, ...] = Field(min_length=1, description="Parents before children")
     parameters: dict[str, dict[str, Value]] = Field(description="By name, then by model")

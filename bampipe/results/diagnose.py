@@ -17,11 +17,9 @@ class AxisVerdict(Record):
     """The effects that one axis lacks."""
 
     verdict: Verdict
-    effects: Names = Field(description="Of the most probable set, on this axis; `extend` adds them")
+    effects: Names = Field(description="Those of the most probable set here; `extend` adds them")
     probabilities: dict[str, Share] = Field(description="Effects of any probable set on this axis")
-    unknown: Share = Field(
-        description="Probability that an effect is missing that the library does not have"
-    )
+    unknown: Share = Field(description="Probability that an effect outside the library is missing")
     rmse_before: Size = Field(description="On held-out trials")
     rmse_after: Size = Field(description="With the most probable set")
     rmse_beyond_bias: Size = Field(
@@ -31,7 +29,7 @@ class AxisVerdict(Record):
     noise_floor_sd: Size
     standing: FloorStatus = Field(description="rmse_after against noise_floor")
     unit: str
-    force_rms: Size = Field(description="Of the applied force, root mean square")
+    force_rms: Size = Field(description="Root mean square of the applied force")
     explained: UpToOne = Field(
         description="Share of the mean square of the applied force that the final model explains"
     )
@@ -59,9 +57,9 @@ class RankedEffect(Record):
     axis: str
     held_out_rmse_before: Size = Field(description="Of the model diagnosed")
     held_out_rmse_after: Size = Field(
-        description="Of an effect of the most probable set, without and with it beside the others;"
-        " else of the model diagnosed with it alone, as if both sides of the equation kept their"
-        " size"
+        description="For an effect of the most probable set, error without and with it beside the"
+        " others; otherwise of the diagnosed model with it alone, as if both sides of the"
+        " equation kept their size"
     )
     unit: str
     probability: Share
@@ -74,10 +72,10 @@ class RankedEffect(Record):
 class WeighedSet(Record):
     """A set of effects and how probable it is."""
 
-    effects: Names = Field(description="Beyond those of the model diagnosed")
+    effects: Names = Field(description="Effects beyond those of the diagnosed model")
     unknown: str | None = Field(default=None, description="Axis with an unknown effect beside them")
     probability: Share
-    log_evidence: float = Field(description="Over that of the first set, nats")
+    log_evidence: float = Field(description="Log evidence over that of the first set, nats")
 
 
 class NullDistribution(Record):
@@ -94,7 +92,7 @@ class SuggestedTrial(Record):
     """A trial that would distinguish effects."""
 
     between: Names
-    axis: str = Field(description="On which they differ most")
+    axis: str = Field(description="Axis on which they differ most")
     design: str
     confusion: Share = Field(description="Probability of taking one for the other, with that trial")
     confusion_now: Share
@@ -146,7 +144,7 @@ class DiagnoseResult(Result):
     )
     sets: tuple[WeighedSet, ...] = Field(description="The most probable first")
     chance: NullDistribution | None = Field(
-        default=None, description="null where replicates do not resemble the measurement"
+        default=None, description="null if replicates do not resemble the measurement"
     )
     cut_short: bool = Field(
         default=False, description="Whether the search stopped at the largest set allowed"

@@ -52,8 +52,8 @@ class DraftedEffect(Record):
 class ChanceOfDraft(Record):
     """Gains of the same search on replicates of the model, in which nothing is missing."""
 
-    gain: float = Field(description="Of the best formula on the grid, log evidence in nats")
-    gains: tuple[float, ...] = Field(description="Of the best formula on each replicate")
+    gain: float = Field(description="Gain in log evidence of the best formula on the grid, nats")
+    gains: tuple[float, ...] = Field(description="Gain of the best formula on each replicate, nats")
     p_value: Share
 
 
@@ -63,7 +63,7 @@ class DraftOption(Record):
     effects: Names = Field(description="Empty for the unchanged model")
     constants: Count
     held_out_rmse: Size
-    log_evidence: float = Field(description="Over the unchanged model, nats")
+    log_evidence: float = Field(description="Gain over the unchanged model, nats")
 
 
 class NearestEffect(Record):
@@ -80,7 +80,7 @@ class AxisDraft(Record):
     verdict: DraftVerdict
     effects: Names = Field(description="Drafted effects, which `extend` adds")
     chance: tuple[ChanceOfDraft, ...] = Field(
-        min_length=1, description="Of the first formula, and of the second one if it was sought"
+        min_length=1, description="Search of the first formula, and of the second one if any"
     )
     options: tuple[DraftOption, ...] = Field(description="Shortest first")
     rmse_before: Size = Field(description="On held-out trials")

@@ -23,7 +23,9 @@ class AxisDifferentiation(Record):
     unit: Literal["rad", "m"]
     bandwidth_hz: Positive
     bandwidth_reason: str
-    order: int | None = Field(default=None, description="Of the motion model, Kalman smoother only")
+    order: int | None = Field(
+        default=None, description="Order of the Kalman smoother's motion model"
+    )
     resolution: Size
     quantisation_sd: Size
     measurement_noise_sd: Size
@@ -61,11 +63,11 @@ class FilterResult(Result):
     axes: dict[str, AxisDifferentiation] = Field(min_length=1)
     force: ForceFilter
     bridged_fraction: dict[str, Share] = Field(
-        description="By trial: share of its grid that had no sample"
+        description="By trial: share of its grid without samples"
     )
-    skipped: dict[str, str] = Field(description="By trial: why it could not be differentiated")
+    skipped: dict[str, str] = Field(description="By trial: reason why it was skipped")
     disturbances: dict[str, tuple[Disturbance, ...]] = Field(
-        default_factory=dict, description="By trial: stretches that are left out"
+        default_factory=dict, description="By trial: excluded stretches"
     )
     force_offsets: dict[str, dict[str, float]] = Field(
         default_factory=dict,

@@ -9,19 +9,19 @@ from typing import Literal
 FloorStatus = Literal["at_floor", "above_floor", "floor_implausible", "floor_missing"]
 
 AT_FLOOR = 1.2
-"""Error over floor up to which a model explains all but sensor noise. No replicate is perfect:
-clean axes reach 1.08 floors, and 1.16 where friction truly stops the arm; the weakest effects that
-were found had 1.18."""
+"""Largest error over floor of a model that explains all but sensor noise. No replicate is perfect:
+clean axes reach 1.08 floors, and 1.16 if friction truly stops the arm; the weakest effects found
+had 1.18."""
 FLOOR_SDS = 3.0
-"""Standard deviations of the floor over replicates that are allowed for. The status of no axis of
-39 sessions changes from 1.9 to 3.0."""
+"""Allowed standard deviations of the floor over replicates. Between 1.9 and 3.0, no axis of 39
+sessions changes its status."""
 IMPLAUSIBLE = 0.7
-"""Error over floor below which the floor is wrong: the sensors are noisier than the data, or a
-replicate does not resemble the machine. No axis of 39 sessions changes its status from 0.55 to
-0.88."""
+"""Least error over floor; below it the floor is wrong, because the stated sensor noise is too large
+or a replicate does not resemble the machine. Between 0.55 and 0.88, no axis of 39 sessions changes
+its status."""
 
 FLOOR_WRONG = ("floor_implausible", "floor_missing")
-"""Statuses in which an error cannot be judged."""
+"""Statuses without a valid floor."""
 
 
 def compare_with_floor(error: float, floor: float | None, floor_sd: float = 0.0) -> FloorStatus:
@@ -29,7 +29,7 @@ def compare_with_floor(error: float, floor: float | None, floor_sd: float = 0.0)
 
     Args:
         error: held-out error of one axis.
-        floor: its noise floor in the same unit, None where there is none.
+        floor: its noise floor in the same unit, None without one.
         floor_sd: scatter of the floor over replicates; `FLOOR_SDS` of it are allowed for.
     """
     if floor is None or not math.isfinite(floor) or not math.isfinite(error) or floor <= 0.0:

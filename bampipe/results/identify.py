@@ -19,27 +19,28 @@ class ParameterEstimate(Record):
     unit: str
     at_bound: bool = Field(description="Within one sd of its physical bound")
     filter_sd: Size | None = Field(
-        default=None, description="Of the filter alone, valid for white noise only"
+        default=None,
+        description="Standard deviation of the filter alone, valid for white noise only",
     )
     smoothing_sd: Size | None = Field(
         default=None,
-        description="Part of sd by which the smoothed sign of a velocity moves the estimate; 0 "
-        "where the machine creeps as the model does, null where the method leaves standstill out",
+        description="Part of sd due to the smoothed sign of a velocity; 0 if the machine creeps"
+        " as the model does, null if the method excludes standstill",
     )
     calibration_sd: Size | None = Field(
         default=None,
-        description="Part of sd from the stated uncertainty of sensors and constants, and from "
-        "encoder zeros that are known to one step; null where there is none",
+        description="Part of sd from the stated uncertainty of sensors and constants, and from"
+        " encoder zeros that are known to one step; null without any",
     )
     statistical_sd: Size | None = Field(
-        default=None, description="The rest of sd, null where all of it is statistical"
+        default=None, description="The rest of sd; null if all of it is statistical"
     )
     least_squares_bias: float | None = Field(
         default=None,
-        description="Bias that filters and friction at standstill would give least squares",
+        description="Bias of least squares by filters and friction at standstill, subtracted",
     )
     bound_sd: Size | None = Field(
-        description="Cramer-Rao bound: least sd that the sensors allow; null where there is none"
+        description="Cramer-Rao bound: least sd that the sensors allow; null without one"
     )
 
 
@@ -61,36 +62,36 @@ class MethodTried(Record):
     """Parameters by one method, and their error on held-out trials."""
 
     held_out_rmse: dict[str, Size] = Field(
-        default={}, description="By axis, N.m or N; empty where it found no parameters"
+        default={}, description="By axis, N.m or N; empty without parameters"
     )
     parameters: dict[str, MethodValue] = Field(default={}, description="By name")
     disagrees: Names = Field(
         default=(),
-        description="Parameters that lie farther from the published ones than twice the "
-        "uncertainty of both",
+        description="Parameters that differ from the published ones by more than twice the"
+        " uncertainty of both",
     )
     doubts: Names = Field(default=(), description="Reasons to distrust it")
 
 
 class WorstSecond(Record):
-    """The second that moves a parameter of the least-squares fit most."""
+    """The second with the largest influence on a parameter of the least-squares fit."""
 
     trial: str
     start_s: Size = Field(description="Since the start of the trial, s")
     parameter: str
     move: float = Field(
-        description="Change of that parameter without the second, in its standard deviations"
+        description="Change of that parameter without this second, in its standard deviations"
     )
     sentence: str = Field(default="", description="Explanation of a transient or an outlier")
 
 
 class Influence(Record):
-    """How far parts of the data move the parameters."""
+    """Influence of parts of the data on the parameters."""
 
     trials: dict[str, dict[str, float]] = Field(
-        description="By trial, or block of a single one, then by parameter and `input_timing`: "
-        "change of the estimate by least squares where it is left out, in published standard "
-        "deviations. Of more than ten trials every tenth is left out together"
+        description="By trial, or block of a single one, then by parameter and `input_timing`:"
+        " change of the least-squares estimate without it, in published standard deviations."
+        " More than ten trials form ten groups"
     )
     worst_second: WorstSecond
 
@@ -102,27 +103,27 @@ class EffectEstimate(Record):
         default=True, description="Whether its strengths, taken together, differ from zero at 95 %"
     )
     identified: bool
-    reasons: Names = Field(default=(), description="Why it does not count as identified")
+    reasons: Names = Field(default=(), description="Reasons why it does not count as identified")
 
 
 NEAR_LIMIT = 0.95
-"""Share of its limit from which a timing counts as at the limit."""
+"""A timing is at its limit from this share of it on."""
 
 
 class InputTiming(Record):
     """Delay of the force samples behind the positions, at most half a sample."""
 
     estimate: float
-    sd: Size = Field(description="0 where it was not estimated")
+    sd: Size = Field(description="0 if it was not estimated")
     unit: Literal["s"]
     limit: Size = Field(
-        default=0.0, description="Largest value, half a sample; 0 where it was not estimated"
+        default=0.0, description="Largest value, half a sample; 0 if it was not estimated"
     )
     of_residual: float = Field(
         default=0.0,
-        description="Timing with the least residual within the limit, s, the bias of filters at"
-        " reversals included; for a robot the one on which most drives agree away from reversals;"
-        " 0 where the trials show none. Residuals are compared at this timing",
+        description="Timing with the least residual within the limit, s, including the bias of"
+        " filters at reversals; for a robot the one on which most drives agree away from"
+        " reversals; 0 if the trials show none. Residuals are compared at this timing",
     )
 
     @property
@@ -155,7 +156,7 @@ class InnovationTestResult(Record):
 
 
 class Whiteness(InnovationTestResult):
-    """Whether the innovations follow from their past."""
+    """Whether the past does not predict the innovations."""
 
     white: bool
 
@@ -205,7 +206,7 @@ class ParameterBound(Record):
 
 
 class WeakDirection(Record):
-    """Parameters that move together, and the share of information left for that."""
+    """Parameters that move together, and the share of information that separates them."""
 
     members: Names
     parts: tuple[float, ...]
@@ -235,7 +236,7 @@ class Combined(Record):
 
 
 class TrialGrowth(Record):
-    """Relative growth of the bound of a parameter without the trial."""
+    """Largest relative growth of a parameter's bound without the trial."""
 
     growth: float
     parameter: str
@@ -253,16 +254,16 @@ class IdentifiabilityReport(Record):
 
 
 class BaseEstimate(Record):
-    """A combination of a robot's inertial numbers that motion determines, but no part of it."""
+    """A base parameter: inertial numbers that motion determines only as a combination."""
 
-    combination: str = Field(description="Of the names of parameters, with factors")
+    combination: str = Field(description="Names of parameters, with factors")
     members: Names
     estimate: float
     sd: Size
     drawn: float = Field(description="Value from the drawing")
     drawn_sd: Size
     unit: str
-    shown: bool = Field(description="Whether the trials determine it better than the drawing")
+    shown: bool = Field(description="Whether the trials determine it better than the drawing does")
 
 
 class IdentifyResult(Result):
@@ -273,7 +274,7 @@ class IdentifyResult(Result):
 
     model: str
     headline: str
-    method: Method = Field(description="That of the published parameters")
+    method: Method = Field(description="Method of the published parameters")
     methods: dict[Method, MethodTried] = Field(description="Every method tried, published first")
     engine: Literal["compiled", "filterpy"]
     trials: Names = Field(description="Free trials used")
@@ -282,8 +283,8 @@ class IdentifyResult(Result):
     )
     effects: dict[str, EffectEstimate] = Field(
         default={},
-        description="By effect of the model. One whose strength or shape is at a bound, or has an "
-        "interval larger than itself, does not count as identified",
+        description="By effect of the model. An effect does not count as identified if its"
+        " strength or shape is at a bound or has an interval larger than itself",
     )
     influence: Influence
     covariance: Covariance
@@ -292,12 +293,12 @@ class IdentifyResult(Result):
     convergence: Convergence
     identifiability: IdentifiabilityReport | None = None
     base_parameters: tuple[BaseEstimate, ...] | None = Field(
-        default=None, description="Of a robot, from the base to the tip"
+        default=None, description="Base parameters of a robot, from the base to the tip"
     )
     sign_width_factor: Annotated[float, Field(gt=0, le=1)] = Field(
         default=1.0,
-        description="Width of the smoothed sign of the velocities over the device's `sign_width`; "
-        "below 1 where trials of a test bench are more likely so. Later stages use it too",
+        description="Width of the smoothed sign of the velocities over the device's `sign_width`;"
+        " below 1 if trials of a test bench are more likely with it. Later stages use it too",
     )
     notes: Names = Field(default=(), description="Limits of the estimates")
     nis: Consistency | None = None
@@ -314,7 +315,7 @@ class IdentifyResult(Result):
     def moves_without(self, trial: str) -> dict[str, float]:
         """Change of each parameter and of ``input_timing`` without a trial, or block of one.
 
-        Nothing moves without a trial that was not fitted.
+        It is zero for a trial that was not fitted.
         """
         sd = {name: entry.sd for name, entry in self.parameters.items()}
         sd["input_timing"] = self.input_timing.sd

@@ -15,9 +15,9 @@ class EncoderChannel(Record):
     resolution: Size = Field(description="Step of the encoder in that unit, as used")
     resolution_stated: Size | None = Field(description="From session.toml, or null")
     resolution_measured: Size | None = Field(
-        description="Step of the readings; null where they lie on no grid"
+        description="Step of the readings; null without a grid"
     )
-    noise_sd: Size = Field(description="Of a reading, rounding included")
+    noise_sd: Size = Field(description="Standard deviation of a reading, rounding included")
     scale: float = Field(default=1.0, description="rad or m for one raw unit, by session.toml")
     zero: float = Field(default=0.0, description="Raw reading at position 0, by session.toml")
     counts_per_unit: float | None = Field(default=None, description="As in session.toml, or null")
@@ -30,13 +30,13 @@ class ForceChannels(Record):
 
     columns: Names
     unit: str
-    noise_sd: dict[str, Size] = Field(description="Of a sample, by channel, as used")
+    noise_sd: dict[str, Size] = Field(description="Standard deviation by channel, as used")
     noise_sd_stated: Size | None = Field(description="From session.toml, or null")
     noise_sd_measured: dict[str, Size | None] = Field(
-        description="By channel; null where too little is recorded"
+        description="By channel; null if too little is recorded"
     )
     calibration: tuple[tuple[float, ...], ...] = Field(
-        default=(), description="One row a component: `unit` for one raw unit of each column"
+        default=(), description="One row per component: `unit` per raw unit of each column"
     )
     zero: tuple[float, ...] = Field(default=(), description="Raw readings without force")
     raw_unit: str = Field(default="", description="Unit of the raw columns")
@@ -55,21 +55,21 @@ class RecordedChannel(Record):
     unit: str
     scale: float = Field(default=1.0, description="SI value = scale * raw + offset")
     offset: float = 0.0
-    raw_unit: str = Field(default="", description="Unit of the column, where it is not rescaled")
+    raw_unit: str = Field(default="", description="Unit of the column if it is not rescaled")
     scale_sd: Size = Field(default=0.0, description="Standard uncertainty of scale, as a share")
     second_encoder_of: str = Field(
-        default="", description="Axis of which it reads the position on the gear's other side"
+        default="", description="Axis whose position it reads on the other side of the gear"
     )
 
 
 class MainsHum(Record):
-    """A sine of the power supply on a channel, taken off the samples."""
+    """A sine of the power supply on a channel, subtracted from the samples."""
 
     channel: str
     unit: str
     hz: Positive = Field(description="Nominal frequency of mains, or of a harmonic")
     amplitude: Size = Field(description="Median over the trials")
-    trials: int = Field(ge=1, description="How many trials had it")
+    trials: int = Field(ge=1, description="Number of trials that had it")
 
 
 class DeadStretch(Record):
@@ -108,11 +108,11 @@ class IngestResult(Result):
     force: ForceChannels
     sensor_warnings: Names = Field(
         description="Stated noise or resolution that differs from the measured one by more than a"
-        " factor of two, and readings that look like counts"
+        " factor of two; readings that look like counts"
     )
     mains_hum: tuple[MainsHum, ...] = ()
     brakes: dict[str, RecordedChannel]
     channels: dict[str, RecordedChannel]
     dead: dict[str, tuple[DeadStretch, ...]] = Field(
-        default_factory=dict, description="By trial: stretches in which a sensor was dead"
+        default_factory=dict, description="By trial: stretches with a dead sensor"
     )

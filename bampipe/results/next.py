@@ -55,7 +55,7 @@ class ExpectedSd(Record):
 
     @property
     def number(self) -> str:
-        """The forecast without its unit: one number where it can be trusted, else a range."""
+        """The forecast without its unit: one number if both ends agree, otherwise a range."""
         return f"{self.after:.2g}" if self.is_sharp else f"{self.low:.2g} to {self.high:.2g}"
 
 
@@ -63,12 +63,12 @@ class PlannedConfusion(Record):
     """Chance of taking one alternative for another, without and with new trials."""
 
     between: Names = Field(description="Each by its effects, joined by +")
-    before: Share = Field(description="By the probabilities of the diagnosis")
+    before: Share = Field(description="Probabilities of the diagnosis")
     after: Share = Field(description="Median over people who follow it")
 
 
 class ExpectedConfusion(PlannedConfusion):
-    """The same with one new trial, and what it shows."""
+    """The same with one new trial, and its errors."""
 
     weight: Share = Field(description="Box-Hill weight of the pair: product of the odds")
     left: dict[str, Size] = Field(
@@ -80,7 +80,7 @@ class Proposal(Record):
     """One trial that could be recorded."""
 
     sentence: str
-    seconds: Size = Field(description="Of all its trials together")
+    seconds: Size = Field(description="Total length of its trials")
     parts: Count = Field(default=1, description="Trials of equal length in which it is recorded")
     like: str = Field(default="", description="The present trial that is imitated, without moves")
     moves: dict[str, Move] = Field(description="By axis; the trial is designed for the first")
@@ -91,7 +91,7 @@ class Proposal(Record):
     information_gain: float = Field(description="Half the drop of the log determinant, nats")
     sd: dict[str, ExpectedSd] = Field(
         default={},
-        description="By parameter; none where the model lacks something or is not fitted to it",
+        description="By parameter; none if the model lacks something or is not fitted to it",
     )
     confusion: tuple[ExpectedConfusion, ...] = ()
     farther: Names = Field(default=(), description="Axes moved farther than in the present trials")
@@ -102,8 +102,8 @@ class Detectable(Record):
     """The smallest strength of an effect that the trials would have revealed."""
 
     parameter: str
-    smallest: Size | None = Field(description="null where they do not excite it")
-    typical: float = Field(description="Size at which the effect is clearly there")
+    smallest: Size | None = Field(description="null if they do not excite it")
+    typical: float = Field(description="Size at which the effect is clearly visible")
     unit: str
     axis: str = Field(description="Axis on which it is revealed first; empty if on none")
     with_proposal: Size | None = Field(default=None, description="With the first proposal recorded")
@@ -147,14 +147,14 @@ class PlannedSd(ExpectedSd):
 
 
 class Plan(Record):
-    """The trials that bring every uncertainty below the limit asked for."""
+    """The trials that bring every uncertainty below the requested limit."""
 
     sentence: str
     seconds: Size = Field(description="Of all trials")
     is_enough: bool = Field(description="Whether the limit is expected to be reached")
     trials: tuple[PlannedTrial, ...]
     sd: dict[str, PlannedSd] = Field(
-        default={}, description="By parameter; none where the model lacks something"
+        default={}, description="By parameter; none if the model lacks something"
     )
     confusion: tuple[PlannedConfusion, ...] = ()
 
@@ -170,7 +170,7 @@ class NextResult(Result):
     model: str
     purpose: Purpose
     parameter: str = Field(default="", description="The parameter whose uncertainty is to fall")
-    trials: Names = Field(description="Present when this was proposed")
+    trials: Names = Field(description="Trials present at the time of this proposal")
     sentence: str = Field(description="The motion to record")
     why: str
     expected: str = Field(description="Its expected result")
@@ -181,7 +181,7 @@ class NextResult(Result):
     )
     shows: Names = Field(
         default=(),
-        description="Effects that the first proposal would reveal, and the present trials do not",
+        description="Effects that the first proposal would reveal, unlike the present trials",
     )
     plan: Plan | None = None
     trajectory: Trajectory | None = None

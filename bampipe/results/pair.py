@@ -53,15 +53,15 @@ class Travel(Record):
     noise_floor: Size | None
     uncertainty: Size = Field(description="Part of the error that the parameters' sd accounts for")
     limit: Size = Field(
-        description="Largest error of a model that travels: by the floor there, or by own_error if"
-        " the model is above the floor of its own session"
+        description="Largest error of a model that travels, from the floor there, or from"
+        " own_error if the model is above the floor of its own session"
     )
     unit: str
     travels: bool
 
 
 class Refit(Record):
-    """Some parameters of a model refitted to the other session, the others as they were."""
+    """Some parameters of a model refitted to the other session, the others unchanged."""
 
     changes: dict[str, float] = Field(description="By parameter, in its unit")
     errors: dict[str, Size] = Field(description="By axis, on trials left out of the refit")
@@ -84,7 +84,7 @@ class Journey(Record):
         description="By axis: verdict on a model with the same effects in the other session, where"
         " no refit reaches the limit or the own model is above its floor",
     )
-    reason: str = Field(default="", description="Why these are not known")
+    reason: str = Field(default="", description="Reason why these are not known")
 
     @property
     def failed(self) -> list[str]:

@@ -24,15 +24,15 @@ Names = tuple[str, ...]
 class Record(Declaration):
     """Part of a result.
 
-    A field of another type, one that is not declared, and a number that is not finite are
-    refused; numbers of numpy are taken. A field that holds its default is left out of the file.
+    Fields of another type, undeclared fields and numbers that are not finite are refused; numpy
+    numbers are accepted. Fields with their default are left out of the file.
     """
 
     model_config = ConfigDict(strict=False, serialize_by_alias=True)
 
     @classmethod
     def of(cls, *sources: object, **values: object) -> Self:
-        """Return a record of ``values`` and of those attributes of ``sources`` that are fields.
+        """Return a record from ``values`` and the attributes of ``sources`` that are fields.
 
         Arrays become tuples; an earlier source goes before a later one.
         """
@@ -56,7 +56,7 @@ class Record(Declaration):
 
 
 class Result(Record):
-    """The whole of one JSON file.
+    """One JSON file.
 
     Attributes:
         FILE: its path in the folder it belongs to; ``{model}`` stands for the model's name.
@@ -76,7 +76,7 @@ class Result(Record):
         """Read and check ``path``; fields that another version of bampipe added are passed over.
 
         Raises:
-            InputError: no such file, or it is not as bampipe writes it: names the field.
+            InputError: no such file, or a wrong field, which is named.
         """
         content = read_json_table(path)
         try:

@@ -13,7 +13,7 @@ _PRIVATE, _OF_SESSION = ".bampipe", "session:"
 
 
 def is_result(name: object) -> bool:
-    """Whether ``name`` can be that of a result: normal, and none of the runner's own files."""
+    """Whether ``name`` can be a result: a normal path, and none of the runner's own files."""
     own = str(name).partition("/")[0].casefold() == _PRIVATE
     return is_normal(name) and name != RunResult.FILE and not own
 
@@ -77,14 +77,14 @@ class StepRecord(Record):
 
 
 class Timing(Record):
-    """When a step ran, and for how long."""
+    """Time and duration of a step."""
 
     started_at: str
     seconds: Size
 
 
 class Commit(Record):
-    """Results of a step that are not yet in their place; ``remove``: obsolete ones."""
+    """Results of a step that have not been moved yet; ``remove``: obsolete ones."""
 
     step: str
     record: StepRecord
@@ -97,7 +97,7 @@ class GateVerdict(Record):
 
     gate: str
     model: str = Field(default="", description='The model that was judged, or ""')
-    key: str = Field(description='The key for which * stood, or ""')
+    key: str = Field(description='The key that * matched, or ""')
     state: GateState
     value: float | None
     message: str
@@ -115,7 +115,7 @@ class RunResult(Result):
     pipeline: PipelineUsed | None = None
     stages: dict[str, StepRecord] = Field(description="By step: <stage>, or <stage>:<model>")
     timings: dict[str, Timing] = Field(default={})
-    failures: dict[str, str] = Field(default={}, description="By step: why its last try failed")
+    failures: dict[str, str] = Field(default={}, description="By step: fault of its last attempt")
     versions: dict[str, str] = Field(
         default={}, description="Of Python, bampipe and its dependencies, at the last run"
     )

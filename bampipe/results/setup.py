@@ -8,7 +8,7 @@ from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.schema import Count
 
 AxisState = Literal["sound", "mistaken", "hardly_moves", "unexplained"]
-"""Unexplained where the bare device hardly follows how the applied force varies."""
+"""Unexplained if the bare device hardly follows the variation of the applied force."""
 Kind = Literal["sign", "scale", "exchange", "zero", "clock", "gravity"]
 
 
@@ -17,8 +17,7 @@ class PossibleMistake(Record):
 
     kind: Kind
     signals: Names = Field(
-        description="Axes, force channels and other channels that it concerns; none of a clock or"
-        " of gravity"
+        description="Axes, force channels and other channels concerned; none for a clock or gravity"
     )
     sentence: str = Field(description="The mistake and its correction")
 
@@ -26,21 +25,19 @@ class PossibleMistake(Record):
 class SetupMistake(PossibleMistake):
     """A mistake that was found, with its evidence."""
 
-    factor: float = Field(
-        default=1.0, description="By which their readings must be multiplied, of a scale or clock"
-    )
-    offset: float = Field(default=0.0, description="Which must be added, rad or m, of a zero")
+    factor: float = Field(default=1.0, description="Correcting factor of a scale or clock")
+    offset: float = Field(default=0.0, description="Correction of a zero, rad or m")
     gravity: tuple[float, float, float] | None = Field(
-        default=None, description="In the frame of a robot's base, m/s2, where that is mistaken"
+        default=None, description="Corrected gravity in the frame of a robot's base, m/s2"
     )
     axes: Names = Field(description="Whose equations it spoils")
-    evidence: str = Field(description="The change once it is corrected")
+    evidence: str = Field(description="The change after its correction")
     error_before: dict[str, Size] = Field(
         description="Error of the fit by axis, per cent of the applied force"
     )
     error_after: dict[str, Size] = Field(description="The same after its correction")
     alternatives: tuple[PossibleMistake, ...] = Field(
-        default=(), description="Other mistakes that the trials cannot tell from this one"
+        default=(), description="Other mistakes that the trials cannot distinguish from this one"
     )
 
 
@@ -49,8 +46,8 @@ class AxisSetup(Record):
 
     state: AxisState
     error_percent: Size | None = Field(
-        description="Error of the bare device fitted by least squares, per cent of the "
-        "applied force; null where none is applied, or the axis hardly moves"
+        description="Error of the bare device fitted by least squares, per cent of the applied"
+        " force; null without applied force, or if the axis hardly moves"
     )
     moving_share: Share = Field(description="Share of the samples in which the axis moves")
 
@@ -61,8 +58,8 @@ class SetupResult(Result):
     FILE: ClassVar[str] = "filter/setup.json"
     STAGE: ClassVar[str] = "filter"
 
-    headline: str = Field(description="Empty where nothing is wrong")
+    headline: str = Field(description="Empty if nothing is wrong")
     mistakes: tuple[SetupMistake, ...]
     warnings: Names = Field(description="Reasons to doubt results that are no mistakes")
-    tested: Count = Field(description="Set-ups that were compared with the stated one")
+    tested: Count = Field(description="Number of set-ups compared with the stated one")
     axes: dict[str, AxisSetup] = Field(min_length=1)

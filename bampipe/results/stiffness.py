@@ -49,11 +49,10 @@ class AxisStiffness(Record):
         description="Standard uncertainty: standard_error, systematic and calibration_sd together"
     )
     standard_error: Size = Field(
-        description="By the scatter over the cycles, or of the regression over all, the larger"
+        description="By the scatter over cycles or by the regression over all, whichever is larger"
     )
     systematic: Size = Field(
-        description="A quarter of the change of slope, measured or possible, where loops should "
-        "be straight"
+        description="A quarter of the change of slope, measured or possible, over the straight part"
     )
     calibration_sd: Size = Field(
         description="Part from the stated uncertainties of sensors, and the zeros of encoders"
@@ -80,13 +79,13 @@ class GearStiffness(Record):
     """Stiffness of a gear with an encoder on either side, over the free trials."""
 
     stiffness: Positive | None = Field(
-        description="Null where the encoders do not move apart with the load"
+        description="Null if the difference of the encoders does not follow the load"
     )
     sd: Size | None = Field(description="Standard uncertainty, by the scatter of stretches")
     unit: str = Field(description="Of the stiffness: N.m/rad or N/m")
     play: float | None = Field(
-        description="Gap that the gear crosses where the load changes sign, rad or m; null where"
-        " it never does"
+        description="Gap that the gear crosses as the load changes sign, rad or m; null if it"
+        " never does"
     )
     play_sd: Size | None
     play_unit: str
@@ -109,7 +108,7 @@ class StiffnessResult(Result):
     headline: str
     notes: Names = Field(description="Trials without loops, slipping brakes, small loads")
     axes: dict[str, AxisStiffness] = Field(
-        description="One entry for each axis with a locked trial; none where there is no such trial"
+        description="One entry for each axis with a locked trial"
     )
     gears: dict[str, GearStiffness] = Field(
         default={}, description="By axis with a second encoder; see channels.second_encoder_of"

@@ -24,7 +24,7 @@ class TermCurve(Record):
     unit: str = Field(description="Of the force")
     variable: str
     variable_unit: str
-    center: tuple[float, ...] = Field(description="By bin of the trials' samples")
+    center: tuple[float, ...] = Field(description="One value per bin of the trials' samples")
     mean: tuple[float, ...]
     low: tuple[float, ...] = Field(description="95 % band by the parameters' covariance")
     high: tuple[float, ...]
@@ -48,6 +48,6 @@ class TermsResult(Result):
 
     model: str
     equations: Names = Field(
-        description="Of M q'' + h = Q, line by line, identified numbers put in; may be empty"
+        description="Lines of M q'' + h = Q with identified numbers; may be empty"
     )
     terms: tuple[ModelTerm, ...]

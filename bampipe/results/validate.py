@@ -20,8 +20,8 @@ class AxisError(Record):
         description="100 held_out_rmse / root mean square of the measured torque"
     )
     fit_percent: Annotated[float, Field(le=100)] | None = Field(
-        description="100 (1 - held_out_rmse / standard deviation of the measured torque); null on "
-        "an axis that nothing drives"
+        description="100 (1 - held_out_rmse / standard deviation of the measured torque); null on"
+        " an undriven axis"
     )
     unit: str
 
@@ -30,8 +30,8 @@ class JudgedError(AxisError):
     """Error of one axis over all trials, compared with its noise floor."""
 
     noise_floor: Size | None = Field(
-        description="Error of the fitted model's own replicates, same sensors and filters; "
-        "null where none was computed"
+        description="Error of the fitted model's own replicates with the same sensors and"
+        " filters; null if none was computed"
     )
     noise_floor_sd: Size = Field(description="Scatter of one replicate")
     standing: FloorStatus
@@ -59,7 +59,7 @@ class ForceError(Record):
 
 
 class FreeRunError(Record):
-    """Position error of one axis of the model left to itself."""
+    """Position error of one axis of the freely running model."""
 
     mean_absolute: Size
     rmse: Size
@@ -77,10 +77,10 @@ class CommandError(Record):
 class Drift(Record):
     """Distance of the simulated position from the measured one, some time after a common start."""
 
-    horizon_s: Positive = Field(description="How long the model has run freely, s")
+    horizon_s: Positive = Field(description="Duration of the free run, s")
     median: Size = Field(description="Over the windows in which the axis moves")
     quantile_90: Size
-    displacement: Size = Field(description="How far the axis itself has moved by then, median")
+    displacement: Size = Field(description="Median distance that the axis itself has moved by then")
     windows: Count = Field(description="Starts from which the axis moves within the horizon")
 
 
@@ -89,13 +89,13 @@ class AxisDrift(Record):
 
     unit: str = Field(description="rad or m")
     horizons: tuple[Drift, ...] = Field(description="Shortest first")
-    reason: str = Field(default="", description="Why there are no longer horizons")
+    reason: str = Field(default="", description="Reason why there are no longer horizons")
 
 
 class FreeRun(Record):
-    """The model left to itself over held-out trials."""
+    """The model running freely over held-out trials."""
 
-    reason: str = Field(default="", description="Why there is none, or none in closed loop")
+    reason: str = Field(default="", description="Reason why there is none, or none in closed loop")
     mode: Literal["closed_loop", "open_loop"] | None = None
     axes: dict[str, FreeRunError] = Field(default={})
     trials: dict[str, dict[str, FreeRunError]] = Field(default={})
@@ -117,7 +117,7 @@ class ValidateResult(Result):
     headline: str
     cutoff_hz: dict[str, Positive] = Field(description="Low-pass of both sides by axis, Hz")
     floor_replays: Count = Field(description="Replicates over which the noise floor is a mean")
-    failed_checks: Names = Field(description="Of data, estimate and floor; a sound model has none")
+    failed_checks: Names = Field(description="Of data, estimate and floor; empty for a sound model")
     notes: Names
     axes: dict[str, JudgedError] = Field(
         description="Over all free trials and those in a viscous field, stretches at rest left out"

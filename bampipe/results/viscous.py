@@ -12,11 +12,11 @@ class Damping(Record):
 
     estimate: float = Field(description="Rendered by the brakes")
     sd: Size
-    own_friction: float = Field(description="The device's own, as felt there")
+    own_friction: float = Field(description="The device's own viscous friction, as felt there")
     felt: float = Field(description="Both together")
     unit: Literal["N.s/m"]
     commanded: float | None = Field(
-        default=None, description="null where it is not recorded, as the following are then"
+        default=None, description="null if it is not recorded, as are the following"
     )
     p_value: Share | None = None
     differs: bool | None = None
@@ -35,11 +35,12 @@ class ViscousResult(Result):
     headline: str
     trials: Names
     blocks: Annotated[int, Field(ge=1)] | None = Field(
-        default=None, description="Stretches of time whose scatter gave the standard deviations"
+        default=None,
+        description="Number of stretches of time whose scatter gives the standard deviations",
     )
     process_noise_factor: Annotated[float, Field(ge=1)] | None = Field(
         default=None,
-        description="Factor by which the filter's process noise had to be raised; mostly 1",
+        description="Factor on the filter's process noise that was needed; usually 1",
     )
     directions: dict[str, Damping] = Field(
         description="By component of the handle's force; empty without viscous trials"

@@ -1,4 +1,4 @@
-"""What happens in a run, for whoever shows it."""
+"""Events of a run, for display."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened in a run, for whoever shows it.
+    """An event of a run, for display.
 
     Attributes:
         run: name of the run folder.
@@ -14,8 +14,8 @@ class Event:
         kind: "waiting", "taken over", "compiling", "start", "progress", "done", "unchanged" or
             "failed".
         fraction: how much of the step is done, 0 to 1.
-        message: what is under way, why the step runs, what went wrong, or who holds or held the
-            run folder.
+        message: the work in progress, the reason of the step, the fault, or the holder of the run
+            folder.
     """
 
     run: str

@@ -1,4 +1,4 @@
-"""Quality gates: results held against the limits of a pipeline."""
+"""Quality gates: results compared with the limits of a pipeline."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def _pick(content: object, dotted: str) -> dict[str, object]:
-    """Return the values at ``dotted``, by what its ``*`` stands for ("" without one)."""
+    """Return the values at ``dotted``, by the key that its ``*`` matches ("" without one)."""
     found: dict[str, object] = {"": content}
     for part in dotted.split("."):
         step: dict[str, object] = {}
@@ -41,9 +41,9 @@ def _number(value: object) -> float | None:
 def _found(
     gate: Gate, key: str, passed: bool, value: float | None, parts: Sequence[str], word: str = ""
 ) -> GateVerdict:
-    """Return what came of ``gate`` for ``key``: ``parts`` in one line, and advice if it fails.
+    """Return the verdict of ``gate`` for ``key``: ``parts`` in one line, and advice if it fails.
 
-    The advice is that for ``word``, where the gate has one.
+    The advice is that for ``word``, if the gate has one.
     """
     from bampipe.results.run import GateVerdict
 
@@ -121,7 +121,7 @@ def _content(path: Path) -> dict[str, Any] | None:
 def _judge_change(
     gate: Gate, root: Path, model: str, baseline: Path
 ) -> tuple[str, list[GateVerdict]]:
-    """Hold changes since the accepted values, in percent, against the limit; and of which model.
+    """Compare changes since the accepted values, in percent, with the limit.
 
     A change beyond the limit but within two standard deviations neither passes nor fails: it warns.
     """

@@ -55,7 +55,7 @@ def session_files(folder: Path) -> dict[str, Path]:
     files = {"session.toml": session}
     try:
         content = read_toml(session)
-    except InputError:  # ingest says what is wrong with it
+    except InputError:  # ingest reports its fault
         return files
     trials, device = content.get("trials"), content.get("device")
     entries = trials if isinstance(trials, list) else []
@@ -73,7 +73,7 @@ def _urdf_of(folder: Path, device: str) -> list[str]:
     """The URDF that a device file of the session names, by its path in the session folder."""
     try:
         robot = read_toml(folder / device).get("robot")
-    except InputError:  # ingest says what is wrong with it
+    except InputError:  # ingest reports its fault
         return []
     urdf = robot.get("urdf") if isinstance(robot, dict) else None
     return [str(PurePosixPath(device).parent / urdf)] if isinstance(urdf, str) else []

@@ -1,4 +1,4 @@
-"""One process at a time in a folder; a lock whose holder was killed is free, and that is said."""
+"""One process at a time in a folder; a lock whose holder was killed is free, with a notice."""
 
 import contextlib
 import os
@@ -83,5 +83,5 @@ def _name(handle: int) -> str:
     os.lseek(handle, 0, os.SEEK_SET)
     try:
         return os.read(handle, 200).decode(errors="replace")
-    except PermissionError:  # Windows keeps what is locked to its holder
+    except PermissionError:  # Windows reserves locked bytes for their holder
         return ""

@@ -1,4 +1,4 @@
-"""What came of a run, in Markdown: for a pull request or the summary of a CI job."""
+"""The outcome of a run in Markdown, for a pull request or the summary of a CI job."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from bampipe.run.request import Outcome
 
 STATES = {0: "passed", 1: "**gate failed**", 2: "**bad input**", 3: "**crashed**"}
 MOST = 30
-"""So many lines of one table are shown; a summary that nobody reads to its end is none."""
+"""Most lines of one table: a summary must be short enough to be read."""
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:

@@ -1,6 +1,6 @@
 """Model versions in a run folder: the base model and its children.
 
-A model that is not there, or is damaged, raises `InputError`, which names those that are.
+A missing or damaged model raises `InputError`, which names the existing ones.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ def choose_model(root: Path, name: str) -> str:
 
 
 def counting_model(root: Path) -> str:
-    """Return the model that counts where a command names none: the best confirmed one.
+    """Return the default model: the best confirmed one.
 
-    The stage compare stores it; the base model where nothing has been compared.
+    The stage compare stores it; without a comparison it is the base model.
     """
     from bampipe.results.compare import CompareResult
 
@@ -61,7 +61,7 @@ def counting_model(root: Path) -> str:
 
 
 def write(root: Path, model: ModelFile) -> None:
-    """Write ``model`` below ``root``, whole or not at all; one that says the same is left."""
+    """Write ``model`` below ``root``, whole or not at all, unless its content is unchanged."""
     path = root / "models" / model.name / "model.toml"
     text = model.text()
     if path.is_file():
@@ -92,7 +92,7 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
 
 
 def _bring_adopted_effects(root: Path) -> None:
-    """Put the effects that the lab has adopted beside the base model: diagnoses weigh them."""
+    """Copy the effects that the lab has adopted to the base model: diagnoses weigh them."""
     for source in sorted((root.parent / ADOPTED).glob("*.toml")):
         if source.is_symlink():
             continue

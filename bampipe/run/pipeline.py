@@ -1,6 +1,6 @@
-"""Pipelines: which stages run, with which settings, and which results are good enough.
+"""Pipelines: stages to run, their settings, and limits of results.
 
-One that is not there or says something impossible raises `InputError`.
+A missing or invalid pipeline raises `InputError`.
 """
 
 from __future__ import annotations

@@ -8,9 +8,8 @@ or shared folder and published whole:
 
 ``current.json`` is written last, in one piece. Whoever reads it first sees the old version or the
 new one, never a mixture; an upload that was cut short is not seen at all, and the next one
-completes it. Versions that no longer count are left: somebody may be reading them.
-
-What fsspec, the driver of a file system or the place itself refuses is an `InputError`.
+completes it. Older versions are kept, because somebody may be reading them. A refusal by fsspec, by
+the driver of a file system or by the place itself is an `InputError`.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ CURRENT = "current.json"
 def publish(root: Path, url: str) -> str:
     """Publish the run folder ``root`` below ``url``; return the version.
 
-    Nobody may be at work in it. A version that is there already, whole, is not sent again.
+    No other process may use it. A complete version that exists already is not sent again.
 
     Args:
         url: a folder as fsspec names it, such as ``s3://bucket/runs`` or ``file:///mnt/runs``.
@@ -81,11 +80,11 @@ def published(url: str) -> list[str]:
 
 
 def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
-    """Fetch the published run of ``session`` into ``runs``, every file held against its hash.
+    """Fetch the published run of ``session`` into ``runs``, every file checked against its hash.
 
     Args:
         url: as for :func:`publish`; session: as `published` lists it; runs: folder of run folders.
-        force: replace a run folder that says something else.
+        force: replace a run folder with other content.
 
     Returns:
         The run folder.
@@ -130,7 +129,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
 
 
 def open_place(url: str) -> tuple[Any, str]:
-    """Return the file system and the path on it; InputError where nothing can be there."""
+    """Return the file system and the path on it; InputError for an impossible place."""
     try:
         from fsspec.core import url_to_fs
     except ImportError as error:
@@ -144,7 +143,7 @@ def open_place(url: str) -> tuple[Any, str]:
 
 @contextlib.contextmanager
 def _driver(what: str, url: str) -> Iterator[None]:
-    """Whatever a driver of fsspec raises is one line: each has errors of its own."""
+    """Turn any exception of an fsspec driver into one line: each driver has its own."""
     try:
         yield
     except InputError:

@@ -1,4 +1,4 @@
-"""``run.json``: what was run on what, with what, and what came out; and the lock of a run."""
+"""``run.json``: inputs, settings and results of every step; and the lock of a run."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ SCHEMA: Final = "bampipe.run/1"
 FILE = "run.json"
 PRIVATE = ".bampipe"
 SESSION = "session:"
-"""What the names of a session's files begin with among the inputs of a step."""
+"""Prefix of a session's files among the inputs of a step."""
 
 
 def read(root: Path) -> RunResult:
-    """Return what ``run.json`` in ``root`` says; of an empty run where there is none.
+    """Return ``run.json`` in ``root``, or an empty record.
 
-    One that is damaged counts as not there: all stages run again, and the file is rebuilt.
+    A damaged one counts as missing: all stages run again, and the file is rebuilt.
     """
     from bampipe.results.run import RunResult
 
@@ -48,7 +48,7 @@ def _sound(root: Path) -> RunResult | None:
 
 
 def require_untouched(root: Path, names: Iterable[str]) -> None:
-    """Hold results against the hashes that ``run.json`` keeps of them.
+    """Compare results with their hashes in ``run.json``.
 
     Args:
         root: the run folder; names: paths in it, passed over if not there or not recorded.
@@ -68,7 +68,7 @@ def require_untouched(root: Path, names: Iterable[str]) -> None:
 
 
 def touched(root: Path, name: str, step: str) -> InputError:
-    """Return the refusal of the result ``name`` that is not as ``step`` wrote it."""
+    """Return the error for the result ``name``, which is not as ``step`` wrote it."""
     remedy = f"run `bampipe {step.partition(':')[0]}` again to rebuild it"
     return InputError(f"{name} was changed since {step} wrote it", where=str(root), remedy=remedy)
 
@@ -80,11 +80,11 @@ def write(root: Path, content: RunResult) -> None:
 
 @contextlib.contextmanager
 def lock(root: Path, wait: bool, listen: Listener = unheard) -> Iterator[None]:
-    """Hold the run folder ``root``, made if need be; what the disk refuses is a user's matter.
+    """Hold the run folder ``root``, made if need be; faults of the disk are `InputError`.
 
     Args:
-        wait: wait while another process holds it; else refuse.
-        listen: called before waiting, and where the last holder was killed.
+        wait: wait while another process holds it; else refuse. listen: called before waiting, and
+        if the last holder was killed.
 
     Raises:
         InputError: another process holds it and ``wait`` is false; or the disk is full, read-only

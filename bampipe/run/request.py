@@ -1,4 +1,4 @@
-"""What is asked of the runner, and what it answers."""
+"""Requests to the runner, and its outcomes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Step:
-    """One stage, for one model where the stage runs once for each."""
+    """One stage, for one model if the stage runs once per model."""
 
     stage: str
     model: str = ""
@@ -30,7 +30,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of the runner.
+    """A request to the runner.
 
     Attributes:
         root: the run folder.
@@ -41,7 +41,7 @@ class Request:
         last: last stage that runs, "" for the last.
         force: run every selected step, changed or not.
         model: the only model to run; "" for the base model and what was run of the others.
-        judge: whether the gates judge `model`, or else the model that counts.
+        judge: whether the gates judge `model` instead of the model that counts.
         accepted: folder of accepted values; None for ``accepted`` beside the folder of runs.
         processes: share of the machine for stages that use several processes; 0 for all of it.
         publish: where to publish the run folder once it is done, a URL for fsspec; "" for nowhere.
@@ -65,7 +65,7 @@ class Request:
 
 @dataclass(frozen=True)
 class StepResult:
-    """What came of one step: its state is "done" or "unchanged".
+    """The outcome of one step: its state is "done" or "unchanged".
 
     Attributes:
         reason: why it ran; seconds: how long it took; summary: what the stage returned.
@@ -80,13 +80,12 @@ class StepResult:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a run.
+    """The outcome of a run.
 
     Attributes:
         state: "done", "refused" (bad input) or "crashed" (a fault of bampipe).
-        verdicts: of the gates.
-        error: one line on what went wrong, or "".
-        traceback: where bampipe itself failed, or "".
+        verdicts: of the gates. error: one line on the fault, or "". traceback: of a fault of
+        bampipe, or "".
         model: which model the gates judged, or "".
     """
 

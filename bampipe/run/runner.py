@@ -71,9 +71,9 @@ class _Runner:
         return StepResult(step.name, "done", reason, seconds, made.summary)
 
     def failed(self, step: Step, error: str, *, noted: bool = True) -> None:
-        """Say, and unless not to be ``noted`` note, that the step failed.
+        """Report that the step failed, and record it if ``noted``.
 
-        What its last success left stays, and stays recorded.
+        Results of its last success stay, and stay recorded.
         """
         shutil.rmtree(staging.folder(self.root, step), ignore_errors=True)
         if noted:

@@ -1,4 +1,4 @@
-"""From settings in a file or on the command line to the typed configuration of a stage."""
+"""Typed configuration of a stage, from settings in a file or on the command line."""
 
 import dataclasses
 import tomllib

@@ -1,7 +1,7 @@
-"""Where a step writes before it counts: results reach the run folder whole or not at all.
+"""Staging of a step's outputs: results reach the run folder whole or not at all.
 
-A step writes below ``.bampipe/staging/``. Once it is done, a commit file says what it made; from
-then on a kill loses nothing, since the next run repeats the moves that the commit file names.
+A step writes below ``.bampipe/staging/``. When it is done, a commit file lists its outputs; from
+then on a kill loses nothing, since the next run repeats the moves of the commit file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def folder(root: Path, step: Step) -> Path:
 
 
 def folder_name(step: str) -> str:
-    """Return what the staging folder of the step named ``step`` is called."""
+    """Return the name of the staging folder of ``step``."""
     return step.replace(":", "@")
 
 
@@ -46,7 +46,7 @@ def prepare(root: Path, step: Step, outputs: tuple[str, ...]) -> Path:
 
 
 def written(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, str]:
-    """Hash what a stage wrote, and hold it to what it declared."""
+    """Hash the outputs of a stage, and compare them with its declaration."""
     files = {
         path.relative_to(staging).as_posix(): path
         for path in sorted(staging.rglob("*"))
@@ -85,7 +85,7 @@ def commit(state: RunState, staging: Path, sealed: Commit) -> None:
 
 
 def recover(state: RunState) -> None:
-    """Finish what a killed run had completed, drop what it had not."""
+    """Finish the completed steps of a killed run, and drop the others."""
     for pattern in (f".{record.FILE}.*.partial", "models/*/.model.toml.*.partial"):
         for draft in state.root.glob(pattern):
             draft.unlink()
@@ -100,7 +100,7 @@ def recover(state: RunState) -> None:
 
 
 def _sealed(root: Path, staging: Path) -> Commit | None:
-    """What the commit file says, if it and what it names and is still here are as they were."""
+    """Return the commit file's content, if it and the remaining files that it names are intact."""
     from bampipe.results.run import Commit
     from bampipe.schema import read
 

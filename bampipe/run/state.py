@@ -1,4 +1,4 @@
-"""What a run folder records, what each step depends on, and whether it must run again."""
+"""The record of a run folder, the dependencies of each step, and whether it must run again."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from bampipe.results.run import GateVerdict, RunResult
 
 FIRST_TIME = "never run"
-"""Why a step runs that has no result yet."""
+"""Reason of a step without a result."""
 NEUTRAL = ("session", "jobs")
 """Fields of a configuration that no result depends on: a place, and a number of processes."""
 
 
 class RunState:
-    """What a run folder records, what its steps depend on, and which of them must run."""
+    """The record of a run folder, the dependencies of its steps, and which of them must run."""
 
     def __init__(self, request: Request) -> None:
         self.request = request
@@ -39,7 +39,7 @@ class RunState:
         self.digests: dict[tuple[str, int, int, int], str] = {}
         self.session = request.session
 
-    # What a step depends on
+    # Dependencies of a step
 
     def digest(self, relative: str) -> str:
         """Hash of a file in the run folder, read once as long as it is the same file."""
@@ -90,7 +90,7 @@ class RunState:
                 raise self.missing(pattern)
             for name in names:
                 if name == record.FILE:
-                    # Only what it says of the other steps counts; times and places do not.
+                    # Only its entries on other steps count; times and places do not.
                     others = {k: made.key for k, made in self.records.items() if k != step.name}
                     found[name] = digest_content(others)
                     continue
@@ -128,7 +128,7 @@ class RunState:
     def declared(self, step: Step) -> tuple[dict[str, object], tuple[str, ...]]:
         """Configuration as recorded, and declared inputs.
 
-        Where the same settings met the same code before, the record answers, and the module of
+        If the settings and the code are those of the record, it supplies them, and the module of
         the stage (which may import much) stays unloaded.
         """
         made = self.records.get(step.name)
@@ -139,7 +139,7 @@ class RunState:
         return lasting(config), base.paths_of(step.model, base.load_stage(step.stage).INPUTS)
 
     def reason(self, step: Step) -> str:
-        """Why the step must run; "" if it need not."""
+        """Return the reason why the step must run, or ""."""
         made = self.records.get(step.name)
         if made is None:
             return "run.json was damaged" if self.damaged else FIRST_TIME
@@ -176,14 +176,14 @@ class RunState:
         )
         return (Step(stage, models.BASE), *(Step(stage, name) for name in children))
 
-    # What is kept of it
+    # Storage
 
     def save(self) -> None:
         """Write ``run.json``."""
         self._write(self._noted())
 
     def close(self, verdicts: Iterable[GateVerdict]) -> None:
-        """Write ``run.json`` with the verdicts of the gates, unless it says the same already."""
+        """Write ``run.json`` with the verdicts of the gates, unless it is unchanged."""
         from bampipe.results.run import PipelineUsed
 
         noted = self._noted()
@@ -194,7 +194,7 @@ class RunState:
             self._write(noted)
 
     def _noted(self) -> RunResult:
-        """What is known by now; versions and machine as they were written."""
+        """Return the present record, with versions and machine as they were written."""
         place = self.written.place
         if self.session is not None:
             place = place.model_copy(update={"session": str(self.session.resolve())})

@@ -1,4 +1,4 @@
-"""Where each step of a run stands, without running anything."""
+"""The status of each step of a run, without running anything."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StepStatus:
-    """Where one step of a run stands.
+    """The status of one step of a run.
 
     Attributes:
         state: "current", "stale", "failed" or "not run".
-        reason: why it would run again, or what went wrong.
-        started_at: when it last ran, UTC, or "".
+        reason: why it would run again, or its fault. started_at: time of its last run, UTC, or "".
         seconds: how long it took, or None.
     """
 
@@ -34,7 +33,7 @@ class StepStatus:
 
 
 def status(root: Path, pipeline: Pipeline) -> list[StepStatus]:
-    """Return where each step of the run ``root`` stands by the settings of ``pipeline``."""
+    """Return the status of each step of the run ``root`` by the settings of ``pipeline``."""
     run = RunState(Request(root, pipeline))
     found = []
     shown = [
@@ -58,7 +57,7 @@ def status(root: Path, pipeline: Pipeline) -> list[StepStatus]:
                 if not reason and stale:
                     reason = "an earlier stage is stale"
                 state = "stale" if reason else "current"
-            # A stage outside the pipeline is not run with it: what follows stays as it is.
+            # A stage outside the pipeline does not run with it: later results stay as they are.
             stale = stale or (state != "current" and stage in pipeline.stages)
             last_run = (timing.started_at, timing.seconds) if timing else ("", None)
             found.append(StepStatus(step.name, state, reason, *last_run))

@@ -1,4 +1,4 @@
-"""Every hash that a run records, computed again."""
+"""Verification of every hash that a run records."""
 
 from pathlib import Path
 
@@ -11,8 +11,8 @@ def verify(root: Path) -> list[tuple[str, str]]:
     """Recompute every hash that ``run.json`` records.
 
     Returns:
-        Pairs of a file and what became of it: "changed", "gone", or "unknown" for a file that no
-        stage recorded; ``run.json`` itself may be "damaged". Empty where all is as it was written.
+        Pairs of a file and its state: "changed", "gone", or "unknown" for a file that no stage
+        recorded; ``run.json`` itself may be "damaged". Empty if all is as it was written.
     """
     content = record.read(root)
     found: dict[str, str] = {record.FILE: "damaged"} if record.is_damaged(root) else {}
@@ -23,7 +23,7 @@ def verify(root: Path) -> list[tuple[str, str]]:
             for name, written in names.items():
                 recorded.add(name)
                 path = root / name
-                # What a stage read is held here if it is text; all else, where it was written.
+                # Text inputs of a stage are checked here, all others as outputs of their stage.
                 held = names is made.outputs or path.suffix == ".toml"
                 if not path.is_file():
                     found.setdefault(name, "gone")

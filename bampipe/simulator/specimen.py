@@ -26,8 +26,8 @@ class Config:
         effects: effects to hide, such as ``stribeck:yaw``, or with a strength,
             ``stribeck:yaw=0.5``.
         strength: strength of the other effects, as a multiple of the ``typical`` value of each
-            strength parameter (of its ``sd`` if it has none); its sign is drawn if both are valid.
-        seed: of every random draw.
+            strength parameter (of its ``sd`` if it has none); its sign is random if both are valid.
+        seed: of all random numbers.
         device: name of a built-in device.
         effect_files: paths of effect files beside the built-in ones.
         trials: number of free trials.

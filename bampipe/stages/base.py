@@ -1,4 +1,4 @@
-"""What a stage is, what it may read, and which stages there are.
+"""The contract of a stage, and the table of stages.
 
 A stage is a module with
 
@@ -50,14 +50,14 @@ class Stage(Protocol):
 
 @dataclass(frozen=True)
 class StageEntry:
-    """What is known of a stage before its module is imported.
+    """Data on a stage that need no import of its module.
 
     Attributes:
         name: of the module and of the command.
         per_model: whether ``Config`` has a field ``model``: it runs once for each model.
         reads_session: whether ``Config`` has a field ``session``.
         prints: whether it calls the report, whose changes then rerun it.
-        after: the command that is suggested once it has run; "" where its own command says more.
+        after: the command that is suggested after it; "" if its own command says more.
     """
 
     name: str
@@ -98,7 +98,7 @@ def check_stage_name(name: str) -> None:
 
 
 def load_stage(name: str) -> Stage:
-    """Import and return the stage ``name``; InputError where there is none."""
+    """Import and return the stage ``name``; InputError if there is none."""
     check_stage_name(name)
     return cast(Stage, importlib.import_module(f"bampipe.stages.{name}"))
 

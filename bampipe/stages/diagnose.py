@@ -1,4 +1,4 @@
-"""Stage diagnose: what the model lacks, axis by axis, and how sure that is."""
+"""Stage diagnose: the effects that the model lacks, by axis, with probabilities."""
 
 import os
 from collections.abc import Sequence
@@ -47,13 +47,13 @@ OUTPUTS = ("models/{model}/diagnose.json", "models/{model}/map_variables.parquet
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config(Criteria):
-    """Settings of the stage; what each number decides is in docs/method_selection.md.
+    """Settings of the stage; docs/method_selection.md describes each number.
 
     Attributes:
         model: which model version to diagnose.
         jobs: number of worker processes; 0 means one for each processor, eight at most.
         seed: seed of the noise in the replicates.
-        trust_setup: whether to diagnose in spite of a mistake that was found in the set-up.
+        trust_setup: whether to diagnose in spite of a mistake in the set-up.
         without: effects that are not weighed, such as one that was added in vain.
         also: effects that are weighed on request only, such as loose_load:joint.
     """
@@ -67,7 +67,7 @@ class Config(Criteria):
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Diagnose one model; write what it lacks, and what its residual was mapped against.
+    """Diagnose one model; write its missing effects and the variables of the residual maps.
 
     Raises:
         InputError: fewer than two moving trials, a setting out of range, an axis that no force
@@ -79,8 +79,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     system = compile_model(model)
     if system.undriven:
         raise InputError(
-            f"no force acts on {system.undriven[0]}: with nothing measured to hold its equation"
-            " against, whatever makes all of it smaller would seem to explain it",
+            f"no force acts on {system.undriven[0]}, so its equation has no measured side, and any"
+            " effect that shrinks all terms would seem to explain it",
             where=f"device {model.device.name!r}",
             remedy="judge its models by validate and compare",
         )
@@ -104,15 +104,15 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         selection = select_effects(session, recipe, start, config.without, progress)
     except Runaway as error:
         raise NothingToDoError(
-            f"model {config.model!r} cannot be diagnosed, for it cannot be replayed and so has no"
-            f" noise to be held against: {error.what}",
+            f"model {config.model!r} cannot be diagnosed, because it cannot be simulated and so"
+            f" has no noise floor: {error.what}",
             where=str(run.root),
             remedy="judge it by validate and compare, and diagnose the model that it came from",
         ) from error
     given = selection.initial.evidence
     samples = _map_variables(given)
     write_parquet(out / f"models/{config.model}/map_variables.parquet", samples)
-    progress(0.95, "the trial that would decide what these do not")
+    progress(0.95, "looking for a trial that would decide")
     result = _result(session, selection, recipe, config)
     result = result.model_copy(
         update={"suggested_trial": suggest_trial(session, selection.final, result)}
@@ -122,20 +122,20 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 
 
 def _require_known(names: Sequence[str], recipe: Recipe, setting: str) -> None:
-    """Refuse a name of no effect, which would change nothing."""
+    """Refuse an unknown effect, which would change nothing."""
     extra = [effect_from(effect) for effect in recipe.extra]
     known = list_candidates(recipe.model().device, (), extra, on_request=True)
     for name in names:
         if name not in known:
             raise InputError(
-                f"{name!r} is no effect of this device{did_you_mean(name, known)}",
+                f"this device has no effect {name!r}{did_you_mean(name, known)}",
                 where=f"diagnose.{setting}",
                 remedy="`bampipe effects` lists them",
             )
 
 
 def _require_sound_setup(run: RunFolder) -> None:
-    """Refuse to look for physics where the signals do not mean what is stated."""
+    """Refuse a diagnosis if the signals do not have their stated meaning."""
     setup = run.find(SetupResult)
     if setup is not None and setup.mistakes:
         mistakes = setup.mistakes
@@ -148,7 +148,7 @@ def _require_sound_setup(run: RunFolder) -> None:
 
 
 def _summary(result: dict[str, Any], limits: str) -> dict[str, object]:
-    """What a person needs first: verdicts, the head of the ranking, what to record or do next."""
+    """Return the summary for a person: verdicts, the head of the ranking, the next step."""
     notes = [limits] if limits else []
     if result["suggested_trial"]:
         notes.append(result["suggested_trial"]["sentence"])
@@ -242,9 +242,9 @@ def _next(
     wrong = [axis for axis, a in zip(names, axes, strict=True) if a.verdict == "no_verdict"]
     if wrong:
         return (
-            f"{', '.join(wrong)} cannot be judged: hold the noise and resolution in session.toml"
-            " against what `bampipe ingest` measured"
+            f"{', '.join(wrong)} cannot be judged: compare the noise and resolution in"
+            " session.toml with those that `bampipe ingest` measured"
         )
     if any(a.verdict == "unknown_effect" for a in axes):
         return f"bampipe draft RUN --model {model}"
-    return "nothing to add; `bampipe report RUN` writes it up"
+    return "nothing to add; `bampipe report RUN` writes the report"

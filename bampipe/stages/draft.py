@@ -1,4 +1,4 @@
-"""Stage draft: a formula for what no effect explains, as an effect file, with its p-value."""
+"""Stage draft: a formula for an unexplained residual, as an effect file, with its p-value."""
 
 import os
 from dataclasses import replace
@@ -35,12 +35,12 @@ from bampipe.results.rounding import round_with_sd, significant
 from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials
 
-SUMMARY = "Draft a formula for what no effect of the library explains"
+SUMMARY = "Draft a formula for a residual that no effect of the library explains"
 INPUTS = (*INGESTED, *FILTERED, *IDENTIFIED_MODEL, "models/{model}/diagnose.json")
 OUTPUTS = ("models/{model}/draft.json", "models/{model}/drafts/*.toml")
 
 _NEAREST = 3
-"""Effects of the library that are held against a draft."""
+"""Effects of the library that are compared with a draft."""
 _MORE_FORMULAS = (
     f" Formulas in several quantities were not searched: pip install 'bampipe[{symbolic.EXTRA}]'"
     " brings pyoperon."
@@ -49,7 +49,7 @@ _MORE_FORMULAS = (
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Config(Criteria):
-    """Settings of the stage, those by which a diagnosis decides among them.
+    """Settings of the stage, with the criteria of a diagnosis.
 
     Attributes:
         model: which model version to draft for.
@@ -65,13 +65,14 @@ class Config(Criteria):
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Draft formulas for one model; write them and what they rest on."""
+    """Draft formulas for one model; write them with their evidence."""
     diagnosis = run.read(DiagnoseResult, config.model)
     if not diagnosis.unnamed_axes:
         raise NothingToDoError(
-            f"nothing to draft: the diagnosis of model {diagnosis.model!r} leaves nothing unnamed",
+            f"nothing to draft: the effects that the diagnosis of model {diagnosis.model!r} names"
+            " explain all of the residual",
             where=str(run.root),
-            remedy="a formula is drafted where `remains` is true: something is left without a name",
+            remedy="a formula is drafted only if something `remains` that no named effect explains",
         )
     model = load_model(run, config.model)
     system = compile_model(model)
@@ -108,8 +109,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         effects |= drafted
     selected = tuple(effects)
     advice = (
-        "record more trials like these: what is missing follows nothing that a formula could be "
-        "held against"
+        "record more trials like these: the residual follows none of the quantities that formulas"
+        " use"
     )
     if added := selected or diagnosis.selected:
         advice = f"bampipe extend RUN {' '.join(added)} --model {diagnosis.model}"
@@ -177,7 +178,7 @@ def _axis(
     diagnosed: AxisVerdict,
     ranked: list[RankedEffect],
 ) -> AxisDraft:
-    """What was found on an axis; ``effects`` were drafted, ``ranked`` are those of the library."""
+    """Return the result of an axis: ``effects`` drafted, ``ranked`` those of the library."""
     fitted = len(found.options) > 1
     verdict: DraftVerdict = "drafted" if effects else "nothing_beyond_chance"
     if fitted and not effects:
@@ -200,9 +201,9 @@ def _axis(
             NearestEffect(
                 effect=row.effect,
                 held_out_rmse=row.held_out_rmse_after,
-                sentence=f"{row.effect} leaves {significant(row.held_out_rmse_after)} "
-                f"{diagnosed.unit}, {row.held_out_rmse_after / max(after, 1e-30):.2g} times what "
-                "the draft leaves",
+                sentence=f"{row.effect} leaves an error of {significant(row.held_out_rmse_after)}"
+                f" {diagnosed.unit}, {row.held_out_rmse_after / max(after, 1e-30):.2g} times that"
+                " with the draft",
             )
             for row in ranked
         ),
@@ -216,9 +217,9 @@ def _say(found: FoundDraft, effects: list[DraftedEffect], diagnosed: AxisVerdict
     before, after = found.options[0].held_out_rmse, found.chosen.held_out_rmse
     most = max(0.0, *chance.gains)
     by_chance = (
-        f"the best formula gains {chance.gain:.3g} nats of log evidence; on {len(chance.gains)} "
-        f"replays, where nothing is missing, the same search gains {most:.2g} at most "
-        f"(p = {chance.p_value:.2g})"
+        f"the best formula gains {chance.gain:.3g} nats of log evidence; on {len(chance.gains)}"
+        f" replicates, which lack nothing, the same search gains {most:.2g} at most (p ="
+        f" {chance.p_value:.2g})"
     )
     if effects:
         ratio = after / max(found.noise_floor, 1e-30)
@@ -229,10 +230,10 @@ def _say(found: FoundDraft, effects: list[DraftedEffect], diagnosed: AxisVerdict
         )
     if found.terms:
         return (
-            f"no draft, for {', '.join(diagnosed.effects)} leaves no more "
-            f"({significant(diagnosed.rmse_after)} {unit}) than the best formula "
-            f"({significant(after)} {unit})."
+            f"no draft, because the error with {', '.join(diagnosed.effects)}"
+            f" ({significant(diagnosed.rmse_after)} {unit}) is no larger than with the best"
+            f" formula ({significant(after)} {unit})."
         )
     if len(found.options) > 1:
-        return f"no draft, for no formula lowers the held-out error; {by_chance}."
-    return f"no draft, for chance would have given as good a formula; {by_chance}."
+        return f"no draft, because no formula lowers the held-out error; {by_chance}."
+    return f"no draft, because chance would give as good a formula; {by_chance}."

@@ -53,18 +53,18 @@ OUTPUTS = (*FILTERED, "filter/setup.json")
 
 _FORCE_CUTOFF_HZ = 25.0
 _CUTOFF_OVER_BAND = 4.0
-"""At a quarter of their cut-off, derivatives of an input are 0.4 % too small. At two thirds, where
-a band of 17 Hz ended, they were 17 %: a delay of 2 ms came out 5 % too long, at 8.6 floors."""
+"""Least cut-off of an input's derivatives over the band: at a quarter of their cut-off they are 0.4
+% too small, at two thirds 17 %, which biases a delay of 2 ms by 5 %."""
 _HIGHEST_CUTOFF = 0.4
-"""Of the sampling rate: twice the highest frequency of a residual, where the filter takes 0.3 %."""
+"""Share of the sampling rate: twice the highest frequency of a residual, with a loss of 0.3 %."""
 _NO_NOISE, _UNFOLLOWED = 30.0, 0.1
-"""Times the noise of the quietest trial, and of the steps from sample to sample, beyond which what
-differences of a position show is motion that is too fast for the rate of the log."""
+"""A motion is too fast for the rate of the log if differences of position exceed so many times the
+noise of the quietest trial, and of the steps from sample to sample."""
 _SHORTEST = 32
-"""Samples of a trial, the least that can be differentiated."""
+"""Fewest samples of a trial that can be differentiated."""
 _INSPECTED, _TUNING_PART = 12_000, 2000
-"""Samples of all trials on which the set-up is judged; and least length of the parts that the
-bandwidth is chosen from, where trials are many."""
+"""Samples of all trials on which the set-up is judged; least length of the parts of many trials
+that determine the bandwidth."""
 _TRIALS_OF_BAND = 5
 
 
@@ -87,9 +87,9 @@ class Config:
             above 8 Hz: a delay is judged by these derivatives up to the end of the band.
         band_hz: upper end of the band in which residuals are compared, Hz, by every later stage; 0
             takes it from the data, axis by axis: where motion and force carry signal above noise.
-        tuning_samples: at most so many samples of each axis are used to choose the bandwidth,
-            in equal parts from all trials, or from some that are spread over the session where
-            there are very many.
+        tuning_samples: at most so many samples of each axis are used to choose the bandwidth, in
+            equal parts from all trials, or from some that are spread over the session if there are
+            very many.
     """
 
     method: Literal["auto", "kalman", "butterworth"] = "auto"
@@ -115,7 +115,7 @@ class _Trial:
 
 @dataclass(frozen=True)
 class _Written:
-    """What differentiating the trials gave.
+    """Results of differentiating the trials.
 
     Attributes:
         levels: by axis, for each trial: errors of position, velocity and acceleration.
@@ -165,7 +165,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     progress(0.9, "the band of motion and force")
     system = compile_model(Model(load_device(run, session.device)))
     names = [k for k in ids if k in written.interpolated]
-    # Where residuals are compared, from some of the trials just written, spread over the session.
+    # The band of residuals, from some of the trials just written, spread over the session.
     sensors = Sensors.from_result(session, system.coordinates, system.model.device.forces)
     some = np.unique(np.linspace(0, len(names) - 1, min(len(names), _TRIALS_OF_BAND)).round())
     motions = _motions(path, [names[int(k)] for k in some], system, {})
@@ -236,11 +236,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 def _nothing_to_differentiate(
     run: RunFolder, trials: pd.DataFrame, refused: Mapping[str, str]
 ) -> InputError:
-    """Say why no trial can be differentiated: the kinds that there are, or that all are short."""
+    """Say why no trial can be differentiated: none has the right kind, or all are short."""
     if refused:
         name, reason = next(iter(refused.items()))
         return InputError(
-            f"none of the {len(refused)} free and viscous trials is long enough: {name} holds"
+            f"none of the {len(refused)} free and viscous trials is long enough: {name} has"
             f" {reason}",
             where=str(run.root),
             remedy="record longer trials, or at a higher rate",
@@ -249,7 +249,8 @@ def _nothing_to_differentiate(
     if len(moving):
         first = moving.iloc[0]
         return InputError(
-            f"every free and viscous trial is set aside: {first['trial_id']}: {first['reason']}",
+            f"every free and viscous trial is set aside, such as {first['trial_id']}:"
+            f" {first['reason']}",
             where=str(run.root),
             remedy="the others are in the report, and in ingest/trials.parquet",
         )
@@ -281,8 +282,8 @@ def _write_motions(
                 position = trial.frame[f"q_{axis}"].to_numpy(dtype=np.float64)
                 if _outruns(position, one.noise_sd):
                     written.skipped[trial_id] = (
-                        f"{axis} moves faster than {kinematics.rate_hz:g} samples a second tell:"
-                        " log it faster"
+                        f"{axis} moves too fast for {kinematics.rate_hz:g} samples a second: log"
+                        " it at a higher rate"
                     )
             if trial_id in written.skipped:
                 continue
@@ -307,7 +308,7 @@ def _motions(
 def _describe_offsets(
     offsets: Mapping[str, Mapping[str, float]], session: IngestResult
 ) -> Iterator[str]:
-    """Say by force what each trial's zero is off."""
+    """Return a sentence on the offsets of each force."""
     force = session.force
     names = {name: None for by_force in offsets.values() for name in by_force}
     for name in names:
@@ -318,8 +319,8 @@ def _describe_offsets(
                 gain, unit = sum(row), force.raw_unit
         each = ", ".join(f"{trial} {by[name] / gain:+.3g}" for trial, by in offsets.items())
         yield (
-            f"{name} is zeroed anew in each trial: against their mean it reads {each} {unit} too"
-            " much, which is taken off; of held-out trials, too, by their own samples"
+            f"{name} is zeroed anew in each trial: its offsets from their mean ({each} {unit})"
+            " were subtracted; those of held-out trials come from their own samples"
         )
 
 
@@ -332,7 +333,7 @@ def _inspect(
     bands: Mapping[str, ResidualBand],
     disturbances: Mapping[str, Sequence[Disturbance]],
 ) -> SetupResult:
-    """Hold the set-up against the trials ``ids``, those in ``free`` fitted."""
+    """Check the set-up on the trials ``ids``, fitting those in ``free``."""
     most = _INSPECTED // min(len(ids), MOST_TRIALS)
 
     def read(name: str) -> Motion:
@@ -340,7 +341,7 @@ def _inspect(
         return deepcopy(shorten([motion], most)[0])  # a view would keep the whole trial
 
     motions = KeptItems(map(read, ids), MOST_OF_TRIALS)
-    # What brakes do is no part of the bare device: it is judged by braked trials, not fitted.
+    # The bare device excludes brakes: braked trials judge it but are not fitted.
     folds = Folds.of_trials(ids, (), [name for name in ids if name in free])
     cutoffs = tuple(min(bands[axis].cutoff_hz, HIGHEST_HZ) for axis in system.coordinates)
     band = Band(session.sample_rate_hz, cutoffs)
@@ -402,9 +403,9 @@ def _choose(
     fits = {k: found for k, found in fits.items() if np.isfinite(found.log_likelihood)}
     if not fits:
         raise InputError(
-            f"{axis} moves in no way that a filter could follow",
+            f"no filter can follow the motion of {axis}",
             where=f"encoders.{axis}",
-            remedy="is this the column of its position, in its unit?",
+            remedy="check that this is the column of its position, in the right unit",
         )
     order = max(fits, key=lambda k: fits[k].log_likelihood)
     best = fits[order].model
@@ -423,9 +424,9 @@ def _choose(
     if config.cutoff_hz:
         why = "set by the user"
     elif found < least:
-        why = f"the data ask for {found:.1f} Hz; held at the minimum bandwidth"
+        why = f"the data suggest {found:.1f} Hz; limited to the minimum bandwidth"
     elif found > most:
-        why = f"the data ask for {found:.1f} Hz; held at a fifth of the sampling rate"
+        why = f"the data suggest {found:.1f} Hz; limited to a fifth of the sampling rate"
     elif kalman:
         why = "maximum likelihood of the encoder samples"
     else:
@@ -444,9 +445,9 @@ def _choose(
 
 
 def _outruns(position: Array, noise_sd: float) -> bool:
-    """Whether an axis goes as far from one sample (T,) to the next one way as the other.
+    """Whether the differences of an axis' samples (T,) look random.
 
-    Such motion no filter follows at this rate; a likelihood would take it for noise.
+    No filter follows such motion at this rate; a likelihood would take it for noise.
     """
     shown = white_noise_sd(position)
     steps = float(np.sqrt(np.mean(np.diff(position) ** 2)))

@@ -75,12 +75,12 @@ class Config(FilterChoice):
     Attributes:
         model: which model version.
         method: ``least-squares`` on the inverse dynamics, under the likelihood by which models are
-            judged; ``ukf``, the augmented unscented Kalman filter; or ``auto``: the filter where it
+            judged; ``ukf``, the augmented unscented Kalman filter; or ``auto``: the filter if it
             agrees with least squares and is more precise, see `bampipe.identification.choice`.
         start_factor: multiplies every starting value: estimates must not depend on it.
         input_timing: whether the time by which inputs were sampled after positions is estimated.
-        remove_bias: whether replicates of the model say how samples weigh, and what filters and
-            friction that stops add to the residual; else all samples of an axis weigh alike.
+        remove_bias: whether replicates of the model give the weights of samples and the bias by
+            filters and stopping friction; otherwise all samples of an axis have equal weight.
         choose_sign_width: whether, on a test bench, the trials may make the sign of the velocity
             narrower than the device's `sign_width`.
     """
@@ -99,8 +99,8 @@ class _Task:
 
     Attributes:
         run: the run folder; config: of the stage; recipe, system: the model.
-        width: of its smoothed sign, where the trials ask for a narrower one.
-        trials: the trials, with the timing of their inputs open where it is estimated.
+        width: of its smoothed sign, if the trials select a narrower one.
+        trials: the trials, with the timing of their inputs free if it is estimated.
     """
 
     run: RunFolder
@@ -125,7 +125,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     identifiability, unseen = assess_identifiability(
         system, motions, squares.problem, squares.p, noise
     )
-    # What the trials say nothing of is as uncertain as it was before, whatever a fit believes.
+    # Directions without information keep their prior uncertainty, whatever the fit gives.
     by_squares = estimate_by_least_squares(system, squares)
     by_squares = replace(by_squares, covariance=by_squares.covariance + unseen)
     by_filter, lost = _filter(task, squares, by_squares, start, noise, progress)
@@ -136,7 +136,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     if published.method == "least-squares":
         notes += _describe_squares(task, squares)
         if by_filter is not None:
-            # What its innovations say of model and noise is kept whatever is published.
+            # The tests of its innovations are kept whatever is published.
             published = replace(published, report={**by_filter.evidence, **published.report})
     progress(0.97, "uncertainty of the calibration")
     moved = propagate_calibration(
@@ -241,7 +241,7 @@ def _filter(
     noise: Noise,
     progress: Progress,
 ) -> tuple[Estimate | None, str]:
-    """The filter's estimate where one is asked for; else why there is none, "" if none is due."""
+    """Return the filter's estimate if requested; otherwise the reason, "" if none is due."""
     config = task.config
     if config.method == "least-squares":
         return None, ""
@@ -278,7 +278,7 @@ def _choose(
 
 
 def _find_timing(task: _Task, squares: SquaresFit, held: InputTiming | None) -> tuple[float, float]:
-    """Timing of the inputs that residuals go by, and its standard deviation, s."""
+    """Return the timing of the inputs for residuals, and its standard deviation, s."""
     if held is not None:
         return held.estimate, held.sd
     if not task.trials.timed:
@@ -290,23 +290,23 @@ def _find_timing(task: _Task, squares: SquaresFit, held: InputTiming | None) -> 
 
 
 def _describe_squares(task: _Task, squares: SquaresFit) -> list[str]:
-    """What to know of least squares: no replicates, an axis that nothing drives."""
+    """Return notes on least squares: no replicates, or an axis that nothing drives."""
     notes, system = [], task.system
     if task.config.remove_bias and not squares.replayed:
         notes.append(
-            "The model cannot be replayed along the trials: all samples weigh alike, and no bias of"
-            " filters was taken off."
+            "The model cannot be simulated on these trials, so all samples have equal weight and"
+            " the bias of filters was not removed."
         )
     if system.undriven:
         notes.append(
-            f"No force acts on {', '.join(system.undriven)}: least squares makes what stands in"
-            " such an equation too small, more so the more the model lacks."
+            f"No force acts on {', '.join(system.undriven)}: least squares underestimates the"
+            " terms of that equation, the more so the more the model lacks."
         )
     return notes
 
 
 def _start(task: _Task) -> Array:
-    """Priors of the device; of effects, what a diagnosis or a search over their range found."""
+    """Return the device's priors, and values of effects from a diagnosis or a search."""
     system, start = task.system, task.system.prior
     count = len(system.model.device.parameters)
     path = task.run.path(f"models/{task.config.model}/model.toml")
@@ -322,29 +322,29 @@ def _start(task: _Task) -> Array:
 
 
 def _choose_width(run: RunFolder, system: System, config: Config) -> SignWidth | None:
-    """The width of the smoothed sign that the trials ask for; None where the declared one stays.
+    """Return the width of the smoothed sign that the trials select; None for the declared one.
 
-    Where no test bench gives the motion it stays: filter and replays integrate along the sign.
+    Without a test bench it stays, because filter and replicates integrate along the sign.
     """
     if not (config.choose_sign_width and system.model.device.prescribed):
         return None
     trials = read_measured_trials(run, system, every_input=True)
-    with suppress(ValueError):  # too short: the fit itself says so
+    with suppress(ValueError):  # too short: the fit itself reports it
         found = choose_sign_width(trials, read_recipe(run, config.model, system.model))
         return found if found.factor < 1.0 else None
     return None
 
 
 def _describe_width(system: System, width: SignWidth) -> list[str]:
-    """Say which narrower width was chosen, and why, for each axis of a narrowed model."""
+    """Return the chosen narrower width, and the reason, for each axis of a narrowed model."""
     said = []
     for i, axis in enumerate(system.model.device.coordinates):
         before, after = width.declared[i], width.chosen[i]
         said.append(
-            f"{axis.name}: the sign of the velocity is smoothed over {significant(axis.sign_width)}"
-            f" {axis.unit}/s, {significant(width.factor)} of the device's `sign_width`, for with"
-            f" that the error on trials left out falls from {significant(before)} to"
-            f" {significant(after)} {system.torque_units[i]}. `sign_width = {axis.sign_width:.2g}`"
-            " in a device file says so from the start."
+            f"{axis.name}: the sign of the velocity is smoothed over"
+            f" {significant(axis.sign_width)} {axis.unit}/s, {significant(width.factor)} of the"
+            " device's `sign_width`, because the held-out error then falls from"
+            f" {significant(before)} to {significant(after)} {system.torque_units[i]}. Put"
+            f" `sign_width = {axis.sign_width:.2g}` into the device file to start from it."
         )
     return said

@@ -37,7 +37,7 @@ INPUTS: tuple[str, ...] = ()
 OUTPUTS = (*INGESTED, "ingest/device*.toml", "ingest/robot*.xml")
 
 RATE_TOLERANCE = 0.02
-"""The announced sample rate is used where the time stamps agree with it this well."""
+"""The announced sample rate is used if the time stamps agree with it this well."""
 _MOST_MEASURED = 100
 """Moving trials whose noise is measured, spread over a longer session: it is their median."""
 
@@ -58,13 +58,13 @@ class Config(CleaningLimits):
 
 
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
-    """Write the sound trials of a session and what became of each."""
+    """Write the sound trials of a session, and the status of every trial."""
     if not config.session:
         raise InputError("no session folder given", remedy="bampipe ingest SESSION")
     session = read_session(Path(config.session))
     device = session_device(session)
     if device.drive:
-        # A command to a motor, unlike a sensor, may rest or stand at its limit for long.
+        # A command to a motor, unlike a sensor, may be constant or at its limit for long.
         config = replace(config, frozen_share=1.0, saturated_share=1.0)
     (out / "ingest").mkdir(parents=True, exist_ok=True)
     channels = ChannelRecords(session, device)
@@ -76,7 +76,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
         pd.DataFrame(rows).drop(columns=["dead", "spans"]).astype(dict.fromkeys(text, "string"))
     )
     write_parquet(out / "ingest/trials.parquet", trials)
-    # The announced rate, or the median of the trials where the time stamps say otherwise.
+    # The announced rate, or the median of the trials if the time stamps disagree.
     rate, measured = session.sample_rate / every, float(trials["sample_rate_hz"].median())
     if abs(measured - rate) > RATE_TOLERANCE * rate:
         rate = measured
@@ -92,10 +92,13 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     ]
     if device.robot is not None:
         notes += [
-            f"no body has what is drawn, and the nearest is taken: {line}"
+            f"physically impossible body replaced by the nearest possible one: {line}"
             for line in device.robot.impossible
         ]
-    notes += [f"{place}: its source still says `fill in`" for place in description.placeholders]
+    notes += [
+        (f"{place}: still a placeholder, with `fill in` as its source")
+        for place in description.placeholders
+    ]
     if every > 1:
         notes.append(
             f"logged at {session.sample_rate:g} Hz, thinned to {rate:g} Hz: inputs after a low-pass"
@@ -112,7 +115,7 @@ def _ingest_trials(
     samples: ParquetAppender,
     progress: Progress,
 ) -> list[dict[str, Any]]:
-    """Write the samples of the sound trials, and return what became of each; refuse if none is."""
+    """Write the samples of the sound trials and return the status of each trial."""
     rows: list[dict[str, Any]] = []
     copies = find_copies(session)
     encoders = {each.name for each in session.channels if each.second_encoder_of}
@@ -146,7 +149,7 @@ def _ingest_trials(
 
 
 def _write_device(file: Path, device: Device, out: Path) -> None:
-    """Keep the session's own device file, with all that its URDF says: a run stands on its own."""
+    """Keep the session's own device file with the content of its URDF: a run is self-contained."""
     path = out / "device.toml"
     if device.robot is None:
         path.write_bytes(file.read_bytes())
@@ -208,7 +211,7 @@ def _description(
     channels: ChannelRecords,
     rows: list[dict[str, Any]],
 ) -> IngestResult:
-    """Return what session.json says, the sensors settled."""
+    """Return the content of session.json, with sensors as used."""
     force = session.force
     encoders, forces = channels.encoders(), channels.forces()
     counted = channels.count_warnings()

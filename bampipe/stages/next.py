@@ -1,4 +1,4 @@
-"""Stage next: the trial to record next, in one sentence, and what it is expected to give."""
+"""Stage next: the trial to record next, in one sentence, and its expected gain."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -53,7 +53,7 @@ from bampipe.schema import STRICT, Count
 from bampipe.trials.measured import read_measured_trials, trial_of_block
 from bampipe.trials.motion import Motion
 
-SUMMARY = "The trial to record next, and what it is expected to give"
+SUMMARY = "The trial to record next, and its expected gain"
 INPUTS = (
     *INGESTED,
     *FILTERED,
@@ -74,7 +74,7 @@ _SHOWN = 3
 _WATCHED = 12
 """Hidden effects that designs are ranked for."""
 _LITTLE = 0.05
-"""Sum of log strengths by which a trial for hidden effects must lower what goes unnoticed."""
+"""Least fall of the log detection limits, summed, by a trial for hidden effects."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -84,8 +84,8 @@ class Config(Criteria):
     Attributes:
         model: which model version.
         purpose: ``precision`` of all parameters; ``decision`` between effects that the diagnosis
-            could not tell apart; ``sensitivity`` to effects that the trials at hand would not have
-            shown; the name of a parameter; or ``auto``: what the diagnosis asks for.
+            could not distinguish; ``sensitivity`` to effects that the present trials would not have
+            shown; the name of a parameter; or ``auto``: by the diagnosis.
         seconds: length of the trial.
         plan: whether to make a set of trials, and its protocol sheet.
         trajectory: ``csv``, ``json`` or ``yaml``: the trial is a trajectory that drives follow, in
@@ -109,7 +109,7 @@ class Config(Criteria):
 
 @dataclass(frozen=True)
 class _Case:
-    """An identified model with its parameters, its trials and diagnosis, and what is asked."""
+    """An identified model with its parameters, its trials and diagnosis, and the request."""
 
     run: RunFolder
     config: Config
@@ -135,7 +135,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     forecast = _make_forecast(case, purpose, progress)
     space = _lay_out_designs(case, forecast)
     ranked = _rank(forecast, space, parameter, progress)
-    progress(0.9, "what they are expected to give")
+    progress(0.9, "forecasting their gain")
     result = _record(case, forecast, parameter, ranked)
     if config.trajectory:
         result = _write_trajectory(out, case, forecast.rehearsal, ranked[0], result)
@@ -164,7 +164,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 def _read_case(
     run: RunFolder, config: Config, progress: Progress
 ) -> tuple[_Case, Purpose | Literal["auto"], str]:
-    """What is known of the model; the purpose and the parameter that are asked for."""
+    """Return the model with its results, and the requested purpose and parameter."""
     model = load_model(run, config.model)
     if config.trajectory:
         require_limits(model.device, f"device {model.device.name!r}")
@@ -180,16 +180,16 @@ def _read_case(
     diagnosed = run.find(DiagnoseResult, config.model)
     if diagnosed is None and purpose == "decision":
         raise InputError(
-            "what is to be decided is not known yet",
+            "there is no diagnosis yet, so nothing to decide is known",
             where=str(run.root),
             remedy=f"run `bampipe diagnose {run.root}{run.model_option(config.model)}` first",
         )
-    progress(0.0, "what the trials at hand say")
+    progress(0.0, "information in the present trials")
     trials = read_measured_trials(run, system, every_input=True, timing=found.input_timing)
     session = Session(trials, config, config.jobs or os.cpu_count() or 1, config.seed)
     seen = Envelope.of_trials(trials.motions, system, p)
     if not seen.moved_axes:
-        raise InputError("no axis moves in the trials at hand", where=str(run.root))
+        raise InputError("no axis moves in the present trials", where=str(run.root))
     limits = read_limits(model.device, seen) if config.trajectory else {}
     recipe = read_recipe(run, config.model, model)
     case = _Case(run, config, recipe, system, p, found, diagnosed, session, seen, limits)
@@ -197,7 +197,7 @@ def _read_case(
 
 
 def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Progress) -> Forecast:
-    """What is needed to forecast: what was asked for, else what the diagnosis left open or hid."""
+    """Prepare a forecast for the purpose asked for, or else for what the diagnosis left open."""
     trials, comparison, detectability = case.session.trials, None, None
     if asked in ("auto", "decision") and case.diagnosed is not None:
         comparison = _compare_alternatives(case, case.diagnosed)
@@ -211,7 +211,7 @@ def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Prog
         verdicts = {axis.verdict for axis in case.diagnosed.axes.values()}
         asked = "sensitivity" if verdicts == {"nothing_missing"} else "precision"
     if asked == "sensitivity":
-        progress(0.1, "what these trials would have shown of each effect")
+        progress(0.1, "smallest strength of each effect that these trials would show")
         detectability = _find_detectability(case)
     noise = sensor_noise(trials.sensors, case.system, case.fitted, case.p, FilterChoice())
     precision = Precision.of_trials(
@@ -229,7 +229,7 @@ def _make_forecast(case: _Case, asked: Purpose | Literal["auto"], progress: Prog
 
 
 def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
-    """The designs to try, trials at hand among them."""
+    """Return the designs to try, including the present trials."""
     seconds, brakes = case.config.seconds, case.system.model.device.brakes
     if case.limits:
         count = count_affordable(forecast.rehearsal, seconds)
@@ -241,7 +241,7 @@ def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
         if not any(motion.channels[n].any() for n in brakes.values() if n in motion.channels)
     ]
     examples, of_effects = imitate_trials(free, case.seen, seconds), forecast.purpose != "precision"
-    # No parameters are fitted to what has the brakes on, but for those of brakes.
+    # Only parameters of brakes are fitted to trials with the brakes on.
     brakes_on = of_effects or case.system.braked
     return DesignSpace(
         forecast.rehearsal, seconds, case.seen.moved_axes, examples, of_effects, brakes_on
@@ -251,7 +251,7 @@ def _lay_out_designs(case: _Case, forecast: Forecast) -> DesignSpace:
 def _rank(
     forecast: Forecast, space: DesignSpace, parameter: str, progress: Progress
 ) -> list[RankedDesign]:
-    """The designs that serve the purpose best."""
+    """Return the designs of the highest utility."""
 
     def report(first: float, fraction: float, message: str) -> None:
         progress(first + 0.3 * fraction, message)
@@ -270,7 +270,7 @@ def _rank(
         )
         if ranked and ranked[0].utility >= _LITTLE:
             return ranked
-        # Nothing that a person could do here shows more: then for the parameters.
+        # No motion would show more: propose for the parameters.
         space = replace(space, with_rests=False, with_brakes=forecast.rehearsal.system.braked)
     precision = forecast.precision
 
@@ -283,7 +283,7 @@ def _rank(
 def _record(
     case: _Case, forecast: Forecast, parameter: str, ranked: Sequence[RankedDesign]
 ) -> NextResult:
-    """What is proposed, why, and what it is expected to give."""
+    """Return the proposal, its reason and its expected gain."""
     proposals = tuple(forecast.proposal(one) for one in ranked)
     table: dict[str, Detectable] = {}
     unbraked: tuple[str, ...] = ()
@@ -321,13 +321,13 @@ def _plan(
     ranked: Sequence[RankedDesign],
     best: Proposal,
 ) -> Plan:
-    """A set of trials that reaches what is asked."""
+    """Return a set of trials that reaches the goal."""
     precision, config = forecast.precision, case.config
     estimates = np.array([case.identified.parameters[name].estimate for name in precision.names])
-    # Of a model that lacks something, no uncertainty of parameters is asked for.
+    # For a model that lacks something, the plan has no goal for uncertainties.
     is_asked = (forecast.comparison is None) & (estimates != 0.0)
     goal = Goal(np.where(is_asked, config.sd * np.abs(estimates), np.inf), config.confusion)
-    # What the best design for all leaves too uncertain gets a design of its own.
+    # Parameters that the best design for all leaves too uncertain get designs of their own.
     asked = dict(zip(precision.names, goal.sd, strict=True))
     utilities = [
         partial(precision.worth, seconds=config.seconds, parameter=name)
@@ -344,12 +344,12 @@ def _plan(
 def _write_trajectory(
     out: Path, case: _Case, rehearsal: Rehearsal, best: RankedDesign, result: NextResult
 ) -> NextResult:
-    """Write what drives follow in each trial of the best design, and record how far it goes."""
+    """Write the trajectory of each trial of the best design, and record its extent."""
     config, series = case.config, best.design.series
     assert config.trajectory and series is not None
     points = Points.of_series(series, rehearsal)
     file = f"models/{config.model}/trajectory.{config.trajectory}"
-    # Drives go by the names of the drawing, of which a coordinate's may be another spelling.
+    # Drives have the names of the drawing; a coordinate's name may be spelt differently.
     drawn = read_tree(case.run.path(DRAWING)).joints if case.run.exists(DRAWING) else ()
     names = {identifier(joint.name): joint.name for joint in drawn}
     write_text(out / file, points.text(config.trajectory, names, result.sentence))
@@ -365,20 +365,20 @@ def _write_trajectory(
 
 
 def _split(asked: str, names: Sequence[str]) -> tuple[Purpose | Literal["auto"], str]:
-    """The purpose that ``asked`` means, and the parameter where it is one of ``names``."""
+    """Return the purpose that ``asked`` means, and the parameter if it is one of ``names``."""
     if asked in names:
         return "precision", asked
     for purpose in ("auto", *get_args(Purpose)):
         if asked == purpose:
             return purpose, ""
     raise InputError(
-        f"nothing is called {asked!r} that a trial could be for",
+        f"there is no purpose or parameter {asked!r} for a trial",
         remedy=choose_from(asked, ["auto", *get_args(Purpose), *names]),
     )
 
 
 def _compare_alternatives(case: _Case, diagnosed: DiagnoseResult) -> Comparison | None:
-    """What a diagnosis left open; None where it decided, or no model of it can be replayed."""
+    """Return the alternatives that a diagnosis left open, None if there are none."""
     asked = find_ambiguity(diagnosed, case.config)
     if asked is None:
         return None
@@ -391,12 +391,12 @@ def _compare_alternatives(case: _Case, diagnosed: DiagnoseResult) -> Comparison 
 
 
 def _find_detectability(case: _Case) -> Detectability:
-    """What the trials would have shown of each effect, were it beside the model as it is."""
+    """Return the smallest strength of each effect that the trials show."""
     try:
         fit = case.session.fit(case.recipe, case.p)
     except Runaway as error:
         raise NothingToDoError(
-            f"what these trials would have shown is not known, for the model cannot be replayed:"
+            "the sensitivity of these trials is not known, because the model cannot be simulated:"
             f" {error.what}",
             where="next",
             remedy="ask for precision or for a parameter by name",
@@ -413,7 +413,7 @@ def _find_lacking(case: _Case) -> list[str]:
 
 
 def _summary(result: NextResult) -> dict[str, object]:
-    """The sentence first, then why and what for; the runners-up beside their worth."""
+    """Return the sentence, reason and gain, then the runners-up with their utilities."""
     more = [f"plan: {result.plan.sentence}"] if result.plan is not None else []
     if result.trajectory is not None:
         more += say_trajectory(result.trajectory)

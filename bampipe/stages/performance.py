@@ -1,4 +1,4 @@
-"""Stage performance: what a hand feels at the handle, from what was identified (Table VIII)."""
+"""Stage performance: the device as felt at the handle, from identified numbers (Table VIII)."""
 
 from itertools import product
 from pathlib import Path
@@ -38,7 +38,7 @@ class Config:
 
     Attributes:
         model: which model version.
-        points: poses along each axis at which the handle is looked at.
+        points: poses along each axis at which the handle is evaluated.
     """
 
     model: str = "base"
@@ -65,8 +65,8 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     largest = (
         Quantity(value=np.quantile(sizes, 0.999), unit=device.force_unit) if sizes.size else None
     )
-    # Only a handle that can be pushed as many ways as there are axes has a stiffness of its own;
-    # where a motor drives the device, there is none.
+    # Only a handle that can be pushed in as many directions as there are axes has a stiffness of
+    # its own; a device driven by a motor has no handle.
     ways = len(device.forces) == len(system.coordinates)
     at_handle = device.force_unit == "N" and ways and not device.drive
     handle = _handle(run, system, p, reach, config.points) if at_handle else None
@@ -90,7 +90,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
 
 
 def _handle(run: RunFolder, system: System, p: Array, reach: Array, points: int) -> Handle:
-    """Return ranges over poses and directions of what acts at the handle.
+    """Return ranges of friction, stiffness and inertia at the handle over poses and directions.
 
     With v = B^T q' the handle's velocity: its volume element is |det B| dq, joint stiffness K is
     felt as B^-1 K B^-T, Coulomb friction c as B^-1 c, and the inertia M along direction j as

@@ -38,17 +38,17 @@ INPUTS = (*INGESTED, "ingest/device.toml?")
 OUTPUTS = ("stiffness/stiffness.json", "stiffness/loops.parquet")
 
 _FEWEST = 100
-"""Samples of a trial from which the wind-up of a gear is seen."""
+"""Most samples of a trial that determine the wind-up of a gear."""
 _SMOOTHED_S = 0.05
-"""Over which the velocity is averaged, whose sign the drive's friction follows."""
+"""Averaging time of the velocity whose sign the drive's friction follows."""
 _SURE = 3.0
-"""Standard uncertainties from which on compliance and play are more than nothing."""
+"""Compliance and play are significant from so many standard uncertainties on."""
 
 _COLUMNS = {
     "trial_id": "str", "axis": "str", "cycle": "int64", "branch": "str",
     "t": "float64", "torque": "float64", "deflection": "float64", "post_yield": "bool",
 }  # fmt: skip
-"""Of loops.parquet, and their types."""
+"""Columns of loops.parquet, and their types."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -206,7 +206,7 @@ def _loops_of(
     t = frame["t"].to_numpy(dtype=np.float64)
     if len(t) < 2:
         return "no sound samples"
-    # Encoder counts must stay counts: where a sample is missing the one before stands.
+    # Encoder counts must stay counts: a missing sample takes the previous value.
     grid = uniform_grid(t, rate)
     held = {
         name: grid.hold(frame[name].to_numpy(dtype=np.float64))
@@ -263,7 +263,7 @@ def _applied(system: System, q: Array, u: Array, t: Array) -> Array:
 
 
 def _slope(values: Array, against: Array) -> float:
-    """Of the straight line through ``values`` (T,) over ``against`` (T,)."""
+    """Return the slope of the straight line through ``values`` (T,) over ``against`` (T,)."""
     centred = against - against.mean()
     return float(values @ centred / (centred @ centred))
 
@@ -278,7 +278,7 @@ def _axis(
     weights = np.array([len(trial.found.cycles) for trial in trials]) / len(cycles)
     stiffness = float(weights @ [trial.found.stiffness for trial in trials])
     error = float(np.linalg.norm(weights * [trial.found.standard_error for trial in trials]))
-    # What is left of the transition has the same sign in every trial.
+    # The remainder of the transition has the same sign in every trial.
     systematic = float(weights @ [trial.found.systematic for trial in trials])
     shares: dict[str, float] = defaultdict(float)
     for weight, trial in zip(weights, trials, strict=True):
@@ -288,15 +288,15 @@ def _axis(
     for trial in trials:
         if not trial.found.yielded:
             notes.append(
-                f"{trial.trial_id}: the slope of the loops still changes by "
-                f"{100.0 * trial.found.slope_change:.1f} % where they should be straight: load "
-                "the axis further; the stiffness is too high."
+                f"{trial.trial_id}: the slope of the loops changes by"
+                f" {100.0 * trial.found.slope_change:.1f} % over their straight part, so the"
+                " stiffness is too high: load the axis further."
             )
         drift = _drift(trial)
         if abs(drift) > config.largest_drift:
             notes.append(
-                f"{trial.trial_id}: the loops drift by {100.0 * drift:.1f} % of their range: the "
-                "brake slips."
+                f"{trial.trial_id}: the loops drift by {100.0 * drift:.1f} % of their range, so"
+                " the brake slips."
             )
     poses = _poses(system, trials[0].pose)
     bandwidths = {}
@@ -344,7 +344,7 @@ def _axis(
 
 
 def _drift(trial: _Loops) -> float:
-    """Return how far the loops wander from first to last cycle, as a share of their range."""
+    """Return the drift of the loops from first to last cycle, as a share of their range."""
     cycles = trial.found.cycles
     reach = 2.0 * max(cycle.amplitude for cycle in cycles) / trial.found.stiffness
     return (cycles[-1].centre - cycles[0].centre) / reach

@@ -44,7 +44,7 @@ OUTPUTS = (
 )
 
 SILENT_PERCENT = 30.0
-"""Fit of a robot's joint below which its parameters say nothing of it."""
+"""Fit of a robot's joint below which its parameters are meaningless."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -75,7 +75,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     trials = read_measured_trials(run, system, timing=estimates.input_timing)
     require_sound_motions(system, trials.motions)
     progress(0.1, "residuals")
-    # Parameters found with the inputs late are those of inputs that late.
+    # Parameters estimated with delayed inputs belong to inputs with that delay.
     published = np.append(p, estimates.input_timing.estimate - trials.late_s)
     names = trial_names(trials.motions)
     unseen = [_leave_out(system, published, estimates, name) for name in names]
@@ -85,11 +85,11 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     notes = []
     if trials.blocks == len(trials.motions):
         notes.append(
-            f"One trial: it is predicted in {trials.blocks} blocks, each with the estimate that the"
-            " others give."
+            f"There is one trial: it is predicted in {trials.blocks} blocks, each with the"
+            " estimate from the others."
         )
     if trials.folds.nothing_held_out:
-        notes.append("One trial, or one group: nothing is held out; the error is that of the fit.")
+        notes.append("With one trial or group, nothing is held out: the error is that of the fit.")
     floor: NoiseFloor | None = None
     if config.noise_floor:
         recipe = read_recipe(run, config.model, model)
@@ -127,12 +127,12 @@ def _noise_floor(
     config: Config,
     progress: Progress,
 ) -> tuple[NoiseFloor | None, list[str]]:
-    """The floor, None where the fitted model cannot be simulated, and what to say of it."""
+    """Return the floor, None if the fitted model cannot be simulated, and notes on it."""
     progress(0.4, "noise floor")
     count = config.repeats or floor_replays(trials.motions)
     if count == 1:
         raise InputError("one replicate has no scatter", where="validate.repeats", remedy="set 2")
-    # Where the session holds trials out, these are few, and all are needed to judge by.
+    # Held-out trials are few, and all are needed for the judgement.
     chosen: Sequence[int] = range(len(trials.motions))
     if all(trials.folds.judged):
         chosen = draw_trials(trial_sizes(trials.motions))
@@ -147,9 +147,9 @@ def _noise_floor(
         if level > AT_FLOOR * creeps:
             unit = system.torque_units[i]
             notes.append(
-                f"{axis}: the noise floor of {significant(level)} {unit} is that of friction that"
-                " stops the machine where it turns; replays that creep there, as `sign_width`"
-                f" says, leave {significant(creeps)}."
+                f"{axis}: the noise floor of {significant(level)} {unit} assumes friction that"
+                " stops the machine at reversals; replicates that creep over `sign_width` have a"
+                f" floor of {significant(creeps)}."
             )
     return found.noise_floor, notes
 
@@ -162,7 +162,7 @@ def _run_freely(
     published: Array,
     unseen: Sequence[Array],
 ) -> FreeRun:
-    """Leave the model to itself, over whole trials and over short horizons."""
+    """Run the model freely, over whole trials and over short horizons."""
     if trials.blocks:  # of the only trial, which runs as a whole
         motions: Sequence[Motion] = read_motions(run, system, braked=True)
         held_out = held_out_trials(run)
@@ -179,18 +179,22 @@ def _run_freely(
 def _silent_joints(
     system: System, compared: Sequence[ComparedTrial], floor: NoiseFloor | None
 ) -> list[str]:
-    """Say which joints of a robot these trials do not identify, and why as far as it shows."""
+    """Say which joints of a robot these trials do not identify, and the likely reason."""
     found = []
     for i, (axis, entry) in enumerate(axis_errors(system, compared).items()):
         if entry.fit_percent is None or entry.fit_percent >= SILENT_PERCENT:
             continue
         size = rms((c.measured for c in compared), (c.used for c in compared))[i]
         buried = floor is not None and entry.held_out_rmse < 2.0 * floor.level[i]
-        why = "noise and friction bury it" if buried else "the model lacks what drives it"
+        why = (
+            "noise and friction mask it"
+            if buried
+            else ("the model lacks the effect that dominates it")
+        )
         share = max(entry.fit_percent, 0.0)
         found.append(
-            f"{axis}: of its torque of {size:.2g} {entry.unit} RMS {share:.0f} % is explained:"
-            f" these trials do not identify this joint; {why}."
+            f"{axis}: the model explains {share:.0f} % of its torque of {size:.2g} {entry.unit}"
+            f" RMS, so these trials do not identify this joint; {why}."
         )
     return found
 
@@ -205,7 +209,7 @@ def _result(
     notes: Sequence[str],
     identified: IdentifyResult,
 ) -> ValidateResult:
-    """Return what validate.json says."""
+    """Return the content of validate.json."""
     axes = {}
     for i, (axis, found) in enumerate(axis_errors(system, compared).items()):
         level, scatter = (floor.level[i], floor.sd[i]) if floor else (None, 0.0)

@@ -64,8 +64,8 @@ class Config(FilterChoice):
 def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> dict[str, object]:
     """Estimate the damping along each direction of the handle from the viscous trials.
 
-    The brakes' commands are taken out of the model and what they did is put into the filter's
-    state; friction and inertia stay as identified, with their uncertainty.
+    The brakes' commands are removed from the model, and their effect becomes a state of the filter;
+    friction and inertia stay as identified, with their uncertainty.
     """
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
     trials = trials[(trials["kind"] == "viscous") & (trials["status"] != "set_aside")]
@@ -109,7 +109,7 @@ def _estimated(
     config: Config,
     progress: Progress,
 ) -> tuple[ViscousResult, pd.DataFrame]:
-    """Return what viscous.json says, and how the estimates converged."""
+    """Return the content of viscous.json, and the convergence of the estimates."""
     known = identified.parameters
     start = system.prior
     for i, item in enumerate(system.parameters):
@@ -216,7 +216,7 @@ def _device_damping(system: System, motions: Sequence[Motion], p: Array) -> Arra
 def _direction(
     estimate: float, sd: float, friction: float, command: float | None, blocks: int
 ) -> Damping:
-    """Return what is stored of one direction; the test is two-sided, Student's t over blocks."""
+    """Return the record of one direction; the test is two-sided, Student's t over blocks."""
     felt = estimate + friction
     found = partial(
         Damping, estimate=estimate, sd=sd, own_friction=friction, felt=felt, unit="N.s/m"
@@ -226,9 +226,9 @@ def _direction(
     ratios = [abs(value - command) / sd if sd > 0.0 else np.inf for value in (estimate, felt)]
     p, felt_p = (float(2.0 * stats.t.sf(ratio, max(blocks - 1, 1))) for ratio in ratios)
     what = (
-        f"differs from {command:.4g} commanded"
+        f"differs from the commanded {command:.4g}"
         if p < _SIGNIFICANT
-        else f"no difference from {command:.4g} commanded shown"
+        else f"no significant difference from the commanded {command:.4g}"
     )
     return found(
         commanded=command,

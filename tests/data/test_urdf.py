@@ -227,13 +227,13 @@ def test_motors_by_current_have_torque_constants(tmp_path: Path) -> None:
         (
             "[robot.motors.one]\nturns = { elbow = 1.0 }\ntorque_constant = 1.0\n"
             "[robot.motors.two]\nturns = { shoulder_pan = 1.0 }\n",
-            "some motors have a torque_constant and some have none",
+            "some motors have a torque_constant, others do not",
         ),
         (
             "[robot.motors.one]\nturns = { elbow = 1.0 }\ntorque_constant = 1.0\n"
             "torque_constant_sd = 0.1\n[robot.motors.two]\nturns = { shoulder_pan = 1.0 }\n"
             "torque_constant = 1.0\ntorque_constant_sd = 0.2\n",
-            "every torque constant is estimated, which leaves the scale of all masses open",
+            "every torque constant is estimated, so the scale of all masses is undetermined",
         ),
         ("[robot.payload]\ncenter = [0.0, 0.0, 0.1]\n", "'mass' is missing"),
     ],

@@ -283,5 +283,5 @@ def test_what_is_missing_for_a_draft_is_said(tmp_path):
     with pytest.raises(InputError, match=r"diagnose\.json"):
         draft_stage.execute(run, tmp_path, draft_stage.Config(), silent)
     unknown_on("joint", remains=False).write(tmp_path)
-    with pytest.raises(NothingToDoError, match="leaves nothing unnamed"):
+    with pytest.raises(NothingToDoError, match="explain all of the residual"):
         draft_stage.execute(run, tmp_path, draft_stage.Config(), silent)

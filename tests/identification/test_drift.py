@@ -69,13 +69,13 @@ def test_only_what_means_something_is_judged():
         return len(found.horizons), found.reason
 
     held = replace(motion(), q=motion().q * 0.0, qd=motion().qd * 0.0)
-    assert reason(held) == (0, "In 0 windows of 0.1 s the axis moves: too few.")
+    assert reason(held) == (0, "The axis moves in only 0 windows of 0.1 s.")
     count, why = reason(motion(), viscous=-5e6)
-    assert count == 0 and "runs away" in why
+    assert count == 0 and "diverges" in why
     count, why = reason(motion(), offset=20.0)
-    assert count == 2 and why == "In 2 s the model drifts further than the axis moves."
+    assert count == 2 and why == "Within 2 s the model drifts farther than the axis moves."
     count, why = reason(motion(seconds=1.2))
-    assert count == 2 and why == "In 0 windows of 2 s the axis moves: too few."
+    assert count == 2 and why == "The axis moves in only 0 windows of 2 s."
     damper = compile_model(Model(registry.device("magnetic_damper")))
     found = find_drift(damper, [], [], [])
     assert all("prescribes" in entry.reason and not entry.horizons for entry in found.values())

@@ -62,4 +62,4 @@ def test_a_counterbalance_that_the_model_lacks_is_not_forced_into_bodies(
     given, (note,) = make_possible(system, fit)
     places = [system.index(q.name) for q in system.model.device.robot.parameters]
     assert all(map(is_possible, given.p[places].reshape(-1, 10))) == possible
-    assert ("ones are given" in note) == possible
+    assert ("ones are published" in note) == possible

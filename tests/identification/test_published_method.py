@@ -48,12 +48,12 @@ def test_a_filter_that_agrees_and_is_more_precise_is_published() -> None:
 @pytest.mark.parametrize(
     ("filtered", "words"),
     [
-        (estimate([1.0, 2.5, 3.0], 0.05), r"the latter puts `p1` at 2\.5.* than by chance"),
-        (estimate([1.0, 2.0, 3.0], 0.12), r"standard deviations are 1\.20 times the former's"),
+        (estimate([1.0, 2.5, 3.0], 0.05), r"it estimates `p1` at 2\.5.* more than chance"),
+        (estimate([1.0, 2.0, 3.0], 0.12), r"standard deviations are 1\.20 times as large"),
         (estimate([1.0, 2.0, 3.0], 0.05, ("it is off",)), "it is off"),
         (
             estimate([1.0, 2.0, 3.0], 0.05, error=0.13),
-            r"err by 0\.130 N\.m on trials left out \(pitch\), those of least squares by 0\.100",
+            r"error of 0\.130 N\.m on pitch, those of least squares 0\.100",
         ),
     ],
     ids=["far", "loose", "doubted", "worse"],
@@ -86,7 +86,7 @@ def test_a_drive_that_friction_stops_at_once_is_not_simulated(tmp_path) -> None:
     identify.execute(run, run.root, identify.Config(), silent)
     found = run.read(IdentifyResult, "base")
     assert found.method == "least-squares"
-    assert any("by the unscented filter: to follow the motion" in note for note in found.notes)
+    assert any("by the unscented filter: following the motion" in note for note in found.notes)
     assert found.parameters["coulomb.rotor"].estimate == pytest.approx(
         truth["coulomb.rotor"], rel=0.01
     )
@@ -95,7 +95,7 @@ def test_a_drive_that_friction_stops_at_once_is_not_simulated(tmp_path) -> None:
     validate.execute(run, run.root, validate.Config(), silent)
     judged = run.read(ValidateResult, "base")
     assert judged.axes["rotor"].noise_floor is not None
-    assert "its drive gives the motion" in judged.free_run.reason
+    assert "its drive prescribes the motion" in judged.free_run.reason
 
 
 def test_the_five_largest_moves_are_named_and_zero_has_no_share() -> None:

@@ -30,7 +30,7 @@ def test_bad_requests_are_refused_in_one_line(tmp_path):
     run, _ = record_run(tmp_path, "joint", 5)
     with pytest.raises(InputError, match=r"coulomb\.join'.*coulomb\.joint"):
         bampipe.run_stage(run, "next", purpose="coulomb.join")
-    with pytest.raises(InputError, match=r"not known yet.*bampipe diagnose"):
+    with pytest.raises(InputError, match=r"no diagnosis yet.*bampipe diagnose"):
         bampipe.run_stage(run, "next", purpose="decision")
     content = json.loads((run.root / "run.json").read_text())
     assert "next:base" not in content["stages"]

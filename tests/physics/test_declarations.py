@@ -92,7 +92,7 @@ EFFECTS = [
     ("torq", "1", "did you mean 'torque'"),
     ("scope", "force_component", "scope"),
     ("scope", "device", "table"),
-    ("kind", "energy", "'torque' has no meaning"),
+    ("kind", "energy", "'torque' does not apply"),
     ("torque", REMOVE, "torque"),
     ("torque", {"yaw": "1"}, "one expression"),
     ("torque", "-forc*qd", "did you mean 'force'"),
@@ -140,7 +140,7 @@ def test_wrong_names_suggest_the_right_ones():
         Model(BAM, ("stribeck:pich",))
     with pytest.raises(InputError, match="choose from stribeck:yaw, stribeck:pitch"):
         Model(BAM, ("stribeck",))
-    with pytest.raises(InputError, match="in the model already"):
+    with pytest.raises(InputError, match="already in the model"):
         Model(BAM, ("stribeck:yaw", "stribeck:yaw"))
     with pytest.raises(InputError, match="did you mean 'bam'"):
         registry.device("bum")

@@ -121,7 +121,7 @@ def test_definitions_that_multiply_each_other_are_refused_quickly():
         }
     )
     start = time.process_time()
-    with pytest.raises(InputError, match="definitions are put in"):
+    with pytest.raises(InputError, match="definitions and rates are expanded"):
         compile_model(Model(device))
     assert time.process_time() - start < 10.0
 

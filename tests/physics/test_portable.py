@@ -77,7 +77,7 @@ def test_models_with_memory_or_of_what_encoders_read_are_refused() -> None:
         portable_source(model, p, "c")
     device = registry.device("bam")
     model = Model(device, ["encoder_scale:yaw"])
-    with pytest.raises(InputError, match="acts on what encoders read"):
+    with pytest.raises(InputError, match="acts on encoder readings"):
         portable_source(model, compile_model(model).prior, "python")
 
 
@@ -88,8 +88,7 @@ def test_the_offset_of_a_drive_is_no_part_of_the_force_and_is_named() -> None:
     p = compile_model(biased).prior + 0.1
     without = portable_source(bare, p[: len(bare.parameters)], "python")
     text = portable_source(biased, p, "python")
-    assert f"what is logged differs by {name}." in text
+    assert f"logged values differ by {name}." in text
     assert (
-        text.replace(f" Forces are those that act; what is logged differs by {name}.", "")
-        == without
+        text.replace(f" Forces are those that act; logged values differ by {name}.", "") == without
     )

@@ -283,7 +283,7 @@ def test_the_drift_of_a_model_is_a_table_and_its_absence_a_sentence(own_run: Pat
     results = Results(own_run)
     validated = results.read(ValidateResult)
     assert validated is not None
-    why = "In 0.5 s the model drifts further than the axis moves."
+    why = "Within 0.5 s the model drifts farther than the axis moves."
     step = {"horizon_s": 0.1, "median": 0.0012, "quantile_90": 0.0034, "displacement": 0.2}
     drift = {"unit": "rad", "horizons": [step | {"windows": 40}], "reason": why}
     content = validated.model_dump(mode="json") | {"free_run": {"drift": {"yaw": drift}}}

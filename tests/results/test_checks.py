@@ -45,10 +45,10 @@ def test_a_sound_model_fails_none() -> None:
 @pytest.mark.parametrize(
     ("where", "change", "words"),
     [
-        ("session", {"placeholders": ["device.ratio"]}, "device.ratio: a place"),
+        ("session", {"placeholders": ["device.ratio"]}, "device.ratio: still a place"),
         ("session", {"axes": {"yaw": {"unit": "rad", "resolution": 0.0}}}, "yaw: resolution"),
         ("session", {"force": {"noise_sd": {"force_x": 0.0}}}, "force_x: the noise"),
-        ("session", {"force": COUNTS}, "force_x: its readings look like counts of a converter"),
+        ("session", {"force": COUNTS}, "force_x: its readings look like raw counts of a converter"),
         ("fit", {"methods": {"ukf": {"doubts": ["lost"]}}}, "by the unscented filter: lost"),
         ("fit", {"convergence": {"converged": False}}, "not converged"),
         ("fit", {"input_timing": TIMING | {"sd": 1e-4}}, "input timing: -0.99 ± 0.10 ms"),

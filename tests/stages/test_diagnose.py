@@ -16,7 +16,7 @@ from bampipe.stages.diagnose import _require_known
 def test_what_is_no_effect_cannot_be_left_out() -> None:
     recipe = Recipe(registry.device("slider").declaration, (), ())
     _require_known(("stribeck:carriage",), recipe, "without")
-    with pytest.raises(InputError, match="no effect of this device, did you mean 'stribeck:"):
+    with pytest.raises(InputError, match=r"has no effect 'stribek:.*', did you mean 'stribeck:"):
         _require_known(("stribek:carriage",), recipe, "also")
 
 

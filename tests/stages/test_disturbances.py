@@ -71,7 +71,7 @@ def test_what_disturbs_is_left_out(root: Path, sound: RunFolder, how: str) -> No
     run = identified(root, how, spoil)
     one = stretches(run)[0]
     assert sum(each.end_s - each.start_s for each in stretches(run)) < 3.0
-    expected = "one and the same value" if how == "dead" else "a hit, a fault of a sensor"
+    expected = "stuck at one value" if how == "dead" else "a hit, a fault of a sensor"
     assert expected in one.reason
     before = sound.read(IdentifyResult, "base").parameters
     after = run.read(IdentifyResult, "base").parameters

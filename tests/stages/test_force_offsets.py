@@ -57,7 +57,7 @@ def test_offsets_by_trial_are_found_and_taken_off(tmp_path: Path, hold_out: bool
         after = read_parquet(out / "filter/kinematics.parquet", trial=f"t{number}")["force_drive"]
         assert before.mean() - after.mean() == pytest.approx(found, abs=0.01)
     (note,) = (line for line in summary["notes"] if "zeroed anew" in line)
-    assert f"t1 {OFFSETS[1] - np.mean(fitted):+.2g}"[:6] in note and " N too much" in note
+    assert f"t1 {OFFSETS[1] - np.mean(fitted):+.2g}"[:6] in note and " N) were subtracted" in note
 
 
 def test_one_offset_for_all_is_left_to_the_model(tmp_path: Path):

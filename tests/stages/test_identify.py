@@ -229,7 +229,7 @@ def test_what_cannot_be_identified_is_said(squares: tuple[Path, dict]) -> None:
     _, content = squares
     said = content["identifiability"]
     assert "N" in said["together"][0]["members"]
-    assert any("no motion tells the parts apart" in line for line in content["notes"])
+    assert any("no motion separates them" in line for line in content["notes"])
     assert set(said["trials"]) == {"t00", "t01"}
     assert min(entry["growth"] for entry in said["trials"].values()) > 0.05
     lever = next(number for number in said["numbers"] if number["name"] == "L")
@@ -256,8 +256,8 @@ def test_innovations_of_the_right_model_pass_and_those_of_a_late_force_do_not(
         assert entry["inputs"]["independent"], (axis, entry)
     late = simulated_run(tmp_path / "late", late=10)
     content = identified(late)
-    note = next(note for note in content["notes"] if "timing of the force" in note)
-    assert "at its limit, 1 ms earlier than logged" in note
+    note = next(note for note in content["notes"] if "input delay" in note)
+    assert "at its limit of half a sample (1 ms earlier than logged" in note
     assert "or the model lacks something that shifts the force in time" in note
     innovations = content["innovations"]
     assert not innovations["yaw"]["inputs"]["independent"]

@@ -182,7 +182,9 @@ def test_a_number_that_was_to_be_filled_in_is_named(tmp_path):
     summary = run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
     content = read_json(tmp_path / "out/ingest/session.json")
     assert content["placeholders"] == ["device.constants.ratio"]
-    assert summary["notes"] == ["device.constants.ratio: its source still says `fill in`"]
+    assert summary["notes"] == [
+        "device.constants.ratio: still a placeholder, with `fill in` as its source"
+    ]
 
 
 @pytest.mark.parametrize(

@@ -250,7 +250,7 @@ def test_a_model_with_a_force_rate_is_refused() -> None:
     from bampipe.monitor.start import list_layouts
 
     system = compile_model(Model(registry.device("bam"), ("force_delay",)))
-    with pytest.raises(InputError, match="known only afterwards"):
+    with pytest.raises(InputError, match="not known in real time"):
         list_layouts(system, None)
 
 

@@ -185,7 +185,7 @@ def test_one_short_trial_holds_nothing_out(tmp_path: Path) -> None:
 def test_one_long_trial_is_left_out_in_blocks(tmp_path: Path) -> None:
     run = identified(simulated_run(tmp_path / "one", trials=1, seconds=12.0))
     content = validated(run)
-    assert content["notes"][0].startswith("One trial: it is predicted in")
+    assert content["notes"][0].startswith("There is one trial: it is predicted in")
     assert content["headline"].startswith("fit on held-out trials")
     assert all(entry["held_out"] for entry in content["trials"].values())
     table = read_parquet(run.path("models/base/residuals.parquet"))

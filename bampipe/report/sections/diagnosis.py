@@ -212,9 +212,9 @@ def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Fig
         if number % 3 == 0:
             panel.set_ylabel(style.label_axis("mean residual", unit))
     caption = (
-        f"Where the force prediction of {axis} fails: mean residual (measured minus predicted) "
-        "with its confidence band against its possible causes. Where a band does not hold zero, "
-        "the model lacks something."
+        f"Where the force prediction of {axis} fails: mean residual (measured minus predicted)"
+        " with its confidence band against its possible causes. Where the band excludes zero,"
+        " the model lacks something."
     )
     return style.finish(figure, f"residual-maps-{model}-{axis}", caption, panels[:1])
 

@@ -143,8 +143,8 @@ def _draw_contribution(name: str, term: ModelTerm, curves: Sequence[TermCurve]) 
 def _describe_curves(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
     variables = join_names(dict.fromkeys(curve.variable for curve in curves))
     return (
-        f"the force taken by `{term.name}`, with its 95 % band, against its main variable "
-        f"({variables}), over the motion of the trials."
+        f"the force of `{term.name}`, with its 95 % band, against its main variable ({variables}),"
+        " over the motion of the trials."
     )
 
 

@@ -28,9 +28,9 @@ from bampipe.results.validate import ValidateResult
 
 TITLE = "Identification"
 _LEAST_CALIBRATION = 0.1
-"""Least share of calibration in an SD for which the table gives it."""
+"""The table gives calibration from this share of an SD on."""
 _PANEL_COLUMNS, _MOST_PANEL_ROWS = (2, 3, 4), 7
-"""Columns and rows of panels: of the columns that leave the fewest places empty, the least."""
+"""Columns and rows of panels: the fewest columns that leave the fewest places empty."""
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
 
@@ -110,7 +110,7 @@ def _tabulate_parameters(results: Results, identified: IdentifyResult) -> Table:
 
 
 def _qualify_intervals(results: Results) -> str:
-    """Return a clause on intervals where the model lacks something, else ""."""
+    """Return a clause on intervals if the model lacks something, else ""."""
     validated = results.read(ValidateResult)
     lacking = [
         error.held_out_rmse / error.noise_floor

@@ -17,7 +17,7 @@ def section(results: Results) -> Section:
     """Return the section."""
     run = results.read(RunResult)
     if run is None:
-        text = "This run folder has no run.json, so that its provenance is not known."
+        text = "This run folder has no run.json, so its provenance is not known."
         return Section("Provenance", (Paragraph(text),))
     stages = {name: made for name, made in run.stages.items() if name != "report"}
     blocks: list[Block] = [Paragraph(_list_versions(stages))]

@@ -67,7 +67,7 @@ def _explain_dash(rows: Iterable[tuple[str, ...]]) -> str:
 
 
 def _format_range(results: Results, place: dict[str, Any]) -> str:
-    """Return a stored number or range with its unit; "" where it is not stored."""
+    """Return a stored number or range with its unit; "" if it is not stored."""
     names = ("value",) if "value" in place else ("lower", "upper")
     values = [_read_number(results, place, name) for name in names]
     if None in values:

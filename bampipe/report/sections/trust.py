@@ -73,10 +73,11 @@ def _tabulate_bounds(
         "Standard deviation of each estimate beside the least possible",
         "Parameter | >SD | >Bound | >Alone | Correlated with | >Bias of filtering | Unit",
         rows,
-        "Bound: Cramér-Rao, the least that sensor noise allows on these trials. Alone: the same if "
-        "all others were known. Correlated with: the parameter whose error is most correlated with "
-        "this one. Bias of filtering: the bias that filtered velocities give plain least squares, "
-        "found by replaying the fit, and subtracted; the unscented filter uses positions alone.",
+        "Bound: Cramér-Rao, the least that sensor noise allows on these trials. Alone: the same"
+        " if all others were known. Correlated with: the parameter whose error is most"
+        " correlated with this one. Bias of filtering: the bias that filtered velocities give"
+        " plain least squares, found from replicates of the fit, and subtracted; the unscented"
+        " filter uses positions alone.",
     )
 
 
