@@ -197,11 +197,7 @@ def _losses(sets: Sequence[WeighedSet]) -> dict[str, float]:
         held = [one for one in sets if effect in one.effects]
         best = max(held, key=lambda one: one.log_evidence)
         rest = {*best.effects} - {effect}
-        less = [
-            one.log_evidence
-            for one in sets
-            if one.unknown == best.unknown and {*one.effects} <= rest
-        ]
+        less = [s.log_evidence for s in sets if s.unknown == best.unknown and {*s.effects} <= rest]
         found[effect] = best.log_evidence - max(less, default=best.log_evidence - _NEAR)
     return found
 

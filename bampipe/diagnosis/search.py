@@ -39,10 +39,7 @@ class Search(SetCosts):
         any_size = copy(self)
         any_size.least_size, any_size._solved = 0.0, {}
         beside = any_size.best_beside((), _PROMISING)
-        if not beside:
-            return 0.0, ""
-        cost, key = beside[0]
-        return any_size.cost(()) - cost, key[0]
+        return (any_size.cost(()) - beside[0][0], beside[0][1][0]) if beside else (0.0, "")
 
     def best_beside(
         self, keys: Sequence[Key], most: int, shapes: int = 2
@@ -61,11 +58,8 @@ class Search(SetCosts):
             name = key[0]
             if not gains[k] > 0.0:
                 break
-            if (
-                name in have
-                or tried.get(name, 0) >= shapes
-                or (name not in tried and len(tried) >= most)
-            ):
+            is_one_too_many = name not in tried and len(tried) >= most
+            if name in have or tried.get(name, 0) >= shapes or is_one_too_many:
                 continue
             cost = self.cost((*keys, key))
             # One that promised much beyond the bounds of others says little of the next.
@@ -111,22 +105,13 @@ class Search(SetCosts):
         slopes = self.shape_slopes(keys, found.strengths)
         if slopes is None:
             return None
-        count = sum(len(shape) for _, shape in keys)
         more = {a: c * self.p.likelihood.root[a][:, None] for a, c in slopes.items()}
         solved = self._solve_with_shapes(all_keys, more, found)
-        moved, place = [], 0
-        for name, shape in keys:
-            step = np.clip(solved[place : place + len(shape)], -_FARTHEST, _FARTHEST)
-            place += len(shape)
-            moved.append(
-                (
-                    name,
-                    tuple(
-                        float(np.clip(u + d, 0.0, 1.0)) for u, d in zip(shape, step, strict=True)
-                    ),
-                )
-            )
-        assert place == count
+        steps = iter(np.clip(solved, -_FARTHEST, _FARTHEST))
+        moved = [
+            (name, tuple(float(np.clip(u + next(steps), 0.0, 1.0)) for u in shape))
+            for name, shape in keys
+        ]
         return (*(key for key in all_keys if key[0][0] == "-"), *moved)
 
     def _solve_with_shapes(

@@ -24,6 +24,7 @@ from bampipe.diagnosis.session import (
 )
 from bampipe.diagnosis.set_cost import added, gone, names
 from bampipe.physics.recipe import Recipe
+from bampipe.results.compare import NOTICEABLE
 
 Progress = Callable[[float, str], None]
 """Called with a fraction of the work done and what is being done."""
@@ -228,7 +229,7 @@ def _fit_better(
             gain = gain_when_fitted(current, moved, search, keys)
             if gain <= _WORTH:
                 kept[names(keys)] = gain
-            elif not moved.errs_more_than(current):
+            elif _held_out_error(moved) < _held_out_error(current) + NOTICEABLE:
                 return moved, kept
         broken.append({*keys})
         if fresh:
@@ -266,23 +267,25 @@ def _leave_out(
     less = change_set(fit.recipe, keys)
     if np.isfinite(search.cost(keys)):
         return session.try_fit(less, start_of(search, keys, less))
-    known = {q.name: v for q, v in zip(fit.evidence.system.parameters, fit.evidence.p, strict=True)}
-    return session.try_fit(less, np.array([known[q.name] for q in system_of(less).parameters]))
+    return session.try_fit(less, start_at(search, np.zeros(search.bb.shape[1]), {}, less))
 
 
 def _misleading(fit: Fit, weighed: Weighed, own: Sequence[str]) -> set[str]:
     """Effects that are rather not there, and make the error on trials not seen larger."""
 
-    def error(out: Collection[str]) -> float:
-        return float(np.sum(np.log(np.maximum(fit.held_out_without(out), 1e-300))))
-
-    out, least = set[str](), error(())
+    out, least = set[str](), _held_out_error(fit)
     while doubtful := [e for e in own if e not in out and weighed.effects.get(e, 0.0) < 0.5]:
-        worst = min(doubtful, key=lambda e: error({*out, e}))
-        if (left := error({*out, worst})) >= least:
+        worst = min(doubtful, key=lambda e: _held_out_error(fit, {*out, e}))
+        if (left := _held_out_error(fit, {*out, worst})) >= least:
             break
         out, least = {*out, worst}, left
     return out
+
+
+def _held_out_error(fit: Fit, without: Collection[str] = ()) -> float:
+    """Its logarithm, summed over the axes, with or without some of the model's effects."""
+    errors = fit.held_out_without(without) if without else fit.held_out_rmse
+    return float(np.sum(np.log(np.maximum(errors, 1e-300))))
 
 
 def gain_when_fitted(before: Fit, after: Fit, search: Search, keys: Sequence[Key]) -> float:

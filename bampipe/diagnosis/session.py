@@ -22,7 +22,6 @@ from bampipe.estimate.simulation import Runaway
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import effect_from
-from bampipe.results.compare import NOTICEABLE
 from bampipe.results.floor import compare_with_floor
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import HELD_OUT
@@ -412,11 +411,6 @@ class Fit:
         lags = int(criteria.block_s * band.rate_hz / band.step)
         return self.likelihood.count_independent(self.problem, lags)
 
-    @property
-    def rmse_beyond_bias(self) -> Array:
-        """Its root mean square, (n_q,)."""
-        return np.array([rms(rows) for rows in self.rows_beyond_bias])
-
     @cached_property
     def held_out_rmse(self) -> Array:
         """Error on trials that parameters have not seen, nor timing, (n_q,), N.m or N, linearised.
@@ -424,11 +418,6 @@ class Fit:
         With one group of trials only, that of the fit.
         """
         return self.held_out_without()
-
-    def errs_more_than(self, other: Fit) -> bool:
-        """Whether its held-out error, as the product over the axes, is noticeably larger."""
-        ratios = self.held_out_rmse / np.maximum(other.held_out_rmse, 1e-300)
-        return bool(np.prod(ratios) > 1.0 + NOTICEABLE)
 
     def held_out_without(self, effects: Iterable[str] = ()) -> Array:
         """`held_out_rmse` where some of the model's effects are taken away."""

@@ -108,7 +108,7 @@ def _judge(
         unknown=unknown,
         rmse_before=before,
         rmse_after=after,
-        rmse_beyond_bias=float(final.rmse_beyond_bias[axis]),
+        rmse_beyond_bias=rms(final.rows_beyond_bias[axis]),
         noise_floor=level,
         noise_floor_sd=scatter,
         standing=against_floor,
@@ -183,9 +183,8 @@ def _alike(selection: Selection, effect: str, mentioned: float) -> tuple[str, ..
 
 
 def _sets(selection: Selection) -> tuple[WeighedSet, ...]:
-    listed = [s for s in selection.weighed.sets if s.probability >= 0.001] or list(
-        selection.weighed.sets[:1]
-    )
+    sets = selection.weighed.sets
+    listed = [s for s in sets if s.probability >= 0.001] or sets[:1]
     return tuple(
         WeighedSet(
             effects=one.effects,
@@ -195,5 +194,5 @@ def _sets(selection: Selection) -> tuple[WeighedSet, ...]:
             probability=min(one.probability, 1.0),
             log_evidence=one.log_evidence,
         )
-        for one in sorted(listed, key=lambda s: -s.probability)
+        for one in listed
     )

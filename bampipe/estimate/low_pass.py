@@ -32,24 +32,17 @@ def _run(values, section, start, kept):  # type: ignore[no-untyped-def]
         for i in range(count):
             for j in range(width):
                 y[i, j] = values[i, first + j]
-        for j in range(_TOGETHER):
-            s0[j], s1[j] = start[0] * y[0, j], start[1] * y[0, j]
-        for i in range(count):
+        for last, step in ((count - 1, 1), (0, -1)):
+            first_row = count - 1 - last
             for j in range(_TOGETHER):
-                x = y[i, j]
-                v = b0 * x + s0[j]
-                s0[j] = b1 * x - a1 * v + s1[j]
-                s1[j] = b2 * x - a2 * v
-                y[i, j] = v
-        for j in range(_TOGETHER):
-            s0[j], s1[j] = start[0] * y[count - 1, j], start[1] * y[count - 1, j]
-        for i in range(count - 1, -1, -1):
-            for j in range(_TOGETHER):
-                x = y[i, j]
-                v = b0 * x + s0[j]
-                s0[j] = b1 * x - a1 * v + s1[j]
-                s1[j] = b2 * x - a2 * v
-                y[i, j] = v
+                s0[j], s1[j] = start[0] * y[first_row, j], start[1] * y[first_row, j]
+            for i in range(first_row, last + step, step):
+                for j in range(_TOGETHER):
+                    x = y[i, j]
+                    v = b0 * x + s0[j]
+                    s0[j] = b1 * x - a1 * v + s1[j]
+                    s1[j] = b2 * x - a2 * v
+                    y[i, j] = v
         for i in range(len(kept)):
             for j in range(width):
                 out[i, first + j] = y[kept[i], j]

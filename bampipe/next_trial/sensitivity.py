@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.stats import norm
@@ -203,17 +202,14 @@ class Detectability:
 
     def factors_with(self, motion: Motion) -> Array:
         """Return the factor from which on each effect is found once ``motion`` is recorded."""
-        now, before = np.array([one.factor for one in self.limits]), self._factors_now
+        now = np.array([one.factor for one in self.limits])
+        before = self._factors(self.comparison.sums_now)
         after = self._factors(self.comparison.sums_now + self.comparison.sums([motion]))
         # An effect that is not linear in its strength is assumed to change by the same ratio.
         ratio = np.ones(len(now))
         known = np.isfinite(before) & np.isfinite(now)
         ratio[known] = now[known] / before[known]
         return np.array([_cap_factor(factor) for factor in after * ratio])
-
-    @cached_property
-    def _factors_now(self) -> Array:
-        return self._factors(self.comparison.sums_now)
 
     def _factors(self, sums: Sums) -> Array:
         found = find_limits(self.comparison, sums, self.needed)

@@ -50,10 +50,6 @@ def _shape_of_parameter(entry: object) -> str:
     return "#ParameterByKind" if by_kind else "#Parameter"
 
 
-def _shape_of_expressions(entry: object) -> str:
-    return "#by_place" if isinstance(entry, Mapping) else "#one"
-
-
 EffectParameter = Annotated[
     Annotated[Parameter, Tag("#Parameter")] | Annotated[ParameterByKind, Tag("#ParameterByKind")],
     Discriminator(_shape_of_parameter),
@@ -61,7 +57,7 @@ EffectParameter = Annotated[
 Expressions = Annotated[
     Annotated[Expression, Tag("#one")]
     | Annotated[dict[Name, Expression], Field(min_length=1), Tag("#by_place")],
-    Discriminator(_shape_of_expressions),
+    Discriminator(lambda entry: "#by_place" if isinstance(entry, Mapping) else "#one"),
 ]
 
 

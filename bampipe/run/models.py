@@ -105,8 +105,7 @@ def _bring_adopted_effects(root: Path) -> None:
 def child_name(parent: str, effects: tuple[str, ...]) -> str:
     """Return the name of the model that adds ``effects`` to ``parent``.
 
-    Where that would be longer than `_LONGEST`, their number and a digest stand for the effects: no
-    file system has room for all names of a dozen.
+    Beyond `_LONGEST` characters, the number of effects and a digest stand for their names.
     """
     name = "+".join([parent, *(effect.replace(":", ".") for effect in effects)])
     if len(name) <= _LONGEST:

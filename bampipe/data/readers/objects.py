@@ -147,7 +147,8 @@ def _samples(
         content = _with_lists(_parsed(text))
     items = content.items() if isinstance(content, dict) else [("", content)]
     lists = {str(k): v for k, v in items if isinstance(v, list) and v and isinstance(v[0], dict)}
-    single = all(_is_sample(items[0]) for items in lists.values())
+    # Objects are samples rather than recordings, whose values are long lists.
+    single = all(any(reads_as_number(x) for _, x in leaves(v[0])) for v in lists.values())
     if not (lists and single) and (arrays := dict(_arrays(content))):
         units = {label: find(content, f"{label.rpartition('.')[0]}.unit") for label in arrays}
         stated = {label: unit if isinstance(unit, str) else "" for label, unit in units.items()}
@@ -178,11 +179,6 @@ def _parsed(text: str, where: str = "") -> object:
         raise InputError(
             f"not sound JSON{line}", where=where, remedy="was the log cut off? copy it again"
         ) from error
-
-
-def _is_sample(value: object) -> bool:
-    """Whether an object is a sample rather than a recording, whose values are long lists."""
-    return any(reads_as_number(cell) for _, cell in leaves(value))
 
 
 def _numbers(content: object) -> dict[str, object]:
