@@ -135,7 +135,7 @@ def test_sessions_of_one_id_and_settings_reach_the_run_once(toy: Toy, command: C
     other = install_toys.make_session(toy.folder / "other" / "first")
     code, out, _ = command("run", *arguments(toy), str(other))
     assert code == 2
-    assert "session_id 'first' is that of" in out
+    assert "session_id 'first' is also that of" in out
     code, out, _ = command("run", *arguments(toy), str(toy.session), "--json")
     assert code == 0
     assert len(json.loads(out)["sessions"]) == 1

@@ -59,6 +59,11 @@ def test_following_judges_the_model_that_it_starts_from(
     assert loop.follow(options, "base", lines.append) == "base"
     assert lines == ["base, joint: unknown effect"]
     assert ran[0] == ("identify", "validate", "base") and ran[-1] == ("compare", "compare", "")
+    # A confirmation adds nothing to what is unknown: each further effect would only imitate it.
+    content = diagnosis(content["axes"], {("quadratic_drag:joint",): 0.3})
+    found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
+    monkeypatch.setattr(loop, "_add", lambda _, model, *__: f"{model}+")
+    assert found.selected and loop.follow(options, "base", lines.append) == "base+"
 
 
 @pytest.mark.parametrize(
@@ -164,20 +169,6 @@ def test_what_came_to_nothing_is_not_weighed_again(
         {"diagnose": {"without": ("quadratic_drag:joint",)}},
         {"diagnose": {"without": tuple(left)}},
     ]
-
-
-def test_a_confirmation_adds_nothing_to_an_unknown_remainder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What describes it best is added once: each further effect would only imitate it."""
-    content = diagnosis({"joint": {"verdict": "unknown_effect"}}, {("quadratic_drag:joint",): 0.3})
-    found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
-    assert found.selected
-    monkeypatch.setattr(loop.LoopOptions, "run", lambda *_: None)
-    monkeypatch.setattr(loop.RunFolder, "read", lambda *_: found)
-    monkeypatch.setattr(loop, "_add", lambda _, model, *__: f"{model}+")
-    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
-    assert loop.follow(options, "base", lambda _: None) == "base+"
 
 
 def test_the_device_file_gives_the_base_model_its_effects(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ NUMERICAL = {
     "select": {
         "0.5": "more probable than not",
         "2": "tasks from which on processes share them",
+        "NOTICEABLE": "a set is not proposed that the ladder would refuse",
         "_MOST_ROUNDS": "work, not a judgement",
         "_TRIED": "work, not a judgement",
         "_WORTH": "half a nat: a set that is no better is weighed, but not fitted",

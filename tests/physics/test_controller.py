@@ -60,10 +60,10 @@ def test_a_loop_with_an_integral_part_and_a_law_of_the_wrong_unit():
         ({"command": {"force_engine": "1"}}, "one expression is needed for each of force_motor"),
         ({"gains": {}}, 'unknown key "gains"'),
         ({"channels": ["goal"]}, "channels: found .*, expected a table"),
-        ({"channels": {"mass": "kg"}}, "'mass' is the name of"),
+        ({"channels": {"mass": "kg"}}, "'mass' is already taken by"),
         ({"rate_hz": -5}, "rate_hz: found -5, expected 0 or more"),
         ({"states": {"wound": {"rate": "goal - carriage"}}}, "states.wound: 'unit' is missing"),
-        ({"states": {"goal": {"unit": "m.s", "rate": "1"}}}, "'goal' is the name of"),
+        ({"states": {"goal": {"unit": "m.s", "rate": "1"}}}, "'goal' is already taken by"),
         (
             {"states": {"wound": {"unit": "m.s", "rate": "1", "lower": 2, "upper": 1}}},
             "lower must be below upper",

@@ -81,8 +81,7 @@ def test_wrong_device_file_is_refused_with_its_field(path, value, says):
     change(entries, path, value)
     with pytest.raises(InputError) as caught:
         compile_device(entries)
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert says in str(caught.value) and "\n" not in str(caught.value)
 
 
 EFFECTS = [
@@ -118,8 +117,7 @@ def test_wrong_effect_file_is_refused_with_its_field(path, value, says):
     with pytest.raises(InputError) as caught:
         effect = registry.effect_from(entries, "lab.toml")
         compile_model(Model(BAM, ("stribeck:yaw",), (effect,)))
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert says in str(caught.value) and "\n" not in str(caught.value)
 
 
 OFFSETS = ["error*qd", "error*ddt(qd)", "error*brake", "error*ddt(f)", "error*sgn(q)*log(q - q)"]

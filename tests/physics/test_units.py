@@ -53,14 +53,11 @@ def test_a_unit_that_is_not_coherent_si_is_refused(text):
 
 
 def test_dimensions_print_as_units_and_stay_exact():
-    assert str(parse_unit("J", "")) == "N.m"
-    assert str(parse_unit("N.s/m", "")) == "kg/s"
-    assert str(parse_unit("m2/s3", "")) == "m2/s3"
-    assert str(parse_unit("1/s", "")) == "1/s"
-    assert str(PURE) == "a pure number"
+    for text, said in {"J": "N.m", "N.s/m": "kg/s", "m2/s3": "m2/s3", "1/s": "1/s"}.items():
+        assert str(parse_unit(text, "")) == said
     metre = parse_unit("m", "")
     assert (metre ** Fraction(1, 2)) ** 2 == metre
-    assert metre / metre == PURE
+    assert metre / metre == PURE and str(PURE) == "a pure number"
 
 
 @pytest.mark.parametrize(

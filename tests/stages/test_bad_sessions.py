@@ -448,32 +448,27 @@ SOUND: dict[str, tuple[Damage, str]] = {
 }
 
 
-def test_all_that_a_session_has_wrong_for_its_device_is_said_at_once(tmp_path):
-    damage = both(
+def test_all_that_is_wrong_is_said_at_once_and_each_reason_once(tmp_path):
+    for_its_device = both(
         drop("encoders.pitch"),
         put("brakes.columns", ["brake_yaw", "brake_extension"]),
         put("brakes.unit", "N.m, N"),
         put("force.components", ["x", "y", "q"]),
     )
-    with pytest.raises(InputError) as caught:
-        run_ingest(Made(), tmp_path, damage)
-    said = caught.value.lines()
-    assert len(said) == 2
-    assert "no encoder for axis 'pitch'" in said[0]
-    assert "no channel for input 'force_z'" in said[1]
 
-
-def test_each_reason_for_having_no_sound_trial_is_said_once(tmp_path):
-    def damage(made):
+    def every_trial(made):
         made.files.update({"trials/t01.csv": "", "trials/t02.parquet": b"\xfe\xff"})
         put("trials.2.file", "trials/t99.csv")(made)
 
-    with pytest.raises(InputError) as caught:
-        run_ingest(Made(), tmp_path, damage)
-    said = caught.value.lines()
-    assert len(said) == 3
-    assert "none of the 3 trials is sound; trials/t01.csv: the file is empty" in said[0]
-    assert "trials/t99.csv: no such file" in said[2]
+    none_sound = "none of the 3 trials is sound; trials/t01.csv: the file is empty"
+    for damage, count, first, last in (
+        (for_its_device, 2, "no encoder for axis 'pitch'", "no channel for input 'force_z'"),
+        (every_trial, 3, none_sound, "trials/t99.csv: no such file"),
+    ):
+        with pytest.raises(InputError) as caught:
+            run_ingest(Made(), tmp_path / str(count), damage)
+        said = caught.value.lines()
+        assert len(said) == count and first in said[0] and last in said[-1]
 
 
 @pytest.mark.parametrize("name", REPAIRED)

@@ -187,9 +187,7 @@ def test_trials_that_are_too_few_or_too_short_are_said_with_their_size(tmp_path:
     whole = free_trial(0)[0]
     frames = {"a": whole.head(20), "b": whole.head(31)}
     run = write_ingested(tmp_path / "run", frames, dict.fromkeys(frames, ("free", "")), AXES)
-    said = (
-        "none of the 2 free and viscous trials is long enough: a holds 20 sound samples, of which"
-    )
+    said = "none of the 2 free and viscous trials is long enough: a has 20 sound samples, of which"
     with pytest.raises(InputError, match=said):
         run_stage(run)
     frames = {"a": whole, "b": whole.head(31)}

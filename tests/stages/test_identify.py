@@ -180,8 +180,7 @@ def test_a_model_with_a_delay_gets_no_timing_of_its_own(simulated: RunFolder) ->
 def test_the_force_noise_moves_the_encoder_of_an_axis_that_winds_up(tmp_path: Path) -> None:
     """Without that in the noise of the readings, the filter gave the friction as 14 for 4.2."""
     name = "transmission_compliance.yaw.compliance"
-    hidden = {name: 2e-3}
-    run = simulated_run(tmp_path, trials=1, effect="transmission_compliance:yaw", hidden=hidden)
+    run = simulated_run(tmp_path, effect="transmission_compliance:yaw", hidden={name: 2e-3})
     wound = MODEL.replace("[]", '["transmission_compliance:yaw"]')
     write_text(run.path("models/base/model.toml"), wound)
     content = identified(run, replace(FAST, method="ukf"))

@@ -88,7 +88,7 @@ def test_a_command_that_was_not_kept_is_found(run: RunFolder, tmp_path: Path) ->
     finally:
         write_parquet(path, kept)
     assert all(entry["differs"] for entry in directions.values())
-    assert "differs from 44 commanded" in directions["x"]["verdict"]
+    assert "differs from the commanded 44" in directions["x"]["verdict"]
 
 
 def test_a_session_without_a_field_says_so(run: RunFolder) -> None:
