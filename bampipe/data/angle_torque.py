@@ -51,22 +51,16 @@ class SmoothedMotion:
             return None
         window = np.hanning(width + 2)[1:-1]
         window = window / window.sum()
-        once = _convolve(q, window)
+        once = np.convolve(q, window, "same")
         qd = np.gradient(once, step)
         sides = [np.gradient(qd, step), qd, np.sign(qd), once]
-        *moving, position = (_convolve(values, window) for values in sides)
+        *moving, position = (np.convolve(values, window, "same") for values in sides)
         inner = slice(2 * width, -2 * width or None)
         return cls(window, inner, np.column_stack(moving), position)
 
     def smooth(self, values: Array) -> Array:
         """``values`` (T,) smoothed as often as the motion."""
-        return _convolve(_convolve(values, self.window), self.window)
-
-
-def _convolve(values: Array, window: Array) -> Array:
-    from scipy.signal import oaconvolve  # it takes half of the time in which ingest starts
-
-    return np.asarray(oaconvolve(values, window, "same"))
+        return np.convolve(np.convolve(values, self.window, "same"), self.window, "same")
 
 
 @dataclass(frozen=True)
