@@ -232,8 +232,7 @@ def _fit_better(
             elif _held_out_error(moved) < _held_out_error(current) + NOTICEABLE:
                 return moved, kept
         broken.append({*keys})
-        if fresh:
-            fits[members] = None
+        fits[members] = None if fresh else moved
     return None, kept
 
 

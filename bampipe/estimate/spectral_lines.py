@@ -10,7 +10,6 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.optimize import minimize_scalar
 
 from bampipe.arrays import Array, Flags
 
@@ -171,6 +170,8 @@ def _fit(record: Array, t: Array, hz: float, within: float, lag: int) -> tuple[f
     Args:
         hz, within: where it is looked for; lag: see `find_lines`.
     """
+    from scipy.optimize import minimize_scalar  # slow to import, and for records with a hum alone
+
     wanted, even = _second_differences(record, lag)
     wanted = wanted[even]
 
