@@ -232,7 +232,8 @@ def _fit_better(
             elif _held_out_error(moved) < _held_out_error(current) + NOTICEABLE:
                 return moved, kept
         broken.append({*keys})
-        fits[members] = None if fresh else moved
+        if fresh:
+            fits[members] = None
     return None, kept
 
 
@@ -274,8 +275,8 @@ def _misleading(fit: Fit, weighed: Weighed, own: Sequence[str]) -> set[str]:
 
     out, least = set[str](), _held_out_error(fit)
     while doubtful := [e for e in own if e not in out and weighed.effects.get(e, 0.0) < 0.5]:
-        worst = min(doubtful, key=lambda e: _held_out_error(fit, {*out, e}))
-        if (left := _held_out_error(fit, {*out, worst})) >= least:
+        left, worst = min((_held_out_error(fit, {*out, e}), e) for e in doubtful)
+        if left >= least:
             break
         out, least = {*out, worst}, left
     return out

@@ -427,15 +427,14 @@ def _find_dependence(
     # A term has few of the model's parameters, and sympy is slow to find a slope zero.
     terms = [[(t, t.free_symbols) for t in sp.Add.make_args(e)] for e in residual]
     for i, symbol in enumerate(p):
-        by_term = {k: [t for t, symbols in row if symbol in symbols] for k, row in enumerate(terms)}
-        by_axis = {k: sp.Add(*(t.diff(symbol) for t in row)) for k, row in by_term.items() if row}
+        by_term = [[_slope(t, symbol) for t, own in row if symbol in own] for row in terms]
+        by_axis = {k: sp.Add(*row) for k, row in enumerate(by_term) if row}
         slopes = [*by_axis.values()]
         slope_symbols, bodily = _collect_symbols(slopes), symbol in numbers
         candidates = slope_symbols.intersection(p[: i + 1])
         sized = [(slope, slope.count_ops() > _LARGE) for slope in slopes]
         small = [slope for slope, is_large in sized if not is_large]
-        # A large slope is assumed to vary with every symbol in it: only in small ones do terms
-        # cancel.
+        # A large slope is assumed to vary with every symbol in it: terms cancel only in small ones.
         curving = candidates & _collect_symbols(slope for slope, is_large in sized if is_large)
         curving |= {s for s in candidates - curving if any(_slope(e, s) != 0 for e in small)}
         linear = symbol not in curving and symbol not in elsewhere
