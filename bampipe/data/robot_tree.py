@@ -172,7 +172,7 @@ class Tree:
         way = self.way(tip)
         links = [*(joint.parent for joint in way), tip]
         if base not in links:
-            raise InputError(f"link {links[0]!r} does not hang on {base!r}")
+            raise InputError(f"no chain of joints leads from link {base!r} to link {tip!r}")
         for joint in way[links.index(base) :]:
             if joint.kind not in (*MOVING, "fixed"):
                 raise InputError(

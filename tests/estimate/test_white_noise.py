@@ -1,4 +1,4 @@
-"""White noise told from hum, lines of the mains, fast signals and coarse counts."""
+"""White noise is distinguished from mains hum, fast signals and coarse quantisation."""
 
 from dataclasses import replace
 

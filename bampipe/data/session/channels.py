@@ -105,8 +105,8 @@ class Clock(Declaration):
     )
     format: str = Field(
         default="",
-        description="How dates and times are written, as of strptime; ISO 8601, or the time of day,"
-        " where left out",
+        description="How dates and times are written, in the codes of strptime; ISO 8601, or the"
+        " time of day, where left out",
     )
     nanoseconds: str = Field(
         default="",
