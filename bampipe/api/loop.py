@@ -239,8 +239,7 @@ def follow(
             tell(f"{model}, {axis}: {verdict(diagnosis, axis)}")
         for line in dict.fromkeys(_list_open_questions(diagnosis)):
             tell(line)
-        verdicts = {diagnosis.axes[axis].verdict for axis in diagnosis.lacking}
-        found = () if model != given and verdicts == {"unknown_effect"} else diagnosis.selected
+        found = () if model != given and diagnosis.remainder_unknown else diagnosis.selected
         if draft and diagnosis.unnamed_axes:
             options.run("draft", "draft", model)
             drafted = run.read(DraftResult, model)

@@ -159,6 +159,11 @@ class DiagnoseResult(Result):
         """Axes with another verdict than ``nothing_missing``."""
         return tuple(a for a, entry in self.axes.items() if entry.verdict != "nothing_missing")
 
+    @property
+    def remainder_unknown(self) -> bool:
+        """Whether something unknown is missing on each lacking axis, and no effect is probable."""
+        return {self.axes[axis].verdict for axis in self.lacking} == {"unknown_effect"}
+
     def sets_on(self, axis: str) -> list[tuple[Names, float]]:
         """Return the sets restricted to one axis, the most probable first."""
         known, found = self.axes[axis].probabilities, dict[Names, float]()

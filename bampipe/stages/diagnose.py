@@ -28,7 +28,7 @@ from bampipe.physics import compile_model, registry
 from bampipe.physics.effect import effect_from
 from bampipe.physics.recipe import Recipe
 from bampipe.progress import Progress
-from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, ResidualMap
+from bampipe.results.diagnose import DiagnoseResult, ResidualMap
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.setup import SetupResult
 from bampipe.results.terms import EffectText
@@ -200,8 +200,9 @@ def _result(
         worst_windows=tuple(worst_windows(given)),
         not_weighed=config.without,
         sentence="",
-        next=_next(found.axes, names, found.selected, config.model),
+        next="",
     )
+    result = result.model_copy(update={"next": _next(result, bool(recipe.effects))})
     shapes = {
         axis: describe(
             (selection.final if result.axes[axis].effects else selection.initial).evidence, i
@@ -232,19 +233,18 @@ def _map_variables(evidence: Evidence) -> pd.DataFrame:
     return pd.DataFrame(columns)
 
 
-def _next(
-    axes: Sequence[AxisVerdict], names: Sequence[str], selected: Sequence[str], model: str
-) -> str:
-    if any(a.verdict == "undecided" for a in axes):
-        return f"bampipe next RUN --model {model}"
-    if selected:
-        return f"bampipe extend RUN {' '.join(selected)} --model {model}"
-    wrong = [axis for axis, a in zip(names, axes, strict=True) if a.verdict == "no_verdict"]
-    if wrong:
+def _next(result: DiagnoseResult, extended: bool) -> str:
+    """Return the next step; an ``extended`` model gets no effect that would imitate an unknown."""
+    verdicts = {axis: entry.verdict for axis, entry in result.axes.items()}
+    if "undecided" in verdicts.values():
+        return f"bampipe next RUN --model {result.model}"
+    if result.selected and not (extended and result.remainder_unknown):
+        return f"bampipe extend RUN {' '.join(result.selected)} --model {result.model}"
+    if wrong := [axis for axis, verdict in verdicts.items() if verdict == "no_verdict"]:
         return (
             f"{', '.join(wrong)} cannot be judged: compare the noise and resolution in"
             " session.toml with those that `bampipe ingest` measured"
         )
-    if any(a.verdict == "unknown_effect" for a in axes):
-        return f"bampipe draft RUN --model {model}"
+    if "unknown_effect" in verdicts.values():
+        return f"bampipe draft RUN --model {result.model}"
     return "nothing to add; `bampipe report RUN` writes the report"
