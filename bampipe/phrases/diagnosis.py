@@ -5,7 +5,13 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from bampipe.lists import join_names
 from bampipe.phrases.results import STANDINGS
-from bampipe.results.diagnose import AxisVerdict, DiagnoseResult, NullDistribution, WeighedSet
+from bampipe.results.diagnose import (
+    UNKNOWN,
+    AxisVerdict,
+    DiagnoseResult,
+    NullDistribution,
+    WeighedSet,
+)
 from bampipe.results.floor import FLOOR_WRONG
 from bampipe.results.rounding import significant
 
@@ -59,14 +65,14 @@ def split_sets(
     sets, known = found.sets_on(axis)[:_MOST_ALTERNATIVES], found.axes[axis].probabilities
     sets = [one for one in sets if probability(one[1]) != "< 0.01"] or sets[:1]
     if len(sets) < 2:
-        return [name for names, _ in sets for name in names if known[name] >= _SURE], sets
-    return [name for name in sets[0][0] if all(name in names for names, _ in sets[1:])], sets
+        return [n for names, _ in sets for n in names if known.get(n, 0.0) >= _SURE], sets
+    return [n for n in sets[0][0] if n in known and all(n in names for names, _ in sets)], sets
 
 
 def name_set(one: WeighedSet, mark: str = "") -> str:
     """Return the effects of a set and what is unknown beside them; ``mark`` on either side."""
     names = [f"{mark}{name}{mark}" for name in one.effects]
-    beside = [f"something unknown on {one.unknown}"] if one.unknown else []
+    beside = [f"{UNKNOWN} on {one.unknown}"] if one.unknown else []
     return join_names(names + beside) or "none"
 
 
@@ -92,13 +98,14 @@ def split_alternatives(
     common, sets = split_sets(found, axis)
     entry, parts = found.axes[axis], list[str]()
     for names, chance in sets if len(sets) > 1 else ():
-        rest = [f"{mark}{name}{mark}" for name in names if name not in common]
+        marks = {name: mark * (name != UNKNOWN) for name in names if name not in common}
+        rest = [f"{around}{name}{around}" for name, around in marks.items()]
         shown = " with ".join(rest) or ("nothing more" if common else "nothing")
         parts.append(f"{shown} ({probability(chance)})")
     if not parts:
-        doubtful = [name for names, _ in sets for name in names if name not in common]
+        doubtful = (n for names, _ in sets for n in names if n not in (*common, UNKNOWN))
         parts = [list_effects(entry, [name], mark) for name in doubtful]
-    parts = parts or [f"something unknown ({probability(entry.unknown)})"]
+    parts = parts or [f"{UNKNOWN} ({probability(entry.unknown)})"]
     parts[0] = parts[0].replace(" (", f" ({first}", 1)
     known = list_effects(entry, common, mark).replace(" (", f" ({first}", 1)
     return known, parts

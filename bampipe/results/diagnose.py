@@ -9,6 +9,8 @@ from bampipe.results.record import Names, Record, Result, Share, Size
 from bampipe.results.terms import EffectText
 from bampipe.schema import Count
 
+UNKNOWN = "something unknown"
+"""Beside effects in a set: whatever no effect of the library explains."""
 Verdict = Literal["nothing_missing", "missing", "undecided", "unknown_effect", "no_verdict"]
 UpToOne = Annotated[float, Field(le=1)]
 
@@ -165,10 +167,15 @@ class DiagnoseResult(Result):
         return {self.axes[axis].verdict for axis in self.lacking} == {"unknown_effect"}
 
     def sets_on(self, axis: str) -> list[tuple[Names, float]]:
-        """Return the sets restricted to one axis, the most probable first."""
-        known, found = self.axes[axis].probabilities, dict[Names, float]()
+        """Return the sets restricted to one axis, the most probable first.
+
+        `UNKNOWN` is a member where it is an open question whether something unknown is missing.
+        """
+        entry, found = self.axes[axis], dict[Names, float]()
+        open_question = entry.standing == "above_floor" and not entry.remains
         for one in self.sets:
-            here = tuple(name for name in known if name in one.effects)
+            here = tuple(name for name in entry.probabilities if name in one.effects)
+            here += (UNKNOWN,) * (open_question and one.unknown == axis)
             found[here] = found.get(here, 0.0) + one.probability
         return sorted(found.items(), key=lambda pair: -pair[1])
 
