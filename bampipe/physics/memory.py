@@ -8,8 +8,8 @@ import numpy as np
 
 from bampipe.arrays import Array, Flags
 
-_STEPS = (1, 3, 12, 48, 192)
-"""Steps per sample, tried in turn until a stiff state does not diverge."""
+STEPS = (1, 3, 12, 48, 192)
+"""Steps from one sample to the next, tried in turn until a stiff state does not diverge."""
 ACCURATE = 0.25
 """Largest product of a step and a state's rate for a single step per sample: the error of RK4 is
 its fifth power over 120, 8e-6."""
@@ -97,11 +97,11 @@ def _integrate(module: ModuleType, commands: Sequence[int], arrays: Sequence[Arr
         q, qd, qdd, t = (np.insert(x, at, x[at], axis=0) for x in (q, qd, qdd, t))
     out = np.empty((len(t), len(z0)))
     stiff, least = getattr(module, "stiff_memory", None), 0.0
-    for steps in _STEPS:
+    for steps in STEPS:
         if stiff is not None and max(steps, least) > STIFF_STEPS:
             stiff(q, qd, qdd, u, p, t, z0, STIFF_STEPS, out)
             break
-        if steps < least and steps < _STEPS[-1]:
+        if steps < least and steps < STEPS[-1]:
             continue
         fastest = module.memory(q, qd, qdd, u, p, t, z0, steps, out)
         enough = STABLE if steps > 1 else ACCURATE

@@ -7,7 +7,7 @@ import sympy as sp
 
 from bampipe.physics.codegen import SCALAR_HEADER, filling_function
 from bampipe.physics.equations import Equations
-from bampipe.physics.memory import ACCURATE, STABLE, STIFF_STEPS
+from bampipe.physics.memory import ACCURATE, STABLE, STEPS, STIFF_STEPS
 
 _FEWEST = 3
 """Exponential steps per sample if the decay of a state depends on the motion."""
@@ -38,7 +38,7 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
 
     Returns the largest product of a step and the rate at which a state decays in it; where that
     asks for exponential steps, or for more than one, as soon as it does, with the rest of out as
-    it was.
+    it was. Coupled states take more steps only between samples that need them.
     """
     fastest = 0.0
     n = len(z0)
@@ -47,43 +47,47 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
     a, b, c = q[0].copy(), qd[0].copy(), u[0].copy()
     out[0] = z
     for i in range(len(t) - 1):
-        h = (t[i + 1] - t[i]) / steps
-        for s in range(2 * steps):
-            share = (s + 1) / (2 * steps)
-            if s % 2 == 0:
-                memory_rate(a, b, c, p, z, k1)
-                for j in range(n):
-                    at[j] = z[j] + 0.5 * h * k1[j]
-            between(q, qd, qdd, u, i, t[i + 1] - t[i], share, a, b, c)
-            if s % 2 == 0:
-                memory_rate(a, b, c, p, at, k2)
-                for j in range(n):
-                    at[j] = z[j] + 0.5 * h * k2[j]
-                memory_rate(a, b, c, p, at, k3)
-                moved, turned = 0.0, 0.0
-                for j in range(n):
-                    moved += abs(k2[j] - k1[j])
-                    turned += abs(k3[j] - k2[j])
-                    at[j] = z[j] + 0.5 * h * k3[j]
-                if COUPLED:
-                    # Of a swing, a position turns into a rate and back: twice around tells.
-                    memory_rate(a, b, c, p, at, k4)
-                    turned = 0.0
+        for tried in TRIED:
+            z[:], a[:], b[:], c[:] = out[i], q[i], qd[i], u[i]
+            h, here = (t[i + 1] - t[i]) / tried, 0.0
+            for s in range(2 * tried):
+                share = (s + 1) / (2 * tried)
+                if s % 2 == 0:
+                    memory_rate(a, b, c, p, z, k1)
                     for j in range(n):
-                        turned += abs(k4[j] - k3[j])
-                    turned = sqrt(turned * moved)
-                for j in range(n):
-                    at[j] = z[j] + h * k3[j]
-                if 2.0 * turned > fastest * moved and turned > 1e-12 * moved:
-                    fastest = 2.0 * turned / moved
-            else:
-                memory_rate(a, b, c, p, at, k4)
-                for j in range(n):
-                    z[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
-        out[i + 1] = z
-        if steps * fastest > (FASTEST if steps > 1 else ACCURATE):
+                        at[j] = z[j] + 0.5 * h * k1[j]
+                between(q, qd, qdd, u, i, t[i + 1] - t[i], share, a, b, c)
+                if s % 2 == 0:
+                    memory_rate(a, b, c, p, at, k2)
+                    for j in range(n):
+                        at[j] = z[j] + 0.5 * h * k2[j]
+                    memory_rate(a, b, c, p, at, k3)
+                    moved, turned = 0.0, 0.0
+                    for j in range(n):
+                        moved += abs(k2[j] - k1[j])
+                        turned += abs(k3[j] - k2[j])
+                        at[j] = z[j] + 0.5 * h * k3[j]
+                    if COUPLED:
+                        # Of a swing, a position turns into a rate and back: twice around tells.
+                        memory_rate(a, b, c, p, at, k4)
+                        turned = 0.0
+                        for j in range(n):
+                            turned += abs(k4[j] - k3[j])
+                        turned = sqrt(turned * moved)
+                    for j in range(n):
+                        at[j] = z[j] + h * k3[j]
+                    if 2.0 * turned > here * moved and turned > 1e-12 * moved:
+                        here = 2.0 * turned / moved
+                else:
+                    memory_rate(a, b, c, p, at, k4)
+                    for j in range(n):
+                        z[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
+            if here < (STABLE if tried > 1 else ACCURATE):
+                break
+        out[i + 1], fastest = z, max(fastest, here)
+        if not COUPLED and steps * fastest > (FASTEST if steps > 1 else ACCURATE):
             break
-    return fastest
+    return 0.0 if COUPLED else fastest
 '''
 
 
@@ -207,10 +211,10 @@ def memory_source(e: Equations, places: Sequence[int]) -> tuple[str, dict[str, l
     if coupled or any(slope.free_symbols & set(z_all) for slope in slopes):
         groups_of = {**passed_symbols, "z": states}
         rate = filling_function("memory_rate", groups_of, {"dz": number_columns(rates)}, "")
-        fastest = "np.inf" if coupled else repr(STIFF_STEPS * STABLE)
-        head = f"import numpy as np\nFASTEST = {fastest}\nACCURATE = {ACCURATE}\n"
-        head += f"COUPLED = {coupled}\n"
-        source = SCALAR_HEADER + head + rate + BETWEEN + MEMORY_LOOP
+        head = f"import numpy as np\nFASTEST = {STIFF_STEPS * STABLE}\nACCURATE = {ACCURATE}\n"
+        head += f"STABLE = {STABLE}\nCOUPLED = {coupled}\n"
+        loop = MEMORY_LOOP.replace("TRIED", str(STEPS) if coupled else "(steps,)")
+        source = SCALAR_HEADER + head + rate + BETWEEN + loop
         if not coupled:
             results = {"slope": number_columns(slopes)}
             slope = filling_function("memory_slope", groups_of, results, "")
