@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval, polyvander
-from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.interpolate import Akima1DInterpolator, CubicSpline, PchipInterpolator
 
 from bampipe.arrays import Array, Flags
 
@@ -59,12 +59,14 @@ class UniformGrid:
         last = np.searchsorted(self.source, self.t + 1e-9, side="right") - 1
         return np.asarray(values[np.clip(last, 0, len(values) - 1)], dtype=np.float64)
 
-    def resample(self, values: Array) -> Array:
+    def resample(self, values: Array, jumps: bool = False) -> Array:
         """Return ``values`` (N,) on the grid (T,).
 
         A cubic spline is used, whose error falls with the fourth power of the sampling interval (de
         Boor 1978, A Practical Guide to Splines); across gaps by monotone cubic interpolation
-        (Fritsch and Butland 1984), which does not overshoot.
+        (Fritsch and Butland 1984), which does not overshoot. Of values with ``jumps``, such as a
+        force when friction reverses, a spline would ring: Akima's interpolation (1970, Journal of
+        the ACM 17, 589), modified, hardly does.
         """
         if self.exact:
             return np.array(values, dtype=np.float64)
@@ -73,7 +75,8 @@ class UniformGrid:
         monotone = PchipInterpolator(t, values)
         if len(t) < 4:
             return np.asarray(monotone(inside), dtype=np.float64)
-        on_grid = np.asarray(CubicSpline(t, values)(inside), dtype=np.float64)
+        curve = Akima1DInterpolator(t, values, method="makima") if jumps else CubicSpline(t, values)
+        on_grid = np.asarray(curve(inside), dtype=np.float64)
         on_grid[self.bridged] = monotone(inside[self.bridged])
         return on_grid
 

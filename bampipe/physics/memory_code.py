@@ -7,7 +7,7 @@ import sympy as sp
 
 from bampipe.physics.codegen import SCALAR_HEADER, filling_function
 from bampipe.physics.equations import Equations
-from bampipe.physics.memory import ACCURATE, STABLE, STEPS, STIFF_STEPS
+from bampipe.physics.memory import ACCURATE, STABLE, STEPS, STIFF_STEPS, TOLERANCE
 
 _FEWEST = 3
 """Exponential steps per sample if the decay of a state depends on the motion."""
@@ -30,28 +30,27 @@ def between(q, qd, qdd, u, i, h, share, x, v, w):
         w[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
 '''
 
+# Coupled states take more steps between samples where a contact opens or closes or where they are
+# stiff.
 MEMORY_LOOP = '''
 
-@njit(types.float64(M, M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
-def memory(q, qd, qdd, u, p, t, z0, steps, out):
+@njit(types.float64(M, M, M, M, V, V, V, M), cache=True, error_model='numpy')
+def memory(q, qd, qdd, u, p, t, z0, out):
     """RK4 along the samples of a motion; fills out (T, n_z).
 
-    Returns the largest product of a step and the rate at which a state decays in it; where that
-    asks for exponential steps, or for more than one, as soon as it does, with the rest of out as
-    it was. Coupled states take more steps only between samples that need them.
+    Returns 1, with the rest of out as it was, where exponential steps are called for; else 0.
     """
-    fastest = 0.0
     n = len(z0)
     k1, k2, k3, k4 = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     z, at = z0.copy(), np.empty(n)
     a, b, c = q[0].copy(), qd[0].copy(), u[0].copy()
     out[0] = z
     for i in range(len(t) - 1):
-        for tried in TRIED:
+        for steps in STEPS:
             z[:], a[:], b[:], c[:] = out[i], q[i], qd[i], u[i]
-            h, here = (t[i + 1] - t[i]) / tried, 0.0
-            for s in range(2 * tried):
-                share = (s + 1) / (2 * tried)
+            h, fastest = (t[i + 1] - t[i]) / steps, 0.0
+            for s in range(2 * steps):
+                share = (s + 1) / (2 * steps)
                 if s % 2 == 0:
                     memory_rate(a, b, c, p, z, k1)
                     for j in range(n):
@@ -76,49 +75,52 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
                         turned = sqrt(turned * moved)
                     for j in range(n):
                         at[j] = z[j] + h * k3[j]
-                    if 2.0 * turned > here * moved and turned > 1e-12 * moved:
-                        here = 2.0 * turned / moved
+                    if 2.0 * turned > fastest * moved and turned > 1e-12 * moved:
+                        fastest = 2.0 * turned / moved
                 else:
                     memory_rate(a, b, c, p, at, k4)
                     for j in range(n):
                         z[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
-            if here < (STABLE if tried > 1 else ACCURATE):
+            if fastest < (STABLE if steps > 1 else ACCURATE):
                 break
-        out[i + 1], fastest = z, max(fastest, here)
-        if not COUPLED and steps * fastest > (FASTEST if steps > 1 else ACCURATE):
-            break
-    return 0.0 if COUPLED else fastest
+            if not COUPLED:
+                return 1.0
+        out[i + 1] = z
+    return 0.0
 '''
 
 
 # If no state's rate depends on another state, steps are exact for the rate at the middle of a step,
 # linearised in its state (exponential Rosenbrock-Euler, Hochbruck and Ostermann 2010, Acta Numerica
 # 19). However stiff, it stays stable: a hysteresis over micrometres is passed many times between
-# two samples.
+# two samples. Where more steps make a difference, as at a reversal, there are more.
 STIFF_MEMORY_LOOP = '''
 
-@njit(types.float64(M, M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
-def stiff_memory(q, qd, qdd, u, p, t, z0, steps, out):
-    """Exponential steps along the samples of a motion; fills out (T, n_z).
-
-    Returns 0: however fast a state decays, such steps follow it.
-    """
+@njit(types.void(M, M, M, M, V, V, V, M), cache=True, error_model='numpy')
+def stiff_memory(q, qd, qdd, u, p, t, z0, out):
+    """Exponential steps along the samples of a motion; fills out (T, n_z)."""
     n = len(z0)
-    rate, slope = np.empty(n), np.empty(n)
+    rate, slope, coarse, largest = np.empty(n), np.empty(n), np.empty(n), np.abs(z0)
     z, x, v, w = z0.copy(), q[0].copy(), qd[0].copy(), u[0].copy()
     out[0] = z
     for i in range(len(t) - 1):
-        h = (t[i + 1] - t[i]) / steps
-        for s in range(steps):
-            share = (s + 0.5) / steps
-            between(q, qd, qdd, u, i, t[i + 1] - t[i], share, x, v, w)
-            memory_rate(x, v, w, p, z, rate)
-            memory_slope(x, v, w, p, z, slope)
+        for steps in STIFF_STEPS:
+            coarse[:], z[:] = z, out[i]
+            h = (t[i + 1] - t[i]) / steps
+            for s in range(steps):
+                between(q, qd, qdd, u, i, t[i + 1] - t[i], (s + 0.5) / steps, x, v, w)
+                memory_rate(x, v, w, p, z, rate)
+                memory_slope(x, v, w, p, z, slope)
+                for j in range(n):
+                    k = h * slope[j]
+                    z[j] += h * rate[j] * (1.0 + k / 2.0 if abs(k) < 1e-5 else (exp(k) - 1.0) / k)
+            settled = steps > 1
             for j in range(n):
-                k = h * slope[j]
-                z[j] += h * rate[j] * (1.0 + k / 2.0 if abs(k) < 1e-5 else (exp(k) - 1.0) / k)
+                largest[j] = max(largest[j], abs(z[j]))
+                settled &= abs(z[j] - coarse[j]) <= TOLERANCE * largest[j]
+            if settled:
+                break
         out[i + 1] = z
-    return 0.0
 '''
 
 
@@ -127,8 +129,8 @@ def stiff_memory(q, qd, qdd, u, p, t, z0, steps, out):
 # stable.
 LINEAR_MEMORY_LOOP = '''
 
-@njit(types.float64(M, M, M, M, V, V, V, types.int64, M), cache=True, error_model='numpy')
-def memory(q, qd, qdd, u, p, t, z0, steps, out):
+@njit(types.float64(M, M, M, M, V, V, V, M), cache=True, error_model='numpy')
+def memory(q, qd, qdd, u, p, t, z0, out):
     """Exponential steps along the samples of a motion; fills out (T, n_z).
 
     Returns 0: however fast a state decays, such steps follow it.
@@ -138,7 +140,7 @@ def memory(q, qd, qdd, u, p, t, z0, steps, out):
     z, x, v, w = z0.copy(), q[0].copy(), qd[0].copy(), u[0].copy()
     out[0] = z
     memory_terms(x, v, w, p, c0, b0)
-    steps = 1 if RAMP and len(v) == 0 else max(steps, FEWEST)
+    steps = 1 if RAMP and len(v) == 0 else FEWEST
     for i in range(len(t) - 1):
         h = (t[i + 1] - t[i]) / steps
         for s in range(steps):
@@ -211,10 +213,10 @@ def memory_source(e: Equations, places: Sequence[int]) -> tuple[str, dict[str, l
     if coupled or any(slope.free_symbols & set(z_all) for slope in slopes):
         groups_of = {**passed_symbols, "z": states}
         rate = filling_function("memory_rate", groups_of, {"dz": number_columns(rates)}, "")
-        head = f"import numpy as np\nFASTEST = {STIFF_STEPS * STABLE}\nACCURATE = {ACCURATE}\n"
-        head += f"STABLE = {STABLE}\nCOUPLED = {coupled}\n"
-        loop = MEMORY_LOOP.replace("TRIED", str(STEPS) if coupled else "(steps,)")
-        source = SCALAR_HEADER + head + rate + BETWEEN + loop
+        head = f"import numpy as np\nCOUPLED, STEPS = {coupled}, {STEPS if coupled else (1,)}\n"
+        head += f"ACCURATE, STABLE = {ACCURATE}, {STABLE}\n"
+        head += f"STIFF_STEPS, TOLERANCE = {STIFF_STEPS}, {TOLERANCE}\n"
+        source = SCALAR_HEADER + head + rate + BETWEEN + MEMORY_LOOP
         if not coupled:
             results = {"slope": number_columns(slopes)}
             slope = filling_function("memory_slope", groups_of, results, "")

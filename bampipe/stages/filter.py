@@ -471,7 +471,7 @@ def _differentiate(
     columns |= {f"qdd_{axis}": motion.acceleration for axis, motion in motions.items()}
     # Forces and other input channels, and their band-limited time derivatives.
     names = [n for n in map(str, frame.columns[2:]) if not n.startswith(("q_", "brake_"))]
-    inputs = {name: grid.resample(frame[name].to_numpy(dtype=np.float64)) for name in names}
+    inputs = {n: grid.resample(frame[n].to_numpy(dtype=np.float64), jumps=True) for n in names}
     columns |= inputs
     for name, values in inputs.items():
         columns |= zip(input_derivatives(name), kinematics.input_rates(values), strict=True)

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from bampipe.data.quality.faulty_readings import INPUT, POSITION, find_equal_runs, find_spikes
+from bampipe.data.quality.faulty_readings import (
+    INPUT,
+    POSITION,
+    find_equal_runs,
+    find_spikes,
+    find_wild_inputs,
+)
 
 T = np.arange(4000) / 500.0
 RNG = np.random.default_rng(3)
@@ -38,6 +44,21 @@ def test_wild_readings_are_found(
 )
 def test_what_machines_do_is_not_wild(values: np.ndarray, rule: tuple[float, float]) -> None:
     assert not find_spikes(values, rule).any()
+
+
+def test_friction_that_turns_with_an_axis_for_two_samples_is_not_wild() -> None:
+    position = np.sin(2.0 * T)
+    force = FORCE + 3.0 * np.sign(np.gradient(position))
+    at = int(np.argmax(T > 0.2))  # the axis moves upwards, and down for two samples
+    turned = position.copy()
+    turned[at:] -= 0.02
+    turned[at + 1 :] -= 0.02
+    pulse = force.copy()
+    pulse[at : at + 2] -= 6.0
+    assert not find_wild_inputs(pulse, [turned]).any()
+    assert np.flatnonzero(find_wild_inputs(pulse, [position])).tolist() == [at, at + 1]
+    pulse[at : at + 2] -= 60.0
+    assert np.flatnonzero(find_wild_inputs(pulse, [turned])).tolist() == [at, at + 1]
 
 
 def test_a_dead_second_is_found_and_a_controllers_kick_is_not_wild() -> None:

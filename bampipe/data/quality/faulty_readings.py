@@ -1,5 +1,7 @@
 """Readings that are none: wild ones, dead stretches, and what stands at a rail."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from bampipe.arrays import Array, Flags
@@ -77,15 +79,32 @@ def find_spikes(values: np.ndarray, rule: tuple[float, float]) -> np.ndarray:
     return wild
 
 
+def find_wild_inputs(values: Array, positions: Sequence[Array]) -> Flags:
+    """Tell which finite readings (T,) of an input are wild, (T,).
+
+    Not those of a usual size during which an axis turns back and forth: friction turns with it.
+    ``positions``: of each axis, (T,).
+    """
+    wild = find_spikes(values, INPUT)
+    runs = list(zip(*find_runs(wild), strict=True))
+    low, high = np.quantile(values[~wild], (0.01, 0.99)) if runs else (0.0, 0.0)
+    for start, stop in runs:
+        usual = np.all((low < values[start:stop]) & (values[start:stop] < high))
+        steps = [np.diff(q)[[start - 2, start - 1, stop - 2, stop]] for q in positions]
+        turns = any(x[0] * (x[1] + x[2]) < 0.0 and x[3] * (x[1] + x[2]) < 0.0 for x in steps)
+        wild[start:stop] = not (usual and turns)
+    return wild
+
+
 def interpolate_spikes(table: TrialTable) -> None:
     """Take wild readings of positions and inputs out and interpolate them, where they are few."""
-    rules = {encoder.column: POSITION for encoder in table.session.encoders}
-    rules |= dict.fromkeys(table.inputs, INPUT)
+    positions = {e.column: table.columns[e.column] for e in table.session.encoders}
+    wild_of = {column: find_spikes(values, POSITION) for column, values in positions.items()}
+    for column in table.inputs:
+        wild_of[column] = find_wild_inputs(table.columns[column], [*positions.values()])
     some = False
-    for column, rule in rules.items():
-        values = table.columns[column]
-        wild = find_spikes(values, rule)
-        if 0 < wild.sum() <= table.limits.nan_share * len(values):
+    for column, wild in wild_of.items():
+        if 0 < wild.sum() <= table.limits.nan_share * len(wild):
             some = True
             take_out(table, column, wild)
     if some:
