@@ -18,6 +18,7 @@ from bampipe.diagnosis.candidates import (
     list_candidates,
 )
 from bampipe.diagnosis.criteria import Criteria
+from bampipe.estimate.least_squares import NotFinite
 from bampipe.estimate.simulation import Runaway
 from bampipe.physics import System, compile_model
 from bampipe.physics.recipe import Recipe
@@ -280,7 +281,12 @@ class Session:
             for share in _SHARES:
                 p = evidence.p.copy()
                 p[list(evidence.free)] += share * step[:count]
-                moved = self.linearise(recipe, np.clip(p, *bounds_of(evidence.system)), evidence)
+                try:
+                    moved = self.linearise(
+                        recipe, np.clip(p, *bounds_of(evidence.system)), evidence
+                    )
+                except NotFinite:
+                    continue
                 tried = likelihood.pose(moved)
                 there = tried.solve_nuisance(count).cost
                 if there < here:
@@ -312,10 +318,10 @@ class Session:
         return Fit(recipe, evidence, flat, problem)
 
     def try_fit(self, recipe: Recipe, start: Array) -> Fit | None:
-        """`fit`; None where the model cannot be replayed."""
+        """`fit`; None where the model cannot be replayed, or has no finite residual."""
         try:
             return self.fit(recipe, start)
-        except Runaway:
+        except (Runaway, NotFinite):
             return None
 
 

@@ -34,6 +34,10 @@ Slopes = Callable[[int, Array, Sequence[int]], tuple[Sequence[int], Array]]
 their place there, and the unfiltered slopes of the residual by them (T, n_q, n)."""
 
 
+class NotFinite(InputError):
+    """The residual of a model is not a finite number."""
+
+
 @dataclass(frozen=True)
 class Stacked:
     """Residual and slopes of one trial after the low-pass.
@@ -198,7 +202,7 @@ def minimise(
 
     Raises:
         ValueError: to fit, fewer samples are clear of standstill than there are parameters.
-        InputError: the residual or its slope at ``start`` is not a finite number.
+        NotFinite: the residual or its slope at ``start`` is not a finite number.
     """
     chosen = list(range(problem.n_trials)) if trials is None else list(trials)
     p = np.array(start, dtype=float)
@@ -308,7 +312,7 @@ def _require_finite(problem: Problem, trial: int, stacked: Stacked, p: Array) ->
     else:
         return
     place = f" on trial number {trial + 1}" if problem.n_trials > 1 else ""
-    raise InputError(
+    raise NotFinite(
         f"the model gives no finite force{place} {culprit}",
         where="least squares",
         remedy="narrow the bounds of the newest effect's parameters, or change their priors",
