@@ -87,6 +87,8 @@ class SetCosts:
         self._scale_without: dict[str, tuple[dict[int, Array], Array]] = {}
         self.applied = [max(float(f @ f), 1e-300) for f in p.likelihood.applied]
         self._weight = p.independent / np.maximum(self.yy, 1e-300)
+        # Columns have the noise of the measured force: they scale or filter that in the residual.
+        self._moves_noise = True
         grid = [key for name in dictionary.candidates for key in dictionary.grid(name)]
         self.ensure(grid)
         places = {key: atom for key in grid if (atom := self.atoms[key]) is not None}
@@ -136,6 +138,7 @@ class SetCosts:
         p, noise = self.p, self.p.likelihood.noise
         rows = zip(noise.residuals, p.likelihood.root, strict=True)
         other.p = replace(p, y=tuple(r[replay] * root for r, root in rows))
+        other._moves_noise = False
         other.by = np.array([b.T @ y for b, y in zip(p.base, other.p.y, strict=True)])
         other.yy = np.array([float(y @ y) for y in other.p.y])
         other.xy = [x.T @ y for x, y in zip(self.columns, other.p.y, strict=True)]
@@ -353,7 +356,9 @@ class SetCosts:
         """
         means = np.array([float(r.mean()) if len(r) else 0.0 for r in rows])
         left = self.dictionary.evidence.log_scale[0] + means
-        return None if (left < np.log(_LEAST_SLOPE)).any() else self.p.independent * means
+        if (left < np.log(_LEAST_SLOPE)).any():
+            return None
+        return self.p.independent * means * self._moves_noise
 
     def _log_slopes(
         self, keys: Sequence[Key], strengths: Sequence[Array], scale: Array
