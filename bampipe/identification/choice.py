@@ -30,7 +30,7 @@ from bampipe.physics import System
 from bampipe.results.identify import Method, MethodTried, MethodValue
 from bampipe.results.rounding import round_with_sd, significant
 from bampipe.trials.motion import Motion, trial_sizes
-from bampipe.trials.replay import steps_to_follow
+from bampipe.trials.replicates import steps_to_follow
 
 MOST_EVALUATIONS = 2e7
 """Most evaluations of the model by all sigma points on all trials: about five seconds per pass."""

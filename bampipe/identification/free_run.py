@@ -26,7 +26,7 @@ from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.results.ingest import IngestResult
 from bampipe.results.validate import AxisDrift, CommandError, Drift, FreeRun, FreeRunError
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import is_stiff
+from bampipe.trials.replicates import is_stiff
 
 CLOSED: Final = "closed_loop"
 OPEN: Final = "open_loop"

@@ -14,7 +14,7 @@ from bampipe.physics import System
 from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import read_by_sensors
+from bampipe.trials.replicates import read_by_sensors
 from bampipe.trials.sensors import Sensors
 
 _SPEED_SPREAD, _RANGE_SPREAD, _TURN_SPREAD, _DRIFT_SHARE = 0.2, 0.15, 0.1, 0.05

@@ -1,4 +1,4 @@
-"""Which trials a fit may see, which are left out together, and which count in the verdict."""
+"""How trials are divided: those a fit may see, groups left out together, and those judged."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 HELD_OUT = -1
-"""Group of the trials that the session holds out."""
+"""Group number of trials that the session holds out."""
 MOST_GROUPS = 10
-"""With more trials than this, they are left out in so many groups: the cost of leaving each out
-alone grows with the square of their number."""
+"""Largest number of groups left out in turn: the cost grows with its square."""
 
 
 @dataclass(frozen=True)
@@ -17,8 +16,8 @@ class Folds:
     """How the trials of a session are held out.
 
     Attributes:
-        groups: number of the group of each trial; those of a group are left out together, those
-            in `HELD_OUT` are never fitted.
+        groups: group number of each trial. The trials of a group are left out together; those in
+            `HELD_OUT` are never fitted.
         fitted: whether a fit may see each trial.
         judged: whether each trial counts in the held-out error.
     """
@@ -29,7 +28,7 @@ class Folds:
 
     @classmethod
     def of_groups(cls, groups: Sequence[int], fitted: Sequence[bool]) -> Folds:
-        """Judge by the trials that the session holds out, else by all in turn."""
+        """Judge the model by the trials that the session holds out; if there are none, by all."""
         held = [group == HELD_OUT for group in groups]
         return cls(tuple(groups), tuple(fitted), tuple(held) if any(held) else (True,) * len(held))
 
@@ -37,7 +36,7 @@ class Folds:
     def of_trials(
         cls, names: Sequence[str], held_out: Collection[str], fitted: Collection[str]
     ) -> Folds:
-        """Leave each trial out alone, or in `MOST_GROUPS` groups where there are more."""
+        """Give each trial a group of its own, or divide them into `MOST_GROUPS` groups."""
         groups = [
             HELD_OUT if name in held_out else number % MOST_GROUPS
             for number, name in enumerate(names)
@@ -45,7 +44,7 @@ class Folds:
         return cls.of_groups(groups, [name in fitted for name in names])
 
     def subset(self, trials: Sequence[int]) -> Folds:
-        """The same of some trials, given by number."""
+        """The division of some of the trials, given by number."""
         return Folds(
             tuple(self.groups[k] for k in trials),
             tuple(self.fitted[k] for k in trials),
@@ -54,10 +53,10 @@ class Folds:
 
     @property
     def fitted_trials(self) -> list[int]:
-        """Numbers of the trials that a fit sees."""
+        """Numbers of the trials that a fit may see."""
         return [k for k, fits in enumerate(self.fitted) if fits]
 
     @property
     def nothing_held_out(self) -> bool:
-        """Whether there is one group only, so that the error is that of the fit."""
+        """Whether all trials are in one group, so that the held-out error is that of the fit."""
         return len(set(self.groups)) == 1

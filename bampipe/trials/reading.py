@@ -1,4 +1,4 @@
-"""Trials of a run folder as motions: which there are, and which of them a fit may see."""
+"""Reads the trials of a run folder as motions, and their sensors, filters and band."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,26 +24,26 @@ KINEMATICS = "filter/kinematics.parquet"
 
 
 def read_sensors(run: RunFolder, system: System) -> Sensors:
-    """Return the sensors that ingest settled, in the order of the model."""
+    """Return the sensors that `ingest` determined, axes and forces in the order of the model."""
     return Sensors.from_result(
         run.read(IngestResult), system.coordinates, system.model.device.forces
     )
 
 
 def read_kinematics(run: RunFolder, system: System) -> Kinematics:
-    """Return the filters that the trials went through, in the order of the model."""
+    """Return the filters of the session, axes in the order of the model."""
     return Kinematics.from_result(run.read(FilterResult), system.coordinates)
 
 
 def read_band(run: RunFolder, system: System) -> Band:
-    """Return the band in which residuals are compared, in the order of the model."""
+    """Return the band in which residuals are compared, axes in the order of the model."""
     found = run.read(FilterResult)
     cutoffs = tuple(found.axes[axis].band.cutoff_hz for axis in system.coordinates)
     return Band(found.sample_rate_hz, cutoffs)
 
 
 def held_out_trials(run: RunFolder) -> frozenset[str]:
-    """Return the trials that the session holds out: never fitted, only for judging."""
+    """Return the trials that the session holds out: never fitted, used only for validation."""
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
     if "hold_out" not in trials:
         return frozenset()
@@ -54,9 +54,8 @@ def free_trials(run: RunFolder, *, fitted: bool = False, braked: bool = False) -
     """Return the free trials that were differentiated, in the order of the session.
 
     Args:
-        fitted: without those that the session holds out.
-        braked: those in a viscous field too, after the others: a lag of the brakes, say, shows
-            in no other.
+        fitted: leave out the trials that the session holds out.
+        braked: append the trials in a viscous field: only these show effects of the brakes.
 
     Raises:
         InputError: there is none.
@@ -90,10 +89,10 @@ def read_motion(
     """Read one trial of a table of kinematics.
 
     Args:
-        system: the model, whose inputs and their first time derivatives are read.
-        disturbances: of the trial, which are left out; filters: that it went through.
-        every_input: every input of its device too, with all time derivatives: what an effect
-            that is not in the model may need.
+        system: the model, whose inputs are read with their first time derivatives.
+        disturbances: stretches of the trial that do not count; filters: those of the session.
+        every_input: read every input of the device with all time derivatives, since effects that
+            are not in the model may need them.
 
     Raises:
         InputError: the file or a column that the model needs is missing.
@@ -149,7 +148,7 @@ def read_motions(
 
     Args:
         fitted, braked: as in :func:`free_trials`; every_input: as in :func:`read_motion`.
-        late_s: time by which inputs were sampled after positions, taken off.
+        late_s: delay of the inputs' sampling behind the positions', which is compensated, s.
 
     Raises:
         InputError: there is none, and as :func:`read_motion`.
@@ -169,7 +168,7 @@ def require_sound_motions(system: System, motions: Sequence[Motion]) -> None:
     """Refuse trials on which the equations of motion cannot be solved.
 
     Raises:
-        InputError: the mass matrix is singular at a pose of a trial, or a force no number there.
+        InputError: in a pose of a trial, the mass matrix is singular or a force is not finite.
     """
     for motion in motions:
         require_sound(
@@ -196,11 +195,11 @@ def read_samples(run: RunFolder, trial_id: str, system: System) -> dict[str, Arr
 def input_columns(
     columns: Mapping[str, Array], names: Sequence[str], brakes: Mapping[str, str]
 ) -> Array:
-    """Return inputs of a model as columns (T, n_u) of raw samples.
+    """Return the inputs of a model as columns (T, n_u), from raw samples.
 
     Args:
         columns: t, force_<c>, brake_<axis>, ...; a brake without a column was off.
-        names: inputs of the model; brakes: input that is the brake command, by axis.
+        names: inputs of the model; brakes: name of the brake command of each axis.
 
     Raises:
         InputError: an input has no column.
