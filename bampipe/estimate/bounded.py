@@ -66,8 +66,8 @@ def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> A
     Parker (1995), which also releases a coefficient from a bound.
 
     Args:
-        normal: (n, n) slope^T slope; moment: (n,) slope^T measured, whatever the weights.
-        lower, upper: (n,), infinite without a bound, equal for a given coefficient.
+        normal: (n, n) slope^T slope; moment: (n,) slope^T measured, with any weights.
+        lower, upper: (n,), infinite without a bound, equal for a fixed coefficient.
     """
     quick = _solve_definite(normal, moment, lower, upper)
     if quick is not None:
@@ -147,7 +147,7 @@ def _solve_definite(normal: Array, moment: Array, lower: Array, upper: Array) ->
 
 
 class Iterate(Protocol):
-    """A point that a nonlinear fit has reached; never changed, only followed by others."""
+    """A point that a nonlinear fit has reached; immutable."""
 
     @property
     def value(self) -> Array:
@@ -161,7 +161,7 @@ class Iterate(Protocol):
         """Return slope^T slope (n, n) and minus slope^T residual (n,), linearised here."""
 
     def moved(self, value: Array, share: float) -> Self:
-        """Return the point at ``value``, which is that ``share`` of a full step away."""
+        """Return the point at ``value``, reached by that ``share`` of a full step."""
 
 
 Point = TypeVar("Point", bound=Iterate)
@@ -172,12 +172,10 @@ def descend(
 ) -> Point:
     """Take Gauss-Newton steps within bounds, each halved until the cost does not rise.
 
-    Returns the point where they end.
-
     Args:
         start: where to start, within the bounds.
         lower, upper: (n,) bounds of the parameters.
-        most_iterations: the most steps.
+        most_iterations: largest number of steps.
         tolerance: change of the cost below which the descent has converged.
     """
     at = start

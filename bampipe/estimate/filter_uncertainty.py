@@ -17,9 +17,9 @@ from bampipe.estimate.unscented import Stored
 _BLOCKS = 3
 """Fewest blocks per parameter: the scores of fewer hardly scatter, because they add up to zero."""
 _ROUNDS, _STEPS = 2, 12
-"""Most passes of a search over all noise levels, and steps of one level in one pass."""
+"""Largest number of passes over all noise levels, and of steps of one level in one pass."""
 _SILENT = 1e-20
-"""Share of the filter's variance below which a parameter has no score in any block."""
+"""Fraction of the filter's variance below which no block has information on a parameter."""
 
 
 def sandwich_covariance(
@@ -72,17 +72,17 @@ def choose_block(seconds: Sequence[float], parameters: int, longest_s: float) ->
     """Return the shortest block length, s, that gives enough blocks for a sandwich.
 
     Args:
-        seconds: length of each trial, of which the last block takes what is left over.
-        parameters: number of those estimated. longest_s: the length for long trials.
+        seconds: length of each trial; its last block takes the rest.
+        parameters: number of estimated parameters. longest_s: the length for long trials.
     """
     return min(longest_s, sum(seconds) / (_BLOCKS * parameters + len(seconds)))
 
 
 def at_block_ends(trial: Stored, block_s: float) -> Stored:
-    """Return what is stored of a trial where blocks of time end; the last sample ends one.
+    """Return the stored distributions of a trial at the ends of blocks of time.
 
     Args:
-        trial: filtered; block_s: shortest length of a block, s; the last takes the rest.
+        trial: filtered; block_s: shortest length of a block, s; the last one takes the rest.
     """
     t = trial.t
     count = max(1, int((t[-1] - t[0]) / block_s))
@@ -105,7 +105,7 @@ def climb(
     Returns:
         (k,) best logarithms, and the likelihood there.
     """
-    likely = cache(lambda *levels: log_likelihood(np.array(levels)))  # a pass meets some again
+    likely = cache(lambda *levels: log_likelihood(np.array(levels)))  # passes repeat some points
     best, value = start.copy(), likely(*start)
     for _ in range(_ROUNDS):
         before = value

@@ -17,10 +17,10 @@ from bampipe.arrays import Array
 from bampipe.estimate.bounded import scaled_eigenbasis
 
 _WEAK, _SMALLEST_PART = 0.1, 0.3
-"""Eigenvalue of the information scaled to a unit diagonal below which a direction is weak, and
-share of the largest part of it below which a parameter is left out."""
+"""A direction of the information, scaled to a unit diagonal, is weak if its eigenvalue is below the
+first number; parameters whose part in it is below this fraction of the largest are not named."""
 _LEAST_NOISE = 1e-12
-"""Least noise at any frequency, as a share of the mean over frequencies."""
+"""Smallest noise at any frequency, relative to the mean over frequencies."""
 
 
 def residual_spectrum(
@@ -34,13 +34,13 @@ def residual_spectrum(
 ) -> Array:
     """Return the spectrum of sensor noise in the residual, (count // 2 + 1, n_q).
 
-    In squared units of the residual a sample, at the frequencies of a real discrete Fourier
+    It is in squared units of the residual per sample, at the frequencies of a real discrete Fourier
     transform of ``count`` samples.
 
     Args:
-        count: samples; rate_hz: of them.
-        inertia, damping, stiffness: (n_q,) of each axis: noise of a position reading acts through
-            them.
+        count: number of samples; rate_hz: their rate.
+        inertia, damping, stiffness: (n_q,) of each axis, through which noise of a position reading
+            acts.
         reading_sd: (n_q,) of a position reading; force_sd: (n_q,) of the generalised force, zero
             on an axis that nothing drives.
     """
@@ -106,10 +106,10 @@ class Weak:
     """A direction in which parameters can move at little cost, because their effects cancel.
 
     Attributes:
-        members: places of the parameters that move, largest part first.
-        parts: (len(members),) by how much each moves, in its own standard deviations with all
+        members: indices of the parameters that move, largest part first.
+        parts: (len(members),) how far each moves, in units of its standard deviation with all
             others known; the largest is 1.
-        strength: share of information that is left in this direction, 0 to 1.
+        strength: fraction of the information that is left in this direction, 0 to 1.
     """
 
     members: tuple[int, ...]
@@ -131,7 +131,7 @@ def weak_directions(matrix: Array) -> list[Weak]:
 
 
 def growth_without(parts: Sequence[Array]) -> Array:
-    """Return the relative growth of each parameter's bound without each trial, (trials, n).
+    """Return the relative growth of each parameter's bound if a trial is left out, (trials, n).
 
     Args:
         parts: by trial, (n, n) information.

@@ -1,4 +1,4 @@
-"""Zero-phase low-pass of many columns at a few kept samples: the inner loop of every comparison."""
+"""Zero-phase low-pass of many columns, evaluated at few samples: the inner loop of comparisons."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
