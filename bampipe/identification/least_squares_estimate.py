@@ -304,9 +304,9 @@ def fit_squares(
             if number > 1 and gain < _SETTLED:
                 break
     if found is None:
-        alike = session.fit_plainly(recipe, begun)
-        alike = _with_values(alike, trials, problem, block_s)
-        found = replace(alike, has_replicates=False)
+        plain_fit = session.fit_plainly(recipe, begun)
+        squares = _with_values(plain_fit, trials, problem, block_s)
+        found = replace(squares, has_replicates=False)
     return found
 
 

@@ -68,7 +68,7 @@ class Envelope:
         usual: median position, (n_q,).
         speed: (n_q,), rad/s or m/s; acceleration: (n_q,), per s squared.
         field: brake command over speed in the viscous trials by axis, (n_q,); zero without them.
-        levels: lowest, usual and highest value of each further channel.
+        levels: low, median and high value of each further channel.
         wider: the wider envelope that the device allows; None if it allows nothing more.
     """
 

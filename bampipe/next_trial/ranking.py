@@ -1,4 +1,4 @@
-"""Ranking of designs: followed exactly, in other surroundings, and roughly, as people do."""
+"""Ranking of designs, as followed exactly, in other surroundings, and roughly by people."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,7 @@
-"""A design as the fitted model would record it: prescribed motion and the force that it needs.
+"""Simulation of a design by the fitted model: prescribed motion and the force that it requires.
 
-People follow a sentence roughly: each version of a design has its own speeds, turns and drift. It
-passes through the sensors and filters of the session.
+People follow a sentence roughly, so each version of a design has its own speeds, turns and drift.
+The result passes the sensors and filters of the session.
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Typed configuration of a stage, from settings in a file or on the command line."""
+"""Configuration of a stage, from settings in a file or on the command line."""
 
 import dataclasses
 import tomllib
@@ -41,7 +41,7 @@ def plain(config: object) -> dict[str, object]:
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
-    """Return name and value of ``name=value``; the value is read as TOML, else taken as text.
+    """Return name and value of ``name=value``; the value is read as TOML, or else as text.
 
     Raises:
         InputError: there is no ``=``.

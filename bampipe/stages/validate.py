@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender
-from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_recipe
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session
 from bampipe.errors import InputError
@@ -70,7 +70,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     """Compare one identified model with all free trials, and those in a viscous field."""
     model = load_model(run, config.model)
     system = compile_model(model)
-    p = identified(run, config.model, system)
+    p = read_estimate(run, config.model, system)
     estimates = run.read(IdentifyResult, config.model)
     trials = read_measured_trials(run, system, timing=estimates.input_timing)
     require_sound_motions(system, trials.motions)

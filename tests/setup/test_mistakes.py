@@ -128,7 +128,7 @@ def test_a_device_without_a_scale_is_refused(tmp_path: Path) -> None:
         "joint.toml",
     )
     used = set_text(r"torque_per_ampere\*current", "gain*torque_per_ampere*current", "joint.toml")
-    with pytest.raises(bampipe.InputError, match="the scale of its equation is undetermined: with"):
+    with pytest.raises(bampipe.InputError, match="the scale of its equation is undetermined"):
         inspected(tmp_path, free, used)
 
 
