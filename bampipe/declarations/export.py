@@ -45,11 +45,9 @@ FORMS: tuple[Form, ...] = get_args(Form)
 def export_model(run: RunFolder, name: str, form: Form) -> str:
     """Return the model called ``name`` of a run folder as text.
 
-    Args:
-        run: the run folder; name: name of the model.
-        form: json for device, parameters and uncertainties; urdf for the robot's own URDF with
-            identified bodies and joint friction; mjcf for these and the drives' inertia, for
-            MuJoCo; python or c for a self-contained function of inverse dynamics.
+    ``form`` is json for device, parameters and uncertainties; urdf for the robot's own URDF with
+    identified bodies and joint friction; mjcf for these and the drives' inertia, for MuJoCo; python
+    or c for a self-contained function of inverse dynamics.
 
     Raises:
         InputError: the model is not identified, or cannot be written in this form.
@@ -203,11 +201,7 @@ def _drive_inertia(system: System, p: Array) -> Array:
 
 
 def _robot(run: RunFolder, system: System) -> Robot:
-    """Return the robot of a device.
-
-    Raises:
-        InputError: the device is not a robot.
-    """
+    """Return the robot of a device; raise `InputError` if the device is not a robot."""
     device = system.model.device
     if device.robot is None:
         others = (f for f in FORMS if f not in ("urdf", "mjcf"))

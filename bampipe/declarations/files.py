@@ -21,13 +21,9 @@ from bampipe.physics.units import check_device, check_effect
 
 
 def read_device(text: str) -> tuple[Mapping[str, Any], str]:
-    """Return the declaration of a built-in device, or of the device file at the path ``text``.
+    """Read the built-in device, or the device file at the path, that ``text`` names.
 
-    Returns:
-        The parsed file, and its name in messages.
-
-    Raises:
-        InputError: there is neither.
+    Returns its declaration and its name in messages; raises `InputError` if there is neither.
     """
     if text.endswith(".toml") or Path(text).is_file():
         return read_device_file(Path(text)), text
@@ -35,10 +31,9 @@ def read_device(text: str) -> tuple[Mapping[str, Any], str]:
 
 
 def read_effect(text: str) -> Mapping[str, Any]:
-    """Return the declaration of the effect file at the path ``text``, or of a built-in effect.
+    """Read the declaration of a built-in effect, or of the effect file at the path ``text``.
 
-    Raises:
-        InputError: there is neither.
+    Raises `InputError` if there is neither.
     """
     if text.endswith(".toml") or Path(text).is_file():
         return read_toml(Path(text))
@@ -46,15 +41,9 @@ def read_effect(text: str) -> Mapping[str, Any]:
 
 
 def device_faults(declaration: Mapping[str, Any], where: str) -> tuple[str, list[str]]:
-    """Derive the equations of motion of a device file, and find its faults.
+    """Derive the equations of motion of a device file, named ``where`` in messages.
 
-    Args:
-        declaration: the parsed file.
-        where: its name in messages.
-
-    Returns:
-        The equations as text of several lines, empty if they cannot be derived; and one line per
-        fault.
+    Returns them as text of several lines, empty if they cannot be derived, and one line per fault.
     """
     if found := schema.faults(Device, declaration, where):
         return "", [str(fault) for fault in found]
@@ -75,16 +64,10 @@ def device_faults(declaration: Mapping[str, Any], where: str) -> tuple[str, list
 def effect_faults(
     declaration: Mapping[str, Any], where: str, device: Device, target: str = ""
 ) -> tuple[list[str], list[str]]:
-    """Find the targets of an effect file on ``device``, and its faults.
+    """Find the targets of an effect file, named ``where`` in messages, on ``device``.
 
-    Args:
-        declaration: the parsed file.
-        where: its name in messages.
-        device: the device on which it is tried.
-        target: axis, force component or pair; "" for all that make sense.
-
-    Returns:
-        The names ``effect[:target]`` that were tried, and one line per fault.
+    ``target`` is an axis, force component or pair; "" tries all that make sense. Returns the names
+    ``effect[:target]`` that were tried, and one line per fault.
     """
     if faults := schema.faults(Effect, declaration, where):
         return [], [str(fault) for fault in faults]

@@ -64,11 +64,7 @@ def read_recipe(run: RunFolder, name: str, model: Model) -> Recipe:
 def read_estimate(run: RunFolder, name: str, system: System) -> NDArray[np.float64]:
     """Return the parameters of the model called ``name``, (n_p,), fixed ones at their prior.
 
-    Args:
-        run: the run folder; system: the compiled model.
-
-    Raises:
-        InputError: the model has not been identified, or has changed since.
+    Raises `InputError` if the model has not been identified, or has changed since.
     """
     found = run.read(IdentifyResult, name).parameters
     p = system.prior

@@ -71,11 +71,7 @@ class Recording:
 
 
 def gather_recording(run: RunFolder) -> Recording:
-    """Gather the content of a run folder for a viewer.
-
-    Raises:
-        InputError: no model has been validated.
-    """
+    """Gather the content of a run folder; raise `InputError` if no model has been validated."""
     session = run.read(IngestResult)
     models = sorted(
         (Path(path).parent.name for path in run.glob("models/*/residuals.parquet")),

@@ -17,13 +17,8 @@ def zero_phase(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, 
     """Return ``values`` (T,) low-passed forwards and backwards, and its two derivatives, each (T,).
 
     The derivatives are central differences of fourth order, which follow the true derivative to
-    0.1 % up to 6 % of the sampling rate (the common two-point difference loses 2 % there).
-
-    Args:
-        values: samples on a uniform grid.
-        rate_hz: sampling rate, Hz.
-        cutoff_hz: half-power frequency of one pass, Hz, where both passes together transmit half
-            of the amplitude.
+    0.1 % up to 6 % of the sampling rate (the common two-point difference loses 2 % there). At
+    ``cutoff_hz``, the half-power frequency of one pass, both passes transmit half of the amplitude.
     """
     x, added = _low_passed(values, rate_hz, cutoff_hz)
     inner = np.arange(added, added + len(values))

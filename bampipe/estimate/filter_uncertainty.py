@@ -96,14 +96,9 @@ def climb(
     """Maximise a likelihood over a few noise levels, one at a time, by doubling steps.
 
     Noise levels matter by their order of magnitude, so a coarse grid is enough: every coordinate
-    moves by its step while the likelihood rises, first up, then down.
-
-    Args:
-        log_likelihood: of the logarithms of the levels (k,); minus infinity where it fails.
-        start: (k,) logarithms; step: (k,) by how much to try; lower: (k,) least values.
-
-    Returns:
-        (k,) best logarithms, and the likelihood there.
+    moves by its step while the likelihood rises, first up, then down. ``log_likelihood``, minus
+    infinity where it fails, takes logarithms (k,), as are ``start``, ``step`` and the ``lower``
+    bounds. Returns the best logarithms (k,) and the likelihood there.
     """
     likely = cache(lambda *levels: log_likelihood(np.array(levels)))  # passes repeat some points
     best, value = start.copy(), likely(*start)

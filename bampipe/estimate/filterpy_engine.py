@@ -34,11 +34,9 @@ def filter_trials_by_filterpy(
     settings: FilterSettings,
     advance: Callable[..., None] = runge_kutta,
 ) -> FilterOutcome:
-    """Filter trials in sequence, as `unscented.filter_trials` does; same arguments and result.
+    """Filter trials as `unscented.filter_trials` does, with the same arguments and result.
 
-    Args:
-        model, trials, theta, covariance, settings: as there.
-        advance: carries one point over an interval, with the arguments of `runge_kutta`.
+    ``advance`` carries one point over an interval, with the arguments of `runge_kutta`.
 
     Raises:
         FilterFailure: the covariance lost positive definiteness.

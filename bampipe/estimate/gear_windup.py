@@ -54,9 +54,9 @@ def find_windup(
     velocity. Each trial has its own offset, since the zeros of two encoders differ.
 
     Args:
-        difference: by trial, (T,), second reading minus first, rad or m.
-        load: generalised force of the drive; rate: velocity of the axis; both at the same evenly
-            spaced samples.
+        difference: by trial, (T,), second reading minus first, rad or m; the samples, as those of
+            ``load``, the drive's generalised force, and ``rate``, the axis' velocity, are evenly
+            spaced.
         rotor_known: whether ``load`` excludes the force on the drive's inertia; otherwise that is
             estimated, which leaves little information on an axis without weight.
 

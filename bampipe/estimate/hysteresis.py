@@ -179,7 +179,6 @@ def _regression(
     """Regress deflection on torque, with an intercept for each branch.
 
     Args:
-        branches: the branches to fit.
         noise_sd: standard deviation of the torque at a count change.
         window: first and last travel of the points used.
         decay: length, in torque, of an exponential approach to the straight line, which is fitted
@@ -262,10 +261,7 @@ def energy_lost(torque: Array, deflection: Array, stiffness: float) -> float:
 def measure_hysteresis(torque: Array, deflection: Array, rate_hz: float) -> Hysteresis:
     """Return the stiffness of a locked axis from its load cycles.
 
-    Args:
-        torque: generalised force on the axis, (T,), N.m or N.
-        deflection: encoder reading, (T,), rad or m.
-        rate_hz: sampling rate, Hz.
+    The generalised force on the axis, N.m or N, and the encoder reading, rad or m, are (T,).
 
     Raises:
         ValueError: fewer than two whole branches, or too few encoder counts to fit a line.

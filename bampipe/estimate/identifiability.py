@@ -71,13 +71,9 @@ def information(slope: Array, spectrum: Array) -> Array:
 
 
 def cramer_rao_bound(matrix: Array) -> Array:
-    """Return the Cramér-Rao bound, the inverse of the information; infinite in its null space.
+    """Return the Cramér-Rao bound, the inverse of the information ``matrix`` (n, n).
 
-    Args:
-        matrix: (n, n), symmetric, not negative.
-
-    Returns:
-        (n, n) covariance; rows and columns of parameters in the null space are infinite.
+    The matrix is symmetric and not negative; parameters in its null space have an infinite bound.
     """
     scale, value, vector, null = scaled_eigenbasis(matrix)
     inverse = (vector[:, ~null] / value[~null]) @ vector[:, ~null].T / np.outer(scale, scale)
@@ -90,11 +86,8 @@ def cramer_rao_bound(matrix: Array) -> Array:
 def undetermined_covariance(matrix: Array, prior_sd: Array) -> Array:
     """Return the prior covariance (n, n) given all combinations that the data determine.
 
-    The parameters are independent in the prior.
-
-    Args:
-        matrix: (n, n) information, symmetric, not negative.
-        prior_sd: (n,) positive.
+    The information ``matrix`` (n, n) is symmetric and not negative; in the prior, parameters are
+    independent, with positive standard deviations (n,).
     """
     scale, _, vector, null = scaled_eigenbasis(matrix)
     free = vector[:, null] / scale[:, None]

@@ -355,13 +355,9 @@ def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
 
 
 def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]:
-    """Apply `smooth` to a complete signal: position, rate and acceleration, each (T,).
+    """Apply `smooth` to a signal without gaps: position, rate and acceleration, each (T,).
 
     This takes a tenth of the time, because no variances are computed.
-
-    Args:
-        signal: (T,) on the uniform grid of ``model.rate_hz``, without gaps.
-        model: motion and noise.
     """
     step, _ = transition(model.order)
     y = np.ascontiguousarray(signal, dtype=np.float64)

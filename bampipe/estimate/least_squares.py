@@ -17,7 +17,7 @@ import numpy as np
 
 from bampipe.arrays import Array, Flags, Indices
 from bampipe.errors import InputError
-from bampipe.estimate.bounded import descend, invert_scaled
+from bampipe.estimate.bounded import invert_scaled, solve_bounded
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
 
@@ -27,6 +27,8 @@ third: 95 % intervals covered 89 % of 320 parameters of independently simulated 
 number, 93 % of 163 on other seeds."""
 _LEAST_STEP = 1e-8
 """Finite difference relative to the parameter: half the digits of a number."""
+_SMALLEST_SHARE = 1e-3
+"""Fraction of a Gauss-Newton step at which its halving ends."""
 Residual = Callable[[int, Array], Array]
 """residual(trial, p) -> (T, n_q): unfiltered residual of one trial for parameters p (np,)."""
 Slopes = Callable[[int, Array, Sequence[int]], tuple[Sequence[int], Array]]
@@ -109,15 +111,10 @@ class Problem:
 def residual_and_slopes(
     problem: Problem, trial: int, p: Array, columns: Sequence[int] | None = None
 ) -> tuple[Array, Array]:
-    """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n).
+    """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n) at ``p`` (np,).
 
-    Slopes that the model does not supply are finite differences.
-
-    Args:
-        problem: the model as residuals.
-        trial: index of the trial.
-        p: (np,) parameters at which to take them; differences are forward, backward at a bound.
-        columns: free parameters by which to take slopes, by number; all by default.
+    Slopes that the model does not supply are finite differences, forward, or backward at a bound.
+    ``columns`` are the free parameters by which slopes are taken, by number; all by default.
     """
     base = problem.residual(trial, p)
     chosen = range(problem.free.size) if columns is None else columns
@@ -146,11 +143,7 @@ def stacked_residual(
 ) -> Stacked:
     """Low-pass and thin the residual of one trial and its slope by every free parameter.
 
-    Args:
-        problem: the model as residuals.
-        trial: index of the trial.
-        p: (np,) parameters at which to linearise.
-        known: slopes that remain valid.
+    It is linearised at ``p`` (np,); slopes in ``known`` remain valid.
     """
     fresh = np.arange(problem.free.size) if known is None else np.flatnonzero(~known.holds)
     base, slopes = residual_and_slopes(problem, trial, p, [int(k) for k in fresh])
@@ -244,6 +237,7 @@ class Linearised:
         return (float(np.sum(count * scatter)) + prior - volume) / max(float(np.mean(count)), 1.0)
 
     def normal_equations(self) -> tuple[Array, Array]:
+        """Return slope^T slope (n, n) and minus slope^T residual (n,), weighted by axis."""
         weight = 1.0 / np.maximum(_scatter(self.stacked), 1e-300)
         n_free = self.problem.free.size
         precision = self.problem.precision
@@ -254,7 +248,8 @@ class Linearised:
             moment -= slope.T @ (s.residual * weight).reshape(-1)
         return normal, moment
 
-    def moved(self, value: Array, share: float) -> Linearised:
+    def moved(self, value: Array) -> Linearised:
+        """Return the trials linearised at the free parameters ``value``, (n_free,)."""
         p = self.p.copy()
         p[self.problem.free] = value
         if self.problem.linear:
@@ -272,6 +267,29 @@ class Linearised:
         return replace(self, p=p, stacked=stacked)
 
 
+def descend(
+    start: Linearised, lower: Array, upper: Array, most_iterations: int, tolerance: float = 1e-10
+) -> Linearised:
+    """Take Gauss-Newton steps within bounds (n,), each halved until the cost does not rise.
+
+    The descent has converged if the cost changes by less than ``tolerance``.
+    """
+    at = start
+    for _ in range(most_iterations):
+        step = solve_bounded(*at.normal_equations(), lower - at.value, upper - at.value)
+        share = 1.0
+        while True:
+            tried = at.moved(np.clip(at.value + share * step, lower, upper))
+            gained = at.cost - tried.cost
+            if gained >= 0.0 or share < _SMALLEST_SHARE:
+                break
+            share /= 2.0
+        at = tried if gained >= 0.0 else at
+        if not gained >= tolerance:
+            break
+    return at
+
+
 def _factors(problem: Problem) -> list[tuple[int, int]]:
     """Indices of the free parameters that multiply the measurement, each with its axis."""
     if problem.multiplied is None:
@@ -283,11 +301,7 @@ def as_measured(problem: Problem, p: Array, stacked: Iterable[Stacked]) -> Itera
     """Yield trials with slopes of the residual divided by its axis' factor, times that factor.
 
     These slopes are zero along a proportional change of all parameters of an axis, whose scale the
-    residual does not determine.
-
-    Args:
-        problem: says which parameters are factors; p: (np,) where it is linearised.
-        stacked: the trials, linearised there.
+    residual does not determine. The trials are linearised at ``p`` (np,).
     """
     factors = _factors(problem)
     for s in stacked:

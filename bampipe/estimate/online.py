@@ -55,11 +55,8 @@ class OnlineFilter:
     def advance(self, t: Array, u: Array, y: Array) -> FilteredTrial:
         """Take samples; the first one of all only sets the time.
 
-        Args:
-            t: (T,) s, increasing; u: (T, nu) inputs; y: (T, ny) readings, NaN where missing.
-
-        Returns:
-            The innovations of these samples, and the distribution at the first one.
+        Times ``t`` (T,), s, increase; inputs are (T, nu), readings (T, ny), NaN where missing.
+        Returns the innovations of these samples, and the distribution at the first one.
 
         Raises:
             FilterFailure: the filter lost the motion; `mean` is then meaningless.

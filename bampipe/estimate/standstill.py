@@ -51,14 +51,7 @@ def find_standstill(qd: Array, qd_sd: Array, rate_hz: float, braked: Flags | Non
 
 
 def find_turns(qd: Array, rate_hz: float) -> Flags:
-    """Find the samples within `REST_S` of a reversal.
-
-    Args:
-        qd: (T, n_q) velocity; rate_hz: sampling rate.
-
-    Returns:
-        (T, n_q).
-    """
+    """Find samples within `REST_S` of a reversal of a velocity (T, n_q); return (T, n_q)."""
     near, turns = round(REST_S * rate_hz), np.zeros(qd.shape, dtype=bool)
     for column, v in zip(turns.T, qd.T, strict=True):
         for last in np.flatnonzero(np.diff(np.sign(v))):
@@ -101,14 +94,7 @@ def _turning(v: Array, limit: Array, start: int, end: int) -> float:
 
 
 def find_moving_samples(rest: Flags, band: Band) -> Flags:
-    """Find the low-passed, thinned samples that no rest affects.
-
-    Args:
-        rest: (T, n_q) from `find_standstill`; band: the low-pass.
-
-    Returns:
-        (K, n_q).
-    """
+    """Find the thinned samples (K, n_q) that no ``rest`` (T, n_q) affects through the low-pass."""
     reached = np.abs(band.thin(rest.astype(float))) >= _REACH
     # The response to a rest rings: samples near a zero between two lobes are affected, too.
     reached[1:-1] |= reached[:-2] & reached[2:]

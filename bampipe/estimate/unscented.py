@@ -239,14 +239,10 @@ def filter_trials(
     covariance: Array,
     settings: FilterSettings,
 ) -> FilterOutcome:
-    """Filter trials in sequence: each starts with its own state, the parameters carry over.
+    """Filter one or more trials: each has its own initial state, the parameters carry over.
 
-    Args:
-        model: the compiled model.
-        trials: at least one.
-        theta: (nt,) parameters before the first trial, on the scale of estimation
-            (`FilterModel.to_estimated`); covariance: (nt, nt).
-        settings: noise and numerical settings.
+    ``theta`` (nt,) and ``covariance`` (nt, nt) describe the parameters before the first trial, on
+    the scale of estimation (`FilterModel.to_estimated`).
 
     Raises:
         FilterFailure: the covariance lost positive definiteness or a number is not finite.
@@ -298,14 +294,11 @@ def run_kernel(
     root: Array,
     stride: int,
 ) -> FilteredTrial:
-    """Filter consecutive samples, given the distribution at the first one.
+    """Filter consecutive samples of ``trial``, whose initial state is not used.
 
-    Args:
-        model, settings: as in `filter_trials`.
-        trial: the samples; its initial state is not used.
-        mean: (n,) state and parameters at the first sample, overwritten with those at the last.
-        root: (n, n) lower root of their covariance, likewise.
-        stride: number of samples from one stored distribution to the next.
+    ``mean`` (n,), state and parameters, and ``root`` (n, n), the lower root of their covariance,
+    are those at the first sample, and are overwritten with those at the last. ``stride`` is the
+    number of samples from one stored distribution to the next.
 
     Raises:
         FilterFailure: the covariance lost positive definiteness or a number is not finite; the
@@ -332,13 +325,9 @@ def run_kernel(
 
 
 def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
-    """Return the most likely parameters within their bounds.
+    """Return the most likely parameters (nt,) within their bounds, on the scale of estimation.
 
-    Parameters outside are put on their bound; the others follow by the covariance.
-
-    Args:
-        model: gives the bounds.
-        theta: (nt,) on the scale of estimation; covariance: (nt, nt).
+    Parameters outside are put on their bound; the others follow by the covariance (nt, nt).
     """
     lower = np.where(model.logarithmic, model.range[0], model.lower)
     upper = model.range[1]
@@ -364,11 +353,9 @@ def _array(values: Any, kind: type = np.float64) -> NDArray[Any]:
 def join_roots(x_sd: Array, covariance: Array) -> Array:
     """Lower root (n, n) of the joint covariance of a state and of independent parameters.
 
-    Zero variances give zero columns. If rounding makes the covariance of nearly dependent variables
-    indefinite, a part in 10^12 is added to each variance.
-
-    Args:
-        x_sd: (nx,) standard deviations of the state; covariance: (nt, nt) of the parameters.
+    The state has standard deviations (nx,), the parameters a covariance (nt, nt). Zero variances
+    give zero columns. If rounding makes the covariance of nearly dependent variables indefinite, a
+    part in 10^12 is added to each variance.
 
     Raises:
         ValueError: the matrix is not positive semidefinite.

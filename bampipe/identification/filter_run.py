@@ -207,14 +207,11 @@ def infer_initial_state(
 
 
 def clear_of_reversal_mask(motion: Motion, system: System, t: Array) -> Flags:
-    """Find the samples at which each axis is well clear of standstill and reversal, (T, n_q).
+    """Find the samples, at times ``t`` (T,), s, at which each axis moves well clear of reversal.
 
     Within a few widths of the smoothed sign, friction changes over less than the spread of the
     state, and the readings of an axis at rest are not Gaussian, so that innovations cannot be
-    tested there.
-
-    Args:
-        t: (T,) times of the samples, s since the start of the trial.
+    tested there. Returns (T, n_q).
     """
     slow = np.abs(motion.qd) < _REVERSAL_WIDTHS * system.sign_widths
     rate = (len(motion.t) - 1) / float(motion.t[-1] - motion.t[0])
@@ -273,14 +270,11 @@ class TrialFilter:
     report_progress: Progress
 
     def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
-        """Search on the first trial, then filter all trials, from the first start that succeeds.
+        """Search on the first trial, then filter all, from the first attempt that succeeds.
 
         A filter that starts far from the truth but trusts its model does not recover. The first
         trial is therefore filtered with high process noise, which adds almost no information, and
         filtered again at the end.
-
-        Args:
-            attempts: starts, tried in order.
 
         Raises:
             MotionLost: no attempt followed the motion.

@@ -80,14 +80,9 @@ def free_runs(
 ) -> FreeRun:
     """Run the model freely over every trial and compare it with the measurement.
 
-    Args:
-        run: the run folder, for the channels of the controller.
-        parameters: for each trial, (>= n_p,) parameters fitted without it.
-        judged: which trials count; all if none does.
-
-    Returns:
-        Errors in closed loop, otherwise in open loop; only a ``reason`` if no free run is possible
-        or meaningful.
+    ``parameters`` of each trial, (>= n_p,), are fitted without it; ``judged`` says which trials
+    count, all if none does. The run folder has the channels of the controller. Returns errors in
+    closed loop, otherwise in open loop; only a ``reason`` if no free run is possible or meaningful.
     """
     why_not = why_not_free(system, motions, parameters)
     if why_not and not system.model.device.prescribed:
@@ -218,14 +213,9 @@ def _percent(error: Array, size: Array) -> float:
 def find_drift(
     system: System, motions: Sequence[Motion], parameters: Sequence[Array], judged: Sequence[bool]
 ) -> dict[str, AxisDrift]:
-    """Run the model from many starts of every trial and measure its drift.
+    """Run the model from many starts of every trial and measure its drift, by axis and horizon.
 
-    Args:
-        parameters: for each trial, (>= n_p,) parameters fitted without it.
-        judged: which trials count; all if none does.
-
-    Returns:
-        By axis: the drift at each horizon, and why some horizons are absent.
+    ``parameters`` and ``judged`` are as in `free_runs`; a ``reason`` says why horizons are absent.
     """
     axes = list(zip(system.coordinates, system.coordinate_units, strict=True))
     why = why_not_free(system, motions, parameters)

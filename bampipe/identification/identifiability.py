@@ -51,15 +51,10 @@ TIMING = "input_timing"
 def assess_identifiability(
     system: System, motions: Sequence[Motion], problem: Problem, p: Array, noise: Noise
 ) -> tuple[IdentifiabilityReport, Array]:
-    """Assess the uncertainty of the parameters at ``p`` due to sensor noise alone.
+    """Assess the uncertainty of the parameters due to sensor noise alone.
 
-    Args:
-        problem: the inverse dynamics of the trials.
-        p: (n_p + 1,) estimates, the input delay last.
-
-    Returns:
-        The report, and the covariance (n_parameters, n_parameters) of the priors in directions
-        without information.
+    ``p`` (n_p + 1,) are estimates, the input delay last. Returns the report, and the covariance
+    (n_parameters, n_parameters) of the priors in directions without information.
     """
     known = structure(system)
     n_p = len(system.parameters)
@@ -134,14 +129,10 @@ def find_information(
 ) -> Array:
     """Return the information of one trial on the estimated parameters, with sensor noise alone.
 
-    Args:
-        problem: inverse dynamics in which the motion has the number ``trial``.
-        p: (n_p + 1,) parameters, the input delay last.
-        further: slopes (T, n_q, m) of the residual by further numbers, as a function of motion,
-            internal states, inputs and parameters.
-
-    Returns:
-        (n, n), or (n + m, n + m) with those numbers last.
+    The motion has the number ``trial`` in ``problem``, and the input delay comes last in ``p``
+    (n_p + 1,). ``further`` returns slopes (T, n_q, m) of the residual by further numbers, given
+    motion, internal states, inputs and parameters. Returns (n, n), or (n + m, n + m) with those
+    numbers last.
     """
     own = p[:-1]
     n = len(system.coordinates)

@@ -272,12 +272,10 @@ def fit_squares(
     block_s: float,
     remove_bias: bool = True,
 ) -> SquaresFit:
-    """Fit a model under the likelihood.
+    """Fit a model under the likelihood, from the parameters ``start`` (n_p,).
 
-    Args:
-        trials: the trials to fit, whose `timing` bounds the input delay.
-        start: (n_p,) parameters to start from.
-        block_s: see `SquaresFit`; remove_bias: whether replicates give weights and bias.
+    The `timing` of the trials bounds the input delay; ``block_s`` is as in `SquaresFit`; with
+    ``remove_bias``, replicates give weights and bias.
 
     Raises:
         ValueError: fewer samples are clear of standstill than there are parameters.

@@ -50,10 +50,7 @@ def read(folder: Path, device: str) -> Accepted | None:
 def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     """Store the values of ``model`` in the run ``root`` as the reference for later sessions.
 
-    Returns the file written.
-
-    Args:
-        folder: of accepted values; force: accept even if a gate failed.
+    With ``force``, they are accepted even if a gate failed. Returns the file written.
 
     Raises:
         InputError: the model is not identified, a gate failed, or a result was changed by hand.

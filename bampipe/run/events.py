@@ -6,16 +6,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Event:
-    """An event of a run, for display.
+    """An event of the run of a folder called ``run``.
 
     Attributes:
-        run: name of the run folder.
         step: a stage, or ``stage:model``.
         kind: "waiting", "taken over", "compiling", "start", "progress", "done", "unchanged" or
             "failed".
         fraction: completed fraction of the step, 0 to 1.
-        message: the work in progress, the reason of the step, the fault, or the holder of the run
-            folder.
+        message: current work, reason of the step, fault, or holder of the run folder.
     """
 
     run: str

@@ -80,14 +80,9 @@ def published(url: str) -> list[str]:
 
 
 def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
-    """Fetch the published run of ``session`` into ``runs``, and check every file by its hash.
+    """Fetch the published run of ``session`` into the folder ``runs``; return its run folder.
 
-    Args:
-        url: as for :func:`publish`; session: as `published` lists it; runs: folder of run folders.
-        force: replace a run folder with other content.
-
-    Returns:
-        The run folder.
+    Every file is checked by its hash. ``force`` replaces a run folder with other content.
 
     Raises:
         InputError: nothing is published, a file does not match its hash, or there is another run.

@@ -48,13 +48,10 @@ def _sound(root: Path) -> RunResult | None:
 
 
 def require_untouched(root: Path, names: Iterable[str]) -> None:
-    """Compare results with their hashes in ``run.json``.
+    """Compare results, paths in the run folder ``root``, with their hashes in ``run.json``.
 
-    Args:
-        root: the run folder; names: paths in it; missing or unrecorded files are ignored.
-
-    Raises:
-        InputError: a file, which is named, was changed or damaged since it was written.
+    Missing and unrecorded files are ignored; the first one that was changed or damaged since it was
+    written raises `InputError`.
     """
     written = {
         name: (step, known)

@@ -12,9 +12,7 @@ from bampipe.stages import base
 def configure(stage: str, settings: Mapping[str, object], where: str = "") -> Any:
     """Return the configuration of ``stage`` with ``settings`` in place of the defaults.
 
-    Args:
-        settings: values by field name, as TOML or the command line gives them.
-        where: the file they come from, for messages.
+    Settings are as TOML or the command line gives them; ``where`` names their file in messages.
 
     Raises:
         InputError: an unknown field, a value of the wrong type, or one the stage refuses.

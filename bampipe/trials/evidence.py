@@ -168,12 +168,10 @@ def gather_evidence(
     like: Evidence | None = None,
     timing: tuple[float, float] = (0.0, 0.0),
 ) -> Evidence:
-    """Fit a model to the fitted trials by least squares, and linearise it there on all trials.
+    """Fit a model to the fitted trials, from parameters (n_p,), and linearise it on all trials.
 
-    Args:
-        start: parameters to start from, (n_p,).
-        like: a fitted model with more or fewer effects, whose slopes are reused where both agree.
-        timing: smallest and largest change of the input delay, s.
+    ``like`` is a fitted model with more or fewer effects, whose slopes are reused where both agree;
+    ``timing`` limits the change of the input delay, s.
 
     Raises:
         ValueError: fewer samples than parameters, if a fit is requested.

@@ -21,19 +21,11 @@ _MOST = 10_000_000
 
 
 class KeptItems(Sequence[Item], Generic[Item]):
-    """A sequence that moves to disk when it exceeds a limit; the last item read stays in memory.
+    """A sequence that moves to disk when it exceeds ``most`` bytes; the last item read stays.
 
-    Items read back are bitwise identical. The file has no name: it disappears with the last process
-    that holds it, however that process ends.
-
-    Args:
-        items: picklable objects.
-        most: largest size in memory, bytes.
-        items: can be pickled.
-        most: bytes in memory at most.
-
-    Raises:
-        InputError: there is no room for temporary files.
+    Items are picklable, and bitwise identical when read back. The file has no name: it disappears
+    with the last process that holds it, however that process ends. If there is no room for it,
+    `InputError` is raised.
     """
 
     def __init__(self, items: Iterable[Item], most: int = _MOST) -> None:

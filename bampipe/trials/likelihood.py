@@ -263,14 +263,10 @@ class Likelihood:
         return tuple(found)
 
     def with_equal_weights(self, problem: Problem, lacking: float) -> Likelihood:
-        """Give all samples equal weight on axes whose error far exceeds the noise of replicates.
+        """Give all samples equal weight on axes whose scale at a fit exceeds ``lacking``.
 
         The noise of replicates says nothing about so large an error. The error is not noise either:
         it recurs with the motion, so each sample counts as independent beside the priors.
-
-        Args:
-            problem: the fit, with its solution at zero.
-            lacking: scale above which an axis counts as such.
         """
         scale = np.sqrt(problem.solve().left / problem.count)
         root, samples = list(self.root), list(self.samples)

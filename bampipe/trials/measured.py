@@ -121,11 +121,8 @@ def read_measured_trials(
     """Read the trials of a run folder for a model.
 
     A model without effects of the brakes is not fitted to trials in a viscous field, but judged by
-    them.
-
-    Args:
-        every_input: as in `read_motion`; timing: the identified input delay, of which the part that
-            minimises the residual is compensated.
+    them. ``every_input`` is as in `read_motion`. Of the input delay ``timing``, the part that
+    minimises the residual is compensated.
 
     Raises:
         InputError: there is no free trial, or a file or column is missing.

@@ -53,12 +53,8 @@ def held_out_trials(run: RunFolder) -> frozenset[str]:
 def free_trials(run: RunFolder, *, fitted: bool = False, braked: bool = False) -> tuple[str, ...]:
     """Return the free trials that were differentiated, in the order of the session.
 
-    Args:
-        fitted: leave out the trials that the session holds out.
-        braked: append the trials in a viscous field: only these show effects of the brakes.
-
-    Raises:
-        InputError: there is none.
+    With ``fitted``, held-out trials are left out; with ``braked``, those in a viscous field follow,
+    which alone show effects of the brakes. If there is none, `InputError` is raised.
     """
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
     kinds = MOVING if braked else MOVING[:1]
@@ -144,14 +140,10 @@ def read_motions(
     every_input: bool = False,
     late_s: float = 0.0,
 ) -> Sequence[Motion]:
-    """Return the free trials of ``filter/kinematics.parquet``.
+    """Return the free trials of ``filter/kinematics.parquet``, with a delay of inputs compensated.
 
-    Args:
-        fitted, braked: as in :func:`free_trials`; every_input: as in :func:`read_motion`.
-        late_s: delay of the inputs' sampling behind the positions', which is compensated, s.
-
-    Raises:
-        InputError: there is none, and as :func:`read_motion`.
+    Arguments and errors are those of :func:`free_trials` and :func:`read_motion`; the inputs were
+    sampled ``late_s`` after the positions, s.
     """
     names = free_trials(run, fitted=fitted, braked=braked)
     path = run.require(KINEMATICS, "filter")
@@ -195,14 +187,10 @@ def read_samples(run: RunFolder, trial_id: str, system: System) -> dict[str, Arr
 def input_columns(
     columns: Mapping[str, Array], names: Sequence[str], brakes: Mapping[str, str]
 ) -> Array:
-    """Return the inputs of a model as columns (T, n_u), from raw samples.
+    """Return inputs of a model by their ``names``, (T, n_u), from raw samples.
 
-    Args:
-        columns: t, force_<c>, brake_<axis>, ...; a brake without a column was off.
-        names: inputs of the model; brakes: name of the brake command of each axis.
-
-    Raises:
-        InputError: an input has no column.
+    ``columns`` are t, force_<c>, brake_<axis>, ...; a brake without a column was off. ``brakes``
+    has the name of each axis' brake command. An input without a column raises `InputError`.
     """
     column = {name: f"brake_{axis}" for axis, name in brakes.items()}
     t = columns["t"]

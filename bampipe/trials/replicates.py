@@ -91,11 +91,7 @@ class SimulatedTrials:
 
 
 def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> Course:
-    """Simulate one trial of a fitted model.
-
-    Raises:
-        Runaway: the simulated motion grows without bounds.
-    """
+    """Simulate one trial of a fitted model; raise `Runaway` if the motion grows without bounds."""
     u = motion.inputs(system.inputs)
     fitted = ModelOnTrial(system, p, [motion])
     if _is_motion_given(fitted):

@@ -33,12 +33,9 @@ def problem_of(
 ) -> Problem:
     """Return the inverse dynamics of ``motions`` as a least-squares problem.
 
-    Its parameters are those of the model, followed by the input delay, s, within half a sample.
-
-    Args:
-        held: parameters that are not estimated, beside those that the model fixes.
-        timing: whether the input delay is estimated; otherwise it stays as given.
-        turning: whether samples near reversals count.
+    Its parameters are those of the model, followed by the input delay, s, within half a sample,
+    which is estimated with ``timing``. Parameters in ``held`` are not estimated. Without
+    ``turning``, samples near reversals do not count.
     """
     n = len(system.parameters)
     by_offset, by_body = list(system.moved_by), list(system.of_bodies)

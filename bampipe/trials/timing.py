@@ -24,10 +24,8 @@ def find_robot_timing(
     do not count: friction that truly stops a joint appears milliseconds late there, and would
     outweigh the rest of the path. Nor do joints whose drive has a delay of its own in the model.
 
-    The residual is linearised at the fitted parameters ``p`` (n_p,).
-
-    Returns:
-        Zero and infinity if no joint determines the delay.
+    The residual is linearised at the fitted parameters ``p`` (n_p,). If no joint determines the
+    delay, the result is zero and infinity.
     """
     problem = problem_of(system, motions, band, timing=True, turning=False)
     at = np.append(p, 0.0)
