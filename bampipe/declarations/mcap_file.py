@@ -55,9 +55,8 @@ def pack_recording(recording: Recording) -> bytes:
         _add_poses(recording, open_topic, add, stamp)
     if recording.urdf:
         text = {"data": {"type": "string"}}
-        add(
-            open_topic("/robot_description", "std_msgs/String", text), 0.0, {"data": recording.urdf}
-        )
+        channel = open_topic("/robot_description", "std_msgs/String", text)
+        add(channel, 0.0, {"data": recording.urdf})
         data = recording.urdf.encode()
         writer.add_attachment(stamp(0.0), stamp(0.0), "robot.urdf", "application/xml", data)
     writer.finish()

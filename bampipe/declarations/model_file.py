@@ -31,9 +31,8 @@ def load_model(run: RunFolder, name: str, *, as_declared: bool = False) -> Model
     relative = f"models/{name}/model.toml"
     path = run.require(relative, "identify")
     model = read_model_file(path)
-    own = []
-    for file in run.glob(f"models/{name}/effects/*.toml"):
-        own.append(registry.effect_from(read_toml(run.path(file)), str(run.path(file))))
+    files = map(run.path, run.glob(f"models/{name}/effects/*.toml"))
+    own = [registry.effect_from(read_toml(file), str(file)) for file in files]
     declared = Model(load_device(run, model.device), model.effects, own)
     if as_declared or not run.exists(IdentifyResult.file(name)):
         return declared

@@ -120,9 +120,8 @@ def simulate_controlled(
         measure: compiled h(x, u, p, y), the encoder readings.
         command: compiled c(y, r, s, out): the commands from readings, references, gains and the
             states of the controller, followed by the rates of these states.
-        u: (T, nu) inputs; the columns ``force`` are replaced by the commands.
+        u: (T, nu) inputs; the columns ``force`` are replaced by the commands, in their order.
         r: (T, nr) references, gains and other channels of the law, linear between samples.
-        force: columns of ``u`` that the controller commands, in the order of its output.
         rate_hz: rate at which the controller acts, rounded to a multiple of the sampling rate; 0
             for once a millisecond or more often.
         limits: (n_s, 2) lower and upper limit of each state of the controller.

@@ -36,12 +36,11 @@ def sandwich_covariance(
     Args:
         trials: filtered trials in order, at the ends of blocks, parameters not walking.
         n_states: length of the state in front of the parameters.
-        theta: (nt,) parameters before the first of them, on the scale of estimation;
-            covariance: (nt, nt).
+        theta, covariance: (nt,) and (nt, nt) before the first of them, on the scale of estimation.
 
     Returns:
-        (nt, nt) covariance on the scale of estimation, and the number of blocks. With no more
-        blocks than parameters, the filter's own covariance.
+        (nt, nt) covariance, which is the filter's own if there are no more blocks than parameters;
+        and the number of blocks.
     """
     information = np.linalg.inv(covariance)
     vector = information @ theta

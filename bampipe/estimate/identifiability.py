@@ -35,14 +35,9 @@ def residual_spectrum(
     """Return the spectrum of sensor noise in the residual, (count // 2 + 1, n_q).
 
     It is in squared units of the residual per sample, at the frequencies of a real discrete Fourier
-    transform of ``count`` samples.
-
-    Args:
-        count: number of samples; rate_hz: their rate.
-        inertia, damping, stiffness: (n_q,) of each axis, through which noise of a position reading
-            acts.
-        reading_sd: (n_q,) of a position reading; force_sd: (n_q,) of the generalised force, zero
-            on an axis that nothing drives.
+    transform of ``count`` samples. Noise ``reading_sd`` of a position reading acts through inertia,
+    damping and stiffness of its axis; ``force_sd`` is that of the generalised force, zero on an
+    axis that nothing drives. All are (n_q,).
     """
     omega = 2.0 * np.pi * np.fft.rfftfreq(count, 1.0 / rate_hz)[:, None]
     gain = (inertia * omega**2) ** 2 + (damping * omega) ** 2 + stiffness**2

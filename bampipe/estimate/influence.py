@@ -43,8 +43,7 @@ def find_worst_stretch(
 
     Args:
         rows: by axis, the change of the parameters by each weighted sample, (n, k), and its
-            weighted residual, (n,).
-        stretches: by axis, (n,) numbers of the stretches of its samples.
+            weighted residual, (n,); stretches: by axis, (n,) the stretch of each sample.
         places: trial and start, s, of each stretch; sd: (k,) of the parameters.
     """
     count = 1 + max(places)

@@ -78,12 +78,8 @@ def check_independence(
     """Regress innovations on present and past inputs; None if there is nothing to regress on.
 
     Inputs by a hand change slowly, so that a correlation at one lag appears at all lags. A joint
-    regression on a few lags counts it once, unlike a table of cross-correlations.
-
-    Args:
-        records: (K,) each, NaN at gaps.
-        inputs: (K, m) each, at the same times; constant ones are left out.
-        lags: number of values by which each input is lagged.
+    regression on a few lags counts it once, unlike a table of cross-correlations. The records (K,)
+    are NaN at gaps; of the inputs (K, m), constant ones are left out.
     """
     reach = max(lags)
 

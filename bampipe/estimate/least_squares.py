@@ -181,9 +181,7 @@ def minimise(
     nonlinear, Gauss-Newton steps are halved until the cost falls.
 
     Args:
-        problem: the model as residuals.
-        start: (np,) parameters to start from.
-        trials: numbers of the trials to use; all by default.
+        start: (np,) parameters to start from; trials: numbers of those to use, all by default.
         most_iterations: largest number of Gauss-Newton steps; 0 only linearises at ``start``.
         known: slopes that remain valid.
         tolerance: change of the negative log likelihood per sample at which the descent ends.

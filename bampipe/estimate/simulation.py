@@ -252,18 +252,14 @@ def simulate(
     smooth: Sequence[int] = (),
     max_step: float = MAX_STEP_S,
 ) -> Array:
-    """Integrate the model from ``x0`` under given inputs, without process noise.
+    """Integrate the model from ``x0`` (nx,) under given inputs, without process noise.
 
     Args:
         derivative: compiled f(x, u, p, w, dx), positions first in x, then rates, then states.
-        x0: (nx,) state at the first sample.
-        u: (T, nu) inputs at the samples, linear in between, but for those that are ``smooth``.
-        p: (np,) parameters.
-        dt: sampling interval, s.
+        u: (T, nu) inputs at samples ``dt`` seconds apart, linear in between; its columns ``smooth``
+            follow cubic splines instead, as forces do.
         width: (n_q,) velocity over which friction changes sign, rad/s or m/s.
-        n_noise: length of the model's process noise w.
-        smooth: columns of ``u`` that follow a cubic spline between samples, as forces do.
-        max_step: longest integration step, s.
+        n_noise: length of the model's process noise w; max_step: longest integration step, s.
 
     Returns:
         (T, nx) states at the samples.

@@ -21,21 +21,14 @@ _REACH = 0.02
 
 
 def find_standstill(qd: Array, qd_sd: Array, rate_hz: float, braked: Flags | None = None) -> Flags:
-    """Find the samples at which an axis stands still.
+    """Find the samples (T, n_q) at which an axis stands still.
 
-    An axis rests while its velocity stays within five of its standard deviations, where its sign is
-    noise, for at least 0.03 s longer than a reversal takes. It also rests between the first and the
-    last of several changes of sign within ten standard deviations, if they last as long; and, while
-    its brake is on, within ten for any duration. Slow reversals are kept, because only they show
-    how friction builds up.
-
-    Args:
-        qd: (T, n_q) velocity; qd_sd: (T, n_q) or (n_q,) its standard deviation; rate_hz: sampling
-            rate.
-        braked: (n_q,) axes whose brake is commanded in this trial; none by default.
-
-    Returns:
-        (T, n_q).
+    An axis rests while its velocity ``qd`` stays within five of its standard deviations ``qd_sd``,
+    (T, n_q) or (n_q,), where its sign is noise, for at least 0.03 s longer than a reversal takes.
+    It also rests between the first and the last of several changes of sign within ten standard
+    deviations, if they last as long; and, if its brake is commanded in this trial (``braked``,
+    (n_q,)), within ten for any duration. Slow reversals are kept, because only they show how
+    friction builds up.
     """
     slow = REST_SPEED * np.broadcast_to(qd_sd, qd.shape)
     ringing = _RINGING_SPEED * np.broadcast_to(qd_sd, qd.shape)

@@ -185,7 +185,7 @@ class Comparison:
             order = np.argsort(speed)
             # An axis that never moves has no samples and does not count.
             known = speed[order], noise.variance[axis][order], noise.speed[axis][order]
-            found.append(known if speed.size else (_ZERO, _ZERO, np.zeros(1, dtype=np.int64)))
+            found.append(known if speed.size else (np.zeros(1), np.zeros(1), np.zeros(1, np.int64)))
         return found
 
     def _sums_of(self, evidence: Evidence, likelihood: Likelihood) -> Sums:
@@ -358,9 +358,6 @@ class Comparison:
                 )
             )
         return tuple(expected)
-
-
-_ZERO = np.zeros(1)
 
 
 def chance_of_confusion(first: float, second: float, gained: float) -> float:

@@ -33,16 +33,12 @@ Answer = TypeVar("Answer")
 
 
 def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener) -> list[Outcome]:
-    """Run several sessions on a Dask cluster.
+    """Run several sessions, no two of which share a run folder, on a Dask cluster.
 
     A session whose worker dies is run again on another; one that kills several workers is reported
-    as crashed. If the cluster is lost, sessions that were not finished are refused.
-
-    Args:
-        requests: one for each session; no two may share a run folder.
-        scheduler: its address, ``tcp://host:port``; "" starts a cluster of worker processes on this
-            machine for the duration of the run.
-        listen: called when a session is done.
+    as crashed. If the cluster is lost, sessions that were not finished are refused. The scheduler
+    has the address ``tcp://host:port``; "" starts a cluster of worker processes on this machine for
+    the duration of the run.
 
     Raises:
         InputError: Dask is not installed, the scheduler does not answer, or has no workers.

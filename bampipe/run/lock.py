@@ -36,11 +36,8 @@ def hold(
 
     The operating system frees it when its holder ends, even if killed. The holder writes its name
     into the file and removes it at the end, so a remaining name is that of a killed process.
-
-    Args:
-        wait: whether to wait while another process holds it; otherwise refuse.
-        waiting: called once, before waiting, with the name of the holder.
-        taking_over: called with the name of a holder that was killed.
+    ``waiting`` is called once, before waiting, with the name of the holder, and ``taking_over``
+    with the name of one that was killed.
 
     Raises:
         InputError: another process holds it and ``wait`` is false.

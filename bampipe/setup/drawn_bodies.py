@@ -217,11 +217,9 @@ class Comparison:
                 for by in turns
             ]
             for motion in self.motions:
-                rates = [motion.rate @ by for by in turns]
+                changes, rates = ([x @ by for by in turns] for x in (motion.change, motion.rate))
                 signs = [np.tanh(r / max(w, 1e-9)) for r, w in zip(rates, widest, strict=True)]
-                columns.append(
-                    np.column_stack([*(motion.change @ by for by in turns), *rates, *signs])
-                )
+                columns.append(np.column_stack([*changes, *rates, *signs]))
             thinned, m = self._thinned(columns, k), len(turns)
             rate, sign = thinned[:, m : 2 * m], thinned[:, 2 * m :]
             powers[m : 2 * m] = np.mean(rate**2, axis=0) if len(rate) else 0.0

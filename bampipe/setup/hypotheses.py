@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import combinations, permutations
 
@@ -71,11 +71,9 @@ def scale_correction(
     units: tuple[str, str] = ("", ""),
 ) -> Correction:
     """Signals ``names`` must be multiplied by ``factor``."""
-    gain = np.eye(len(signals.names))
-    for place in signals.places(names):
-        gain[place, place] = factor
-    none = np.zeros(len(signals.names))
-    return Correction("scale", tuple(names), Change(gain, none), cost, factor, 0.0, *units)
+    change, places = Change.none(len(signals.names)), signals.places(names)
+    change.gain[places, places] = factor
+    return Correction("scale", tuple(names), change, cost, factor, 0.0, *units)
 
 
 def zero_correction(signals: Signals, axis: str, offset: float, cost: float) -> Correction:
@@ -93,9 +91,8 @@ def sign_correction(signals: Signals, names: Sequence[str], cost: float = 0.0) -
 
 def gravity_correction(signals: Signals, gravity: Iterable[float], cost: float) -> Correction:
     """Gravity has another direction in the frame of the base, m/s2, (3,)."""
-    none = Change.none(len(signals.names))
     x, y, z = (float(v) for v in gravity)
-    change = Change(none.gain, none.offset, gravity=(x, y, z))
+    change = replace(Change.none(len(signals.names)), gravity=(x, y, z))
     return Correction("gravity", (), change, cost)
 
 
@@ -169,8 +166,8 @@ def exchange_corrections(signals: Signals) -> Iterator[Correction]:
 def clock_corrections(signals: Signals) -> Iterator[Correction]:
     """Time stamps in another unit than stated, with the stated rate wrong by the same factor."""
     for factor in CLOCKS:
-        none = Change.none(len(signals.names))
-        yield Correction("clock", (), Change(none.gain, none.offset, factor), 2.0, factor)
+        change = replace(Change.none(len(signals.names)), time=factor)
+        yield Correction("clock", (), change, 2.0, factor)
 
 
 def unit_corrections(signals: Signals) -> Iterator[Correction]:

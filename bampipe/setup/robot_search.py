@@ -257,8 +257,7 @@ class DrawnSearch(Search):
         """
         n, forces = len(self.signals.axes), len(self.signals.forces)
         readings, drives = change.gain[:n, :n], change.gain[n : n + forces, n : n + forces]
-        beside = change.gain[:n, n:].any() or change.gain[n:, :n].any()
-        if beside:
+        if change.gain[:n, n:].any() or change.gain[n:, :n].any():
             return None
         key = readings.tobytes() + np.array([change.time, id(stated)]).tobytes()
         if key not in self._reread:

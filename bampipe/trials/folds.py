@@ -27,21 +27,17 @@ class Folds:
     judged: tuple[bool, ...]
 
     @classmethod
-    def of_groups(cls, groups: Sequence[int], fitted: Sequence[bool]) -> Folds:
-        """Judge the model by the trials that the session holds out; if there are none, by all."""
-        held = [group == HELD_OUT for group in groups]
-        return cls(tuple(groups), tuple(fitted), tuple(held) if any(held) else (True,) * len(held))
-
-    @classmethod
     def of_trials(
         cls, names: Sequence[str], held_out: Collection[str], fitted: Collection[str]
     ) -> Folds:
-        """Give each trial a group of its own, or divide them into `MOST_GROUPS` groups."""
-        groups = [
-            HELD_OUT if name in held_out else number % MOST_GROUPS
-            for number, name in enumerate(names)
-        ]
-        return cls.of_groups(groups, [name in fitted for name in names])
+        """Give each trial a group of its own, or divide them into `MOST_GROUPS` groups.
+
+        The trials that the session holds out judge the model; if there are none, all do.
+        """
+        held = [name in held_out for name in names]
+        groups = (HELD_OUT if out else number % MOST_GROUPS for number, out in enumerate(held))
+        judged = held if any(held) else [True] * len(held)
+        return cls(tuple(groups), tuple(name in fitted for name in names), tuple(judged))
 
     def subset(self, trials: Sequence[int]) -> Folds:
         """The division of some of the trials, given by number."""

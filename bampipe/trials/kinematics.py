@@ -108,13 +108,7 @@ class Kinematics:
                 names = names[: max(taken, default=0) + TIMING_ORDERS]
             rates = self.input_rates(recording.channels[name], len(names))
             channels |= dict(zip(names, rates, strict=True))
-        return Motion(
-            recording.trial_id,
-            np.arange(len(recording.q)) / self.rate_hz,
-            np.column_stack([m.position for m in moved]),
-            np.column_stack([m.velocity for m in moved]),
-            np.column_stack([m.acceleration for m in moved]),
-            np.column_stack([m.velocity_sd for m in moved]),
-            channels,
-            filters=self,
-        )
+        parts = ("position", "velocity", "acceleration", "velocity_sd")
+        q, qd, qdd, qd_sd = (np.column_stack([getattr(m, x) for m in moved]) for x in parts)
+        t = np.arange(len(recording.q)) / self.rate_hz
+        return Motion(recording.trial_id, t, q, qd, qdd, qd_sd, channels, filters=self)

@@ -189,7 +189,6 @@ class Likelihood:
         model: the weighted model, without its residual and slopes.
         force_sd: noise of each measured force, (n_forces,), in its unit.
         discrepancy: relative error that any model may have.
-        factors: those of the measured forces to which the weights refer; see `Evidence`.
     """
 
     samples: tuple[Samples, ...]
@@ -200,7 +199,6 @@ class Likelihood:
     model: Evidence
     force_sd: Array
     discrepancy: float
-    factors: tuple[float, ...] = ()
 
     @classmethod
     def of(
@@ -237,7 +235,7 @@ class Likelihood:
         model = replace(e, residual=(), jacobian=(), used=())  # their memory
         return cls(
             samples, noise, KeptItems(root), KeptItems(bias_variance), KeptItems(force), model,
-            force_sd, discrepancy, e.factors,
+            force_sd, discrepancy,
         )  # fmt: skip
 
     @cached_property
@@ -321,7 +319,7 @@ class Likelihood:
         """Weight the residual and slopes of a linearised model, and add its priors."""
         samples, noise, n_q, weights = self.samples, self.noise, len(self.samples), self.root
         if evidence.factors:  # the unit is that of the measured force: small factors gain nothing
-            ratio = np.array(self.factors) / np.array(evidence.factors)
+            ratio = np.array(self.model.factors) / np.array(evidence.factors)
             weights = [root * by for root, by in zip(weights, ratio, strict=True)]
         timing = evidence.timing if evidence.by_timing else ()
         n = len(evidence.free) + len(timing[:1])

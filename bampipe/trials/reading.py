@@ -84,11 +84,9 @@ def read_motion(
 ) -> Motion:
     """Read one trial of a table of kinematics.
 
-    Args:
-        system: the model, whose inputs are read with their first time derivatives.
-        disturbances: stretches of the trial that do not count; filters: those of the session.
-        every_input: read every input of the device with all time derivatives, since effects that
-            are not in the model may need them.
+    The model's inputs are read with their first time derivatives; with ``every_input``, all inputs
+    of the device are, with all derivatives, since effects that are not in the model may need them.
+    Disturbances do not count; ``filters`` are those of the session.
 
     Raises:
         InputError: the file or a column that the model needs is missing.

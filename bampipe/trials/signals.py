@@ -150,9 +150,7 @@ class Change:
             orders.append((values + self.offset if order == 0 else values) / self.time**order)
         sd = np.zeros((motion.t.size, len(self.gain)))
         sd[:, :n] = motion.qd_sd
-        channels = {}
-        for i, name in enumerate(signals.inputs, n):
-            channels[name] = orders[0][:, i]
+        channels = dict(zip(signals.inputs, orders[0][:, n:].T, strict=True))
         return replace(
             motion,
             t=motion.t * self.time,
