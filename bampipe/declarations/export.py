@@ -163,16 +163,14 @@ def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
         if before.bodies[link].mass != 0.0 and body.mass == 0.0 and not body.inertia.any()
     ]
     if emptied:
-        notes.append(
-            f"the mass of what is fixed to a link is in that link, not in {join_names(emptied)}"
-        )
+        notes.append(f"masses fixed to a link are part of that link, not of {join_names(emptied)}")
     if robot.payload is not None:
         notes.append(f"the payload of {robot.payload.mass:g} kg is in the last link that moves")
     overdrawn = _overdrawn(bodies, after)
     if overdrawn:
         notes.append(
-            f"no body has what is left for {join_names(overdrawn)}: what hangs there beside the"
-            " chain is drawn too heavy"
+            f"no possible body remains for {join_names(overdrawn)}: the bodies beside the chain"
+            " there are drawn too heavy"
         )
     urdf = file if read_xml(file).tag == "robot" else None
     flat = hold_beside(after, robot.base, robot.tip)

@@ -60,7 +60,7 @@ class _Option:
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """Trials to record, in order, and what is expected in the end.
+    """Trials to record, in order, and the expected outcome.
 
     Attributes:
         confusion: chance of confusing each pair of alternatives.

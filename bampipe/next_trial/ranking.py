@@ -84,7 +84,7 @@ def count_affordable(rehearsal: Rehearsal, seconds: float) -> int:
 class RankedDesign:
     """A design that has been tried, with the quantile of the utility over its versions.
 
-    Of the motions the hasty one is last.
+    The last of the motions is the hasty one.
     """
 
     design: Primitive

@@ -178,7 +178,7 @@ class Search:
 
     Attributes:
         motions: the trials as stated, shortened; tested: number of set-ups tried.
-        heavier: the only drawn body that is far too light; None if there is none.
+        heavier: the only body that is far heavier than drawn; None if there is none.
         over_position: plausibility of the stated set-up with a torque over position that the
             device lacks, if this rather than a mistake explains the error; otherwise None.
     """

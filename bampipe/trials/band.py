@@ -55,7 +55,7 @@ def find_band(
             cutoff, reason = force_hz, "95 % of the power of the applied force above its noise"
         else:
             cutoff = max(most, least)
-            reason = f"the force goes on to {force_hz:.3g} Hz, the motion is known up to here"
+            reason = f"the force extends to {force_hz:.3g} Hz, but the motion is known up to here"
         found[axis] = ResidualBand(
             cutoff_hz=cutoff, reason=reason, force_hz=force_hz, motion_hz=motion_hz
         )

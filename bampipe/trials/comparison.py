@@ -39,9 +39,8 @@ def compare_trial(
 ) -> ComparedTrial:
     """Compare one trial with the model as published, held out, and without friction.
 
-    Args:
-        published: (n_p + 1,) parameters, and the timing of the inputs as far as it is not taken off
-            the trials, s; unseen: the same without the trial.
+    ``published`` (n_p + 1,) are parameters, followed by the change of the input delay from that
+    compensated in the trials, s; ``unseen`` is the same from the other trials.
     """
     motion, band, folds = trials.motions[number], trials.band, trials.folds
     dry = (effect for effect in system.model.effects if effect.effect.is_dry_friction)

@@ -1,4 +1,4 @@
-"""How trials are divided: those a fit may see, groups left out together, and those judged."""
+"""Division of trials into those to fit, groups to leave out together, and those to judge."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MOST_GROUPS = 10
 
 @dataclass(frozen=True)
 class Folds:
-    """How the trials of a session are held out.
+    """Division of a session's trials for fits and held-out errors.
 
     Attributes:
         groups: group number of each trial. The trials of a group are left out together; those in

@@ -21,7 +21,7 @@ from bampipe.trials.motion import TIMING_ORDERS, Motion, Recording, input_deriva
 
 @dataclass(frozen=True)
 class AxisFilter:
-    """How the positions of one axis are differentiated.
+    """The filter that differentiates the positions of one axis.
 
     Attributes:
         bandwidth_hz: half-power frequency, Hz.

@@ -253,6 +253,6 @@ class ModelOnTrial:
 
     @cached_property
     def contribution(self) -> Array:
-        """What the model's effects add to the residual; see `System.contribution`, (T, n_q)."""
+        """Contribution of the effects to the residual, see `System.contribution`, (T, n_q)."""
         at = self.mechanism.kinematics
         return self.system.contribution(*at, self.memory, self.inputs, self.p)

@@ -154,7 +154,7 @@ def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> floa
     """Noise of a channel, which is the same in every trial, whereas the signal may differ.
 
     Noise correlated over several samples is used if it clearly exceeds that of neighbouring
-    samples, unless the stated noise supports the latter: nothing else tells it from a fast signal.
+    samples, unless the stated noise is closer to the latter: it may be a fast signal.
     The commands of a controller differ by trial, and their mean square is used.
     """
     pulses = [r.white_sd for r in records if r.pulsed]
