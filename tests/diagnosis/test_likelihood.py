@@ -57,7 +57,7 @@ def test_a_replay_has_unit_variance_in_units_of_its_noise(fitted):
         assert spread.max() > 1.5 * spread.min()
 
 
-def test_replays_are_the_same_in_other_processes(fitted):
+def test_replicates_are_the_same_in_other_processes(fitted):
     session, fit = fitted
     e = fit.evidence
     alone = session.replay(e, e.p, 3)

@@ -10,7 +10,7 @@ from independent_runs import record_trials
 
 from bampipe.diagnosis.session import system_of
 from bampipe.physics import Model, compile_model
-from bampipe.trials import replay
+from bampipe.trials import replicates
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.measured import MeasuredTrials
@@ -41,7 +41,7 @@ def test_a_replay_for_one_model_has_the_same_inputs(fitted) -> None:
     simulated = SimulatedTrials(system, evidence.p, [motion], trials.sensors.rate_hz)
     rngs, course = [np.random.default_rng(3) for _ in range(2)], simulated.courses[0]
     own = make_replicate(simulated, 0, trials.sensors, trials.kinematics, rngs[0])
-    recording = replay.read_by_sensors(system, motion, *course, trials.sensors, rngs[1])
+    recording = replicates.read_by_sensors(system, motion, *course, trials.sensors, rngs[1])
     every = trials.kinematics.observe(recording, system.model.device.forces)
     np.testing.assert_array_equal(every.inputs(system.inputs), own.inputs(system.inputs))
     np.testing.assert_array_equal(
@@ -50,18 +50,18 @@ def test_a_replay_for_one_model_has_the_same_inputs(fitted) -> None:
     assert len(own.channels) < len(every.channels)
 
 
-def test_replays_differ_by_noise_alone_and_share_what_was_simulated(
+def test_replicates_differ_by_noise_alone_and_share_what_was_simulated(
     fitted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trials, evidence = fitted
     simulated: list[str] = []
 
-    def counted(system: Any, p: Any, motion: Any, rate_hz: float) -> replay.Course:
+    def counted(system: Any, p: Any, motion: Any, rate_hz: float) -> replicates.Course:
         simulated.append(motion.trial_id)
         return follow(system, p, motion, rate_hz)
 
-    follow = replay.follow_motion
-    monkeypatch.setattr(replay, "follow_motion", counted)
+    follow = replicates.follow_motion
+    monkeypatch.setattr(replicates, "follow_motion", counted)
     rate_hz, motions = trials.sensors.rate_hz, trials.motions
 
     def replayed(simulated: SimulatedTrials, number: int) -> Any:
@@ -115,7 +115,7 @@ def test_the_jumps_of_a_drive_that_acts_or_is_read_late_are_seen(late: float) ->
     motion = SimpleNamespace(q=q[:, None], qd=qd[:, None])
 
     def jumps(force) -> bool:
-        return replay._jumps(
+        return replicates._jumps(
             SimpleNamespace(
                 system=system, motion=motion, p=np.zeros(1), inputs=force[:, None],
                 residual=(force - needed)[:, None],
@@ -168,7 +168,7 @@ def test_the_force_that_a_motion_needs_leaves_no_residual(fitted, effect, values
     )
     motion = trials.motions[0]
     measured = ModelOnTrial(system, p, [motion])
-    force = replay._required_force(measured, trials.sensors.rate_hz)
+    force = replicates._required_force(measured, trials.sensors.rate_hz)
     named = dict(zip(system.model.device.forces, force.T, strict=True))
     needed = ModelOnTrial(system, p, [motion.with_channels(named)])
     before, after = (
@@ -189,5 +189,5 @@ def test_how_late_a_force_acts_is_read_off_the_model(fitted, effect, late) -> No
     motion = trials.motions[0]
     derivatives = {name: np.zeros(motion.t.size) for name in system.inputs}
     motion = motion.with_channels(derivatives | dict(motion.channels))
-    found = replay._lateness(ModelOnTrial(system, p, [motion]))
+    found = replicates._lateness(ModelOnTrial(system, p, [motion]))
     np.testing.assert_allclose(found, [late], atol=1e-9)
