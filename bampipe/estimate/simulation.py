@@ -105,11 +105,11 @@ _ARM = record_type(_Arm, _I, _I, _I, _I, _I, float64, float64, float64)
 
 @part()
 def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-def]
-    """Number of Runge-Kutta steps that ``dt`` needs from state ``x`` on.
+    """Number of Runge-Kutta steps that ``dt`` requires from state ``x``.
 
-    At most ``plant.max_step`` long, and no longer than the time constant of any axis: the
-    derivative is probed at both sides of standstill where it may come to rest within ``dt``, else
-    at a rate nearby, for heavy damping on a small mass is stiff at any speed.
+    Steps are at most ``plant.max_step`` long, and no longer than the time constant of any axis. The
+    derivative is probed at both sides of standstill if the axis may come to rest within ``dt``,
+    otherwise at a rate nearby, since heavy damping on a small mass is stiff at any speed.
 
     Args:
         derivative: f(x, u, p, w, dx).
