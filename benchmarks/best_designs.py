@@ -26,7 +26,7 @@ from next_trials import TIMID, USUAL, run_of
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model_file import identified, load_model
+from bampipe.declarations.model_file import load_model, read_estimate
 from bampipe.identification.identifiability import find_information
 from bampipe.identification.sensor_noise import FilterChoice, sensor_noise
 from bampipe.next_trial.primitives import (
@@ -56,7 +56,7 @@ class Session:
     def __init__(self, root: Path) -> None:
         run = RunFolder(root)
         self.system = compile_model(load_model(run, "base"))
-        p = identified(run, "base", self.system)
+        p = read_estimate(run, "base", self.system)
         found = run.read(IdentifyResult, "base")
         trials = read_measured_trials(run, self.system, every_input=True, timing=found.input_timing)
         self.motions = [trials.motions[k] for k in trials.folds.fitted_trials]

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from bampipe.run import pipeline
 from bampipe.run.cluster import run_on_cluster
-from bampipe.run.events import unheard
+from bampipe.run.events import ignore_event
 from bampipe.run.request import Request
 
 
@@ -51,7 +51,7 @@ def measure(folder: Path, sessions: int, workers: int) -> None:
         client.wait_for_workers(workers)
         before = sum(cpu for cpu, _ in client.run(cost).values())
         start = time.perf_counter()
-        outcomes = run_on_cluster(requests, cluster.scheduler_address, unheard)
+        outcomes = run_on_cluster(requests, cluster.scheduler_address, ignore_event)
         wall = time.perf_counter() - start
         used = client.run(cost).values()
     bad = [outcome.error for outcome in outcomes if outcome.state != "done"]

@@ -30,7 +30,7 @@ from independent.sensors import Conditions, hold_back
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model_file import identified, load_model, read_recipe
+from bampipe.declarations.model_file import load_model, read_estimate, read_recipe
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.drafts.search import draft_formulas
 from bampipe.diagnosis.session import Session
@@ -184,7 +184,7 @@ def force_drafts(machine: str, seed: int) -> dict[str, tuple[float, tuple[str, .
         trials = read_measured_trials(run, system, every_input=True, timing=timing)
         session = Session(replace(trials, motions=tuple(trials.motions)), Criteria())
         found = draft_formulas(
-            session, read_recipe(run, "base", model), identified(run, "base", system),
+            session, read_recipe(run, "base", model), read_estimate(run, "base", system),
             range(len(system.coordinates)), "a benchmark",
         )  # fmt: skip
         return {
@@ -216,11 +216,11 @@ def curve_error(run: RunFolder, model: str, axis: str, effect: str, truth: dict[
         return float("nan")
     law = truth["hidden_laws"][effect]
     system = compile_model(load_model(run, model))
-    p = identified(run, model, system)
+    p = read_estimate(run, model, system)
     bare = compile_model(load_model(run, "base"))
     trials = read_measured_trials(run, bare, every_input=True)
     evidence = gather_evidence(
-        bare, trials.motions, trials.band, identified(run, "base", bare), trials.folds
+        bare, trials.motions, trials.band, read_estimate(run, "base", bare), trials.folds
     )
     number = bare.coordinates.index(axis)
     width = bare.model.device.coordinates[number].sign_width

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model_file import identified, load_model
+from bampipe.declarations.model_file import load_model, read_estimate
 from bampipe.estimate.simulation import simulate
 from bampipe.physics import System, compile_model
 from bampipe.trials.motion import Motion
@@ -117,7 +117,7 @@ def load(run: Path, model: str) -> tuple[System, Array]:
     """The compiled model of a run folder and its identified parameters."""
     folder = RunFolder(run)
     system = compile_model(load_model(folder, model))
-    return system, identified(folder, model, system)
+    return system, read_estimate(folder, model, system)
 
 
 def read_trial(run: Path, trial: str, system: System) -> Motion:

@@ -17,7 +17,7 @@ import numpy as np
 
 from bampipe.data.stream import SampleStream
 from bampipe.monitor.monitor import Monitor
-from bampipe.monitor.start import MonitorOptions, layouts
+from bampipe.monitor.start import MonitorOptions, list_layouts
 from bampipe.physics import Model, compile_model, registry
 
 RATE = 5000.0
@@ -42,7 +42,7 @@ def main() -> None:
     system = compile_model(Model(registry.device("bam")))
     names, values = record(10_000)
     source, sink = os.pipe()
-    stream = SampleStream(source, "pipe", layouts(system, None), True, print)
+    stream = SampleStream(source, "pipe", list_layouts(system, None), True, print)
     watch = Monitor(system, None, MonitorOptions(), lambda _: None)
     os.write(sink, (",".join(names) + "\n").encode())
     stream.read()

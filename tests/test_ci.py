@@ -164,11 +164,11 @@ def test_every_command_takes_the_best_confirmed_model(
             "standing": compare_with_floor(error, 0.1),
         }
         write_result(root, ValidateResult, model=name, axes={"yaw": axis})
-    assert models.counting_model(root) == "base", "nothing has been compared"
+    assert models.default_model(root) == "base", "nothing has been compared"
     code, out, _ = command("accept", "s1")
     assert code == 0 and "warning: yaw: the error is above the noise floor, 5.6 times" in out
     write_result(root, CompareResult, best=better, ladder=[{"model": "base"}, {"model": better}])
-    assert models.counting_model(root) == Run(root).model == Results(root).model == better
+    assert models.default_model(root) == Run(root).model == Results(root).model == better
     code, out, _ = command("accept", "s1")
     assert code == 0 and f"model {better}" in out and "warning" not in out
     kept = json.loads((tmp_path / "accepted/bam.json").read_text())

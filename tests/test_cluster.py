@@ -22,7 +22,7 @@ from bampipe.errors import InputError
 from bampipe.run import cluster as engine
 from bampipe.run import pipeline as pipelines
 from bampipe.run.cluster import _placed, run_on_cluster
-from bampipe.run.events import Event, unheard
+from bampipe.run.events import Event, ignore_event
 from bampipe.run.request import Request, Step
 from bampipe.run.runner import run_session
 from bampipe.run.state import RunState
@@ -67,7 +67,7 @@ def check(toy: Toy, given: list[Request], states: list[str]) -> None:
 @pytest.mark.slow
 def test_same_bytes_as_the_local_engine(toy: Toy, cluster: Any) -> None:
     given = requests(toy)
-    outcomes = run_on_cluster(given, cluster.scheduler_address, unheard)
+    outcomes = run_on_cluster(given, cluster.scheduler_address, ignore_event)
     check(toy, given, [outcome.state for outcome in outcomes])
 
 
@@ -84,7 +84,7 @@ def test_a_worker_killed_in_mid_run_loses_nothing(toy: Toy, cluster: Any) -> Non
 
     thread = threading.Thread(target=kill)
     thread.start()
-    outcomes = run_on_cluster(given, cluster.scheduler_address, unheard)
+    outcomes = run_on_cluster(given, cluster.scheduler_address, ignore_event)
     thread.join()
     check(toy, given, [outcome.state for outcome in outcomes])
 
@@ -96,7 +96,7 @@ def test_workers_publish_what_they_have_run(toy: Toy, cluster: Any) -> None:
 
     url = f"file://{toy.folder / 'far'}"
     given = [replace(request, publish=url) for request in requests(toy)]
-    outcomes = run_on_cluster(given, cluster.scheduler_address, unheard)
+    outcomes = run_on_cluster(given, cluster.scheduler_address, ignore_event)
     check(toy, given, [outcome.state for outcome in outcomes])
     assert published(url) == sorted(
         request.root.name for request in given if request is not given[1]
@@ -150,7 +150,7 @@ def test_what_is_no_scheduler_is_one_line(
     server = Listener(answer)
     began = time.monotonic()
     with pytest.raises(InputError, match="no Dask scheduler answers"):
-        run_on_cluster([toy.request()], server.address, unheard)
+        run_on_cluster([toy.request()], server.address, ignore_event)
     assert time.monotonic() - began < 8.0
     server.socket.close()
 
@@ -163,7 +163,7 @@ def test_an_address_that_nobody_answers_at_is_one_line(
 ) -> None:
     monkeypatch.setattr(engine, "PATIENCE_S", 3.0)
     with pytest.raises(InputError, match="no Dask scheduler answers"):
-        run_on_cluster([toy.request()], address, unheard)
+        run_on_cluster([toy.request()], address, ignore_event)
 
 
 @contextlib.contextmanager
@@ -204,7 +204,7 @@ def test_a_scheduler_without_workers_is_one_line(toy: Toy, monkeypatch: pytest.M
     with scheduler(toy.folder) as (address, _):
         began = time.monotonic()
         with pytest.raises(InputError, match="has had no workers for 4 s"):
-            run_on_cluster([toy.request()], address, unheard)
+            run_on_cluster([toy.request()], address, ignore_event)
         assert time.monotonic() - began < 9.0
 
 
@@ -212,7 +212,7 @@ def test_a_scheduler_without_workers_is_one_line(toy: Toy, monkeypatch: pytest.M
 def test_a_worker_in_place_of_a_scheduler_is_one_line(toy: Toy, cluster: Any) -> None:
     worker = next(iter(cluster.workers.values()))
     with pytest.raises(InputError, match="no Dask scheduler answers"):
-        run_on_cluster([toy.request()], worker.worker_address, unheard)
+        run_on_cluster([toy.request()], worker.worker_address, ignore_event)
 
 
 @pytest.mark.long

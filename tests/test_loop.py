@@ -11,7 +11,7 @@ from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.run import RunResult
 from bampipe.run import models, pipeline, record
-from bampipe.run.events import unheard
+from bampipe.run.events import ignore_event
 
 
 def made(settings: dict[str, object]) -> dict[str, object]:
@@ -54,7 +54,7 @@ def test_following_judges_the_model_that_it_starts_from(
     found = DiagnoseResult.model_validate(filled(DiagnoseResult, content))
     monkeypatch.setattr(loop.LoopOptions, "run", lambda _, *steps: ran.append(steps))
     monkeypatch.setattr(loop.RunFolder, "read", lambda *_: found)
-    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
+    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, ignore_event)
     lines: list[str] = []
     assert loop.follow(options, "base", lines.append) == "base"
     assert lines == ["base, joint: unknown effect"]
@@ -108,7 +108,7 @@ def test_a_child_that_was_never_identified_is_removed(
 
     write_result(tmp_path, IngestResult, device="slider", axes={"carriage": {}})
     monkeypatch.setattr(loop.LoopOptions, "run", run)
-    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
+    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, ignore_event)
     with pytest.raises(fault):
         loop.extend(options, "base", ["stribeck:carriage"])
     assert models.names(tmp_path) == ("base",)
@@ -133,7 +133,7 @@ def test_identification_starts_where_the_diagnosis_ended(
     write_result(tmp_path, IngestResult, device="slider", axes={"carriage": {}})
     write_result(tmp_path, DiagnoseResult, model="base", **content, fitted=fitted)
     monkeypatch.setattr(loop.LoopOptions, "run", lambda *_: None)
-    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
+    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, ignore_event)
     child = loop.extend(options, "base", effects)
     assert models.read(tmp_path, child).start == start
 
@@ -158,7 +158,7 @@ def test_what_came_to_nothing_is_not_weighed_again(
     monkeypatch.setattr(loop.RunFolder, "read", diagnosed)
     monkeypatch.setattr(loop, "_add", lambda *_: "")
     lines: list[str] = []
-    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, unheard)
+    options = loop.LoopOptions(tmp_path, pipeline.load(), False, True, ignore_event)
     assert loop.follow(options, "base", lines.append) == "base"
     assert lines == [
         *(f"base, joint: missing {name} (> 0.99)" for name in left),

@@ -10,7 +10,7 @@ from bampipe.api import loop
 from bampipe.api.opened import Run, open_run
 from bampipe.run import batch, runner
 from bampipe.run import pipeline as pipelines
-from bampipe.run.events import unheard
+from bampipe.run.events import ignore_event
 from bampipe.run.request import Request
 from bampipe.run.session_name import session_folder, session_id
 from bampipe.stages import base
@@ -57,7 +57,7 @@ def run_session(
             force=force,
             judge=True,
         ),
-        unheard,
+        ignore_event,
     )
     return Run(root)
 
@@ -150,7 +150,7 @@ def _open(run: Run | Path_) -> Run:
 
 def _make_options(run: Run) -> loop.LoopOptions:
     batch.limit_threads(1)
-    return loop.LoopOptions(run.root, pipelines.whole(run.root), False, True, unheard)
+    return loop.LoopOptions(run.root, pipelines.whole(run.root), False, True, ignore_event)
 
 
 def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object) -> dict[str, Any]:
@@ -191,6 +191,6 @@ def _run_stage(
             last=stage,
             model=model,
         ),
-        unheard,
+        ignore_event,
     )
     return [step.summary for step in outcome.steps]

@@ -96,7 +96,7 @@ class Run:
     @property
     def model(self) -> str:
         """The best confirmed model, the default of the methods below."""
-        return models.counting_model(self.root)
+        return models.default_model(self.root)
 
     def effects(self, model: str = "") -> tuple[str, ...]:
         """The effects that a model has beyond the bare device."""

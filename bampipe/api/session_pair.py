@@ -14,7 +14,7 @@ from bampipe.api import actions
 from bampipe.api.opened import open_run
 from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model_file import identified, load_model
+from bampipe.declarations.model_file import load_model, read_estimate
 from bampipe.diagnosis.shape import variables
 from bampipe.errors import InputError
 from bampipe.lists import join_names
@@ -66,7 +66,7 @@ class _Side:
         run, model = RunFolder(root), models.choose_model(root, model)
         found, validated = run.read(IdentifyResult, model), run.read(ValidateResult, model)
         system = compile_model(load_model(run, model))
-        p = identified(run, model, system)
+        p = read_estimate(run, model, system)
         return cls(name, run, model, system, p, found, validated)
 
     @property

@@ -144,7 +144,7 @@ def next_(
     if sd and not plan:
         raise InputError("--sd needs --plan", remedy="give --plan with it")
     root = places.find_run(run, options.runs)
-    chosen = model or models.counting_model(root)
+    chosen = model or models.default_model(root)
     share = _parse_share(sd) if sd else 0.0
     if not options.json:
         # A new proposal closes forecasts that a recorded trial has followed: compare these first.

@@ -1,1 +1,1 @@
-"""Device, effect and model files read and checked."""
+"""Reading and checks of device, effect, model and pipeline files, and exports of models."""

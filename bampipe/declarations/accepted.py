@@ -1,4 +1,4 @@
-"""The file ``accepted/<device>.json``: what later sessions of a device are held against."""
+"""The file ``accepted/<device>.json``: reference values for later sessions of a device."""
 
 from typing import Any, Literal
 
@@ -8,13 +8,13 @@ from bampipe.schema import Declaration, Text
 
 
 class Accepted(Declaration):
-    """What `bampipe accept` keeps, and gates with against = "accepted" read."""
+    """Values that `bampipe accept` stores and gates with against = "accepted" read."""
 
     schema_: Literal["bampipe.accepted/1"] = Field(default="bampipe.accepted/1", alias="schema")
-    device: Text = Field(description="Its name")
+    device: Text = Field(description="Name of the device")
     session: str = Field(description="Session whose values were accepted")
-    recorded_at: str | None = Field(default=None, description="When it was recorded")
+    recorded_at: str | None = Field(default=None, description="Time of that session's recording")
     model: Text = Field(description="Model version whose values were accepted")
     results: dict[str, dict[str, dict[str, dict[str, Any]]]] = Field(
-        description="By file of the run folder, {model} unresolved: its values as there"
+        description="By file of the run folder, with {model} unresolved: accepted values from it"
     )

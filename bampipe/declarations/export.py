@@ -1,4 +1,4 @@
-"""An identified model in forms that other programs read."""
+"""Export of an identified model to formats that other programs read."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from bampipe.data.robot_xml import number_list, read_xml
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.urdf import changed_urdf, urdf_text
 from bampipe.declarations.mjcf_effects import add_effects
-from bampipe.declarations.model_file import identified, load_model
+from bampipe.declarations.model_file import load_model, read_estimate
 from bampipe.declarations.recording import DRAWING
 from bampipe.errors import InputError
 from bampipe.files import json_text
@@ -45,17 +45,15 @@ FORMS: tuple[Form, ...] = get_args(Form)
 def export_model(run: RunFolder, name: str, form: Form) -> str:
     """Return the model called ``name`` of a run folder as text.
 
-    Args:
-        run: the run folder; name: of the model.
-        form: json, device, parameters and uncertainties; urdf, the robot's own URDF with bodies and
-            joint friction as identified; mjcf, these and the inertia of its drives, for MuJoCo;
-            python or c, a self-contained function of inverse dynamics.
+    ``form`` is json for device, parameters and uncertainties; urdf for the robot's own URDF with
+    identified bodies and joint friction; mjcf for these and the drives' inertia, for MuJoCo; python
+    or c for a self-contained function of inverse dynamics.
 
     Raises:
         InputError: the model is not identified, or cannot be written in this form.
     """
     system = compile_model(load_model(run, name))
-    p = identified(run, name, system)
+    p = read_estimate(run, name, system)
     writers: dict[Form, Callable[[], str]] = {
         "json": lambda: _json(run, name, system, p),
         "urdf": lambda: _urdf(run, system, p),
@@ -111,13 +109,13 @@ def _mjcf(run: RunFolder, system: System, p: Array) -> str:
 
 
 def _head(drawn: _Drawn, lacks: Sequence[str]) -> str:
-    """Where a model comes from, where its masses are, and what of it is not in the text."""
+    """Describe the origin of a model, moved masses, and the parts that the text lacks."""
     parts = ["identified by bampipe", *drawn.notes]
     return "; ".join([*parts, f"not in it: {', '.join(lacks)}"] if lacks else parts)
 
 
 def _coupled(robot: Robot, drives: Array) -> list[str]:
-    """What motors do that turn with several joints."""
+    """List the couplings by motors that move several joints, which a URDF cannot express."""
     lacks = []
     if np.any(np.abs(drives - np.diag(np.diag(drives))) > 0.0):
         lacks.append("inertia by which drives couple joints")
@@ -127,14 +125,14 @@ def _coupled(robot: Robot, drives: Array) -> list[str]:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """A robot's links and joints as they were drawn, and as they were identified.
+    """A robot's links and joints, as drawn and as identified.
 
     Attributes:
-        urdf: copy of the drawing in the run folder; None where there is none, or another.
-        before, after: all links and joints, as drawn and with what was identified.
-        flat: of ``after``, what the model has: the part on the base, joints beside the chain fixed.
+        urdf: copy of the drawing in the run folder; None if there is none, or it is no URDF.
+        before, after: all links and joints, as drawn and as identified.
+        flat: the part of ``after`` in the model: on the base, with joints beside the chain fixed.
         base: link that stands still.
-        notes: what is where other than in the drawing, one clause each.
+        notes: masses that are not where the drawing has them, one clause each.
     """
 
     urdf: Path | None
@@ -165,16 +163,14 @@ def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
         if before.bodies[link].mass != 0.0 and body.mass == 0.0 and not body.inertia.any()
     ]
     if emptied:
-        notes.append(
-            f"the mass of what is fixed to a link is in that link, not in {join_names(emptied)}"
-        )
+        notes.append(f"masses fixed to a link are part of that link, not of {join_names(emptied)}")
     if robot.payload is not None:
         notes.append(f"the payload of {robot.payload.mass:g} kg is in the last link that moves")
     overdrawn = _overdrawn(bodies, after)
     if overdrawn:
         notes.append(
-            f"no body has what is left for {join_names(overdrawn)}: what hangs there beside the"
-            " chain is drawn too heavy"
+            f"no possible body remains for {join_names(overdrawn)}: the bodies beside the chain"
+            " there are drawn too heavy"
         )
     urdf = file if read_xml(file).tag == "robot" else None
     flat = hold_beside(after, robot.base, robot.tip)
@@ -182,7 +178,7 @@ def _drawn(run: RunFolder, system: System, p: Array) -> _Drawn:
 
 
 def _overdrawn(identified: Mapping[str, Body], after: Tree) -> list[str]:
-    """Links that are no body once what joints beside the chain carry, as drawn, is taken off."""
+    """Find links that become impossible once the drawn bodies beside the chain are subtracted."""
     links = {identifier(joint.name): joint.child for joint in after.joints}
     return [
         links[joint]
@@ -192,7 +188,7 @@ def _overdrawn(identified: Mapping[str, Body], after: Tree) -> list[str]:
 
 
 def _drive_inertia(system: System, p: Array) -> Array:
-    """What is left of the mass matrix when no body has any inertia, (n, n)."""
+    """Mass matrix without the inertia of any body, (n, n)."""
     robot = system.model.device.robot
     assert robot is not None
     without = p.copy()
@@ -203,16 +199,12 @@ def _drive_inertia(system: System, p: Array) -> Array:
 
 
 def _robot(run: RunFolder, system: System) -> Robot:
-    """The robot of a device.
-
-    Raises:
-        InputError: the device is none.
-    """
+    """Return the robot of a device; raise `InputError` if the device is not a robot."""
     device = system.model.device
     if device.robot is None:
         others = (f for f in FORMS if f not in ("urdf", "mjcf"))
         raise InputError(
-            f"device {device.name!r} is no robot: it has no bodies on joints",
+            f"device {device.name!r} is not a robot: it has no bodies on joints",
             where=str(run.root),
             remedy=f"choose another form: {', '.join(others)}",
         )
@@ -222,7 +214,7 @@ def _robot(run: RunFolder, system: System) -> Robot:
 def _identified_joints(
     robot: Robot, system: System, p: Array
 ) -> tuple[dict[str, Body], dict[str, DriveLimits]]:
-    """Bodies by joint, and what the joints' drives can do, their friction and inertia in it."""
+    """Return bodies by joint, and limits, friction and inertia of the joints' drives."""
     value = {item.name: float(p[i]) for i, item in enumerate(system.parameters)}
     drives = dict(zip(system.coordinates, np.diag(_drive_inertia(system, p)), strict=True))
     bodies, limits = {}, {}
@@ -244,7 +236,7 @@ def _identified_joints(
 
 
 def _body(numbers: Array) -> Body:
-    """Mass, centre and inertia about it, of the ten numbers about the joint."""
+    """Return mass, centre and central inertia from the ten numbers about the joint."""
     mass = float(numbers[0])
     center = numbers[1:4] / mass if mass != 0.0 else np.zeros(3)
     inertia = symmetric(numbers[4:]) - Body(mass, center).about(np.zeros(3))

@@ -1,8 +1,8 @@
-"""Device and effect files held to everything that can be known before there are data.
+"""Checks of device and effect files that need no data.
 
-First every field by itself, then what fields say of each other, then units, at last the derivation
-of the equations of motion: each step is taken only where the one before found nothing, and reports
-all that it finds.
+They check first each field by itself, then the fields against each other, then units, and finally
+the derivation of the equations of motion. Each step requires that the one before found no fault,
+and reports all faults that it finds.
 """
 
 from collections.abc import Mapping
@@ -21,13 +21,9 @@ from bampipe.physics.units import check_device, check_effect
 
 
 def read_device(text: str) -> tuple[Mapping[str, Any], str]:
-    """The declaration of a built-in device, or of the device file at the path ``text``.
+    """Read the built-in device, or the device file at the path, that ``text`` names.
 
-    Returns:
-        The parsed file, and what to call it in messages.
-
-    Raises:
-        InputError: there is neither.
+    Returns its declaration and its name in messages; raises `InputError` if there is neither.
     """
     if text.endswith(".toml") or Path(text).is_file():
         return read_device_file(Path(text)), text
@@ -35,10 +31,9 @@ def read_device(text: str) -> tuple[Mapping[str, Any], str]:
 
 
 def read_effect(text: str) -> Mapping[str, Any]:
-    """The declaration of the effect file at the path ``text``, or of a built-in effect.
+    """Read the declaration of a built-in effect, or of the effect file at the path ``text``.
 
-    Raises:
-        InputError: there is neither.
+    Raises `InputError` if there is neither.
     """
     if text.endswith(".toml") or Path(text).is_file():
         return read_toml(Path(text))
@@ -46,14 +41,9 @@ def read_effect(text: str) -> Mapping[str, Any]:
 
 
 def device_faults(declaration: Mapping[str, Any], where: str) -> tuple[str, list[str]]:
-    """The equations of motion of a device file, and what is wrong with it.
+    """Derive the equations of motion of a device file, named ``where`` in messages.
 
-    Args:
-        declaration: the parsed file.
-        where: its name, for messages.
-
-    Returns:
-        Text of several lines, empty where the equations cannot be derived; and one line a fault.
+    Returns them as text of several lines, empty if they cannot be derived, and one line per fault.
     """
     if found := schema.faults(Device, declaration, where):
         return "", [str(fault) for fault in found]
@@ -74,16 +64,10 @@ def device_faults(declaration: Mapping[str, Any], where: str) -> tuple[str, list
 def effect_faults(
     declaration: Mapping[str, Any], where: str, device: Device, target: str = ""
 ) -> tuple[list[str], list[str]]:
-    """Where an effect file can act on ``device``, and what is wrong with it.
+    """Find the targets of an effect file, named ``where`` in messages, on ``device``.
 
-    Args:
-        declaration: the parsed file.
-        where: its name, for messages.
-        device: on which it is tried.
-        target: axis, force component or pair; all that make sense where empty.
-
-    Returns:
-        Names ``effect[:target]`` that were tried, and one line a fault.
+    ``target`` is an axis, force component or pair; "" tries all that make sense. Returns the names
+    ``effect[:target]`` that were tried, and one line per fault.
     """
     if faults := schema.faults(Effect, declaration, where):
         return [], [str(fault) for fault in faults]
@@ -108,7 +92,7 @@ def _unfit(effect: Effect, device: Device) -> str:
 
 
 def _named(error: InputError, where: str) -> str:
-    """The error with the file in front, in place of what the derivation calls the device."""
+    """Return the error located in the file, instead of the derivation's name for the device."""
     place = error.where.partition(": ")[2]
     return str(InputError(error.what, where=f"{where}: {place}" if place else where,
                           remedy=error.remedy))  # fmt: skip

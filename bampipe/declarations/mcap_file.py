@@ -1,4 +1,4 @@
-"""A recording as an MCAP file with JSON messages, as Foxglove reads it.
+"""Export of a recording as an MCAP file with JSON messages, for Foxglove.
 
 Source: mcap.dev, specification; docs.foxglove.dev, message schemas Log and FrameTransforms.
 """
@@ -16,7 +16,7 @@ _INFO, _WARNING = 2, 3
 
 
 def pack_recording(recording: Recording) -> bytes:
-    """Return the file: a topic an axis, /markers, and of a robot /tf and /robot_description.
+    """Return the file: a topic per axis, /markers, and for a robot /tf and /robot_description.
 
     Raises:
         InputError: the library mcap is not installed.
@@ -55,9 +55,8 @@ def pack_recording(recording: Recording) -> bytes:
         _add_poses(recording, open_topic, add, stamp)
     if recording.urdf:
         text = {"data": {"type": "string"}}
-        add(
-            open_topic("/robot_description", "std_msgs/String", text), 0.0, {"data": recording.urdf}
-        )
+        channel = open_topic("/robot_description", "std_msgs/String", text)
+        add(channel, 0.0, {"data": recording.urdf})
         data = recording.urdf.encode()
         writer.add_attachment(stamp(0.0), stamp(0.0), "robot.urdf", "application/xml", data)
     writer.finish()

@@ -1,4 +1,4 @@
-"""Effects of a robot's model as MuJoCo has them: polynomial joints, tendons, motors, bristles."""
+"""Effects of a robot's model as MuJoCo elements: polynomial joints, tendons, motors, bristles."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -15,25 +15,25 @@ from bampipe.physics.effect import BoundEffect
 from bampipe.physics.robot import Robot
 
 _FAR = 1e6
-"""Where a spring on one side ends on the other, rad or m."""
+"""Far end of a spring that acts on one side only, rad or m."""
 _BRISTLE, _SETTLE_S = 1e-5, 1e-5
-"""Travel in which a bristle that stands for Stribeck friction gives way, rad or m, and its damping
-over its stiffness: more of it acts a step late."""
+"""Deflection at which a bristle for Stribeck friction yields, rad or m, and its damping over its
+stiffness: with more damping, it acts a step late."""
 _AS_LOGGED: Mapping[str, float] = {"gain": 1.0, "offset": 0.0, "delay": 0.0, "lag": 0.0}
 
 
 @dataclass
 class _Writer:
-    """Collects what effects add to a robot, and those that it has no place for.
+    """Collects the elements that effects add to a robot, and effects that MJCF cannot express.
 
     Attributes:
         system, p: the model and its parameters; robot: its joints.
-        names: of the drawing, by that of the coordinate.
-        armature: inertia of each joint's drives, less what tendons have of it.
-        add: what goes into the MJCF; lacks: effects that do not, and how others differ.
-        friction: what is left of each joint's Coulomb friction.
+        names: the drawing's name of each coordinate's joint.
+        armature: inertia of each joint's drives, less the part in tendons.
+        add: elements of the MJCF; lacks: effects that cannot be expressed, and other differences.
+        friction: each joint's Coulomb friction that no bristle has taken.
         springs: coefficients of position, its square and cube by joint, N.m or N.
-        drives: what stands between each drive's input and its joint.
+        drives: gain, offset, delay and lag between each drive's input and its joint.
     """
 
     system: System
@@ -48,11 +48,11 @@ class _Writer:
     drives: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def value(self, name: str) -> float:
-        """A parameter of the model by its name."""
+        """Return a parameter of the model by its name."""
         return float(self.p[self.system.index(name)])
 
-    def tendon(self, turns: Mapping[str, float], **attributes: float | str) -> None:
-        """A tendon over joints with what acts on the sum of their turns."""
+    def add_tendon(self, turns: Mapping[str, float], **attributes: float | str) -> None:
+        """Add a tendon over joints, with elements that act on the sum of their turns."""
         for joint in turns:
             if "armature" in attributes:
                 self.armature[joint] -= turns[joint] ** 2 * float(attributes["armature"])
@@ -61,29 +61,29 @@ class _Writer:
         self.add.tendons.append(({"name": f"tendon_{len(self.add.tendons) + 1}", **shown}, joints))
 
     def set_joint(self, axis: str, **attributes: float | Array) -> None:
-        """Give a joint attributes in place of its own."""
+        """Replace attributes of a joint."""
         shown = {k: number_list(np.atleast_1d(v)) for k, v in attributes.items()}
         self.add.joints.setdefault(self.names[axis], {}).update(shown)
 
-    def bristles(self, axis: str, *numbers: float) -> None:
-        """LuGre friction at a joint: a motor that never drives it."""
+    def add_bristles(self, axis: str, *numbers: float) -> None:
+        """Add LuGre friction to a joint, as a motor that never drives it."""
         joint = self.names[axis]
         given = {"joint": joint, "motorconst": "1e-6", "resistance": "1"}
         name = f"friction_{len(self.add.bristles) + 1}_{joint}"
         self.add.bristles.append({"name": name, **given, "lugre": number_list(numbers)})
 
     def drive(self, force: str) -> dict[str, float]:
-        """What stands between a drive's input and its joint, to be changed."""
+        """Return the changeable numbers between a drive's input and its joint."""
         return self.drives.setdefault(force, {**_AS_LOGGED})
 
-    def left_of_friction(self, axis: str) -> float:
-        """Coulomb friction of a joint that no bristle has yet."""
+    def remaining_friction(self, axis: str) -> float:
+        """Return the Coulomb friction of a joint that no bristle has taken."""
         return self.friction.get(axis, self.value(f"coulomb.{axis}"))
 
     def write(self, item: BoundEffect) -> None:
-        """Add one effect, or note that it has no place."""
+        """Add one effect, or note that it cannot be expressed."""
         name, act = item.effect.name, _WRITERS.get(item.effect.name)
-        # A lab's own effect may have the name of one of these.
+        # An effect of the user's own may have the name of a built-in one.
         if act is not None and item.effect.declaration == registry.effect(name).declaration:
             short = {q.name.removeprefix(f"{item.prefix}."): q.name for q in item.parameters}
             values = {key: self.value(full) for key, full in short.items()}
@@ -92,12 +92,14 @@ class _Writer:
         self.lacks.append(item.name)
 
     def finish(self) -> None:
-        """Give joints and drives what motors and effects make together."""
+        """Write the attributes of joints and drives to which motors and effects contribute."""
         for name, motor in self.robot.motors.items():
             if len(motor.turns) > 1:
                 kinds = ("rotor_inertia", "viscous", "coulomb")
                 inertia, viscous, coulomb = (self.value(f"{kind}_{name}") for kind in kinds)
-                self.tendon(motor.turns, armature=inertia, damping=viscous, frictionloss=coulomb)
+                self.add_tendon(
+                    motor.turns, armature=inertia, damping=viscous, frictionloss=coulomb
+                )
         for axis, inertia in self.armature.items():
             self.set_joint(axis, armature=inertia)
         for axis, c in self.friction.items():
@@ -120,7 +122,7 @@ class _Writer:
 
 
 _Act = Callable[[_Writer, BoundEffect, SimpleNamespace], bool]
-"""Writes an effect, its parameters by their short names; False where it has no place."""
+"""Writes an effect, given its parameters by their short names; returns False if it cannot."""
 
 
 def _spring(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
@@ -138,7 +140,7 @@ def _drag(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
 
 def _stop(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
     ends = (-_FAR, v.position) if item.effect.name == "upper_stop" else (v.position, _FAR)
-    w.tendon({item.target: 1.0}, stiffness=v.stiffness, springlength=number_list(ends))
+    w.add_tendon({item.target: 1.0}, stiffness=v.stiffness, springlength=number_list(ends))
     return True
 
 
@@ -147,7 +149,7 @@ def _load(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
     load = f"load_{w.names[axis]}"
     kind = next(c.kind for c in w.system.model.device.coordinates if c.name == axis)
     w.add.loads.append((load, "slide" if kind == "linear" else "hinge", v.inertia))
-    w.tendon(
+    w.add_tendon(
         {load: 1.0, axis: -1.0},
         stiffness=v.inertia * v.frequency**2,
         damping=2.0 * v.damping * v.frequency * v.inertia,
@@ -159,20 +161,20 @@ def _load(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
 
 
 def _presliding(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
-    left = w.left_of_friction(item.target) - v.force
+    left = w.remaining_friction(item.target) - v.force
     if left >= 0.0:
         w.friction[item.target] = left
-        w.bristles(item.target, v.force / v.distance, 0.0, v.force, v.force, 1.0)
+        w.add_bristles(item.target, v.force / v.distance, 0.0, v.force, v.force, 1.0)
     return bool(left >= 0.0)
 
 
 def _stribeck(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
-    least = w.left_of_friction(item.target)
+    least = w.remaining_friction(item.target)
     if least <= 0.0 or v.force <= 0.0:
         return False
     w.friction[item.target] = 0.0
     stiffness = (least + v.force) / _BRISTLE
-    w.bristles(item.target, stiffness, _SETTLE_S * stiffness, least, least + v.force, v.speed)
+    w.add_bristles(item.target, stiffness, _SETTLE_S * stiffness, least, least + v.force, v.speed)
     return True
 
 
@@ -181,9 +183,9 @@ def _pair(w: _Writer, item: BoundEffect, v: SimpleNamespace) -> bool:
         zip(item.axes, (1.0, 1.0 if item.effect.name.endswith("_sum") else -1.0), strict=True)
     )
     if not hasattr(v, "inertia"):
-        w.tendon(turns, damping=v.viscous, frictionloss=v.coulomb)
+        w.add_tendon(turns, damping=v.viscous, frictionloss=v.coulomb)
     elif v.inertia >= 0.0:
-        w.tendon(turns, armature=v.inertia)
+        w.add_tendon(turns, armature=v.inertia)
     return bool(getattr(v, "inertia", 0.0) >= 0.0)
 
 
@@ -214,7 +216,7 @@ _WRITERS: Mapping[str, _Act] = {
         for what in ("friction", "inertia")
         for how in ("sum", "difference")
     },
-    # In the armature of the joint already.
+    # The armature of the joint includes it already.
     "inertia_mismatch": lambda w, item, v: True,
     **dict.fromkeys(
         ("force_gain", "force_bias", "actuator_lag", "actuator_delay", "drive_delay"), _drive
@@ -225,7 +227,7 @@ _WRITERS: Mapping[str, _Act] = {
 def add_effects(
     system: System, p: Array, robot: Robot, names: Mapping[str, str], drives: Array
 ) -> tuple[Additions, list[str]]:
-    """What a model's effects and shared motors add to an MJCF, and which find no place in it.
+    """Convert a model's effects and shared motors to MJCF; return also those that have no place.
 
     Args:
         system, p: the model and its parameters (n_p,); robot: its joints.
@@ -233,7 +235,7 @@ def add_effects(
         drives: inertia of the drives at each joint, (n_q,).
     """
     writer = _Writer(system, p, robot, names, dict(zip(system.coordinates, drives, strict=True)))
-    # Presliding takes its part of the friction before Stribeck's takes the rest.
+    # Presliding takes its part of the friction before Stribeck friction takes the rest.
     for item in sorted(system.model.effects, key=lambda item: item.effect.name == "stribeck"):
         writer.write(item)
     writer.finish()

@@ -1,4 +1,4 @@
-"""The file ``models/<name>/model.toml``: a device, its effects, and the model it came from."""
+"""The file ``models/<name>/model.toml``: a device, its effects, and the parent model."""
 
 from pathlib import Path
 from typing import Literal
@@ -15,15 +15,15 @@ class ModelFile(Declaration):
 
     schema_: Literal["bampipe.model/1"] = Field(default="bampipe.model/1", alias="schema")
     name: Text = Field(
-        description="Name of the model; a child's is its parent's, + and the effect added"
+        description="Name of the model; a child's is its parent's, then + and each added effect"
     )
     parent: str = Field(default="", description="Name of the parent; empty for the base model")
     device: Text = Field(description="Name of the device")
     effects: Several[Text] = Field(default=(), description="Effects, name[:target]")
     start: dict[str, float] = Field(
         default={},
-        description="Where identification starts, by parameter of an effect; searched for where "
-        "one is absent",
+        description="Initial values for identification, by parameter of an effect; those not given"
+        " are searched for",
     )
 
     def text(self) -> str:
@@ -36,7 +36,7 @@ def read_model_file(path: Path) -> ModelFile:
     """Read a ``model.toml`` of a run folder.
 
     Raises:
-        InputError: there is none, it is damaged, or the folder of its parent is missing.
+        InputError: the file is missing or damaged, or the folder of its parent is missing.
     """
     model = read(ModelFile, read_toml(path), str(path))
     if model.parent and not (path.parent.parent / model.parent / path.name).is_file():

@@ -1,4 +1,4 @@
-"""The model that a run folder names: device, effects, a lab's own files among them, estimates."""
+"""Models of a run folder: device, built-in and own effects, and identified parameters."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,27 +13,26 @@ from bampipe.physics.recipe import Recipe
 from bampipe.results.identify import IdentifyResult
 
 MODEL_INPUTS = ("models/{model}/model.toml", "models/{model}/effects/*.toml", "ingest/device.toml?")
-"""What `load_model` reads, as a stage declares it."""
+"""Files that `load_model` reads, in the form in which a stage declares its inputs."""
 IDENTIFIED_MODEL = (*MODEL_INPUTS, "models/{model}/identify.json")
-"""What `load_model` and `identified` read."""
+"""Files that `load_model` and `read_estimate` read."""
 
 
 def load_model(run: RunFolder, name: str, *, as_declared: bool = False) -> Model:
     """Return the model called ``name`` as ``models/<name>/model.toml`` declares it.
 
-    Once it is identified, the sign of its velocities has the width that was chosen then, unless it
-    is asked for ``as_declared``. Effect files in ``models/<name>/effects/`` and the device file
-    ``ingest/device.toml`` come before built-in ones.
+    An identified model has the sign width that its identification chose, unless it is requested
+    ``as_declared``. Effect files in ``models/<name>/effects/`` and the device file
+    ``ingest/device.toml`` take precedence over built-in ones.
 
     Raises:
-        InputError: a file is missing or wrong, or an effect or the device is not known.
+        InputError: a file is missing or invalid, or an effect or the device is unknown.
     """
     relative = f"models/{name}/model.toml"
     path = run.require(relative, "identify")
     model = read_model_file(path)
-    own = []
-    for file in run.glob(f"models/{name}/effects/*.toml"):
-        own.append(registry.effect_from(read_toml(run.path(file)), str(run.path(file))))
+    files = map(run.path, run.glob(f"models/{name}/effects/*.toml"))
+    own = [registry.effect_from(read_toml(file), str(file)) for file in files]
     declared = Model(load_device(run, model.device), model.effects, own)
     if as_declared or not run.exists(IdentifyResult.file(name)):
         return declared
@@ -44,10 +43,10 @@ def load_model(run: RunFolder, name: str, *, as_declared: bool = False) -> Model
 
 
 def load_device(run: RunFolder, name: str) -> Device:
-    """Return the device of a run folder: the lab's own file, else the built-in one.
+    """Return the device of a run folder: its own device file if present, else the built-in one.
 
     Args:
-        run: the run folder; name: of the built-in device.
+        run: the run folder; name: name of the built-in device.
     """
     if run.exists("ingest/device.toml"):
         path = run.path("ingest/device.toml")
@@ -61,14 +60,10 @@ def read_recipe(run: RunFolder, name: str, model: Model) -> Recipe:
     return Recipe(model.device.declaration, tuple(e.name for e in model.effects), tuple(own))
 
 
-def identified(run: RunFolder, name: str, system: System) -> NDArray[np.float64]:
-    """Return the parameters of the model called ``name``, (n_p,): fixed ones at their prior.
+def read_estimate(run: RunFolder, name: str, system: System) -> NDArray[np.float64]:
+    """Return the parameters of the model called ``name``, (n_p,), fixed ones at their prior.
 
-    Args:
-        run: the run folder; system: the compiled model.
-
-    Raises:
-        InputError: the model has not been identified, or was another one when it was.
+    Raises `InputError` if the model has not been identified, or has changed since.
     """
     found = run.read(IdentifyResult, name).parameters
     p = system.prior

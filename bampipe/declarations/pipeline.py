@@ -1,4 +1,4 @@
-"""Pipeline files: which stages run, with which settings, and which results are good enough."""
+"""Pipeline files: stages to run, their settings, and limits for the results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _in_order(stages: tuple[str, ...]) -> tuple[str, ...]:
     order = [base.STAGES.index(stage) for stage in stages]
     if order != sorted(set(order)):
         raise fault(
-            "stages must stand once each and in order",
+            "each stage must stand once, and in order",
             remedy=f"the order is {', '.join(base.STAGES)}",
         )
     return stages
@@ -37,9 +37,9 @@ NumberPath = Annotated[
 
 
 class Gate(Declaration):
-    """A limit on one number of a result, or on that number for each axis."""
+    """A limit for one number of a result, or for that number on each axis."""
 
-    name: Text = Field(description="What the gate guards, a few words")
+    name: Text = Field(description="Purpose of the gate, in a few words")
     result: Annotated[
         str,
         StringConstraints(pattern=r"^[^/].*\.json$"),
@@ -47,26 +47,26 @@ class Gate(Declaration):
     ]
     value: NumberPath
     divide_by: NumberPath = Field(
-        default="", description="a dotted path of a number that the value is divided by"
+        default="", description="a dotted path of a number by which the value is divided"
     )
     against: Literal["", "accepted"] = Field(
         default="",
-        description="Judge the change since the accepted values instead, in percent; one within two"
-        " standard deviations warns where it would fail",
+        description="Judge the change from the accepted values instead, in percent; a change beyond"
+        " the limit, but within two standard deviations, only warns",
     )
     judged_by: NumberPath = Field(
         default="", description="a dotted path of a word that says whether the value passes"
     )
     passes: Distinct[Text] = Field(default=(), description="Words of judged_by that pass")
     max: Number | None = Field(
-        default=None, description="Largest value that passes; of a list, the most entries"
+        default=None, description="Largest value that passes; for a list, the most entries"
     )
     min: Number | None = Field(default=None, description="Smallest value that passes")
     level: Literal["fail", "warn"] = Field(
-        default="fail", description="fail: exit code 1; warn: said, but the run counts as good"
+        default="fail", description="fail: exit code 1; warn: reported, but the run counts as good"
     )
-    optional: bool = Field(default=False, description="A result that is not there passes")
-    advice: str = Field(default="", description="What to do where the gate does not pass")
+    optional: bool = Field(default=False, description="Whether a missing result passes")
+    advice: str = Field(default="", description="What to do if the gate does not pass")
     advice_on: dict[str, Text] = Field(
         default={}, description="Other advice for some words of judged_by, by word"
     )
@@ -81,10 +81,10 @@ class Gate(Declaration):
 
 
 class BaseModelTable(Declaration):
-    """The base model, where it differs from the bare device of the session."""
+    """The base model, if it differs from the bare device of the session."""
 
     device: str = Field(
-        default="", description="Device of the base model; the session's where left out"
+        default="", description="Device of the base model; the session's by default"
     )
     effects: Distinct[Text] = Field(
         default=(), description="Effects of the base model, name[:target]"
@@ -92,28 +92,28 @@ class BaseModelTable(Declaration):
 
 
 class Pipeline(Declaration):
-    """What ``bampipe run`` does."""
+    """Work of ``bampipe run``."""
 
     schema_: Literal["bampipe.pipeline/1"] = Field(alias="schema")
     name: Annotated[str, StringConstraints(pattern="^[A-Za-z0-9_-]+$")] = Field(
         description="Letters, digits, '_' and '-'"
     )
-    summary: str = Field(default="", description="What the pipeline is for, in one sentence")
+    summary: str = Field(default="", description="Purpose of the pipeline, in one sentence")
     stages: Annotated[Several[StageName], AfterValidator(_in_order), Field(min_length=1)] = Field(
         description="The stages, in order"
     )
     model: BaseModelTable = Field(
-        default=BaseModelTable(), description="The base model, where it is not the bare device"
+        default=BaseModelTable(), description="The base model, if it is not the bare device"
     )
     settings: dict[StageName, dict[str, Any]] = Field(
-        {}, description="By stage: fields of its configuration, in place of the defaults"
+        {}, description="By stage: fields of its configuration that replace the defaults"
     )
-    gates: Several[Gate] = Field(default=(), description="Limits that the results are held against")
+    gates: Several[Gate] = Field(default=(), description="Limits for the results")
     _where: str = PrivateAttr("")
 
     @property
     def where(self) -> str:
-        """The file, for messages."""
+        """The file of the pipeline, for messages."""
         return self._where or f"pipeline {self.name}"
 
     @property
@@ -122,11 +122,11 @@ class Pipeline(Declaration):
         return self.model.device, self.model.effects
 
     def with_every_stage(self) -> Pipeline:
-        """Return the pipeline for single stages: its settings count, each stage may run."""
+        """Return the pipeline for single stages: with its settings, but with every stage."""
         return self.model_copy(update={"stages": base.STAGES})
 
     def content(self) -> dict[str, Any]:
-        """Return what ``run.json`` keeps of the pipeline."""
+        """Return the pipeline's record in ``run.json``."""
         return {
             "name": self.name,
             "stages": list(self.stages),

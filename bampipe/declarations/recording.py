@@ -1,4 +1,4 @@
-"""What viewers of recordings show of a run: torques by every model, markers, and the robot."""
+"""A run as viewers of recordings show it: torques by every model, markers, and the robot."""
 
 import re
 from collections.abc import Mapping
@@ -20,15 +20,15 @@ from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.ingest import IngestResult
 
 DRAWING = "ingest/robot.xml"
-"""The URDF or MJCF that a session brought."""
+"""The session's own URDF or MJCF."""
 _BETWEEN_S = 0.5
-"""Time between the end of a trial and the start of the next."""
+"""Pause between the end of a trial and the start of the next."""
 _POSES_HZ = 30.0
 
 
 @dataclass(frozen=True)
 class Marker:
-    """A remark at a moment, s; ``warns`` where it needs attention."""
+    """A remark at an instant, s; ``warns`` if it needs attention."""
 
     time: float
     text: str
@@ -47,16 +47,17 @@ class Frame:
 
 @dataclass(frozen=True)
 class Recording:
-    """A session with its trials one after another.
+    """The trials of a session, one after another.
 
     Attributes:
         name: of the session; start: of its first trial, s since 1970, or 0.
         signals: by axis, the times (T,), s after the start, and columns (T,) by name: measured,
             then predicted and residual of each model version, N.m or N.
-        units: of these, by axis.
-        markers: trials, worst windows and verdicts, in the order of their times.
-        times: of the poses, (n,), s; frames: links there, parents first; none without a drawing.
-        urdf: the drawing where it is a URDF, else "".
+        units: units of these, by axis.
+        markers: trials, worst windows and verdicts, in order of time.
+        times: times of the poses, (n,), s; frames: links at these times, parents first; empty
+            without a drawing.
+        urdf: the drawing if it is a URDF, else "".
     """
 
     name: str
@@ -70,11 +71,7 @@ class Recording:
 
 
 def gather_recording(run: RunFolder) -> Recording:
-    """Gather what a viewer shows of a run folder.
-
-    Raises:
-        InputError: no model has been validated.
-    """
+    """Gather the content of a run folder; raise `InputError` if no model has been validated."""
     session = run.read(IngestResult)
     models = sorted(
         (Path(path).parent.name for path in run.glob("models/*/residuals.parquet")),
@@ -128,7 +125,7 @@ def _place_rows(rows: pd.DataFrame, offsets: Mapping[str, float]) -> Array:
 
 
 def _mark(found: DiagnoseResult, offsets: Mapping[str, float]) -> list[Marker]:
-    """The verdicts on a model, and its worst windows."""
+    """Mark the verdicts on a model, and its worst windows."""
     markers = [
         Marker(0.0, f"{found.model}: {entry.sentence}", entry.verdict != "nothing_missing")
         for entry in found.axes.values()
@@ -143,7 +140,7 @@ def _mark(found: DiagnoseResult, offsets: Mapping[str, float]) -> list[Marker]:
 def _pose_links(
     tree: Tree, motion: pd.DataFrame, offsets: Mapping[str, float]
 ) -> tuple[Array, tuple[Frame, ...]]:
-    """Times, and every link in the frame of its parent; joints that are not logged stay at zero."""
+    """Return times, and links in their parents' frames; joints that are not logged stay at zero."""
     times = _place_rows(motion, offsets)
     step = max(1, round(1.0 / (_POSES_HZ * float(np.median(np.diff(times))))))
     times, motion = times[::step], motion.iloc[::step]

@@ -1,4 +1,4 @@
-"""A recording as an .rrd file, as the viewer of Rerun reads it."""
+"""Export of a recording as an .rrd file for the viewer Rerun."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -43,7 +43,7 @@ def pack_recording(recording: Recording) -> bytes:
 
 
 def _draw_links(recording: Recording) -> Array:
-    """From each link's frame to that of the next, in the frame of the root, (n, joints, 2, 3)."""
+    """Return lines from each link's frame to the next, in the root's frame, (n, joints, 2, 3)."""
     n = len(recording.times)
     placed: dict[str, tuple[Rotation, Array]] = {}
     lines = []

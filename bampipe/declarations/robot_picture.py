@@ -1,4 +1,4 @@
-"""A robot as it is declared, drawn at position zero: from the side and from above, as SVG."""
+"""Drawing of a declared robot at position zero, from the side and from above, as SVG."""
 
 import io
 from collections.abc import Sequence
@@ -14,21 +14,22 @@ from bampipe.physics.robot import Joint, Robot, rotation_matrix
 
 _INK, _FAINT, _BODY, _WRONG = "#1c2024", "#b4b8bd", "#56b4e9", "#d55e00"
 _VIEWS = {"from the side": (0, 2, 1), "from above": (0, 1, 2)}
-"""By title, the base's axes to the right, upwards and to the eye."""
+"""By title: the axes of the base to the right, upwards and towards the viewer."""
 _ALONG = 0.8
-"""Of an axis' length along the view: it is drawn as one that points at the eye."""
+"""Component of an axis along the view above which it is drawn as pointing to the viewer."""
 _AXIS = 0.04
-"""Of the robot's length: what is drawn of an axis on either side of its joint."""
+"""Length of a drawn axis on either side of its joint, relative to the robot's length."""
 _HEAVIEST = 800.0
 """Area of the heaviest body, square points."""
 _NEAR, _LINE = 0.03, 11.0
-"""Of the robot's length, joints so close have their names one below the other, so many points."""
+"""Distance, relative to the robot's length, of joints whose names are stacked, and the line height,
+points."""
 _SETTINGS: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "bampipe", "font.size": 9.0}
 
 
 @dataclass(frozen=True)
 class _Placed:
-    """A joint in the base's frame: where it is and what is before it, its axis, its body."""
+    """A joint in the base's frame: its predecessor's place, its own, its axis and body centre."""
 
     joint: Joint
     before: Array
@@ -38,10 +39,9 @@ class _Placed:
 
 
 def draw_robot(robot: Robot) -> str:
-    """The chain at position zero: joints with their axes, and bodies as large as their mass.
+    """Draw the chain at position zero, with joint axes, and bodies in proportion to their mass.
 
-    A joint that turns is round, one that slides is square; a body that cannot exist has another
-    colour.
+    Rotary joints are round, sliding ones square; impossible bodies have another colour.
 
     Returns:
         Text of an SVG file.

@@ -1,4 +1,4 @@
-"""The device of a session: found, held against the session's channels, and what it leaves open."""
+"""The device of a session, checked against the session's channels; and its placeholders."""
 
 from collections.abc import Iterator, Mapping
 
@@ -11,11 +11,11 @@ from bampipe.physics.units import parse_unit
 
 
 def session_device(session: Session) -> Device:
-    """Return the device that a session names, built in or a file of its own.
+    """Return the device that a session names, a built-in one or a file of its own.
 
     Raises:
-        InputError: there is none, or an axis or an input of it has no channel, or one of another
-            name or unit; all of it.
+        InputError: there is no such device, or channels for its axes and inputs are missing or
+            have another name or unit; all faults are listed.
     """
     device = _device(session)
     found = list(_mismatches(session, device))
@@ -83,7 +83,7 @@ def _mismatches(session: Session, device: Device) -> Iterator[InputError]:
     for channel in session.channels:
         expected = wanted.get(channel.name, channel.unit)
         if device.robot is not None and (channel.unit, expected) == ("N", "N.m"):
-            continue  # the drive of a joint that slides: its force, along the joint
+            continue  # the drive of a sliding joint: its force along the joint
         if not _alike(channel.unit, expected):
             yield InputError(
                 f"a unit of {channel.unit or 'a pure number'}, but device '{device.name}' takes"
@@ -94,14 +94,14 @@ def _mismatches(session: Session, device: Device) -> Iterator[InputError]:
         yield InputError(
             f"found \"{session.force.unit}\", but device '{device.name}' takes {device.force_unit}",
             where=f"{where}: force.unit",
-            remedy="lever_m, its distance from the axis in m, makes a torque of a force"
+            remedy="lever_m, its distance from the axis in m, converts a force to a torque"
             if (session.force.unit, device.force_unit) == ("N", "N.m")
             else "",
         )
 
 
 def _alike(one: str, other: str) -> bool:
-    """Whether two units have the same dimension, as far as they can be read."""
+    """Whether two units have the same dimension; unreadable units differ."""
     if one == other:
         return True
     try:

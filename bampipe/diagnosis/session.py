@@ -41,7 +41,7 @@ from bampipe.trials.likelihood import (
 )
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import NoiseFloor
-from bampipe.trials.replay import StandIn, keep_motion, replay_motion
+from bampipe.trials.replicates import SimulatedTrials, keep_motion, make_replicate
 from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.sensors import Sensors
 from bampipe.workers import process_pool
@@ -180,12 +180,12 @@ class Session:
     def _replay(
         self, e: Evidence, system: System, p: Array, sensors: Sensors, seeds: Sequence[Seed]
     ) -> Sequence[Array]:
-        stand_in = StandIn(system, p, e.motions, sensors.rate_hz)
+        simulated = SimulatedTrials(system, p, e.motions, sensors.rate_hz)
         parts = [[seed] for seed in seeds] if self.jobs > 1 else [seeds]
         # Workers inherit what the machine does, which is the same in all replays.
-        trials = range(min(len(stand_in.courses), len(stand_in.rests)))
+        trials = range(min(len(simulated.courses), len(simulated.rests)))
         tasks = [(trial, part) for trial in trials for part in parts]
-        state = e, stand_in, sensors, self.trials.kinematics
+        state = e, simulated, sensors, self.trials.kinematics
         with workers(state, min(self.jobs, len(tasks))) as spread:
             found = spread(_residuals_of_replays, tasks)
             return KeptItems(np.concatenate([next(found) for _ in parts], axis=2) for _ in trials)
@@ -253,7 +253,7 @@ class Session:
         log_likelihood = problem.log_likelihood()
         # How far the bias may be off is known once the model is fitted.
         likelihood = self.weight_samples(recipe, evidence, likelihood.noise)
-        likelihood = likelihood.with_heavy_tails(likelihood.pose(evidence), c.tails)
+        likelihood = likelihood.with_heavy_tails(likelihood.pose_problem(evidence), c.tails)
         likelihood = likelihood.with_equal_weights(problem, lacking)
         evidence, problem = self._descend(recipe, evidence, likelihood)
         return Fit(recipe, evidence, likelihood, problem, log_likelihood)
@@ -269,7 +269,7 @@ class Session:
         Raises:
             ValueError: fewer samples are clear of standstill than there are parameters.
         """
-        problem, count = likelihood.pose(evidence), len(evidence.free)
+        problem, count = likelihood.pose_problem(evidence), len(evidence.free)
         if sum(map(len, problem.y)) <= count:
             raise ValueError("fewer samples clear of standstill than parameters")
         here = problem.solve_nuisance(count).cost
@@ -287,7 +287,7 @@ class Session:
                     )
                 except NotFinite:
                     continue
-                tried = likelihood.pose(moved)
+                tried = likelihood.pose_problem(moved)
                 there = tried.solve_nuisance(count).cost
                 if there < here:
                     break
@@ -304,7 +304,7 @@ class Session:
         """
         evidence = self.linearise(recipe, p, judged=True)
         likelihood = self.weight_samples(recipe, evidence, count=count)
-        return Fit(recipe, evidence, likelihood, likelihood.pose(evidence), given=True)
+        return Fit(recipe, evidence, likelihood, likelihood.pose_problem(evidence), given=True)
 
     def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
         """Fit a model with noise that is the same for all samples of an axis, without replays."""
@@ -452,11 +452,11 @@ def rms(values: Array) -> float:
 
 def _residuals_of_replays(task: tuple[int, Sequence[Seed]]) -> Array:
     """The residuals of one trial on replays of it, by seed, (K, n_q, seeds)."""
-    (e, stand_in, sensors, kinematics), (trial, seeds) = shared(), task
+    (e, simulated, sensors, kinematics), (trial, seeds) = shared(), task
     rows = []
     for seed in seeds:
         rng = np.random.default_rng([*seed, trial])
-        motion = replay_motion(stand_in, trial, sensors, kinematics, rng)
+        motion = make_replicate(simulated, trial, sensors, kinematics, rng)
         rows.append(ModelOnTrial(e.system, e.p, [motion]).residual)
     thin = e.band.thin_trials(rows, range(len(e.system.coordinates)))
     return np.stack([values * e.used[trial] for values in thin], axis=2)

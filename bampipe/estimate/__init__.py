@@ -1,1 +1,1 @@
-"""Estimators: they see callables and arrays only, never the physics or the data."""
+"""Estimators, which depend only on arrays and callables, not on physics or data files."""

@@ -1,16 +1,13 @@
-"""Least squares within bounds: one linear solver, and one Gauss-Newton descent on top of it.
+"""Linear least squares within bounds.
 
-A linear fit hands its normal equations to `solve_bounded`. Sums over trials, over axes and over all
+A fit hands its normal equations to `solve_bounded`. Sums over trials, over axes and over all
 trials but one are sums of normal equations, so a held-out fit needs no second pass over the data:
 
     normal, moment = slope.T @ slope, slope.T @ measured
     solve_bounded(normal, moment, lower, upper)
 
-Coefficients with equal bounds are held at that value. A nonlinear fit wraps the point it has
-reached in an `Iterate` and calls `descend`.
+Coefficients with equal bounds are held at that value.
 """
-
-from typing import Protocol, Self, TypeVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -24,17 +21,13 @@ _DETERMINED = 1e-6
 """A Cholesky factor whose squared pivots exceed this, at unit diagonal, is well determined."""
 _MOST_CHANGES = 20
 """Changes of the active set before the method that always terminates takes over."""
-_SMALLEST_SHARE = 1e-3
-"""Halving of a Gauss-Newton step ends at this share of it."""
 
 
 def scaled_eigenbasis(matrix: Array) -> tuple[Array, Array, Array, Flags]:
     """Return the eigenvectors of normal equations, scaled to a unit diagonal.
 
-    A coefficient without any information keeps its scale and is a null vector by itself.
-
-    Args:
-        matrix: (n, n) symmetric, not negative.
+    A coefficient without any information keeps its scale and is a null vector by itself. The
+    ``matrix`` (n, n) is symmetric and not negative.
 
     Returns:
         scale (n,), eigenvalues (n,) rising, eigenvectors (n, n) and which of them are null (n,).
@@ -66,8 +59,8 @@ def solve_bounded(normal: Array, moment: Array, lower: Array, upper: Array) -> A
     Parker (1995), which also releases a coefficient from a bound.
 
     Args:
-        normal: (n, n) slope^T slope; moment: (n,) slope^T measured, whatever the weights.
-        lower, upper: (n,), infinite without a bound, equal for a given coefficient.
+        normal: (n, n) slope^T slope; moment: (n,) slope^T measured, with any weights.
+        lower, upper: (n,), infinite without a bound, equal for a fixed coefficient.
     """
     quick = _solve_definite(normal, moment, lower, upper)
     if quick is not None:
@@ -144,53 +137,3 @@ def _solve_definite(normal: Array, moment: Array, lower: Array, upper: Array) ->
         x[beyond] = np.clip(x[beyond], low[beyond], high[beyond])
         fixed = (fixed | beyond) & ~back
     return None
-
-
-class Iterate(Protocol):
-    """A point that a nonlinear fit has reached; never changed, only followed by others."""
-
-    @property
-    def value(self) -> Array:
-        """(n,) parameters."""
-
-    @property
-    def cost(self) -> float:
-        """The cost; not finite if the model fails."""
-
-    def normal_equations(self) -> tuple[Array, Array]:
-        """Return slope^T slope (n, n) and minus slope^T residual (n,), linearised here."""
-
-    def moved(self, value: Array, share: float) -> Self:
-        """Return the point at ``value``, which is that ``share`` of a full step away."""
-
-
-Point = TypeVar("Point", bound=Iterate)
-
-
-def descend(
-    start: Point, lower: Array, upper: Array, most_iterations: int, tolerance: float = 1e-10
-) -> Point:
-    """Take Gauss-Newton steps within bounds, each halved until the cost does not rise.
-
-    Returns the point where they end.
-
-    Args:
-        start: where to start, within the bounds.
-        lower, upper: (n,) bounds of the parameters.
-        most_iterations: the most steps.
-        tolerance: change of the cost below which the descent has converged.
-    """
-    at = start
-    for _ in range(most_iterations):
-        step = solve_bounded(*at.normal_equations(), lower - at.value, upper - at.value)
-        share = 1.0
-        while True:
-            tried = at.moved(np.clip(at.value + share * step, lower, upper), share)
-            gained = at.cost - tried.cost
-            if gained >= 0.0 or share < _SMALLEST_SHARE:
-                break
-            share /= 2.0
-        at = tried if gained >= 0.0 else at
-        if not gained >= tolerance:
-            break
-    return at

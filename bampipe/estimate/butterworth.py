@@ -10,20 +10,15 @@ from bampipe.estimate.differentiation import Derivatives, extend
 from bampipe.estimate.low_pass import low_pass_at
 
 _REACH = 6
-"""Samples on either side that a derivative of an input uses."""
+"""Samples on either side from which a derivative of an input is computed."""
 
 
 def zero_phase(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, Array, Array]:
     """Return ``values`` (T,) low-passed forwards and backwards, and its two derivatives, each (T,).
 
     The derivatives are central differences of fourth order, which follow the true derivative to
-    0.1 % up to 6 % of the sampling rate (the common two-point difference loses 2 % there).
-
-    Args:
-        values: samples on a uniform grid.
-        rate_hz: sampling rate, Hz.
-        cutoff_hz: half-power frequency of one pass, Hz; both passes together let 50 % of the
-            amplitude through there.
+    0.1 % up to 6 % of the sampling rate (the common two-point difference loses 2 % there). At
+    ``cutoff_hz``, the half-power frequency of one pass, both passes transmit half of the amplitude.
     """
     x, added = _low_passed(values, rate_hz, cutoff_hz)
     inner = np.arange(added, added + len(values))
@@ -39,9 +34,10 @@ def zero_phase(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, 
 def rates(values: Array, rate_hz: float, cutoff_hz: float, count: int) -> list[Array]:
     """Return the first ``count`` time derivatives of ``values`` (T,), each (T,), band-limited.
 
-    Two orders come from each pass of the filter, so that higher ones are smoothed more. The central
-    differences are of twelfth order: to 0.1 % up to a fifth of the sampling rate, where residuals
-    may end; those of :func:`zero_phase` lose 7 % there, by which a delay would look like a lag.
+    Each pass of the filter gives two orders, so that higher ones are smoothed more. The central
+    differences are of twelfth order and exact to 0.1 % up to a fifth of the sampling rate, the
+    highest cut-off of residuals. Those of :func:`zero_phase` lose 7 % there, so that a delay would
+    look like a lag.
     """
     found: list[Array] = []
     while len(found) < count:
@@ -57,7 +53,8 @@ def rates(values: Array, rate_hz: float, cutoff_hz: float, count: int) -> list[A
 def _difference_weights() -> tuple[Array, Array]:
     """Weights (2 _REACH + 1,) of samples in central differences, first and second order.
 
-    Those of the polynomial through all of them (Fornberg 1988, Mathematics of Computation 51, 699).
+    They follow from the polynomial through all samples (Fornberg 1988, Mathematics of Computation
+    51, 699).
     """
     at = np.arange(-_REACH, _REACH + 1)
     inverse = np.linalg.inv(np.vander(at.astype(float), increasing=True))
@@ -65,7 +62,7 @@ def _difference_weights() -> tuple[Array, Array]:
 
 
 def _low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array, int]:
-    """``values`` (T,), continued at both ends and low-passed both ways; samples added at each.
+    """Extend ``values`` (T,) at both ends and low-pass them; return also the samples added per end.
 
     Raises:
         ValueError: the cut-off is not between 0 and half the sampling rate.
@@ -80,9 +77,9 @@ def _low_passed(values: Array, rate_hz: float, cutoff_hz: float) -> tuple[Array,
 
 
 def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -> Derivatives:
-    """Return the motion behind ``position`` (T,), with error bands of white noise of ``noise_sd``.
+    """Return the motion behind ``position`` (T,), with error bands for white noise of ``noise_sd``.
 
-    They do not cover motion above the cut-off, which is lost.
+    The bands do not cover motion above the cut-off, which is lost.
     """
     length = len(position)
     # Near the ends the noise gain differs from that in the middle.
@@ -97,12 +94,12 @@ def smooth(position: Array, rate_hz: float, cutoff_hz: float, noise_sd: float) -
 
 
 def floor_frequency(position: Array, rate_hz: float, noise_sd: float) -> float:
-    """Return the frequency, Hz, above which the spectrum of ``position`` (T,) is noise only.
+    """Return the frequency, Hz, above which the spectrum of ``position`` (T,) is only noise.
 
-    Noise of standard deviation ``noise_sd`` has the density 2 noise_sd² / rate; the answer is the
-    highest frequency up to which the density of the motion, averaged over a third of an octave,
-    stays above twice that (the signal is as strong as the noise). A line through the end points
-    is taken off first and a Blackman window applied, so that leakage stays below the floor.
+    Noise of standard deviation ``noise_sd`` has the density 2 noise_sd² / rate. The result is the
+    highest frequency up to which the spectral density, averaged over a third of an octave, stays
+    above twice that, so that the signal is as strong as the noise. A line through the end points is
+    subtracted and a Blackman window applied, so that leakage stays below the floor.
     """
     steps = np.arange(len(position))
     line = np.interp(steps, (0, len(position) - 1), (position[0], position[-1]))

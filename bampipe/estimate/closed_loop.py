@@ -1,4 +1,4 @@
-"""Machine and controller simulated together: the motion in closed loop."""
+"""Simulation of a machine together with its controller, in closed loop."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -112,20 +112,19 @@ def simulate_controlled(
 ) -> tuple[Array, Array, Array]:
     """Integrate machine and controller together from ``x0``: a free run in closed loop.
 
-    The controller reads the encoders, computes its command and holds it until it acts again. Its
-    integrals start where its first command is nearest to the recorded one.
+    The controller reads the encoders, computes its command and holds it until it acts again. The
+    integrals start at values for which its first command is nearest to the recorded one.
 
     Args:
         derivative, x0, p, dt, width, n_noise: as in `simulate`.
-        measure: compiled h(x, u, p, y): what the encoders read.
-        command: compiled c(y, r, s, out): commands from readings, references, gains and the states
-            of the controller; and the rates of these.
-        u: (T, nu) inputs; the columns ``force`` are replaced by the commands.
+        measure: compiled h(x, u, p, y), the encoder readings.
+        command: compiled c(y, r, s, out): the commands from readings, references, gains and the
+            states of the controller, followed by the rates of these states.
+        u: (T, nu) inputs; the columns ``force`` are replaced by the commands, in their order.
         r: (T, nr) references, gains and other channels of the law, linear between samples.
-        force: columns of ``u`` that the controller commands, in the order of its output.
-        rate_hz: how often the controller acts, rounded to whole times a sample; where it is 0,
-            once a millisecond or oftener.
-        limits: (n_s, 2) between which each state of the controller is kept.
+        rate_hz: rate at which the controller acts, rounded to a multiple of the sampling rate; 0
+            for once a millisecond or more often.
+        limits: (n_s, 2) lower and upper limit of each state of the controller.
 
     Returns:
         states (T, nx), inputs with the commands (T, nu), readings (T, 2 n_q).
@@ -156,8 +155,8 @@ def simulate_controlled(
 def _first_states(command: Any, y: Array, r: Array, recorded: Array, limits: Array) -> Array:
     """Return states (n_s,) of the controller that give the recorded command, within ``limits``.
 
-    One step of Newton's method from zero, exact for a command linear in them; the smallest solution
-    if there are several.
+    It takes one Newton step from zero, which is exact for a command linear in the states; of
+    several solutions it returns the smallest.
     """
     count, nf = len(limits), len(recorded)
     states, out = np.clip(np.zeros(count), *limits.T), np.zeros(nf + count)

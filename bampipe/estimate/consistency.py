@@ -1,10 +1,10 @@
-"""Test whether a filter is consistent with its model, on windows of normalised innovations.
+"""Test of a filter's consistency with its model, by windows of normalised innovations.
 
-Over a window the normalised innovation squared (NIS) of a consistent filter averages the number of
-readings, and with white Gaussian noise its sum follows the chi-squared law (Bar-Shalom, Li and
-Kirubarajan 2001, section 5.4). Encoder steps are not Gaussian and model errors not white, so if
-there are windows known to be good, the law is a gamma distribution with their mean and variance, of
-which chi-squared is a special case.
+Over a window, the normalised innovation squared (NIS) of a consistent filter averages the number of
+readings, and with white Gaussian noise its sum follows the chi-squared distribution (Bar-Shalom, Li
+and Kirubarajan 2001, section 5.4). Encoder steps are not Gaussian and model errors are not white.
+If some windows are known to be good, a gamma distribution with their mean and variance is therefore
+used, of which chi-squared is a special case.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from scipy.special import gammaincinv
 from bampipe.arrays import Array, Flags
 
 FEWEST_READINGS = 0.1
-"""A reading in less than this share of a window is useless; slow sensors leave gaps too."""
+"""Smallest fraction of a window in which a reading must be present; slow sensors leave gaps."""
 
 FEWEST_WINDOWS = 10
-"""Fewest good windows whose scatter is used."""
+"""Smallest number of good windows whose scatter is used."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Law of the mean NIS of a reading over a window: a gamma distribution.
+    """Distribution of the mean NIS per reading over a window: a gamma distribution.
 
     Attributes:
-        shape, scale: its mean is their product, 1 for a filter that is given the right noise.
+        shape, scale: parameters; their product is the mean, 1 for a filter with the right noise.
     """
 
     shape: float
@@ -41,11 +41,11 @@ class Reference:
 
     @staticmethod
     def of_windows(means: Array, readings: int) -> Reference:
-        """The law of good windows; with fewer than `FEWEST_WINDOWS` of them, theory's.
+        """Fit the distribution to good windows; fewer than `FEWEST_WINDOWS` give `of_theory`.
 
         Args:
-            means: (n,) mean NIS of a reading over each window.
-            readings: in a window. The variance is at least that of theory at this mean.
+            means: (n,) mean NIS per reading over each window.
+            readings: number in a window. The variance is at least that of theory at this mean.
         """
         theory = Reference.of_theory(readings)
         if means.size < FEWEST_WINDOWS:
@@ -60,10 +60,10 @@ class Reference:
 
 
 def window_means(nis: Array, n_readings: int, samples: int) -> Array:
-    """Mean NIS of a reading over whole windows of ``samples``, (windows,).
+    """Mean NIS per reading over whole windows of ``samples``, (windows,).
 
     Args:
-        nis: (T,) NaN where no reading was taken; n_readings: of one sample.
+        nis: (T,) NaN where no reading was taken; n_readings: per sample.
         samples: length of a window; windows less than half full are left out.
     """
     count = nis.size // samples
@@ -75,15 +75,15 @@ def window_means(nis: Array, n_readings: int, samples: int) -> Array:
 
 
 class WindowTest:
-    """Sums innovations up to windows, one after the other.
+    """Collects innovations into consecutive windows and averages each.
 
     Attributes:
-        ratio: mean NIS of a reading over the last complete window; NaN before the first, and
-            infinite where a reading was of no use.
+        ratio: mean NIS per reading over the last complete window; NaN before the first, and
+            infinite if a reading was unusable.
         by_reading: (ny,) mean square of each innovation in its own standard deviation, there.
-        useless: (ny,) which readings were of no use there: absent, or beyond what the filter
-            could take, in all but a tenth of the window.
-        windows: how many were judged.
+        useless: (ny,) which readings were unusable there: absent, or beyond the range of the
+            filter, in all but a tenth of the window.
+        windows: number of windows judged.
     """
 
     def __init__(self, n_readings: int, samples: int) -> None:
@@ -96,12 +96,12 @@ class WindowTest:
         self._waiting = np.zeros((0, 1 + 2 * n_readings))
 
     def take(self, nis: Array, squares: Array, present: Flags) -> list[float]:
-        """Add samples; return the mean NIS of a reading of each window that is now whole.
+        """Add samples; return the mean NIS per reading of each window completed by them.
 
         Args:
             nis: (T,); squares: (T, ny) squared innovations in their own variance; not finite
-                where there was no reading, or none that the filter could use.
-            present: (T, ny) whether there was a reading that the filter could use.
+                where a reading was missing or unusable.
+            present: (T, ny) whether a usable reading was present.
         """
         self._waiting = np.vstack([self._waiting, np.column_stack([nis, squares, present])])
         found, n = [], squares.shape[1]

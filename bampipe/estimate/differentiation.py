@@ -1,9 +1,9 @@
-"""Common parts of all methods that differentiate a sampled motion.
+"""Parts that all methods of differentiating a sampled motion share.
 
 A method takes positions on a uniform grid and returns position, velocity and acceleration with
 their standard deviations. Two are implemented: a zero-phase Butterworth filter followed by central
-differences (:mod:`bampipe.estimate.butterworth`) and a Kalman smoother of an integrated white noise
-(:mod:`bampipe.estimate.kalman_smoother`).
+differences (:mod:`bampipe.estimate.butterworth`), and a Kalman smoother of an integrated white
+noise (:mod:`bampipe.estimate.kalman_smoother`).
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from scipy.interpolate import Akima1DInterpolator, CubicSpline, PchipInterpolato
 from bampipe.arrays import Array, Flags
 
 _GAP = 2.5
-"""Splines do not bridge gaps of more than so many usual sampling intervals."""
+"""Splines do not bridge gaps longer than this multiple of the median sampling interval."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Derivatives:
     """A motion and its first two derivatives, each of shape (T,).
 
     The standard deviations (``*_sd``) cover the measurement noise; those of the Kalman smoother
-    also cover what the motion may do between and beyond the samples.
+    also cover possible motion between and beyond the samples.
     """
 
     position: Array
@@ -42,7 +42,7 @@ class UniformGrid:
     Attributes:
         t: the grid, shape (T,), s.
         bridged: shape (T,), true where no sample lies within one sampling interval of the grid
-            point, so that the value there is a guess across a gap.
+            point, so that the value is a guess across a gap.
         exact: whether all samples lie on the grid, so that nothing is interpolated.
         source: time stamps of the samples, shape (N,), s.
     """
@@ -60,10 +60,10 @@ class UniformGrid:
         return np.asarray(values[np.clip(last, 0, len(values) - 1)], dtype=np.float64)
 
     def resample(self, values: Array, jumps: bool = False) -> Array:
-        """Return ``values`` (N,) on the grid (T,).
+        """Interpolate ``values`` (N,) to the grid (T,).
 
         A cubic spline is used, whose error falls with the fourth power of the sampling interval (de
-        Boor 1978, A Practical Guide to Splines); across gaps by monotone cubic interpolation
+        Boor 1978, A Practical Guide to Splines), and across gaps a monotone cubic interpolation
         (Fritsch and Butland 1984), which does not overshoot. Of values with ``jumps``, such as a
         force when friction reverses, a spline would ring: Akima's interpolation (1970, Journal of
         the ACM 17, 589), modified, hardly does.
@@ -84,9 +84,9 @@ class UniformGrid:
 def spline_curvature(t: Array, values: Array) -> Array:
     """Second derivatives (N, n) of cubic splines through ``values`` (N, n) at times ``t`` (N,), s.
 
-    Between two samples a second derivative runs linearly. Where samples lie further apart than
-    most, or close together, the splines end, straight: across a gap they would overshoot, and
-    between close stamps follow noise.
+    Between two samples a second derivative is linear. Splines end with zero curvature at gaps,
+    where they would overshoot, and between stamps that are close together, where they would follow
+    noise.
     """
     curvature = np.zeros(values.shape)
     step = np.diff(t)
@@ -135,10 +135,10 @@ def uniform_grid(t: Array, rate_hz: float) -> UniformGrid:
 def extend(values: Array, reach: int, fit: int) -> Array:
     """Return ``values`` (T,) with ``reach`` samples added at both ends, shape (T + 2 reach,).
 
-    The signal is reflected in its end point so that position, velocity and acceleration go on
-    without a jump: x(-t) = 2 x0 - x(t) + a t², with x0 and a from a cubic fitted to the ``fit``
-    samples at the end. A plain odd reflection (a = 0) would turn the acceleration round, and the
-    filtered acceleration would run to zero at either end.
+    The signal is reflected in its end point so that position, velocity and acceleration are
+    continuous: x(-t) = 2 x0 - x(t) + a t², with x0 and a from a cubic fitted to the ``fit`` samples
+    at the end. A plain odd reflection (a = 0) would reverse the acceleration, so that the filtered
+    acceleration would go to zero at either end.
     """
     reach = min(reach, len(values) - 1)
     fit = min(fit, len(values))

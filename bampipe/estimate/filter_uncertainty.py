@@ -17,9 +17,9 @@ from bampipe.estimate.unscented import Stored
 _BLOCKS = 3
 """Fewest blocks per parameter: the scores of fewer hardly scatter, because they add up to zero."""
 _ROUNDS, _STEPS = 2, 12
-"""Most passes of a search over all noise levels, and steps of one level in one pass."""
+"""Largest number of passes over all noise levels, and of steps of one level in one pass."""
 _SILENT = 1e-20
-"""Share of the filter's variance below which a parameter has no score in any block."""
+"""Fraction of the filter's variance below which no block has information on a parameter."""
 
 
 def sandwich_covariance(
@@ -36,12 +36,11 @@ def sandwich_covariance(
     Args:
         trials: filtered trials in order, at the ends of blocks, parameters not walking.
         n_states: length of the state in front of the parameters.
-        theta: (nt,) parameters before the first of them, on the scale of estimation;
-            covariance: (nt, nt).
+        theta, covariance: (nt,) and (nt, nt) before the first of them, on the scale of estimation.
 
     Returns:
-        (nt, nt) covariance on the scale of estimation, and the number of blocks. With no more
-        blocks than parameters, the filter's own covariance.
+        (nt, nt) covariance, which is the filter's own if there are no more blocks than parameters;
+        and the number of blocks.
     """
     information = np.linalg.inv(covariance)
     vector = information @ theta
@@ -72,17 +71,17 @@ def choose_block(seconds: Sequence[float], parameters: int, longest_s: float) ->
     """Return the shortest block length, s, that gives enough blocks for a sandwich.
 
     Args:
-        seconds: length of each trial, of which the last block takes what is left over.
-        parameters: number of those estimated. longest_s: the length for long trials.
+        seconds: length of each trial; its last block takes the rest.
+        parameters: number of estimated parameters. longest_s: the length for long trials.
     """
     return min(longest_s, sum(seconds) / (_BLOCKS * parameters + len(seconds)))
 
 
 def at_block_ends(trial: Stored, block_s: float) -> Stored:
-    """Return what is stored of a trial where blocks of time end; the last sample ends one.
+    """Return the stored distributions of a trial at the ends of blocks of time.
 
     Args:
-        trial: filtered; block_s: shortest length of a block, s; the last takes the rest.
+        trial: filtered; block_s: shortest length of a block, s; the last one takes the rest.
     """
     t = trial.t
     count = max(1, int((t[-1] - t[0]) / block_s))
@@ -96,16 +95,11 @@ def climb(
     """Maximise a likelihood over a few noise levels, one at a time, by doubling steps.
 
     Noise levels matter by their order of magnitude, so a coarse grid is enough: every coordinate
-    moves by its step while the likelihood rises, first up, then down.
-
-    Args:
-        log_likelihood: of the logarithms of the levels (k,); minus infinity where it fails.
-        start: (k,) logarithms; step: (k,) by how much to try; lower: (k,) least values.
-
-    Returns:
-        (k,) best logarithms, and the likelihood there.
+    moves by its step while the likelihood rises, first up, then down. ``log_likelihood``, minus
+    infinity where it fails, takes logarithms (k,), as are ``start``, ``step`` and the ``lower``
+    bounds. Returns the best logarithms (k,) and the likelihood there.
     """
-    likely = cache(lambda *levels: log_likelihood(np.array(levels)))  # a pass meets some again
+    likely = cache(lambda *levels: log_likelihood(np.array(levels)))  # passes repeat some points
     best, value = start.copy(), likely(*start)
     for _ in range(_ROUNDS):
         before = value

@@ -1,8 +1,8 @@
-"""The filter of `unscented` by filterpy: slow, an independent check on the compiled engine.
+"""The filter of `unscented` by filterpy: slow, an independent check of the compiled engine.
 
-filterpy knows no process noise that enters the equations of motion, so the noise is part of its
-state: carried as a state that each step forgets, with its variance put back by Q. Since 2.0
-filterpy draws the sigma points afresh after adding Q, as the compiled engine does.
+filterpy has no process noise that enters the equations of motion. The noise is therefore part of
+its state: each step forgets it, and Q restores its variance. Since version 2.0, filterpy draws the
+sigma points afresh after adding Q, as the compiled engine does.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,11 +34,9 @@ def filter_trials_by_filterpy(
     settings: FilterSettings,
     advance: Callable[..., None] = runge_kutta,
 ) -> FilterOutcome:
-    """Filter trials in sequence, as `unscented.filter_trials` does; same arguments and result.
+    """Filter trials as `unscented.filter_trials` does, with the same arguments and result.
 
-    Args:
-        model, trials, theta, covariance, settings: as there.
-        advance: carries one point over an interval, with the arguments of `runge_kutta`.
+    ``advance`` carries one point over an interval, with the arguments of `runge_kutta`.
 
     Raises:
         FilterFailure: the covariance lost positive definiteness.

@@ -9,27 +9,27 @@ from bampipe.arrays import Array
 from bampipe.errors import InputError
 
 _BLOCKS = 20
-"""Stretches of the record with independent errors, whose scatter gives the uncertainties."""
+"""Parts of the record with independent errors, whose scatter gives the uncertainties."""
 _EITHER_SIGN = 0.05
-"""The play counts as crossed if loads of either sign have this share of the samples."""
+"""The play counts as crossed if loads of either sign make up this fraction of the samples."""
 _CLOSING = 0.02
-"""A gap is closed at a few times this share of the largest load."""
+"""A gap is closed at a few times this fraction of the largest load."""
 _TURNING = 0.01
-"""Dry friction is fully developed at a few times this share of the largest velocity."""
+"""Dry friction is fully developed at a few times this fraction of the largest velocity."""
 
 
 @dataclass(frozen=True)
 class Windup:
-    """How the two sides of a gear move apart.
+    """Relative motion of the two sides of a gear.
 
     Attributes:
-        compliance, compliance_sd: rad/(N.m) or m/N; positive where the second encoder leads with
-            the load of the drive, as on the motor's side.
-        play, play_sd: rad or m; None where the load never changes sign.
-        late_s, late_sd: by how much the second encoder is read after the first; viscous friction of
-            the drive adds a little.
-        explained: share, by compliance and play, of the difference's variance that remains after
-        timing and the drive's own losses.
+        compliance, compliance_sd: rad/(N.m) or m/N; positive if the second encoder leads with the
+            load of the drive, as it does on the motor's side.
+        play, play_sd: rad or m; None if the load never changes sign.
+        late_s, late_sd: delay of the second encoder's reading behind the first's; viscous friction
+            of the drive adds a little.
+        explained: fraction, by compliance and play, of the difference's variance that remains after
+            timing and the drive's own losses.
     """
 
     compliance: float
@@ -49,18 +49,19 @@ def find_windup(
 ) -> Windup:
     """Regress the difference of two encoders on the drive's load.
 
-    The inertia and friction of the drive itself do not pass the gear: terms with acceleration,
-    velocity and its sign take them off. A late encoder adds a difference in proportion to the
+    The inertia and friction of the drive itself do not load the gear: terms with acceleration,
+    velocity and its sign remove them. A late encoder adds a difference in proportion to the
     velocity. Each trial has its own offset, since the zeros of two encoders differ.
 
     Args:
-        difference: by trial, (T,), second reading minus first, rad or m.
-        load: generalised force of the drive; rate: velocity of the axis at the same samples, which
-            are evenly spaced.
+        difference: by trial, (T,), second reading minus first, rad or m; the samples, as those of
+            ``load``, the drive's generalised force, and ``rate``, the axis' velocity, are evenly
+            spaced.
         rotor_known: whether ``load`` excludes the force on the drive's inertia; otherwise that is
             estimated, which leaves little information on an axis without weight.
 
-    Raises: InputError: the load does not change.
+    Raises:
+        InputError: the load does not change.
     """
     largest = max(float(np.abs(x).max(initial=0.0)) for x in load)
     if not largest > 0.0 or max(float(np.ptp(x)) for x in load) < 1e-9 * largest:

@@ -1,15 +1,15 @@
 """Stiffness of a locked axis from its hysteresis loops.
 
-Model of the loop: an elastic transmission of stiffness K in parallel with friction that follows
-the deflection x only after some slip (a Jenkins or Iwan element, or Bouc and Wen's smooth one):
-torque = K x + F z, z in [-1, 1]. After every reversal z turns round and the loop is stiffer than
-K; once z has come to rest at its other limit (post-yield) the slope of the loop is K. So K is
-read from that part of every branch, and the transition is never assumed to have a certain shape:
-an exponential approach is fitted only to find where it has died away.
+The model of the loop is an elastic transmission of stiffness K in parallel with friction that
+follows the deflection x only after some slip (a Jenkins or Iwan element, or the smooth Bouc-Wen
+model): torque = K x + F z, z in [-1, 1]. After every reversal z turns round, and the loop is
+stiffer than K; once z has settled at its other limit (post-yield), the slope of the loop is K. So
+K is read from that part of every branch. The shape of the transition is not assumed: an exponential
+approach is fitted only to find where it has decayed.
 
 The encoder is the coarse channel. It is used where it is exact, at the changes from one count to
-the next, and deflection is regressed on torque; the torque's own noise is taken out of the
-regression (Fuller 1987, eq. 1.2.3), else it would make the axis look stiff.
+the next, and deflection is regressed on torque. The noise of the torque is removed from the
+regression (Fuller 1987, eq. 1.2.3), because it would make the axis appear too stiff.
 """
 
 from collections.abc import Sequence
@@ -26,18 +26,20 @@ from bampipe.estimate.white_noise import white_noise_sd
 
 _TREMOR_HZ = 5.0
 _PROMINENCE = 0.3
-"""A reversal stands out by this share of the range of the torque."""
+"""Smallest prominence of a reversal, relative to the range of the torque."""
 _LEFTOVER = 0.01
-"""Post-yield: the fitted transition changes the slope by less than this share."""
+"""Post-yield begins where the fitted transition changes the slope by less than this fraction."""
 _LATEST_START = 0.6
-"""The rest of a branch counts as post-yield after this share at the latest: the exponential fits a
-long transition with a sharp end poorly, and the slope needs a range."""
+"""Post-yield begins after this fraction of a branch at the latest: an exponential fits a long
+transition with a sharp end poorly, and the slope needs a range."""
 _LARGEST_SLOPE_CHANGE = 0.02
 """A loop is post-yield if the slopes of the two halves of the used part differ by less."""
 
+
 _SYSTEMATIC = 0.25
-"""Share of the change of the slope by which the stiffness may be off: with it, 95 to 100 % of the
-intervals hold the truth for loops that turn in seven ways (benchmarks/notebook/estimates.md)."""
+"""Uncertainty of the stiffness as a fraction of the change of the slope: 95 to 100 % of the
+intervals contain the truth for loops with seven kinds of transition
+(benchmarks/notebook/estimates.md)."""
 
 
 @dataclass(frozen=True)
@@ -61,17 +63,17 @@ class Branch:
 
 @dataclass(frozen=True)
 class Cycle:
-    """One load cycle: two branches, one each way.
+    """One load cycle: a branch in each direction.
 
     Attributes:
         start, stop: its first and last sample.
         stiffness: N.m/rad or N/m.
         width_torque: height of the loop between its two straight sides, N.m or N.
-        width_deflection: the same across, rad or m.
+        width_deflection: its width in the other direction, rad or m.
         energy: lost in the cycle, J.
         amplitude: half the range of the torque, N.m or N.
-        centre: deflection in the middle of the loop at no torque, rad or m: its drift from cycle
-            to cycle says whether the brake slips.
+        centre: deflection in the middle of the loop at zero torque, rad or m: a drift from cycle to
+            cycle shows that the brake slips.
     """
 
     start: int
@@ -86,21 +88,21 @@ class Cycle:
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """The results of the loops of one axis.
+    """Stiffness and related results from the loops of one axis.
 
     Attributes:
         stiffness: of all post-yield parts together, N.m/rad or N/m.
-        standard_error: of that, by the scatter over the cycles or by the regression over all
-            branches, whichever is larger.
-        systematic: its uncertainty from what is left of the transition: a quarter of the change of
-            the slope, or of the standard error of that change where it is larger.
-        scatter: standard deviation over the cycles; with one cycle, that of its regression.
-        cycles: cycle by cycle.
+        standard_error: of the stiffness, from the scatter over the cycles or the regression over
+            all branches, whichever is larger.
+        systematic: uncertainty of the stiffness due to the rest of the transition: a quarter of the
+            change of the slope, or of the standard error of that change if larger.
+        scatter: standard deviation over the cycles; for one cycle, that of its regression.
+        cycles: results by cycle.
         branches: all whole branches.
-        transition: torque after a reversal from which the loop is taken as post-yield, N.m or N.
+        transition: torque after a reversal from which the loop counts as post-yield, N.m or N.
         slope_change: change of the slope within the post-yield part: stiffness of its first half
             over that of its second, less one.
-        yielded: whether ``slope_change`` is small (2 %, or three of its standard errors): if not,
+        yielded: whether ``slope_change`` is small (2 %, or three of its standard errors). If not,
             the load was too small to overcome the friction, and the stiffness is too high.
     """
 
@@ -115,25 +117,25 @@ class Hysteresis:
     yielded: bool
 
 
-def smoothed(torque: Array, rate_hz: float) -> Array:
-    """Return the torque (T,) without noise and tremor: low-passed forwards and backwards."""
+def smooth_torque(torque: Array, rate_hz: float) -> Array:
+    """Return the torque (T,) without noise and tremor, by a zero-phase low-pass."""
     cutoff = min(_TREMOR_HZ, 0.2 * rate_hz)
     sections = butter(2, cutoff, fs=rate_hz, output="sos")
     padding = min(len(torque) - 1, int(2 * rate_hz / cutoff))
     return np.asarray(sosfiltfilt(sections, torque, padlen=padding))
 
 
-def reversals(smooth: Array) -> NDArray[np.intp]:
-    """Return the samples at which the loading turns round, in order.
+def find_reversals(smooth: Array) -> NDArray[np.intp]:
+    """Return the samples at which the loading reverses, in order.
 
-    A turn of the torque ``smooth`` (T,), from :func:`smoothed`, stands out by 30 % of its range,
-    so that pauses are none.
+    At a reversal, ``smooth`` (T,), from :func:`smooth_torque`, must stand out by 30 % of its range,
+    so that pauses do not count.
     """
     least = _PROMINENCE * float(np.ptp(smooth))
     peaks = find_peaks(smooth, prominence=least)[0]
     valleys = find_peaks(-smooth, prominence=least)[0]
     turns = np.sort(np.concatenate((peaks, valleys)))
-    # Two peaks in a row can only be shoulders of one: the higher is the turn.
+    # Two successive peaks can only be shoulders of one: the higher is the reversal.
     turning = []
     for top, run in groupby(turns, key=lambda turn: turn in peaks):
         same = np.array([*run])
@@ -141,16 +143,16 @@ def reversals(smooth: Array) -> NDArray[np.intp]:
     return np.array(turning, dtype=np.intp)
 
 
-def branches_of(torque: Array, deflection: Array, rate_hz: float) -> tuple[Branch, ...]:
-    """Return the whole branches of a loading record: those between two reversals.
+def split_branches(torque: Array, deflection: Array, rate_hz: float) -> tuple[Branch, ...]:
+    """Return the whole branches of a loading record, each between two reversals.
 
-    They hold the record where the encoder count changes: half way between two samples that
-    differ the deflection is half way between their counts, exactly so for a step of one count.
-    How far a point is from the reversal is read from the smoothed torque: to choose points by
-    the noisy torque would prefer noise of one sign.
+    They contain the record at the changes of the encoder count. Half-way between two samples that
+    differ, the deflection is half-way between their counts, exactly so for a step of one count. The
+    distance of a point from the reversal comes from the smoothed torque, since a choice by the
+    noisy torque would prefer noise of one sign.
     """
-    smooth = smoothed(torque, rate_hz)
-    turns = reversals(smooth)
+    smooth = smooth_torque(torque, rate_hz)
+    turns = find_reversals(smooth)
     branches = []
     for start, stop in pairwise(turns):
         at = start + np.flatnonzero(np.diff(deflection[start : stop + 1]))
@@ -174,14 +176,13 @@ def _regression(
     window: tuple[float, float],
     decay: float | None = None,
 ) -> tuple[float, float, Array]:
-    """Regress deflection on torque, an intercept to each branch.
+    """Regress deflection on torque, with an intercept for each branch.
 
     Args:
-        branches: what to fit.
-        noise_sd: of the torque at a count change.
+        noise_sd: standard deviation of the torque at a count change.
         window: first and last travel of the points used.
-        decay: length, in torque, of an exponential approach to the straight line that is fitted
-            besides, one amplitude for all branches; None for none.
+        decay: length, in torque, of an exponential approach to the straight line, which is fitted
+            with one amplitude for all branches; None for no approach.
 
     Returns:
         Compliance, its standard error, and the coefficients: compliance, (amplitude of the
@@ -209,11 +210,11 @@ def _regression(
     return float(coefficients[0]), error, np.asarray(coefficients)
 
 
-def transition_of(branches: Sequence[Branch], noise_sd: float) -> float:
-    """Return the torque after a reversal from which the branches are taken as post-yield.
+def find_transition(branches: Sequence[Branch], noise_sd: float) -> float:
+    """Return the torque after a reversal from which the branches count as post-yield.
 
-    There the slope of the fitted exponential approach has fallen to 1 % of the compliance; at the
-    latest it is at 60 % of a branch.
+    There the slope of the fitted exponential approach has fallen to 1 % of the compliance, but it
+    is at most 60 % of a branch.
     """
     span = float(np.median([branch.travel[-1] for branch in branches]))
 
@@ -236,7 +237,7 @@ def transition_of(branches: Sequence[Branch], noise_sd: float) -> float:
 
 
 def _sum_of_squares(branches: Sequence[Branch], coefficients: Array, length: float) -> float:
-    """Return the misfit of line and approach to all points of ``branches``."""
+    """Return the sum of squares that line and approach leave at all points of ``branches``."""
     total = 0.0
     for number, b in enumerate(branches):
         line = coefficients[0] * b.torque + coefficients[2 + number]
@@ -246,10 +247,10 @@ def _sum_of_squares(branches: Sequence[Branch], coefficients: Array, length: flo
 
 
 def energy_lost(torque: Array, deflection: Array, stiffness: float) -> float:
-    """Return the area, J, of one loop (T,), also where it does not quite close.
+    """Return the area, J, of one loop (T,), even if it does not quite close.
 
-    The work of a spring of ``stiffness`` is taken off first: around a closed loop it is none, and
-    else it is what was stored rather than lost.
+    The work of a spring of ``stiffness`` is subtracted first: it is zero around a closed loop, and
+    stored energy rather than a loss otherwise.
     """
     x = deflection - 0.5 * (float(np.min(deflection)) + float(np.max(deflection)))
     level = 0.5 * (float(np.min(torque)) + float(np.max(torque)))
@@ -257,24 +258,21 @@ def energy_lost(torque: Array, deflection: Array, stiffness: float) -> float:
     return float(np.sum(0.5 * (rest[1:] + rest[:-1]) * np.diff(x)))
 
 
-def hysteresis(torque: Array, deflection: Array, rate_hz: float) -> Hysteresis:
+def measure_hysteresis(torque: Array, deflection: Array, rate_hz: float) -> Hysteresis:
     """Return the stiffness of a locked axis from its load cycles.
 
-    Args:
-        torque: generalised force on the axis, (T,), N.m or N.
-        deflection: encoder reading, (T,), rad or m.
-        rate_hz: sampling rate, Hz.
+    The generalised force on the axis, N.m or N, and the encoder reading, rad or m, are (T,).
 
     Raises:
         ValueError: fewer than two whole branches, or too few encoder counts to fit a line.
     """
-    branches = branches_of(torque, deflection, rate_hz)
+    branches = split_branches(torque, deflection, rate_hz)
     if len(branches) < 2:
         raise ValueError("no whole load cycle: the load must turn round three times at least")
     if min(len(branch.torque) for branch in branches) < 8:
         raise ValueError("the deflection changes by fewer than 8 encoder counts on a branch")
-    noise = white_noise_sd(torque) / np.sqrt(2.0)  # a count change takes the mean of two samples
-    start = transition_of(branches, noise)
+    noise = white_noise_sd(torque) / np.sqrt(2.0)  # a count change averages two samples
+    start = find_transition(branches, noise)
     window = (start, np.inf)
     compliance, error, _ = _regression(branches, noise, window)
     if compliance <= 0.0:
@@ -309,7 +307,7 @@ def _cycle(
     noise_sd: float,
     window: tuple[float, float],
 ) -> Cycle:
-    """Return the numbers of one cycle."""
+    """Return the results of one cycle."""
     compliance, _, coefficients = _regression(pair, noise_sd, window)
     intercepts = {b.direction: float(c) for b, c in zip(pair, coefficients[-2:], strict=True)}
     across = intercepts[-1] - intercepts[1]

@@ -17,10 +17,10 @@ from bampipe.arrays import Array
 from bampipe.estimate.bounded import scaled_eigenbasis
 
 _WEAK, _SMALLEST_PART = 0.1, 0.3
-"""Eigenvalue of the information scaled to a unit diagonal below which a direction is weak, and
-share of the largest part of it below which a parameter is left out."""
+"""A direction of the information, scaled to a unit diagonal, is weak if its eigenvalue is below the
+first number; parameters whose part in it is below this fraction of the largest are not named."""
 _LEAST_NOISE = 1e-12
-"""Least noise at any frequency, as a share of the mean over frequencies."""
+"""Smallest noise at any frequency, relative to the mean over frequencies."""
 
 
 def residual_spectrum(
@@ -34,15 +34,10 @@ def residual_spectrum(
 ) -> Array:
     """Return the spectrum of sensor noise in the residual, (count // 2 + 1, n_q).
 
-    In squared units of the residual a sample, at the frequencies of a real discrete Fourier
-    transform of ``count`` samples.
-
-    Args:
-        count: samples; rate_hz: of them.
-        inertia, damping, stiffness: (n_q,) of each axis: noise of a position reading acts through
-            them.
-        reading_sd: (n_q,) of a position reading; force_sd: (n_q,) of the generalised force, zero
-            on an axis that nothing drives.
+    It is in squared units of the residual per sample, at the frequencies of a real discrete Fourier
+    transform of ``count`` samples. Noise ``reading_sd`` of a position reading acts through inertia,
+    damping and stiffness of its axis; ``force_sd`` is that of the generalised force, zero on an
+    axis that nothing drives. All are (n_q,).
     """
     omega = 2.0 * np.pi * np.fft.rfftfreq(count, 1.0 / rate_hz)[:, None]
     gain = (inertia * omega**2) ** 2 + (damping * omega) ** 2 + stiffness**2
@@ -71,13 +66,9 @@ def information(slope: Array, spectrum: Array) -> Array:
 
 
 def cramer_rao_bound(matrix: Array) -> Array:
-    """Return the Cramér-Rao bound, the inverse of the information; infinite in its null space.
+    """Return the Cramér-Rao bound, the inverse of the information ``matrix`` (n, n).
 
-    Args:
-        matrix: (n, n), symmetric, not negative.
-
-    Returns:
-        (n, n) covariance; rows and columns of parameters in the null space are infinite.
+    The matrix is symmetric and not negative; parameters in its null space have an infinite bound.
     """
     scale, value, vector, null = scaled_eigenbasis(matrix)
     inverse = (vector[:, ~null] / value[~null]) @ vector[:, ~null].T / np.outer(scale, scale)
@@ -90,11 +81,8 @@ def cramer_rao_bound(matrix: Array) -> Array:
 def undetermined_covariance(matrix: Array, prior_sd: Array) -> Array:
     """Return the prior covariance (n, n) given all combinations that the data determine.
 
-    The parameters are independent in the prior.
-
-    Args:
-        matrix: (n, n) information, symmetric, not negative.
-        prior_sd: (n,) positive.
+    The information ``matrix`` (n, n) is symmetric and not negative; in the prior, parameters are
+    independent, with positive standard deviations (n,).
     """
     scale, _, vector, null = scaled_eigenbasis(matrix)
     free = vector[:, null] / scale[:, None]
@@ -106,10 +94,10 @@ class Weak:
     """A direction in which parameters can move at little cost, because their effects cancel.
 
     Attributes:
-        members: places of the parameters that move, largest part first.
-        parts: (len(members),) by how much each moves, in its own standard deviations with all
+        members: indices of the parameters that move, largest part first.
+        parts: (len(members),) how far each moves, in units of its standard deviation with all
             others known; the largest is 1.
-        strength: share of information that is left in this direction, 0 to 1.
+        strength: fraction of the information that is left in this direction, 0 to 1.
     """
 
     members: tuple[int, ...]
@@ -131,7 +119,7 @@ def weak_directions(matrix: Array) -> list[Weak]:
 
 
 def growth_without(parts: Sequence[Array]) -> Array:
-    """Return the relative growth of each parameter's bound without each trial, (trials, n).
+    """Return the relative growth of each parameter's bound if a trial is left out, (trials, n).
 
     Args:
         parts: by trial, (n, n) information.

@@ -1,4 +1,4 @@
-"""How far each stretch of time moves the parameters of a least-squares fit."""
+"""Influence of each stretch of time on the parameters of a least-squares fit."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from bampipe.arrays import Array, Indices
 
 _SD_OF_MEDIAN = 1.4826
-"""Standard deviation of a Gaussian over its median absolute value."""
+"""Standard deviation of a Gaussian divided by its median absolute value."""
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,8 @@ class RemovedStretch:
 
     Attributes:
         trial: its number among those fitted; start_s: since the start of the trial, s.
-        move: (n,) change of the parameters without it, in the standard deviations that the rest
-            leaves them.
+        move: (n,) change of the parameters without it, in the standard deviations that the
+            remaining data give.
         typical: (n,) median change by stretches with as much information.
     """
 
@@ -36,14 +36,14 @@ def find_worst_stretch(
 ) -> RemovedStretch:
     """Return the stretch without which some parameter would move most.
 
-    To first order: the inverse of all information times the score of the stretch (Cook 1977). A
-    stretch that dominates a sandwich would be hidden by it, since it moves by at most one of its
-    deviations; so its own part is subtracted, down to the scatter of typical stretches.
+    To first order, the change is the inverse of the total information times the score of the
+    stretch (Cook 1977). A stretch that dominates the sandwich covariance would hide in it, since it
+    moves a parameter by at most one of its standard deviations. Its own contribution is therefore
+    subtracted, down to the scatter of typical stretches.
 
     Args:
-        rows: by axis, (n, k) how far the parameters move by each weighted sample, and the weighted
-            residual there, (n,).
-        stretches: by axis, (n,) numbers of the stretches of its samples.
+        rows: by axis, the change of the parameters by each weighted sample, (n, k), and its
+            weighted residual, (n,); stretches: by axis, (n,) the stretch of each sample.
         places: trial and start, s, of each stretch; sd: (k,) of the parameters.
     """
     count = 1 + max(places)
@@ -51,7 +51,7 @@ def find_worst_stretch(
     for (move, left), number in zip(rows, stretches, strict=True):
         np.add.at(parts, number, move * left[:, None])
         np.add.at(shares, number, move**2)
-    # The effect of white noise of its size on each stretch, scaled to the typical scatter.
+    # Scale the effect of white noise on each stretch to the typical scatter.
     with np.errstate(divide="ignore", invalid="ignore"):
         moves = np.nan_to_num(parts / sd, posinf=0.0, neginf=0.0)
         expected = np.nan_to_num(np.sqrt(shares) / sd, posinf=0.0)

@@ -1,8 +1,8 @@
 """Tests whether a filter's innovations are white, and whether they are independent of the inputs.
 
-A filter that has the right model leaves innovations that neither their own past nor any input
-predicts (Kailath 1968; Mehra 1970). With tens of thousands of samples a test of significance
-rejects every filter on earth, so each test also says how much is predictable: its share.
+If the model is right, neither the past of the innovations nor any input predicts them (Kailath
+1968; Mehra 1970). With tens of thousands of samples, a test of significance rejects every real
+filter, so each test also reports the predictable fraction of the variance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,9 +22,9 @@ class InnovationTest:
     """Outcome of one test.
 
     Attributes:
-        statistic: Ljung-Box Q, or F of the regression; degrees: of freedom. p_value: probability of
-        a statistic as large by chance.
-        share: of the variance that is predictable, beyond what chance alone would give.
+        statistic: Ljung-Box Q, or F of the regression; degrees: degrees of freedom.
+        p_value: probability of a statistic as large by chance.
+        share: predictable fraction of the variance, beyond that expected by chance.
     """
 
     statistic: float
@@ -34,20 +34,20 @@ class InnovationTest:
 
 
 def average_stretches(values: Array, length: int) -> Array:
-    """Means of consecutive stretches, (T // length, n), NaN where a value is missing.
+    """Means of consecutive stretches, (T // length, n); NaN if a value is missing.
 
     Args:
-        values: (T, n); length: samples.
+        values: (T, n); length: in samples.
     """
     count = len(values) // length
     return np.asarray(values[: count * length].reshape(count, length, -1).mean(axis=1))
 
 
 def check_whiteness(records: Sequence[Array]) -> InnovationTest | None:
-    """Ljung and Box's test over records with gaps; None where there are too few values.
+    """Ljung-Box test over records with gaps; None if there are too few values.
 
     Args:
-        records: (K,) each, NaN at gaps; products reach over a gap, never over two records.
+        records: (K,) each, NaN at gaps; products span gaps, but never two records.
     """
     joined = np.concatenate(records)
     size = int(np.isfinite(joined).sum())
@@ -75,15 +75,11 @@ def check_whiteness(records: Sequence[Array]) -> InnovationTest | None:
 def check_independence(
     records: Sequence[Array], inputs: Sequence[Array], lags: Sequence[int]
 ) -> InnovationTest | None:
-    """Regress innovations on present and past inputs; None where there is nothing to regress on.
+    """Regress innovations on present and past inputs; None if there is nothing to regress on.
 
-    Inputs of a hand change slowly, so that a correlation at one lag appears at all lags. A joint
-    regression on a few lags counts it once, unlike a table of cross-correlations.
-
-    Args:
-        records: (K,) each, NaN at gaps.
-        inputs: (K, m) each, beside them; those that never change are left out.
-        lags: by how many values back each input is taken.
+    Inputs by a hand change slowly, so that a correlation at one lag appears at all lags. A joint
+    regression on a few lags counts it once, unlike a table of cross-correlations. The records (K,)
+    are NaN at gaps; of the inputs (K, m), constant ones are left out.
     """
     reach = max(lags)
 

@@ -27,7 +27,7 @@ from bampipe.estimate.differentiation import Derivatives
 ORDERS = (3, 4)
 _SETTLED = 1e-10
 _WIDE = 1e8
-"""Prior variance of an unknown first state over its later variance."""
+"""Ratio of the prior variance of an unknown initial state to its later variance."""
 
 _V = float64[::1]
 _M = float64[:, ::1]
@@ -204,7 +204,7 @@ def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
 def _evidence(y, present, step, noise, x, p, skip):  # type: ignore[no-untyped-def]
     """Return sums of log S and v²/S over the innovations after ``skip``, and their count.
 
-    Once the covariance has settled it is kept until a sample is missing.
+    Once the covariance has settled, it is kept until a sample is missing.
     """
     n = x.shape[0]
     work, gain = np.empty((n, n)), np.empty(n)
@@ -246,9 +246,9 @@ def _prior(y: Array, order: int) -> tuple[Array, Array]:
 def _informed_prior(y: Array, present: Flags, step: Array, noise: Array) -> tuple[Array, Array]:
     """Return a prior for the first state from the samples themselves, ten times too wide.
 
-    The filter is run backwards in time (odd derivatives change sign). Against a prior that says
-    nothing, this costs one per cent of double use and keeps the smoothed variances from being
-    small differences of large numbers.
+    The filter runs backwards in time (odd derivatives change sign). Compared with a vague prior,
+    this adds one per cent of information, but prevents the smoothed variances from being small
+    differences of large numbers.
     """
     order = len(step)
     signs = (-1.0) ** np.arange(order)
@@ -289,8 +289,8 @@ def smooth(position: Array, model: MotionModel, present: Flags | None = None) ->
     Args:
         position: samples on the uniform grid of ``model.rate_hz``.
         model: motion and noise.
-        present: shape (T,), false where there is no sample: ``position`` is then not used, and the
-            bands widen. The first sample must be there. All are, by default.
+        present: shape (T,), false where a sample is missing: ``position`` is ignored there, and the
+            bands widen. The first sample must be present. By default all are.
     """
     order, count = model.order, len(position)
     present = np.ones(count, dtype=bool) if present is None else np.ascontiguousarray(present)
@@ -337,17 +337,17 @@ def _smooth_mean(y, step, gains, covariances, spreads):  # type: ignore[no-untyp
 
 @lru_cache(maxsize=16)
 def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
-    """Gains (K, n), covariances (K, n, n) and variances (K,) of ``most`` samples until they settle.
+    """Gains (K, n), covariances (K, n, n) and variances (K,) until they settle, at most ``most``.
 
-    They do not depend on the samples. Nothing is known about the first state.
+    They do not depend on the samples. The initial state is unknown.
     """
     step, noise = transition(order)
-    # A state settles at about the cut-off, in rad a sample, to the power of its order.
+    # The settled size of a state is about the cut-off, rad per sample, to the power of its order.
     wide = np.diag(_WIDE * ratio ** (np.arange(order) / order))
     there = np.ones(most, dtype=bool)
     passed = _filter(np.zeros(most), there, step, ratio * noise, np.zeros(order), wide)
     _, covariances, gains, _, spreads = passed
-    # They oscillate as they settle, so a momentary rest is not enough.
+    # Gains oscillate as they settle, so a momentary rest is not enough.
     change = np.abs(np.diff(gains, axis=0))
     settled = np.flatnonzero((change < _SETTLED * gains[1:]).all(axis=1))
     count = int(settled[0]) + 2 if settled.size else most
@@ -355,13 +355,9 @@ def _settled(order: int, ratio: float, most: int) -> tuple[Array, Array, Array]:
 
 
 def smooth_mean(signal: Array, model: MotionModel) -> tuple[Array, Array, Array]:
-    """Apply `smooth` to a signal in the samples: position, rate and acceleration, each (T,).
+    """Apply `smooth` to a signal without gaps: position, rate and acceleration, each (T,).
 
     This takes a tenth of the time, because no variances are computed.
-
-    Args:
-        signal: (T,) on the uniform grid of ``model.rate_hz``, all of it there.
-        model: motion and noise.
     """
     step, _ = transition(model.order)
     y = np.ascontiguousarray(signal, dtype=np.float64)
@@ -375,7 +371,7 @@ class Fit:
 
     Attributes:
         model: the chosen model.
-        log_likelihood: of all innovations, up to a constant common to all models of the data.
+        log_likelihood: of all innovations, up to a constant that is the same for all models.
     """
 
     model: MotionModel
@@ -383,7 +379,7 @@ class Fit:
 
 
 _FINEST = 1e-8
-"""Noise below this share of the travel would leave the variances of a filter to rounding."""
+"""Smallest noise relative to the travel: below it, rounding dominates a filter's variances."""
 
 
 def maximum_likelihood(
@@ -397,19 +393,19 @@ def maximum_likelihood(
     """Choose process and measurement noise of one axis by maximum likelihood.
 
     The measurement noise is at least that of quantisation, resolution²/12 (Widrow 1956), and larger
-    if the innovations require it: for each ratio its best value is known in closed form, so that
-    one search over the ratio finds both.
+    if the innovations require it. Its best value for each ratio has a closed form, so that one
+    search over the ratio finds both.
 
     Args:
-        records: positions (T,) on the uniform grid and flags (T,) of the samples there are, of
+        records: positions (T,) on the uniform grid and flags (T,) of the samples present, of
             trials that share sensor and kind of motion.
         rate_hz: sampling rate, Hz.
-        resolution: step of the encoder, position units; 0 where unknown.
+        resolution: step of the encoder, position units; 0 if unknown.
         order: 3 or 4.
         bandwidth_limits_hz: range of the smoother's bandwidth that is searched.
     """
     step, noise = transition(order)
-    # The log of a machine at rest may seem noise-free; this is the resolution of the numbers.
+    # The log of a machine at rest may seem free of noise; use the resolution of the numbers then.
     travel = max((float(np.ptp(position)) for position, _ in records), default=0.0)
     quantum = max(resolution / np.sqrt(12.0), _FINEST * travel) if resolution > 0.0 else 0.0
     unit = quantum if quantum > 0.0 else float(np.std(np.diff(records[0][0]))) or 1.0

@@ -1,11 +1,11 @@
-"""Least squares on the inverse dynamics, both sides of the equation filtered alike.
+"""Least squares on the inverse dynamics, with both sides of the equation filtered alike.
 
-A residual of the inverse dynamics is torque minus a sum of regressors. Velocities from encoders
-are low-passed, forces are not, and the sign of a velocity has sharp edges: fitted raw, the
-mismatch passes for physics. So the residual as a whole, and its slope by every parameter, goes
-through one zero-phase low-pass and is thinned to what that leaves independent, trial by trial.
+The residual of the inverse dynamics is a torque minus a sum of regressors. Velocities from encoders
+are low-passed, forces are not, and the sign of a velocity has sharp edges: in a fit of the raw
+signals, the mismatch would appear as physics. So the residual as a whole, and its slope by every
+parameter, passes one zero-phase low-pass and is thinned to nearly independent samples, by trial.
 
-Everything here sees arrays and callables only.
+This module depends only on arrays and callables.
 """
 
 from __future__ import annotations
@@ -17,21 +17,23 @@ import numpy as np
 
 from bampipe.arrays import Array, Flags, Indices
 from bampipe.errors import InputError
-from bampipe.estimate.bounded import descend, invert_scaled
+from bampipe.estimate.bounded import invert_scaled, solve_bounded
 from bampipe.estimate.low_pass import Band
 from bampipe.estimate.standstill import find_moving_samples
 
 BLOCKS_A_PARAMETER = 3
-"""Fewest blocks per parameter: with fewer, their scatter gives a standard deviation only to a
-third, and 95 % intervals covered 89 % of 320 parameters of independently simulated joints; with
-this number, 93 % of 163 on other seeds."""
+"""Fewest blocks per parameter. With fewer, their scatter determines a standard deviation only to a
+third: 95 % intervals covered 89 % of 320 parameters of independently simulated joints; with this
+number, 93 % of 163 on other seeds."""
 _LEAST_STEP = 1e-8
-"""Finite difference as a share of the parameter: half the digits of a number."""
+"""Finite difference relative to the parameter: half the digits of a number."""
+_SMALLEST_SHARE = 1e-3
+"""Fraction of a Gauss-Newton step at which its halving ends."""
 Residual = Callable[[int, Array], Array]
 """residual(trial, p) -> (T, n_q): unfiltered residual of one trial for parameters p (np,)."""
 Slopes = Callable[[int, Array, Sequence[int]], tuple[Sequence[int], Array]]
-"""slopes(trial, p, wanted) -> free parameters of ``wanted`` whose slopes need no difference, by
-their place there, and the unfiltered slopes of the residual by them (T, n_q, n)."""
+"""slopes(trial, p, wanted) -> indices within ``wanted`` of free parameters whose slopes need no
+finite differences, and the unfiltered slopes of the residual by them (T, n_q, n)."""
 
 
 class NotFinite(InputError):
@@ -58,9 +60,8 @@ class KnownSlopes:
     """Slopes of the residual from an earlier fit that remain valid.
 
     Attributes:
-        take: gives those of a trial, low-passed and thinned, (K, n_q, n_free); the columns that
-            hold count.
-        holds: (n_free,) which columns those are.
+        take: returns the slopes of a trial, low-passed and thinned, (K, n_q, n_free).
+        holds: (n_free,) which of these columns are valid.
     """
 
     take: Callable[[int], Array]
@@ -69,28 +70,28 @@ class KnownSlopes:
 
 @dataclass(frozen=True)
 class Problem:
-    """A model seen as residuals.
+    """A least-squares problem: a model as a function that returns residuals.
 
     Attributes:
         residual: the unfiltered residual of a trial; see `Residual`.
         n_trials: number of trials.
         free: indices of the estimated parameters in p.
         lower, upper: (n_free,) their bounds.
-        step: (n_free,) sizes of their finite differences; any size does where the residual is
+        step: (n_free,) sizes of their finite differences; any size is exact if the residual is
             linear in the parameter.
         linear: whether the residual is linear in all of them.
-        constant: (n_free,) by which of them its slope is the same wherever it is taken.
+        constant: (n_free,) parameters by which the slope is the same everywhere.
         band: the low-pass.
         standstill: by trial, (T, n_q) whether an axis stands still; see `find_standstill`.
-        precision: (n_free,) of what is known of the parameters beforehand, one over its variance,
-            zero where nothing is; known: (n_free,) that.
-        slopes: those by some of the parameters, where they are known; see `Slopes`.
-        keep: holds trials that are linearised, of which a long session has more than memory.
-        multiplied: (n_free,) axis whose measured force a parameter multiplies, as a current by a
-            torque constant, an axis for one parameter only; -1 of others, and of all by default. A
-            small factor would leave a small residual and explain nothing: the likelihood is that of
-            the measured force.
-        parts: rows between which the low-pass begins anew, where a trial stands for several.
+        precision: (n_free,) inverse variances of the priors, zero without a prior; known: (n_free,)
+            their means.
+        slopes: the slopes that need no finite differences; see `Slopes`.
+        keep: stores linearised trials, which may exceed the memory in a long session.
+        multiplied: (n_free,) axis whose measured force a parameter multiplies, as a torque constant
+            multiplies a current, at most one parameter per axis; -1 for others, and for all by
+            default. Because a small factor would leave a small residual without explaining
+            anything, the likelihood is that of the measured force.
+        parts: rows of a joined trial between which the low-pass restarts.
     """
 
     residual: Residual
@@ -114,15 +115,10 @@ class Problem:
 def residual_and_slopes(
     problem: Problem, trial: int, p: Array, columns: Sequence[int] | None = None
 ) -> tuple[Array, Array]:
-    """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n).
+    """Unfiltered residual of one trial (T, n_q) and its slopes (T, n_q, n) at ``p`` (np,).
 
-    Slopes that the model does not supply are finite differences.
-
-    Args:
-        problem: the model as residuals.
-        trial: index of the trial.
-        p: (np,) parameters at which to take them; differences are forward, backward at a bound.
-        columns: free parameters by which to take slopes, by number; all by default.
+    Slopes that the model does not supply are finite differences, forward, or backward at a bound.
+    ``columns`` are the free parameters by which slopes are taken, by number; all by default.
     """
     base = problem.residual(trial, p)
     chosen = range(problem.free.size) if columns is None else columns
@@ -151,11 +147,7 @@ def stacked_residual(
 ) -> Stacked:
     """Low-pass and thin the residual of one trial and its slope by every free parameter.
 
-    Args:
-        problem: the model as residuals.
-        trial: index of the trial.
-        p: (np,) parameters at which to linearise.
-        known: slopes that need not be taken again.
+    It is linearised at ``p`` (np,); slopes in ``known`` remain valid.
     """
     fresh = np.arange(problem.free.size) if known is None else np.flatnonzero(~known.holds)
     base, slopes = residual_and_slopes(problem, trial, p, [int(k) for k in fresh])
@@ -187,21 +179,19 @@ def minimise(
     known: KnownSlopes | None = None,
     tolerance: float = 1e-10,
 ) -> Linearised:
-    """Find the free parameters within their bounds with the least squares, weighted by axis.
+    """Minimise the sum of squares, weighted by axis, over the free parameters within bounds.
 
-    Each axis is weighted by the scatter of its own residual, which is iterated; parameters in
-    which the residual is not linear are found by Gauss-Newton with halved steps.
+    Each axis is weighted by the scatter of its own residual, iteratively. If the residual is
+    nonlinear, Gauss-Newton steps are halved until the cost falls.
 
     Args:
-        problem: the model as residuals.
-        start: (np,) parameters to start from.
-        trials: which trials to use; all by default.
-        most_iterations: the most Gauss-Newton steps; with 0 the model is linearised at ``start``.
-        known: slopes that need not be taken again.
-        tolerance: change of the cost, the negative log likelihood a sample, at which it ends.
+        start: (np,) parameters to start from; trials: numbers of those to use, all by default.
+        most_iterations: largest number of Gauss-Newton steps; 0 only linearises at ``start``.
+        known: slopes that remain valid.
+        tolerance: change of the negative log likelihood per sample at which the descent ends.
 
     Raises:
-        ValueError: to fit, fewer samples are clear of standstill than there are parameters.
+        ValueError: fewer samples are clear of standstill than there are parameters to fit.
         NotFinite: the residual or its slope at ``start`` is not a finite number.
     """
     chosen = list(range(problem.n_trials)) if trials is None else list(trials)
@@ -218,11 +208,11 @@ def minimise(
 
 @dataclass(frozen=True)
 class Linearised:
-    """Trials, linearised at parameters ``p``: what `descend` follows.
+    """Trials linearised at parameters ``p``; the iterate of `descend`.
 
     Attributes:
         problem, trials: the model, and the numbers of the trials.
-        p: (np,) parameters, those not free as given; stacked: by trial, linearised there.
+        p: (np,) parameters, including those not free; stacked: the trials, linearised there.
     """
 
     problem: Problem
@@ -236,7 +226,7 @@ class Linearised:
 
     @property
     def cost(self) -> float:
-        """Return the negative log likelihood per sample, with an unknown scatter of each axis."""
+        """Negative log likelihood per sample, with an unknown scatter of each axis."""
         count = np.sum([np.sum(s.used, axis=0) for s in self.stacked], axis=0)
         scatter = np.log(np.maximum(_scatter(self.stacked), 1e-300))
         off = self.value - self.problem.known
@@ -249,6 +239,7 @@ class Linearised:
         return (float(np.sum(count * scatter)) + prior - volume) / max(float(np.mean(count)), 1.0)
 
     def normal_equations(self) -> tuple[Array, Array]:
+        """Return slope^T slope (n, n) and minus slope^T residual (n,), weighted by axis."""
         weight = 1.0 / np.maximum(_scatter(self.stacked), 1e-300)
         n_free = self.problem.free.size
         precision = self.problem.precision
@@ -259,7 +250,8 @@ class Linearised:
             moment -= slope.T @ (s.residual * weight).reshape(-1)
         return normal, moment
 
-    def moved(self, value: Array, share: float) -> Linearised:
+    def moved(self, value: Array) -> Linearised:
+        """Return the trials linearised at the free parameters ``value``, (n_free,)."""
         p = self.p.copy()
         p[self.problem.free] = value
         if self.problem.linear:
@@ -277,21 +269,41 @@ class Linearised:
         return replace(self, p=p, stacked=stacked)
 
 
+def descend(
+    start: Linearised, lower: Array, upper: Array, most_iterations: int, tolerance: float = 1e-10
+) -> Linearised:
+    """Take Gauss-Newton steps within bounds (n,), each halved until the cost does not rise.
+
+    The descent has converged if the cost changes by less than ``tolerance``.
+    """
+    at = start
+    for _ in range(most_iterations):
+        step = solve_bounded(*at.normal_equations(), lower - at.value, upper - at.value)
+        share = 1.0
+        while True:
+            tried = at.moved(np.clip(at.value + share * step, lower, upper))
+            gained = at.cost - tried.cost
+            if gained >= 0.0 or share < _SMALLEST_SHARE:
+                break
+            share /= 2.0
+        at = tried if gained >= 0.0 else at
+        if not gained >= tolerance:
+            break
+    return at
+
+
 def _factors(problem: Problem) -> list[tuple[int, int]]:
-    """Free parameters that multiply what is measured, and the axis of each, by number."""
+    """Indices of the free parameters that multiply the measurement, each with its axis."""
     if problem.multiplied is None:
         return []
     return [(k, int(axis)) for k, axis in enumerate(problem.multiplied) if axis >= 0]
 
 
 def as_measured(problem: Problem, p: Array, stacked: Iterable[Stacked]) -> Iterator[Stacked]:
-    """Return trials with the slopes of the residual over the factors of its axes, times these.
+    """Yield trials with slopes of the residual divided by its axis' factor, times that factor.
 
-    They are zero along a proportional change of all parameters of an axis, whose scale is unknown.
-
-    Args:
-        problem: says which parameters are factors; p: (np,) where it is linearised.
-        stacked: the trials, linearised there.
+    These slopes are zero along a proportional change of all parameters of an axis, whose scale the
+    residual does not determine. The trials are linearised at ``p`` (np,).
     """
     factors = _factors(problem)
     for s in stacked:
@@ -303,7 +315,7 @@ def as_measured(problem: Problem, p: Array, stacked: Iterable[Stacked]) -> Itera
 
 
 def _require_finite(problem: Problem, trial: int, stacked: Stacked, p: Array) -> None:
-    """Say which parameter makes the residual of a trial not a number at the start of the fit."""
+    """Name the parameter that makes the residual of a trial not finite at the start of the fit."""
     if not np.isfinite(stacked.residual).all():
         culprit = "with the parameters that the fit starts from"
     elif not np.isfinite(stacked.slope).all():
@@ -331,17 +343,17 @@ def covariance_by_blocks(
     blocks: Sequence[Indices],
     independent: Sequence[float],
 ) -> Array:
-    """Covariance (P, P) by the scatter of the scores of blocks of time (White; Newey and West).
+    """Covariance (P, P) from the scatter of the scores of blocks of time (White; Newey and West).
 
-    At the minimum the scores of all blocks add up to zero; with as many parameters as blocks, some
-    combination does not scatter at all. With few blocks, the covariance is therefore at least that
-    of independent samples.
+    At the minimum the scores of all blocks sum to zero; with as many parameters as blocks, some
+    combination does not scatter at all. If blocks are few, the covariance is therefore at least
+    that of independent samples.
 
     Args:
-        rows: by axis, slopes (n, P) and residual (n,), in standard deviations of that.
-        precision: (P, P) of what is known beforehand.
+        rows: by axis, slopes (n, P) and residual (n,), in standard deviations of the residual.
+        precision: (P, P) precision of the prior.
         blocks: by axis, (n,) numbers of the blocks, which are independent of each other.
-        independent: by axis, how many samples are independent.
+        independent: by axis, the number of independent samples.
     """
     count = 1 + max((int(number.max()) for number in blocks if number.size), default=0)
     scores, size = np.zeros((count, len(precision))), np.zeros((count, 1))
@@ -354,7 +366,7 @@ def covariance_by_blocks(
     normal = precision + products
     inverse = invert_scaled(normal)
     fitted = float(np.trace(inverse @ (normal - precision)))
-    # Priors and bounds pull at the fit: the common part of all blocks is no scatter.
+    # The pull of priors and bounds, common to all blocks, is no scatter.
     scores -= scores.sum(axis=0) * size / size.sum()
     filled = int(np.count_nonzero(size))
     meat = scores.T @ scores * (filled / max(filled - fitted, 1.0)) + precision

@@ -1,4 +1,4 @@
-"""Zero-phase low-pass of many columns at a few kept samples: the inner loop of every comparison."""
+"""Zero-phase low-pass of many columns, evaluated at few samples: the inner loop of comparisons."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -56,20 +56,11 @@ def _design(cutoff_hz: float, rate_hz: float) -> tuple[Array, Array]:
 
 
 def low_pass_at(values: Array, cutoff_hz: float, rate_hz: float, kept: Indices) -> Array:
-    """Low-pass columns forwards and backwards and return the rows ``kept``.
+    """Low-pass columns (T, k) forwards and backwards; return the rows ``kept``, (K, k).
 
-    A second-order Butterworth filter in each direction, started in the steady state of the first
-    (last) sample. The transient from that is left to the caller, who keeps no samples near the
-    ends.
-
-    Args:
-        values: (T, k), on a uniform grid.
-        cutoff_hz: half-power frequency of one pass, Hz.
-        rate_hz: sampling rate, Hz.
-        kept: indices of the rows wanted, (K,).
-
-    Returns:
-        (K, k).
+    It is a second-order Butterworth filter in each direction, with ``cutoff_hz`` the half-power
+    frequency of one pass, started in the steady state of the first (last) sample. The caller keeps
+    no samples near the ends, which contain the transient.
 
     Raises:
         ValueError: the cut-off is not between 0 and half the sampling rate.

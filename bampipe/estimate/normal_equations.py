@@ -1,7 +1,7 @@
-"""Linear least squares from sums of products by trial and axis: leaving a trial out costs nothing.
+"""Linear least squares from sums of products by trial and axis.
 
 A residual r + X b, linear in b, enters through X'X, X'r and r'r of every trial and axis. Any subset
-of trials, any weights of the axes and any bounds are then solved without touching a sample again.
+of trials, with any weights of the axes and any bounds, is then solved without access to a sample.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ class NormalEquations:
         xx: X'X, (K, n_q, P, P).
         xy: -X'r, (K, n_q, P).
         yy: r'r, (K, n_q).
-        count: samples that they are of, (K, n_q).
-        precision: of the priors, one over their variances, (P,); zero without a prior. known: their
-            means, (P,), measured from the point where the residual was linearised.
+        count: number of samples summed, (K, n_q).
+        precision: inverse variances of the priors, (P,); zero without a prior. known: their means,
+            (P,), relative to the point at which the residual was linearised.
     """
 
     xx: Array
@@ -50,7 +50,7 @@ class NormalEquations:
             slopes: X by trial, each (T, n_q, P), zero where a sample is not used.
             residuals: r by trial, each (T, n_q), zero where a sample is not used.
             used: which samples count, by trial, each (T, n_q).
-            precision, known: of the first coefficients, (<= P,); the others have no priors.
+            precision, known: of the first coefficients, (<= P,); the others have no prior.
         """
         xx, xy, yy = [], [], []
         for slope, residual in zip(slopes, residuals, strict=True):
@@ -81,8 +81,8 @@ class NormalEquations:
         """Weighted least squares over all trials within bounds, (P,); see `solve_bounded`.
 
         Args:
-            weight: of the squares of each axis, (n_q,).
-            lower, upper: (P,); equal where a coefficient is given.
+            weight: weight of the squares of each axis, (n_q,).
+            lower, upper: (P,); equal for a fixed coefficient.
         """
         normal = np.tensordot(weight, self.xx.sum(axis=0), 1) + np.diag(self.precision)
         moment = weight @ self.xy.sum(axis=0) + self.precision * self.known

@@ -1,4 +1,4 @@
-"""The unscented filter fed sample by sample: the batch filter's numbers, in bounded memory."""
+"""The unscented filter for samples as they arrive: the batch filter's numbers, bounded memory."""
 
 from dataclasses import replace
 
@@ -16,11 +16,11 @@ from bampipe.estimate.unscented import (
 
 
 class OnlineFilter:
-    """A filter of `unscented` that takes samples as they come.
+    """A filter of `unscented` that takes samples as they arrive.
 
-    However they are cut into portions, the estimates are those of `filter_trials` on all of them:
-    the same compiled function carries mean and root on. Inputs are linear between samples, because
-    their curvature would need later samples.
+    For any division into portions, the estimates are those of `filter_trials` on all samples,
+    because the same compiled function propagates mean and root. Inputs are linear between samples,
+    since their curvature would require later samples.
 
     Attributes:
         mean: (n,) state and parameters on the scale of estimation.
@@ -53,16 +53,13 @@ class OnlineFilter:
         return np.asarray(self._root @ self._root.T)
 
     def advance(self, t: Array, u: Array, y: Array) -> FilteredTrial:
-        """Take samples; the very first one only starts the clock.
+        """Take samples; the first one of all only sets the time.
 
-        Args:
-            t: (T,) s, increasing; u: (T, nu) inputs; y: (T, ny) readings, NaN where missing.
-
-        Returns:
-            The innovations of these samples; of distributions, that at the first one.
+        Times ``t`` (T,), s, increase; inputs are (T, nu), readings (T, ny), NaN where missing.
+        Returns the innovations of these samples, and the distribution at the first one.
 
         Raises:
-            FilterFailure: the filter lost the motion; `mean` is then of no use.
+            FilterFailure: the filter lost the motion; `mean` is then meaningless.
         """
         ny = y.shape[1]
         if self._last is not None:

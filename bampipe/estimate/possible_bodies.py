@@ -1,8 +1,8 @@
-"""Physically possible inertial parameters, and the nearest ones to an estimate.
+"""Physically possible inertial parameters, and those nearest to an estimate.
 
-A body's mass, first moment and inertia are those of some distribution of mass exactly where its
-pseudo-inertia, a symmetric 4 by 4 matrix linear in the ten numbers, has no negative eigenvalue
-(Wensing, Kim and Slotine 2018, IEEE Robotics and Automation Letters 3(1)). These numbers are a
+Mass, first moment and inertia belong to some distribution of mass if and only if the pseudo-inertia
+of the body, a symmetric 4 by 4 matrix linear in the ten numbers, has no negative eigenvalue
+(Wensing, Kim and Slotine 2018, IEEE Robotics and Automation Letters 3(1)). Such numbers form a
 convex cone.
 """
 
@@ -12,17 +12,17 @@ from bampipe.arrays import Array, Indices
 from bampipe.estimate.bounded import invert_scaled
 
 _SMALLEST = 1e-3
-"""Least eigenvalue of the pseudo-inertia at the start of a search, as a share of the largest."""
+"""Smallest eigenvalue of the pseudo-inertia at the start of a search, relative to the largest."""
 _ROUNDING = 1e-9
-"""Negative eigenvalues within this share of the largest are rounding errors."""
+"""Negative eigenvalues below this fraction of the largest are rounding errors."""
 _ANCHOR = 1e-4
-"""Share of each number's weight that holds it to the estimate if the others leave it open."""
+"""Fraction of each number's weight that draws it to the estimate if the others do not."""
 _FIRST, _SHARPER, _GAP = 1e-6, 10.0, 1e-6
 """First weight of the cost over the barrier, its growth, and the excess cost allowed at the end."""
 _STEPS, _CENTRED, _SHORTEST = 50, 1e-6, 1e-9
-"""Most steps at one weight, the decrease that ends them, and the least share of a step."""
+"""Largest number of steps at one weight, decrease that ends them, and shortest relative step."""
 _AT_BOUND = 1e-2
-"""A number within so many standard deviations of a bound is at the bound."""
+"""A number that is closer to a bound than this, in standard deviations, is put on it."""
 
 
 def pseudo_inertia(numbers: Array) -> Array:
@@ -43,7 +43,7 @@ _UNIT_BODIES = np.array([pseudo_inertia(row) for row in np.eye(10)])
 
 
 def is_possible(numbers: Array) -> bool:
-    """Whether some body has these ten numbers."""
+    """Whether these ten numbers are those of some body."""
     values = np.linalg.eigvalsh(pseudo_inertia(numbers))
     return bool(values[0] >= -_ROUNDING * max(abs(values[-1]), 1e-300))
 
@@ -51,17 +51,17 @@ def is_possible(numbers: Array) -> bool:
 def nearest_possible(
     value: Array, weight: Array, bodies: Indices, start: Array, bounds: tuple[Array, Array]
 ) -> Array:
-    """Return the numbers nearest to an estimate that are possible, (n,).
+    """Return the possible numbers that are nearest to an estimate, (n,).
 
-    Minimises ``(x - value)^T weight (x - value)`` over possible bodies, the others within their
-    bounds: a convex problem, solved by Newton's method with a logarithmic barrier (Boyd and
-    Vandenberghe 2004, Convex Optimization, 11.3).
+    Minimises ``(x - value)^T weight (x - value)`` over possible bodies, with other parameters
+    within their bounds. This convex problem is solved by Newton's method with a logarithmic barrier
+    (Boyd and Vandenberghe 2004, Convex Optimization, 11.3).
 
     Args:
         value: (n,), the estimate; weight: (n, n), such as the inverse of its covariance.
-        bodies: (bodies, 10) places of the numbers of each body.
-        start: (bodies, 10), starting values, possible or not, such as a drawing's.
-        bounds: least and largest values, (n,) each, of the other parameters.
+        bodies: (bodies, 10) indices of the numbers of each body.
+        start: (bodies, 10), starting values, possible or not, such as those of a drawing.
+        bounds: lower and upper bounds, (n,) each, of the other parameters.
     """
     size = np.diag(weight)
     weight = weight + np.diag(np.where(size > 0.0, _ANCHOR * size, 1.0))
@@ -74,7 +74,7 @@ def nearest_possible(
     x[bodies] = [_inside(body) for body in start]
 
     def barrier(x: Array) -> tuple[float, Array, Array]:
-        """The barrier, infinite outside, its gradient (n,) and its Hessian (n, n)."""
+        """The barrier, infinite outside, with its gradient (n,) and Hessian (n, n)."""
         matrices = np.array([pseudo_inertia(body) for body in x[bodies]])
         gaps = np.concatenate([x[others] - low, high - x[others]])
         eigenvalues = np.linalg.eigvalsh(matrices)

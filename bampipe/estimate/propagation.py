@@ -1,4 +1,4 @@
-"""Sigma points carried over one sampling interval by the equations of motion, compiled."""
+"""Propagation of sigma points over one sampling interval by the equations of motion, compiled."""
 
 from typing import NamedTuple
 
@@ -18,8 +18,8 @@ class Estimated(NamedTuple):
 
     Attributes:
         n_states: length nx of the state.
-        timing: index among all parameters of the time by which the inputs were sampled after the
-            positions, s, at most a fraction of a sampling interval.
+        timing: index among all parameters of the input delay, the time by which the inputs were
+            sampled after the positions, s, at most a fraction of a sampling interval.
         free: (nt,) indices of the estimated parameters among all.
         logarithmic: (nt,) which of them are estimated as logarithms.
         lower, upper: (nt,) their range, logarithms where so estimated.
@@ -57,7 +57,7 @@ def allocate_points(nx, nu, p, nw):  # type: ignore[no-untyped-def]
 
     Args:
         nx, nu, nw: lengths of state, input and process noise.
-        p: (np,) all parameters, the timing of the inputs last.
+        p: (np,) all parameters, the input delay last.
 
     Returns:
         (10, width).
@@ -166,11 +166,11 @@ def propagate_points(  # type: ignore[no-untyped-def]
         reach: distance of the points, in standard deviations.
         noise_sd: (nw,) of the process noise, independent of the state: its root is diagonal,
             which is why the (n + nw) root never needs to be formed.
-        u0, u1: (nu,) input at both ends; c0, c1: (nu,) its second time derivative there, between
-            which that runs linearly, so that the input is cubic, or straight where both are zero.
+        u0, u1: (nu,) input at both ends; c0, c1: (nu,) its second time derivative there, linear in
+            between, so that the input is cubic, or straight if both are zero.
         dt: s; substeps: of the Runge-Kutta method.
-        images: (nx, 1 + 2 (n + nw)) result, states only, for parameters stay: the points ahead
-            of the mean along each column of the joint root, those behind it, the centre.
+        images: (nx, 1 + 2 (n + nw)) result, only the states, since parameters do not change: the
+            points ahead of the mean along each column of the joint root, those behind, the centre.
         points: from `allocate_points`, which has put the other parameters in position.
     """
     n, nx = mean.shape[0], estimated.n_states
@@ -198,7 +198,7 @@ def propagate_points(  # type: ignore[no-untyped-def]
                     distance = reach if row < pairs else -reach
                     w[i * ROWS + row - first] = distance * noise_sd[i]
         for i in range(nu):
-            # The input some time ago, to second order, on average over the interval.
+            # The delayed input, to second order, on average over the interval.
             gain = 0.25 * (c0[i] + c1[i])
             for r in range(padded):
                 late = p[timing + r]

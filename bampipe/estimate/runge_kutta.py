@@ -1,4 +1,4 @@
-"""One state carried over one sampling interval by the equations of motion, compiled."""
+"""Propagation of one state over one sampling interval by the equations of motion, compiled."""
 
 from numba import float64, int64, void
 

@@ -27,9 +27,9 @@ _M = float64[:, ::1]
 _I = int64[::1]
 _MOST_STEPS = 4000
 MAX_STEP_S = 2.5e-4
-"""Longest integration step by default."""
+"""Default of the longest integration step."""
 _BRAKES_S = 0.01
-"""Time over which a controller of brakes averages the speed."""
+"""Averaging time of the speed in the controller of the brakes."""
 _WIDEST_GRID_S = 1e-3
 """Longest interval for linear interpolation of a continuous force: at a hundred samples a second, a
 straight line takes 3 % off a component at 10 Hz, and at a thousand 0.03 %."""
@@ -105,11 +105,11 @@ _ARM = record_type(_Arm, _I, _I, _I, _I, _I, float64, float64, float64)
 
 @part()
 def stable_steps(derivative, x, u, plant, dt, work):  # type: ignore[no-untyped-def]
-    """Number of Runge-Kutta steps that ``dt`` needs from state ``x`` on.
+    """Number of Runge-Kutta steps that ``dt`` requires from state ``x``.
 
-    At most ``plant.max_step`` long, and no longer than the time constant of any axis: the
-    derivative is probed at both sides of standstill where it may come to rest within ``dt``, else
-    at a rate nearby, for heavy damping on a small mass is stiff at any speed.
+    Steps are at most ``plant.max_step`` long, and no longer than the time constant of any axis. The
+    derivative is probed at both sides of standstill if the axis may come to rest within ``dt``,
+    otherwise at a rate nearby, since heavy damping on a small mass is stiff at any speed.
 
     Args:
         derivative: f(x, u, p, w, dx).
@@ -252,18 +252,14 @@ def simulate(
     smooth: Sequence[int] = (),
     max_step: float = MAX_STEP_S,
 ) -> Array:
-    """Integrate the model from ``x0`` under given inputs, without process noise.
+    """Integrate the model from ``x0`` (nx,) under given inputs, without process noise.
 
     Args:
         derivative: compiled f(x, u, p, w, dx), positions first in x, then rates, then states.
-        x0: (nx,) state at the first sample.
-        u: (T, nu) inputs at the samples, linear in between, but for those that are ``smooth``.
-        p: (np,) parameters.
-        dt: sampling interval, s.
+        u: (T, nu) inputs at samples ``dt`` seconds apart, linear in between; its columns ``smooth``
+            follow cubic splines instead, as forces do.
         width: (n_q,) velocity over which friction changes sign, rad/s or m/s.
-        n_noise: length of the model's process noise w.
-        smooth: columns of ``u`` that follow a cubic spline between samples, as forces do.
-        max_step: longest integration step, s.
+        n_noise: length of the model's process noise w; max_step: longest integration step, s.
 
     Returns:
         (T, nx) states at the samples.
@@ -301,24 +297,24 @@ def simulate_tracking(
 ) -> tuple[Array, Array]:
     """Integrate the model under given inputs plus an arm that holds it near a given motion.
 
-    Simulates a recording with the friction, sticking included, of a fitted model: the recorded
-    forces act, and the arm adds what keeps the motion from drifting away. The arm's share is in the
-    returned inputs, so these with the returned motion are one consistent recording.
+    It simulates a recording with the friction, including sticking, of a fitted model. The recorded
+    forces act, and the arm adds the force that keeps the motion from drifting away. The returned
+    inputs include the arm's force, so that with the returned motion they form one consistent
+    recording.
 
     Args:
         derivative, x0, p, dt, width, n_noise, smooth, max_step: as in `simulate`.
-        u: (T, nu) inputs without the arm's share; copied.
-        q_ref, qd_ref: (T, n_q) motion that the arm wants.
-        force: columns of ``u`` with the handle force, N. They may be fewer than coordinates; the
-            arm's force is then the least-squares one. Without any there is no arm.
-        rate, curvature: columns with its first and second derivative, where the model has them;
-            they receive those of the arm's force. In the order of ``force``, -1 for one
-            that the model does not use.
+        u: (T, nu) inputs without the arm's force; copied.
+        q_ref, qd_ref: (T, n_q) motion that the arm follows.
+        force: columns of ``u`` with the handle force, N. If they are fewer than the coordinates,
+            the arm's force is the least-squares one. Without any there is no arm.
+        rate, curvature: columns with its first and second derivative, to which those of the arm's
+            force are added; in the order of ``force``, -1 for one that the model does not use.
         impedance: of the arm; by default 12 rad/s, critically damped.
         brake: columns with the brake command of each coordinate, in their order, or none.
         brake_gain: (T, n_q) damping that the brakes render: each command is this times the
             speed, low-passed as a controller sees it. N.m.s/rad or N.s/m.
-        moved_first: (n_q, 2) places in the state of the positions that the arm leads along
+        moved_first: (n_q, 2) indices in the state of the positions that the arm moves along
             ``q_ref``, and of their rates; by default those of the coordinates.
 
     Returns:
@@ -357,13 +353,13 @@ def simulate_tracking(
 
 
 def read_finely(u: Array, dt: float, smooth: Sequence[int]) -> tuple[Array, float]:
-    """Inputs (T, n_u, ...) as finely as smooth ones want them, and the interval of that grid, s."""
+    """Resample inputs (T, n_u, ...) as finely as smooth ones require; return also the step, s."""
     finer = int(np.ceil(dt / _WIDEST_GRID_S - 1e-6)) if len(smooth) else 1
     return (u, dt) if finer == 1 else (_read_between(u, finer, smooth), dt / finer)
 
 
 def _read_between(values: Array, finer: int, smooth: Sequence[int] = ()) -> Array:
-    """Columns (T, n, ...) ``finer`` times as finely: linear, or cubic where smooth."""
+    """Interpolate columns (T, n, ...) ``finer`` times: linearly, or by cubic splines if smooth."""
     coarse = np.arange(len(values))
     fine = np.arange((len(values) - 1) * finer + 1) / finer
     between = np.empty((len(fine), *values.shape[1:]))
@@ -377,7 +373,7 @@ def _read_between(values: Array, finer: int, smooth: Sequence[int] = ()) -> Arra
 
 
 def make_plant(p: Array, n_noise: int, width: Array, max_step: float) -> Plant:
-    """Return the plant as kernels take it, without process noise."""
+    """Return the plant in the form of the compiled functions, without process noise."""
     return Plant(
         np.ascontiguousarray(p, dtype=np.float64), np.zeros(n_noise),
         np.ascontiguousarray(width, dtype=np.float64), max_step,
@@ -395,7 +391,7 @@ def count_steps(
     n_noise: int,
     max_step: float = MAX_STEP_S,
 ) -> float:
-    """Steps that the integration takes from one sample to the next, on average over some states.
+    """Mean number of integration steps from one sample to the next, over some states.
 
     Args:
         x: (K, nx) states; u: (K, nu) inputs there; the others as in `simulate`.
@@ -406,7 +402,7 @@ def count_steps(
 
 
 def require_finite(x: Array, dt: float) -> None:
-    """Raise Runaway where a simulated motion (T, nx), sampled every ``dt`` s, has diverged."""
+    """Raise Runaway if a simulated motion (T, nx), sampled every ``dt`` s, has diverged."""
     bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
     if len(bad):
         raise Runaway(

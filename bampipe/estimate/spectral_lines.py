@@ -1,7 +1,8 @@
 """Spectral lines far above their surroundings, mostly mains hum.
 
-Second differences keep a signal that is smooth over a few samples out of their fits; those of a
-sine are taken at the time stamps as they are, so that uneven stamps tell it from its aliases.
+The fits use second differences, which remove a signal that is smooth over a few samples. The
+differences of a sine are taken at the actual time stamps, so that uneven stamps distinguish it from
+its aliases.
 """
 
 from collections.abc import Sequence
@@ -14,27 +15,29 @@ from scipy.ndimage import median_filter
 from bampipe.arrays import Array, Flags
 
 LOWEST_LINE = 0.1
-"""Lowest frequency of a line, cycles a sample: differences remove slower sines."""
+"""Lowest frequency of a line, cycles per sample: differences remove slower sines."""
+
 
 _JUMP = 10.0
-"""A second difference of so many medians is no part of a sine in noise."""
+"""Multiple of the median above which a second difference is no part of a sine in noise."""
 _UNEVEN = 1e-3
-"""Aliases differ if the time between samples varies by this share of it."""
+"""Relative variation of the sampling interval from which on aliases differ from a sine."""
 _MOST, _ABOVE, _BESIDE = 6, 40.0, 31
-"""Most lines; least power over the typical one nearby, by chance once in 10^17; its frequencies."""
+"""Largest number of lines; smallest power of a line relative to the median of nearby frequencies,
+exceeded by chance once in 10^17; number of these frequencies."""
 _FOLDS = 4
-"""Below so many times the rate, uneven stamps tell a sine from its aliases."""
+"""Largest multiple of the rate up to which aliases of a sine are tried."""
 _ALONE, _ALONE_HZ, _LEAKAGE = 4.0, 12.0, 3
-"""A hum has so many times the power of all else within so many Hz, without leakage to so many bins
-beside it: a periodic motion has lines at every multiple of its own frequency."""
+"""Smallest power of a hum relative to everything else within so many Hz, and the neighbouring bins
+that leakage fills: a periodic motion has lines at every multiple of its own frequency."""
 _MAINS_HZ, _HARMONICS, _OFF = (50.0, 60.0), 5, 0.002
-"""Frequencies of mains and how many harmonics of them are looked for; how far off they may be, as a
-share: the grid keeps to half a thousandth, the clock of a recorder may be worse."""
+"""Mains frequencies, the number of their harmonics that are searched, and the largest relative
+deviation: the grid is accurate to 0.0005, the clock of a recorder may be worse."""
 _STRETCH, _STRETCH_S, _STRETCHES = 2000, 4.0, 8
-"""Mains drift in phase: they are fitted by stretches of at least so many samples and seconds, and
-looked for in at most so many."""
+"""The phase of mains drifts, so hum is fitted by stretches of at least so many samples and seconds,
+and searched in at most so many of them."""
 _FEWEST = 200
-"""Fewest samples of a search."""
+"""Smallest number of samples for a search."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +45,9 @@ class Line:
     """One sine.
 
     Attributes:
-        hz: its frequency, in cycles by the unit of the time stamps.
+        hz: its frequency, in cycles per unit of the time stamps.
         values: (T,) the sine at the time stamps, in the unit of the record.
-        alone: power over that of the strongest frequency around it.
+        alone: power relative to that of the strongest frequency around it.
     """
 
     hz: float
@@ -55,13 +58,13 @@ class Line:
 def find_lines(
     record: Array, t: Array, lowest: float, highest: float = 0.5, lag: int = 1
 ) -> list[Line]:
-    """Find sines on a record (T,) with time stamps ``t`` (T,), the clearest first.
+    """Find sines in a record (T,) with time stamps ``t`` (T,), the clearest first.
 
     Args:
-        lowest, highest: frequencies between which they appear at this rate, in cycles a sample; at
-            the highest there is, 0.5, aliases of faster ones are among them.
-        lag: samples between those whose second differences are taken; noise counts least where a
-            sine turns by a quarter to half a cycle in so many.
+        lowest, highest: range of their apparent frequencies, in cycles per sample; up to 0.5, it
+            contains aliases of faster sines.
+        lag: samples between those of which second differences are taken; noise counts least if a
+            sine advances by a quarter to half a cycle in this time.
     """
     rate = _mean_rate(t)
     frequency = np.fft.rfftfreq(t.size - 2 * lag)
@@ -92,15 +95,15 @@ def find_lines(
 def remove_mains(
     record: Array, t: Array, moving: Sequence[Array] = ()
 ) -> tuple[Array, dict[float, float]]:
-    """Subtract the mains hum of a record (T,) with time stamps ``t`` (T,), s.
+    """Subtract the mains hum from a record (T,) with time stamps ``t`` (T,), s.
 
     Args:
-        moving: other records (T,) at the same stamps, which mains do not reach, as of positions: a
-            line that one of them shows, too, is a motion and no hum.
+        moving: other records (T,) at the same stamps that mains do not reach, such as positions: a
+            line that one of them shows as well is motion.
 
     Returns:
-        The record without it; by nominal frequency of mains or of one of their harmonics, Hz, the
-        amplitude taken off, typical of all stretches. Empty where there is none.
+        The record without hum, and its amplitude, the median over the stretches, by the nominal
+        frequency of the mains or a harmonic, Hz; empty if there is no hum.
     """
     if record.size < _FEWEST:
         return record, {}
@@ -126,7 +129,7 @@ def remove_mains(
 
 
 def _find_mains(record: Array, t: Array) -> dict[float, float]:
-    """Return nominal mains frequencies, Hz, that a record (T,) shows, and those found for them."""
+    """Return the nominal mains frequencies, Hz, in a record (T,), each with the actual one."""
     rate = _mean_rate(t)
 
     def apparent(hz: float) -> float:
@@ -159,7 +162,7 @@ def _is_uniform(t: Array) -> bool:
 
 
 def _second_differences(record: Array, lag: int) -> tuple[Array, Flags]:
-    """Return second differences of a record (T,), and which are no jumps of friction."""
+    """Return second differences of a record (T,), and which are not jumps of friction."""
     wanted = record[2 * lag :] - 2.0 * record[lag:-lag] + record[: -2 * lag]
     return wanted, np.abs(wanted) <= _JUMP * float(np.median(np.abs(wanted)))
 
@@ -168,9 +171,9 @@ def _fit(record: Array, t: Array, hz: float, within: float, lag: int) -> tuple[f
     """Return frequency and values (T,) of the best-fitting sine of a record (T,), and its misfit.
 
     Args:
-        hz, within: where it is looked for; lag: see `find_lines`.
+        hz, within: centre and half-width of the search, Hz; lag: see `find_lines`.
     """
-    from scipy.optimize import minimize_scalar  # slow to import, and for records with a hum alone
+    from scipy.optimize import minimize_scalar  # slow to import, and only needed if there is a hum
 
     wanted, even = _second_differences(record, lag)
     wanted = wanted[even]

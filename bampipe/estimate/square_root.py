@@ -93,23 +93,23 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     """Filter one trial, propagating the lower root of the covariance.
 
     The prediction is a QR factorisation of the weighted deviations (Van der Merwe and Wan 2001),
-    by differences and sums of opposite points: parameters stay where they are, so that in the
-    sums, and in the points that move the noise, only the state is not zero. The update rotates
-    the joint root of measurement and state, so that it needs no downdate and cannot lose positive
-    definiteness. It is longer than other functions because prediction and update share all of
-    their memory.
+    by differences and sums of opposite points. Parameters do not change, so that only the state is
+    nonzero in the sums and in the points of the noise. The update rotates the joint root of
+    measurement and state, so that it needs no downdate and cannot lose positive definiteness.
+    Prediction and update are one function because they share all of their memory.
 
     Args:
         derivative: f(count, x, u, p, w, dx); measure: h(count, x, u, p, y).
         estimated, levels, samples: the model, its noise and the trial.
-        p: (np + 1,) all parameters, then the timing of the inputs.
+        p: (np + 1,) all parameters, then the input delay.
         mean: (n,) state and parameters, in and out; factor: (n, n) lower root of their
             covariance, in and out.
 
     Returns:
-        Why it stopped, `DONE` or another, and the sample where it did. What it found: means (R, n)
-        and covariances (R, n, n) of every ``levels.stride``-th sample; innovations (T, ny) and
-        their standard deviations, nis (T,) and log likelihood (T,), NaN where no reading is.
+        The reason for stopping, `DONE` if there was no fault, and the sample at which it stopped;
+        then means (R, n) and covariances (R, n, n) of every ``levels.stride``-th sample,
+        innovations (T, ny) and their standard deviations, nis (T,) and log likelihood (T,), NaN
+        where there is no reading.
     """
     t, u, curvature, y = samples
     nx, observed = estimated.n_states, estimated.observed

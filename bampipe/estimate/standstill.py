@@ -1,6 +1,6 @@
 """Detection of standstill, where samples contain no information about friction.
 
-At standstill Coulomb friction is whatever balances the load, and the sign of the velocity is noise.
+At standstill, Coulomb friction balances any load, and the sign of the velocity is noise.
 """
 
 import numpy as np
@@ -9,32 +9,26 @@ from bampipe.arrays import Array, Flags
 from bampipe.estimate.low_pass import Band
 
 REST_S = 0.03
-"""A rest lasts longer than a change of direction by this time, s."""
+"""Time by which a rest lasts longer than a reversal, s."""
 REST_SPEED = 5.0
 """Speed below which an axis may rest, in standard deviations of the velocity."""
 _RINGING_SPEED = 10.0
 """The same for a smoothed velocity that rings, as it does at a stop: it changes sign several times,
-at a reversal once. It also applies under a commanded brake, however shortly: the brake may hold the
-axis for a moment at each reversal, with a hundred times the friction."""
+whereas at a reversal it does so once. This limit also applies, for any duration, under a commanded
+brake, which may hold the axis for a moment at each reversal with a hundred times the friction."""
 _REACH = 0.02
-"""A low-passed sample is left out if a rest has a larger share in it."""
+"""A low-passed sample is left out if rests have a larger weight in it."""
 
 
 def find_standstill(qd: Array, qd_sd: Array, rate_hz: float, braked: Flags | None = None) -> Flags:
-    """Tell where an axis stands still.
+    """Find the samples (T, n_q) at which an axis stands still.
 
-    An axis rests while its velocity stays within five of its standard deviations, where its sign is
-    noise, for longer than 0.03 s beyond what it takes to turn round; from the first to the last of
-    several changes of sign within ten, for as long; where its brake is on, within ten, however
-    shortly. Slow reversals are kept, because only they show how friction builds up.
-
-    Args:
-        qd: (T, n_q) velocity; qd_sd: (T, n_q) or (n_q,) its standard deviation; rate_hz: of the
-            samples.
-        braked: (n_q,) axes whose brake is commanded in this trial; none by default.
-
-    Returns:
-        (T, n_q).
+    An axis rests while its velocity ``qd`` stays within five of its standard deviations ``qd_sd``,
+    (T, n_q) or (n_q,), where its sign is noise, for at least 0.03 s longer than a reversal takes.
+    It also rests between the first and the last of several changes of sign within ten standard
+    deviations, if they last as long; and, if its brake is commanded in this trial (``braked``,
+    (n_q,)), within ten for any duration. Slow reversals are kept, because only they show how
+    friction builds up.
     """
     slow = REST_SPEED * np.broadcast_to(qd_sd, qd.shape)
     ringing = _RINGING_SPEED * np.broadcast_to(qd_sd, qd.shape)
@@ -50,14 +44,7 @@ def find_standstill(qd: Array, qd_sd: Array, rate_hz: float, braked: Flags | Non
 
 
 def find_turns(qd: Array, rate_hz: float) -> Flags:
-    """Tell where an axis turns round: within `REST_S` of a change of the velocity's sign.
-
-    Args:
-        qd: (T, n_q) velocity; rate_hz: of the samples.
-
-    Returns:
-        (T, n_q).
-    """
+    """Find samples within `REST_S` of a reversal of a velocity (T, n_q); return (T, n_q)."""
     near, turns = round(REST_S * rate_hz), np.zeros(qd.shape, dtype=bool)
     for column, v in zip(turns.T, qd.T, strict=True):
         for last in np.flatnonzero(np.diff(np.sign(v))):
@@ -66,13 +53,13 @@ def find_turns(qd: Array, rate_hz: float) -> Flags:
 
 
 def find_runs(chosen: Flags) -> list[tuple[int, int]]:
-    """First sample and the one after the last of every run of chosen samples."""
+    """Return the first sample, and the one after the last, of every run of chosen samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(int), [0]])))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def _ringing(v: Array, limit: Array) -> list[tuple[int, int]]:
-    """Tell where a velocity (T,) within a limit (T,) oscillates, sign changes included."""
+    """Find runs in which a velocity (T,) within a limit (T,) oscillates, sign changes included."""
     found = []
     for start, end in find_runs(np.abs(v) < limit):
         turns = start + np.flatnonzero(np.diff(np.sign(v[start:end])))
@@ -82,17 +69,17 @@ def _ringing(v: Array, limit: Array) -> list[tuple[int, int]]:
 
 
 def _turning(v: Array, limit: Array, start: int, end: int) -> float:
-    """Return the samples of ``start:end`` that a reversal takes from ``-limit`` to ``limit``.
+    """Return the number of samples within ``start:end`` that a reversal takes within the limit.
 
-    It is taken at the acceleration of the same time before and after; zero if the velocity (T,) has
-    no known change of sign, or at the ends of a trial.
+    It is computed from the acceleration over equal times before and after. It is zero if the
+    velocity (T,) does not change sign, or at the ends of a trial.
     """
     length = end - start
     before, after = start - 1 - length, end + length
     if before < 0 or after >= len(v) or v[start - 1] * v[end] >= 0.0:
         return 0.0
     slow = float(limit[start:end].mean())
-    # A steady turn comes from three times the limit, and goes to it.
+    # In a steady reversal, the velocity exceeds twice the limit before and after.
     if min(v[before] * np.sign(v[start - 1]), v[after] * np.sign(v[end])) < 2.0 * slow:
         return 0.0
     outside = abs(v[start - 1] - v[before]) + abs(v[after] - v[end])
@@ -100,15 +87,8 @@ def _turning(v: Array, limit: Array, start: int, end: int) -> float:
 
 
 def find_moving_samples(rest: Flags, band: Band) -> Flags:
-    """Tell which low-passed, thinned samples no rest affects.
-
-    Args:
-        rest: (T, n_q) from `find_standstill`; band: the low-pass.
-
-    Returns:
-        (K, n_q).
-    """
+    """Find the thinned samples (K, n_q) that no ``rest`` (T, n_q) affects through the low-pass."""
     reached = np.abs(band.thin(rest.astype(float))) >= _REACH
-    # The response to a rest rings: where it passes zero between two lobes the rest acts, too.
+    # The response to a rest rings: samples near a zero between two lobes are affected, too.
     reached[1:-1] |= reached[:-2] & reached[2:]
     return ~reached

@@ -1,17 +1,17 @@
 """Augmented unscented Kalman filter: state and parameters together (section III-B).
 
-The estimated vector is ``[x, theta]``: the state of the equations of motion and the parameters
-that are estimated, which follow a random walk. Process noise ``w`` enters the equations of
-motion and gets sigma points of its own; measurement noise is additive.
+The estimated vector is ``[x, theta]``: the state of the equations of motion, and the estimated
+parameters, which follow a random walk. Process noise ``w`` enters the equations of motion and has
+sigma points of its own; measurement noise is additive.
 
-Physical range. A parameter whose lower bound is above zero (a mass, a speed) is estimated as its
-logarithm: a sigma point can then not come near zero, where the motion would explode, and starts
-five times too small and five times too large are alike. A parameter with a lower bound of zero
-(a damping, a friction, the strength of an effect) is estimated as it is, because zero is a proper
-value, where a logarithm has no end; the filter lets it pass through zero and `constrain` moves
-the final estimate to the most likely one within the range. Clamping it on the way instead would
-cut off every excursion to one side and settle at a positive value where the truth is zero. Other
-bounds are kept all along, by clamping sigma points and mean.
+Bounds. A parameter with a positive lower bound (a mass, a speed) is estimated as its logarithm, so
+that no sigma point comes near zero, where the motion would diverge, and starts that are five times
+too small or too large are equivalent. A parameter with the lower bound zero (a damping, a friction,
+the strength of an effect) is estimated as it is, since zero is a proper value. The filter lets it
+pass through zero, and `constrain` moves the final estimate to the most likely one within bounds:
+clamping on the way would cut off every excursion to one side, so that an estimate would settle at a
+positive value although the truth is zero. Other bounds always hold, by clamping sigma points and
+mean.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ _REASONS = {
 }
 ALPHA = (2.0 - 3.0**0.5) ** 0.5
 """Spread of the scaled sigma points (Van der Merwe 2004, with beta = 2 and kappa = 0): the smallest
-that makes no weight in a covariance negative. That of the central point is zero with it, so that a
-covariance is a sum of positive terms; with the usual 1e-3, rounding alone costs nine digits."""
+without negative weights in a covariance. The central weight is then zero, so that a covariance is a
+sum of positive terms; with the usual 1e-3, rounding alone costs nine digits."""
 _NOT_A_SPREAD = (
-    "the spread of the parameters is not positive definite any more: priors far too wide, or"
-    " parameters that cannot be distinguished"
+    "the spread of the parameters is no longer positive definite: the priors are far too wide, or"
+    " some parameters cannot be distinguished"
 )
 
 
 class FilterFailure(ArithmeticError):
-    """The filter lost the trial.
+    """The filter lost the motion of a trial.
 
     Attributes:
         trial: index of the trial; sample: index of the sample; reason: what happened.
@@ -65,21 +65,21 @@ class FilterFailure(ArithmeticError):
 
 @dataclass(frozen=True)
 class FilterModel:
-    """A model as the filter takes it.
+    """A model, as the filter uses it.
 
     Attributes:
-        functions: with the compiled functions ``derivative_rows`` and ``measure_rows``, of the
+        functions: holds the compiled functions ``derivative_rows`` and ``measure_rows``, of the
             kinds in `bampipe.model_functions`; for filterpy also ``derivative`` and ``measure``.
         n_states: length of x.
-        parameters: (np + 1,) values of all parameters, then the timing of the inputs: the time by
-            which they were sampled after the positions, s. Channels of one sample are never read at
+        parameters: (np + 1,) values of all parameters, then the input delay: the time by which the
+            inputs were sampled after the positions, s. Channels of one sample are never read at
             the same instant; unmodelled, 0.1 ms already biases a damping by ten of its standard
-            deviations. Parameters that are not estimated stay as given.
-        free: (nt,) places of the estimated parameters in ``parameters``.
-        lower, upper: (nt,) physical range of the estimated parameters; infinite where none; see
-            the module docstring on when it is kept.
-        reads_parameters: whether the measurement depends on estimated parameters; where it does
-            not, the filter need not work them out twice a step.
+            deviations. Parameters that are not estimated keep these values.
+        free: (nt,) indices of the estimated parameters in ``parameters``.
+        lower, upper: (nt,) bounds of the estimated parameters, infinite if there are none; see the
+            module docstring.
+        reads_parameters: whether the measurement depends on estimated parameters; otherwise the
+            filter computes them only once per step.
     """
 
     functions: Any
@@ -97,7 +97,7 @@ class FilterModel:
 
     @cached_property
     def range(self) -> tuple[Array, Array]:
-        """(nt,) and (nt,): the range that holds all along, on the scale of estimation."""
+        """(nt,) and (nt,): the bounds that always hold, on the scale of estimation."""
         log = self.logarithmic
         lower, upper = self.lower.astype(float), self.upper.astype(float)
         lower[lower == 0.0] = -np.inf
@@ -123,10 +123,10 @@ class FilterModel:
         p[self.free] = value
 
     def to_physical(self, mean: Array) -> tuple[Array, Array]:
-        """Return physical parameters and slopes of ``mean`` (..., nt), as estimated."""
+        """Return the physical parameters for ``mean`` (..., nt), and their derivatives by it."""
         value, slope = np.array(mean, dtype=float), np.ones_like(mean)
         log = self.logarithmic
-        # A filter that has lost the motion may be anywhere.
+        # A filter that has lost the motion may diverge.
         with np.errstate(over="ignore"):
             value[..., log] = np.exp(value[..., log])
         slope[..., log] = value[..., log]
@@ -135,15 +135,15 @@ class FilterModel:
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """Noise and numerical settings.
+    """Noise levels and numerical settings.
 
     Attributes:
-        observed: (ny,) which elements of the model's measurement are in ``Trial.y``.
+        observed: (ny,) indices of the model's measurements that ``Trial.y`` contains.
         reading_sd: (ny,) standard deviation of the measurement noise.
         noise_sd: (nw,) standard deviation of the process noise of one sample.
         walk_sd: (nt,) random walk of the parameters, per square root of a second.
         longest_step: longest Runge-Kutta step, s.
-        stride: store the distribution of every so many samples.
+        stride: number of samples from one stored distribution to the next.
     """
 
     observed: Indices
@@ -163,8 +163,8 @@ class Trial:
         u: (T, nu) inputs of the model.
         y: (T, ny) readings, NaN where one is missing.
         x: (nx,) state at the first sample; x_sd: (nx,) its standard deviation.
-        curvature: (T, nu) second time derivatives of the inputs, between which these run linearly
-            from sample to sample, so that the inputs are cubic; None where they run straight.
+        curvature: (T, nu) second time derivatives of the inputs, linear between samples, so that
+            the inputs are cubic; None for inputs that are linear between samples.
     """
 
     t: Array
@@ -176,11 +176,11 @@ class Trial:
 
     @property
     def input_curvature(self) -> Array:
-        """(T, nu) second time derivatives of the inputs, zero where they run straight."""
+        """(T, nu) second time derivatives of the inputs, zero for linear interpolation."""
         return np.zeros(self.u.shape) if self.curvature is None else self.curvature
 
     def first(self, samples: int) -> Trial:
-        """The same with no more than so many samples."""
+        """The trial, cut to at most so many samples."""
         return replace(
             self, t=self.t[:samples], u=self.u[:samples], y=self.y[:samples],
             curvature=None if self.curvature is None else self.curvature[:samples],
@@ -207,7 +207,7 @@ class FilteredTrial(Stored):
 
     Attributes:
         innovation: (T, ny) reading minus prediction, NaN at the first sample and at gaps.
-        innovation_sd: (T, ny) what the filter expects of it.
+        innovation_sd: (T, ny) standard deviation that the filter expects of it.
         nis: (T,) squared innovation in its own covariance (mean ny if the filter is consistent).
         log_likelihood: (T,) of each reading given those before.
     """
@@ -239,14 +239,10 @@ def filter_trials(
     covariance: Array,
     settings: FilterSettings,
 ) -> FilterOutcome:
-    """Filter trials in sequence: each starts with its own state, the parameters carry over.
+    """Filter one or more trials: each has its own initial state, the parameters carry over.
 
-    Args:
-        model: the compiled model.
-        trials: at least one.
-        theta: (nt,) parameters before the first trial, on the scale of estimation
-            (`FilterModel.to_estimated`); covariance: (nt, nt).
-        settings: noise and numerical settings.
+    ``theta`` (nt,) and ``covariance`` (nt, nt) describe the parameters before the first trial, on
+    the scale of estimation (`FilterModel.to_estimated`).
 
     Raises:
         FilterFailure: the covariance lost positive definiteness or a number is not finite.
@@ -275,11 +271,11 @@ def in_sequence(
     theta: Array,
     covariance: Array,
 ) -> FilterOutcome:
-    """Filter trials one after the other, the parameters carried over.
+    """Filter trials one after the other; each starts from the parameters of the one before.
 
     Args:
-        filter_one: filters the trial of a number from parameters (nt,) and their covariance
-            (nt, nt); returns it and these after it.
+        filter_one: filters one trial, given its number, the parameters (nt,) and their covariance
+            (nt, nt); returns the filtered trial, and parameters and covariance after it.
         trials, theta, covariance: as in `filter_trials`.
     """
     theta, covariance = np.array(theta, dtype=float), np.array(covariance, dtype=float)
@@ -298,18 +294,15 @@ def run_kernel(
     root: Array,
     stride: int,
 ) -> FilteredTrial:
-    """Filter consecutive samples, from the distribution at the first one.
+    """Filter consecutive samples of ``trial``, whose initial state is not used.
 
-    Args:
-        model, settings: as in `filter_trials`.
-        trial: the samples; its state is not read.
-        mean: (n,) state and parameters at the first sample, overwritten with those at the last.
-        root: (n, n) lower root of their covariance, likewise.
-        stride: store the distribution of every so many samples.
+    ``mean`` (n,), state and parameters, and ``root`` (n, n), the lower root of their covariance,
+    are those at the first sample, and are overwritten with those at the last. ``stride`` is the
+    number of samples from one stored distribution to the next.
 
     Raises:
-        FilterFailure: of trial 0: the covariance lost positive definiteness or a number is not
-            finite.
+        FilterFailure: the covariance lost positive definiteness or a number is not finite; the
+            trial has the number 0.
     """
     p, spread = _array(model.parameters), ALPHA**2 * (mean.size + settings.noise_sd.size)
     estimated = Estimated(
@@ -332,13 +325,9 @@ def run_kernel(
 
 
 def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
-    """Return the most likely parameters within the physical range.
+    """Return the most likely parameters (nt,) within their bounds, on the scale of estimation.
 
-    Those outside are put on their bound and the others follow by their covariance.
-
-    Args:
-        model: gives the range.
-        theta: (nt,) on the scale of estimation; covariance: (nt, nt).
+    Parameters outside are put on their bound; the others follow by the covariance (nt, nt).
     """
     lower = np.where(model.logarithmic, model.range[0], model.lower)
     upper = model.range[1]
@@ -357,18 +346,16 @@ def constrain(model: FilterModel, theta: Array, covariance: Array) -> Array:
 
 
 def _array(values: Any, kind: type = np.float64) -> NDArray[Any]:
-    """Return ``values`` as compiled code takes them: table columns, for example, are read-only."""
+    """Return ``values`` as compiled code requires them: columns of tables are read-only."""
     return np.require(values, dtype=kind, requirements=["C", "W"])
 
 
 def join_roots(x_sd: Array, covariance: Array) -> Array:
-    """Lower root (n, n) of the covariance of a state and of parameters that are independent of it.
+    """Lower root (n, n) of the joint covariance of a state and of independent parameters.
 
-    Zero variances give zero columns. Rounding may leave a covariance of nearly dependent variables
-    a little short of definite: then a part in 10^12 is added to each variance.
-
-    Args:
-        x_sd: (nx,) standard deviations of the state; covariance: (nt, nt) of the parameters.
+    The state has standard deviations (nx,), the parameters a covariance (nt, nt). Zero variances
+    give zero columns. If rounding makes the covariance of nearly dependent variables indefinite, a
+    part in 10^12 is added to each variance.
 
     Raises:
         ValueError: the matrix is not positive semidefinite.

@@ -1,10 +1,10 @@
 """White noise and counting steps of a record whose signal is otherwise smooth.
 
 A difference of order k, divided by the root of its squared weights, has the standard deviation of
-white noise, while that of a smooth signal falls with every order. The least over several orders
-therefore bounds the noise from above, and is the noise wherever the signal is smooth over a few
-samples. Hum is neither: at a low sampling rate no difference removes it, and it has almost no power
-at the frequencies of the motion. It is fitted and subtracted first.
+white noise, while that of a smooth signal falls with every order. The smallest over several orders
+therefore bounds the noise from above, and equals it if the signal is smooth over a few samples. Hum
+is neither: at a low sampling rate no difference removes it, and it has almost no power at the
+frequencies of the motion. It is fitted and subtracted first.
 """
 
 import numpy as np
@@ -18,43 +18,43 @@ _SLOWEST_HZ = 100.0
 frequencies of the motion. A record thinned to this rate shows that noise."""
 _NORMAL_MEDIAN = 0.6744897501960817
 _CUT = 2.0
-"""Multiple of the magnitude below which nine in ten differences lie at which larger ones are cut:
-3.3 standard deviations of a normal distribution."""
+"""Multiple of the 90 % quantile of the magnitudes at which larger differences are clipped: 3.3
+standard deviations of a normal distribution."""
 _FEWEST = 200
-"""Fewest samples to measure noise."""
+"""Smallest number of samples from which noise is measured."""
 _STRETCHES, _STRETCH = 8, 2000
-"""A longer record is sampled in so many stretches of so many samples: enough for 1 %."""
+"""Number of stretches, and their length, by which a longer record is sampled: enough for 1 %."""
 _LAGS = range(-1, 16)
-"""Samples by which a controller may lag the readings that it acts on, or the log lead them."""
+"""Delays, in samples, of a controller behind the readings that it acts on; the log may lead."""
 _FEEDBACK_ORDER, _FEEDBACK_ROWS = 3, 16000
 _REACHES, _OFF_GRID = (1.5, 10.0, 100.0), 0.05
-"""Multiples of a step up to which it is refined, and the tolerance of values."""
+"""Multiples of a step up to which it is refined, and the tolerance of values on the grid."""
 
 
 def white_noise_sd(
     record: Array, t: Array | None = None, step: float = 0.0, *, pulsed: bool = False
 ) -> float:
-    """Standard deviation of the white noise on a record (T,) of a signal that is otherwise smooth.
+    """Standard deviation of the white noise in a record (T,) of a signal that is otherwise smooth.
 
-    It comes from the median absolute difference, which is robust against spikes and steps; NaN for
-    records that are too short.
+    It comes from the median absolute difference, which is robust against spikes and steps. It is
+    NaN for records that are too short.
 
     Args:
         record: samples.
         t: (T,) their time stamps, s, which need not be uniform; a uniform record needs none.
-        step: of its counts, 0.0 where its values lie on no grid.
-        pulsed: whether the noise comes in pulses, as a controller makes them of counts: the median
-            misses those, so that the mean square counts, without single spikes.
+        step: step of its counts; 0.0 if its values lie on no grid.
+        pulsed: whether the noise comes in pulses, such as those of a controller that acts on
+            encoder counts. The median misses them, so a clipped mean square is used.
     """
     return _without_dither(_difference_noise(_dithered(record, step), t, pulsed), step)
 
 
 def slow_noise_sd(record: Array, t: Array, step: float = 0.0) -> float:
-    """The same of a record (T,) at stamps ``t`` (T,), thinned to `_SLOWEST_HZ`.
+    """`white_noise_sd` of a record (T,) at stamps ``t`` (T,), thinned to `_SLOWEST_HZ`.
 
     It includes noise that a sensor's own low-pass correlates between neighbouring samples, and any
     signal that is not smooth from one kept sample to the next. Sines of the whole record are
-    subtracted. NaN if the record is too short or no faster.
+    subtracted. It is NaN if the record is too short or no faster than that.
     """
     every = round(1.0 / (_SLOWEST_HZ * float(np.median(np.diff(t))))) if t.size > _FEWEST else 0
     if every < 2:
@@ -71,10 +71,10 @@ def slow_noise_sd(record: Array, t: Array, step: float = 0.0) -> float:
 
 
 def without_feedback(records: Array, readings: Array) -> Array:
-    """Return what in ``records`` (T, n) does not follow ``readings`` (T, n_q), (T', n).
+    """Return the part of ``records`` (T, n) that does not follow ``readings`` (T, n_q), (T', n).
 
-    A controller derives its force from the readings, rounding included, and that force acts on the
-    machine: it is no noise. The part linear in the last readings is found by least squares on
+    A controller derives its force from the readings, rounding included. That force acts on the
+    machine, so it is not noise. The part linear in the last readings is found by least squares on
     differences, which keep the rounding and remove the motion. At most 16,000 samples from the
     middle are used.
     """
@@ -94,7 +94,7 @@ def without_feedback(records: Array, readings: Array) -> Array:
 
 
 def _dithered(record: Array, step: float) -> Array:
-    """Dither a record (T,) over its counts: the median of whole counts is a whole count."""
+    """Add uniform dither to a record (T,) of counts, whose median would be a whole count."""
     return record + step * np.random.default_rng(0).uniform(-0.5, 0.5, record.size)
 
 
@@ -104,7 +104,7 @@ def _without_dither(noise: float, step: float) -> float:
 
 
 def _difference_noise(record: Array, t: Array | None, pulsed: bool = False) -> float:
-    """Return the least noise, over several orders, that differences of a record show."""
+    """Return the smallest noise that differences of several orders of a record show."""
     if record.size < _FEWEST:
         return float("nan")
     if record.size > _STRETCHES * _STRETCH:
@@ -148,7 +148,7 @@ def _without_lines(record: Array, t: Array, lowest: float) -> Array:
 
 
 def counting_step(record: Array) -> float:
-    """Step of the counts that a record (T,) consists of; 0.0 where its values lie on no grid."""
+    """Return the step of the counts in a record (T,); 0.0 if its values lie on no grid."""
     steps = np.abs(np.diff(record))
     steps = steps[steps > 1e-12 * max(float(np.ptp(record)), 1e-300)]
     if steps.size < _FEWEST // 4:

@@ -16,15 +16,15 @@ from bampipe.physics.newton_euler import INERTIAL
 from bampipe.results.identify import BaseEstimate
 
 _SHOWN = 0.5
-"""The trials determine a base parameter if its uncertainty is below this share of the drawing's."""
+"""The trials determine a base parameter if its sd is below this fraction of the drawing's."""
 
 
 def make_possible(system: System, squares: SquaresFit) -> tuple[SquaresFit, list[str]]:
-    """Return the fit with the nearest possible bodies, and notes on the change.
+    """Replace impossible bodies of the fit by the nearest possible ones, with notes on the change.
 
-    Distance is measured by the normal equations of the fit, drawing included, and all other
-    parameters adapt. If the nearest possible bodies explain the trials far worse, the fit stays as
-    it is: the model lacks something, such as a counterbalance.
+    The distance is measured by the normal equations of the fit, including the drawing, and all
+    other parameters adapt. If the nearest possible bodies explain the trials far worse, the fit
+    stays as it is: the model lacks something, such as a counterbalance.
     """
     robot = system.model.device.robot
     if robot is None:
@@ -53,7 +53,7 @@ def _find_nearest(system: System, squares: SquaresFit, places: Array, drawn: Arr
     ``places`` and the drawing's numbers, ``drawn``, are (b, 10).
     """
     count, unseen = squares.free.size, np.setdiff1d(places, squares.free)
-    # The drawing weighs combinations that no motion shows.
+    # The drawing determines the combinations that no motion shows.
     of_drawing = [system.parameters[k].sd ** -2.0 for k in unseen]
     weight = block_diag(squares.information, np.diag(of_drawing))
     at = np.full(len(weight), -1)  # without the nuisance parameters
@@ -68,9 +68,9 @@ def _find_nearest(system: System, squares: SquaresFit, places: Array, drawn: Arr
 
 
 def base_estimates(system: System, p: Array, covariance: Array) -> tuple[BaseEstimate, ...] | None:
-    """Return the base parameters, by the drawing and by the trials.
+    """Return the base parameters, from the drawing and from the trials.
 
-    ``p`` (>= n_p,) are parameters of the model; ``covariance`` is that of those estimated.
+    ``p`` (>= n_p,) are parameters of the model; ``covariance`` is that of the estimated ones.
     """
     robot = system.model.device.robot
     if robot is None:

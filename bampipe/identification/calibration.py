@@ -1,4 +1,4 @@
-"""Contribution of uncertain sensors and drawings to the uncertainty of parameters, by source."""
+"""Uncertainty of parameters due to the calibration of sensors and constants, by source."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
@@ -18,7 +18,7 @@ from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.signals import ZERO_OF, Signals, calibration_changes
 
 _Source = tuple[str, System, Callable[[Motion], Motion]]
-"""Name of a source; model and motion changed by one standard uncertainty of it."""
+"""Name of a source of uncertainty, and model and motion changed by one standard uncertainty."""
 
 
 def propagate_calibration(
@@ -28,13 +28,13 @@ def propagate_calibration(
     motions: Sequence[Motion],
     squares: SquaresFit,
 ) -> Mapping[str, Array]:
-    """Return the changes of the estimates, (n,), by one standard uncertainty of each source.
+    """Return the change of the estimates, (n,), by one standard uncertainty of each source.
 
-    Sources are gains and cross-talk of sensors and scales of encoders and channels as the session
+    Sources are gains and cross-talk of sensors and scales of encoders and channels, as the session
     file states them, zeros of encoders, and constants of the device file with an ``sd``; they are
     independent. Changes are those of least squares (law of propagation of uncertainty, JCGM
-    100:2008, 5.1) for either method; a parameter at its bound stays. The motions that were fitted
-    have every input of the device.
+    100:2008, 5.1) for either method; a parameter at its bound stays. The fitted motions must have
+    every input of the device.
     """
     count = int(np.sum(squares.free < len(system.parameters)))
     held = [int(k) for k in np.flatnonzero(squares.at_bound)]
@@ -46,7 +46,7 @@ def propagate_calibration(
 
 
 def _residual(system: System, motion: Motion, squares: SquaresFit) -> Array:
-    """Return the residual (T, n_q) of a trial by uncompiled functions, which serve once."""
+    """Return the residual (T, n_q) of a trial by uncompiled functions, since they run only once."""
     p = squares.fit.evidence.p
     here = ModelOnTrial(system, p, [motion.with_input_timing(squares.trials.late_s)])
     at = here.mechanism.kinematics
@@ -54,7 +54,7 @@ def _residual(system: System, motion: Motion, squares: SquaresFit) -> Array:
 
 
 def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate:
-    """Return the estimate with the calibration in its covariance, and as a separate term."""
+    """Add the calibration to the covariance of an estimate, and report it as a separate term."""
     if not moved:
         return estimate
     added = sum(
@@ -81,7 +81,7 @@ def _sources(system: System, recipe: Recipe, session: IngestResult) -> Iterator[
 
 
 def describe_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> tuple[str, ...]:
-    """Say what calibration adds to the intervals, or that no uncertainty is stated."""
+    """Report the calibration's part in the intervals, or that no uncertainty is stated."""
     if all(name.startswith(ZERO_OF) for name in moved):
         return ("No uncertainty of gains, scales and constants is stated or included.",)
     sd = np.maximum(estimate.sd, np.finfo(float).tiny)

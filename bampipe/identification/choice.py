@@ -30,19 +30,19 @@ from bampipe.physics import System
 from bampipe.results.identify import Method, MethodTried, MethodValue
 from bampipe.results.rounding import round_with_sd, significant
 from bampipe.trials.motion import Motion, trial_sizes
-from bampipe.trials.replay import steps_to_follow
+from bampipe.trials.replicates import steps_to_follow
 
 MOST_EVALUATIONS = 2e7
 """Most evaluations of the model by all sigma points on all trials: about five seconds per pass."""
 _CHANCE = 0.01
-"""Two estimates disagree if their largest difference has a lower probability by chance."""
+"""Two estimates disagree if chance explains their largest difference with a lower probability."""
 _MOST_WORSE = 1.2
-"""An estimate is published if its held-out error is at most this multiple of the other's."""
+"""Largest ratio of held-out errors at which an estimate may still be published."""
 _SHOWN = 4
 
 
 def why_not_filtered(system: System, squares: SquaresFit, longest_step_s: float) -> str | None:
-    """Return why the filter is not run: "" if no reason is worth a note, None if it is run."""
+    """Return why the filter is not run: "" if that needs no note, None if it is run."""
     device = system.model.device
     if device.prescribed or device.robot is not None or not squares.problem.linear:
         return ""
@@ -80,9 +80,9 @@ def find_objections(system: System, by_filter: Estimate, by_squares: Estimate) -
 def describe_worse(
     system: System, error: Array, other: Array, name: str = METHODS["least-squares"]
 ) -> str:
-    """Say that parameters have a far larger held-out error than those by ``name``, or return "".
+    """State that parameters have a far larger held-out error than those by ``name``; else "".
 
-    ``error`` and ``other`` are theirs by axis, (n_q,).
+    ``error`` and ``other`` are their errors by axis, (n_q,).
     """
     ratio = error / np.maximum(other, 1e-300)
     axis = int(np.argmax(ratio))

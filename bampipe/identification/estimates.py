@@ -1,4 +1,4 @@
-"""An estimate of a model's parameters by any method, and its record in identify.json."""
+"""An estimate of a model's parameters, by any method, and its record in identify.json."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,30 +30,30 @@ from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd
 
 MOST_SHOWN = 24
-"""Parameters that a headline lists."""
+"""Largest number of parameters in a headline."""
 _MOVES, _OUTLYING = 2.0, 15.0
-"""The worst second is reported if it moves a parameter by so many standard deviations, and by so
-many times the effect of noise. In 32 sound sessions no second reached the first limit (1.9 at
-friction reversals); a second with a dead sensor reached 3.5 and 35."""
+"""The worst second is reported if it moves a parameter by more standard deviations than the first
+number, and by more than the second number times the effect of noise. In 32 sound sessions no second
+reached the first limit (1.9 at friction reversals); one with a dead sensor reached 3.5 and 35."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Parameters in physical units, and the quantities of the estimated ones, in their order.
+    """Parameters in physical units, with the covariance and record of the estimated ones.
 
     Attributes:
-        p: (n_p + 1,) all parameters, the timing of the inputs last.
-        problem: the inverse dynamics, its free parameters those estimated, the timing last
-            where it was.
-        method: that made it.
+        p: (n_p + 1,) all parameters, followed by the input delay.
+        problem: the inverse dynamics; its free parameters are the estimated ones, with the input
+            delay last if it is estimated.
+        method: estimation method.
         covariance: (n, n) of the estimated parameters of the model.
-        at_bound: (n,) which are at the limit of their range.
+        at_bound: (n,) which are at a bound.
         held_out_rmse: held-out error by axis, (n_q,), N.m or N.
         details: by parameter, further fields of its record.
         report: further fields of the result.
-        tabulate: makes the tables of the states, trial by trial or all in one, and the table of the
-            parameters along the data.
-        doubts: objections to it, a clause each.
+        tabulate: returns the tables of the states, one per trial or a single one, and the table of
+            the parameters along the data.
+        doubts: objections to the estimate, a clause each.
         notes: other reservations, a sentence each.
     """
 
@@ -71,12 +71,12 @@ class Estimate:
 
     @property
     def evidence(self) -> dict[str, Any]:
-        """Return the filter's results on model and noise, published or not."""
+        """The filter's results on model and noise, published or not."""
         return {key: self.report[key] for key in ("nis", "innovations", "noise")}
 
     @property
     def free(self) -> Indices:
-        """(n,) places of the estimated parameters of the model."""
+        """(n,) indices of the estimated parameters of the model."""
         return self.problem.free[: len(self.covariance)]
 
     @property
@@ -91,9 +91,9 @@ class Estimate:
 
 
 def input_timing(p: Array, problem: Problem, covariance: Array) -> InputTiming:
-    """The timing of the inputs, the last of ``p`` (n_p + 1,) and, if estimated, of a problem.
+    """The record of the input delay, which is the last of ``p`` (n_p + 1,).
 
-    ``covariance`` is (n_free, n_free).
+    ``problem`` says whether it is estimated; ``covariance`` is (n_free, n_free).
     """
     timed = problem.free[-1] == len(p) - 1
     return InputTiming(
@@ -118,11 +118,11 @@ def collect_result(
 
     Args:
         estimate: the published one; trials: names of the trials.
-        moves: (n_free,) change of what is estimated, the timing last where it is, without each
-            trial, or block of a single one, by name.
+        moves: (n_free,) change of the estimated quantities, the input delay last if it is among
+            them, if a trial, or block of a single one, is left out; by its name.
         worst: the second with the largest influence on least squares.
-        late: timing of the inputs that residuals go by, and its standard deviation, s.
-        further: fields of the result as they are; notes among them on how it came about.
+        late: input delay used by residuals, and its standard deviation, s.
+        further: other fields of the result; its notes come after those on effects.
     """
     free, sd = estimate.free, estimate.sd
     names = tuple(system.parameters[i].name for i in free)
@@ -177,7 +177,7 @@ def collect_result(
 
 
 def _headline(parameters: Mapping[str, ParameterEstimate]) -> str:
-    """Return the parameters in one line; only the first of many."""
+    """Return the parameters in one line, truncated if there are many."""
     shown = [
         f"{name} {round_with_sd(entry.estimate, entry.sd)} {entry.unit}".rstrip()
         for name, entry in parameters.items()
@@ -227,11 +227,11 @@ def _assess_influence(
 def _judge_effect(
     effect: BoundEffect, parameters: Mapping[str, ParameterEstimate], covariance: Array
 ) -> EffectEstimate:
-    """Say whether an effect is determined: its strength differs from zero, and its shape is known.
+    """Judge whether an effect is identified: its strength is not zero, and its shape is known.
 
     Several strengths, such as those of sine and cosine, are tested jointly, because correlated
-    errors may leave none determined alone. A shape that cannot be negative needs an interval
-    smaller than itself. ``covariance`` is (n, n), of all ``parameters`` in their order.
+    errors may leave none of them determined alone. A shape that cannot be negative needs an
+    interval smaller than its value. ``covariance`` is (n, n), of all ``parameters`` in their order.
     """
     free = [(item, parameters[item.name]) for item in effect.parameters if item.name in parameters]
     faults = {item.name: _fault(item.name, entry) for item, entry in free}
@@ -260,7 +260,7 @@ def _differs_from_zero(value: Array, covariance: Array) -> bool:
 
 
 def _fault(name: str, entry: ParameterEstimate) -> str:
-    """Return why a parameter is not determined, or ""."""
+    """Return why a parameter is not determined; "" if it is."""
     if entry.at_bound:
         return f"`{name}` is at the limit of its range"
     if NORMAL_95 * entry.sd >= abs(entry.estimate):

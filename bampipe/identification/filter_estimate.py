@@ -1,4 +1,4 @@
-"""The unscented filter's estimate: noise levels, convergence, all trials, intervals."""
+"""The unscented filter's estimate: noise levels, pass over all trials, sign width, intervals."""
 
 from __future__ import annotations
 
@@ -57,34 +57,34 @@ from bampipe.trials.kept import KeptItems
 from bampipe.trials.motion import Motion, trial_names, trial_sizes
 
 _RESTARTS = 3
-"""Searches from least squares, each with four times the process noise of the one before."""
+"""Number of starts from least squares, each with four times the process noise of the one before."""
 _LEAST_REGION = 1e-3
-"""Least initial deviation of a nonlinear model from least squares, in prior standard deviations."""
+"""Smallest initial deviation from least squares, for a nonlinear model, in prior deviations."""
 _AROUND = 10.0
 """Widening of the standard deviations around an answer: such a start adds 1 % of information."""
 _PARTS, _LIKELIER = (1, 2, 4), 30.0
-"""Division of the Runge-Kutta step, and the least gain of log likelihood by it: three times that
-with friction that is smooth on the scale of a step."""
+"""Divisions of the Runge-Kutta step, and the smallest gain of log likelihood that counts: three
+times the gain by a division if friction is smooth on the scale of a step."""
 _NARROWER = (0.5, 0.25, 0.0625)
-"""Widths of the smoothed sign that are tried, times the device's."""
+"""Widths of the smoothed sign that are tried, relative to the device's."""
 _MOVED_TRIALS, _MOVED_SAMPLES = 5, 10_000
-"""Most trials, and samples of all, on which other widths and steps are compared."""
+"""Largest number of trials, and of samples in all, on which widths and steps are compared."""
 _MOST, _SHOWN = 0.5, 6
-"""Smoothing is reported from this share of a parameter's variance on; most parameters named."""
+"""Fraction of a parameter's variance from which smoothing is reported; most parameters named."""
 _SOUND_NIS = (0.5, 2.0)
-"""Mean normalised innovation squared of a filter whose noise levels fit: 0.9 to 1.3 on sound
-sessions, 0.06 to 0.2 and 2.8 to 3.7 on those whose motion it lost."""
+"""Range of the mean normalised innovation squared with proper noise levels: 0.9 to 1.3 in sound
+sessions, 0.06 to 0.2 and 2.8 to 3.7 in those whose motion the filter lost."""
 
 
 @dataclass(frozen=True)
 class FilterTask:
-    """A task for the filter.
+    """The model, start and noise levels for the filter.
 
     Attributes:
-        recipe: the model as data; name: of it, for messages.
-        start: (n_p,) starting values.
-        squares: least squares, which give the region of the answer.
-        known: (n,) their standard deviations, those of the prior for undetermined parameters.
+        recipe: the model's specification; name: its name in messages.
+        start: (n_p,) initial values.
+        squares: the least-squares fit, which gives the region of the answer.
+        known: (n,) its standard deviations, those of the prior for undetermined parameters.
     """
 
     run: RunFolder
@@ -98,7 +98,7 @@ class FilterTask:
     choice: FilterChoice
 
     def narrowed(self, factor: float) -> System:
-        """The model with the widths of its smoothed signs times a factor."""
+        """The model with the widths of its smoothed signs multiplied by a factor."""
         return compile_model(self.recipe.with_sign_widths(factor).model())
 
 
@@ -106,9 +106,9 @@ class _Filtering:
     """The trials, the model and the noise levels of the filter.
 
     Attributes:
-        motions: parts of trials between disturbances; of_trial: the trial of each.
-        trials: raw samples of these; model, settings, choice: of the filter.
-        late_sd: (1,) or (0,) of the timing of the inputs.
+        motions: parts of trials between disturbances; of_trial: number of each part's trial.
+        trials: their raw samples; model, settings, choice: of the filter.
+        late_sd: (1,) standard deviation of the input delay; (0,) if it is not estimated.
     """
 
     def __init__(self, task: FilterTask, report_progress: Progress) -> None:
@@ -135,17 +135,17 @@ class _Filtering:
 
     @property
     def answer(self) -> Array:
-        """(nt,) least squares, the inputs not late."""
+        """(nt,) the least-squares parameters, with no change of the input delay."""
         late = np.zeros(self.late_sd.size)
         return np.append(self.task.squares.p[self.task.squares.free[: self.count]], late)
 
     @property
     def known(self) -> Array:
-        """(nt,) its standard deviations."""
+        """(nt,) standard deviations of `answer`."""
         return np.append(self.task.known, self.late_sd)
 
     def clear(self, place: int) -> Flags:
-        """Which samples of a trial are clear of reversals, (T, n_q)."""
+        """Find the samples of a trial that are clear of reversals, (T, n_q)."""
         return clear_of_reversal_mask(self.motions[place], self.task.system, self.trials[place].t)
 
     def _tuned(self) -> FilterSettings:
@@ -165,10 +165,10 @@ class _Filtering:
 
     @property
     def attempts(self) -> list[Attempt]:
-        """Return the starts: the prior, then least squares with increasing process noise.
+        """The starts: the prior, then least squares with increasing process noise.
 
-        A model that is nonlinear in its parameters starts around least squares: a prior as wide as
-        a range would make it diverge.
+        A model that is nonlinear in its parameters only starts around least squares: a prior as
+        wide as its range would make it diverge.
         """
         task, count = self.task, self.count
         places, late = task.squares.free[:count], np.zeros(self.late_sd.size)
@@ -184,7 +184,7 @@ class _Filtering:
         return attempts + [(self.answer, around, 4.0**k) for k in range(_RESTARTS)]
 
     def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
-        """Filter all trials from the first of some starts that follows the motion."""
+        """Filter all trials, from the first of some starts that follows the motion."""
         return TrialFilter(
             self.model,
             self.trials,
@@ -197,7 +197,7 @@ class _Filtering:
         ).run(attempts, settings)
 
     def find(self) -> tuple[FilterRun, _Width | None, _Widths]:
-        """Return the run that counts, the narrower width that readings favour, and others."""
+        """Return the run to publish, the narrower sign width if chosen, and the widths compared."""
         found = self.run(self.attempts, self.settings)
         widths = self._widths_around(found)
         width = None if self.task.system.model.device.prescribed else widths.choose()
@@ -223,7 +223,7 @@ class _Filtering:
 
 
 def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
-    """Tune the noise, converge on the first trial, then filter all trials.
+    """Tune the noise, search on the first trial, then filter all trials.
 
     Raises:
         MotionLost: the filter does not follow the motion.
@@ -281,14 +281,14 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
 
 
 def _find_smoothing(width: _Width | None, widths: _Widths) -> tuple[Array, Array]:
-    """Return the bias by smoothing, and the spread between likely widths, both (nt,).
+    """Return the bias due to smoothing, and the spread between likely widths, both (nt,).
 
     A machine with dry friction truly stands still, whereas the model creeps within the width of its
-    smoothed sign. The error of the filter is proportional to that width: it is twice the change at
-    half the chosen width. If the narrower sign makes the readings less likely, or fails, the
-    machine creeps and the bias is zero. Both widths are filtered around the answer, over some of
+    smoothed sign. The error of the filter is proportional to that width, so it is twice the change
+    at half the chosen width. If the narrower sign makes the readings less likely, or fails, the
+    machine creeps too, and the bias is zero. Both widths are filtered around the answer, on some of
     the trials and in finer steps, because the narrower one may be stiffer. The spread is the
-    disagreement of widths that are nearly as likely.
+    disagreement between widths of nearly equal likelihood.
     """
     factor, parts = (1.0, 1) if width is None else (width.factor, width.parts)
     likely, value = widths.filter(factor, 2 * parts)
@@ -300,7 +300,7 @@ def _find_smoothing(width: _Width | None, widths: _Widths) -> tuple[Array, Array
 def _describe_smoothing(
     names: Sequence[str], smoothing: Array, sd: Array, width: _Width | None
 ) -> tuple[str, ...]:
-    """Return sentences on a narrower sign, and on uncertainty mostly due to smoothing."""
+    """Describe a narrower sign, and parameters whose uncertainty is mostly due to smoothing."""
     said = []
     if width is not None:
         said.append(
@@ -318,7 +318,7 @@ def _describe_smoothing(
 
 
 def _some_of(trials: Sequence[Trial], found: FilterRun) -> tuple[list[Trial], Array]:
-    """Beginnings of trials, spread evenly, and a covariance to start from around the answer."""
+    """Return beginnings of evenly spread trials, and a covariance to start from near the answer."""
     stride = found.settings.stride
     count = min(len(trials), _MOVED_TRIALS)
     places = np.linspace(0, len(trials) - 1, count).round().astype(int)
@@ -332,11 +332,11 @@ def _some_of(trials: Sequence[Trial], found: FilterRun) -> tuple[list[Trial], Ar
 
 @dataclass(frozen=True)
 class _Width:
-    """The narrower width over which the filter smooths the sign of a velocity.
+    """A narrower width over which the filter smooths the sign of a velocity.
 
     Attributes:
-        factor: times the device's; parts: division of the Runge-Kutta step.
-        spread: (n,) how far parameters move between the widths and steps that are nearly as likely.
+        factor: relative to the device's width; parts: division of the Runge-Kutta step.
+        spread: (n,) range of the parameters over widths and steps of nearly equal likelihood.
     """
 
     factor: float
@@ -346,13 +346,13 @@ class _Width:
 
 @dataclass(frozen=True)
 class _Widths:
-    """Narrower widths of the smoothed sign on some trials, around an answer.
+    """Comparison of widths of the smoothed sign on some trials, around an answer.
 
     Attributes:
         found: the answer; model, width: of the filter that found it.
         some: parts of trials, and the covariance (nt, nt) to start from, by `_some_of`.
-        narrowed: the system by its width, times the device's; step: the longest step, s. filtered:
-            log likelihood and answer by width and division of the step.
+        narrowed: returns the system for a relative width; step: the longest step, s.
+        filtered: log likelihood and answer, by width and division of the step.
     """
 
     found: FilterRun
@@ -364,7 +364,7 @@ class _Widths:
     filtered: dict[tuple[float, int], tuple[float, Array]] = field(default_factory=dict)
 
     def filter(self, width: float, parts: int) -> tuple[float, Array]:
-        """Log likelihood, minus infinity where the motion is lost, and answer, (nt,) physical."""
+        """Log likelihood, minus infinity if the motion is lost, and answer, (nt,) physical."""
         if (width, parts) not in self.filtered:
             likely, theta = -np.inf, self.found.theta
             model = self.model
@@ -381,16 +381,16 @@ class _Widths:
         return self.filtered[width, parts]
 
     def choose(self) -> _Width | None:
-        """Return the width of the highest likelihood; None if no narrower one raises it.
+        """Return the width of the highest likelihood; None if no narrower one raises it clearly.
 
         Friction that stops a machine changes over less than the declared width, and estimates are
         biased in proportion to the difference.
         """
         first, *others = (self.filter(width, _PARTS[1])[0] for width in (1.0, *_NARROWER[:2]))
-        if max(others) < first:  # this is the usual case, and `_find_smoothing` needs it too
+        if max(others) < first:  # the usual case, at no extra cost: `_find_smoothing` needs both
             return None
         declared = max(self.filter(1.0, parts)[0] for parts in _PARTS)
-        if not np.isfinite(declared):  # nothing to compare the others with
+        if not np.isfinite(declared):  # there is nothing to compare with
             return None
         best = [max(self.filter(width, parts)[0] for parts in _PARTS) for width in _NARROWER]
         if max(best[:2]) < declared + _LIKELIER:

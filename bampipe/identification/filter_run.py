@@ -1,4 +1,4 @@
-"""Raw samples through the unscented filter: a search for the region of the answer, then all."""
+"""The unscented filter on raw samples: a search on the first trial, then a pass over all trials."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,21 +27,22 @@ from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.reading import input_columns, read_samples
 
 _STORED, _STORED_IN_ALL = 20_000, 100_000
-"""Most distributions stored of one trial: memory must not grow with the log."""
+"""Largest number of distributions stored of one trial, and of all: memory must not grow with the
+log."""
 _COARSE = 300.0
-"""Factor on the process noise of the search for the region of the answer."""
+"""Factor on the process noise in the search."""
 _LARGEST_NIS = 10.0
 """The filter has lost the motion if its mean normalised innovation squared exceeds this."""
 
 STRETCH_S = 0.05
-"""Averaging time of innovations: encoder counts are no noise from sample to sample, and missing
+"""Averaging time of innovations: encoder counts are not noise from sample to sample, and missing
 effects act at the pace of a hand."""
 _SHIFT_KNOWN = 0.1
 """Relative uncertainty of the initial displacement between encoder and mechanism."""
 _REVERSAL_WIDTHS = 5.0
-"""Widths of the smoothed sign of the velocity within which an axis counts as reversing."""
+"""An axis counts as reversing within this many widths of the smoothed sign of the velocity."""
 _REVERSAL_MARGIN_S = 0.02
-"""Time around a reversal that counts too, s."""
+"""Time before and after a reversal that is left out as well, s."""
 
 
 class MotionLost(InputError):
@@ -54,17 +55,18 @@ Attempt = tuple[Array, Array, float]
 
 @dataclass(frozen=True)
 class Pass:
-    """A filtered trial without its samples, so that memory does not grow with the log.
+    """Summary of a filtered trial, without its samples, so that memory does not grow with the log.
 
     Attributes:
         t: (R,) times, s: every ``stride``-th sample.
         mean: (R, n) state and parameters on the scale of estimation; variance: (R, n).
         ends: distributions at the ends of blocks of time.
-        nis: mean normalised innovation squared; counted: over so many samples.
+        nis: mean normalised innovation squared; counted: number of samples averaged.
         log_likelihood: of all readings, each given those before.
         ratio: (ny,) root mean square of each innovation in its standard deviation.
-        stretches: (K, ny) means of innovations in their standard deviations over ``STRETCH_S``,
-            NaN where one is missing; inputs: (K, nu) those of the inputs; stretch_samples: in one.
+        stretches: (K, ny) means over ``STRETCH_S`` of innovations in their standard deviations,
+            NaN if one is missing; inputs: (K, nu) means of the inputs; stretch_samples: number of
+            samples in each.
     """
 
     t: Array
@@ -85,16 +87,16 @@ class FilterRun:
     """A filter that followed all trials.
 
     Attributes:
-        search: the first pass over the first trial.
-        search_theta: (nt,) parameters after it, on the scale of estimation; search_covariance:
-            (nt, nt).
-        trials: the main passes over all trials in ``order``.
+        search: the search, a first pass over the first trial.
+        search_theta: (nt,) parameters after the search, on the scale of estimation;
+            search_covariance: (nt, nt).
+        trials: the main passes over all trials, in ``order``.
         theta: (nt,) parameters after them; covariance: (nt, nt).
-        settings: noise levels of the main pass.
+        settings: noise levels of the main passes.
         order: indices of ``trials`` in the session.
-        restarts: attempts that failed before.
-        repeats: how often it was restarted around its own answer.
-        first: passes before that, of the run from the real start; empty where there is one run.
+        restarts: number of attempts that failed before.
+        repeats: number of restarts around the filter's own answer.
+        first: passes of the run before such a restart; empty if there was none.
     """
 
     search: Pass
@@ -116,17 +118,17 @@ class FilterRun:
 
     @property
     def passes(self) -> tuple[Pass, ...]:
-        """All passes over trials of the first run and of the last, the search of each first."""
+        """All passes of the first run and of the last, each with its search first."""
         return (*self.first, self.search, *self.trials)
 
     @property
     def steps(self) -> tuple[int, ...]:
-        """Places in the session of the trials of `passes`."""
+        """Index in the session of the trial of each of `passes`."""
         return (0, *self.order) * (2 if self.first else 1)
 
     @property
     def log_likelihood(self) -> float:
-        """Of all readings in the main passes."""
+        """Log likelihood of all readings in the main passes."""
         return sum(each.log_likelihood for each in self.trials)
 
 
@@ -145,14 +147,13 @@ def load_filter_trial(
     stride: int,
     choice: FilterChoice,
 ) -> Trial:
-    """Return the raw samples of one trial, or of a part of it, as the filter reads them.
+    """Read the raw samples of a trial, or of a part of it, for the filter.
 
-    The state is that of the mechanism, which may be displaced from its encoders by elements between
-    the two.
+    The state is that of the mechanism, which elements between it and the encoders may displace.
 
     Args:
         p: (n_p,) parameters near the answer, for the state at the first sample.
-        stride: the filter stores every so many samples.
+        stride: samples from one stored distribution to the next.
     """
     columns = read_samples(run, motion.trial_id, system)
     t = columns["t"] - columns["t"][0]
@@ -169,7 +170,7 @@ def load_filter_trial(
     if choice.measure == "position_velocity":
         velocity = [np.interp(t, motion.t, column) for column in motion.qd.T]
         y = np.hstack([y, np.stack(velocity, axis=1)])
-    # The grid of the motion ends up to a sample before the stamps do.
+    # The grid of the motion ends up to a sample before the time stamps.
     step = float(motion.t[-1] - motion.t[0]) / (len(motion.t) - 1)
     own = (t > motion.t[0] - 0.5 * step) & (t < motion.t[-1] + step)
     t, u, y = t[own], u[own], y[own]
@@ -192,11 +193,11 @@ def load_filter_trial(
 def infer_initial_state(
     system: System, p: Array, q: Array, qd: Array, u: Array, reading_sd: Array, speed_sd: Array
 ) -> tuple[Array, Array]:
-    """Return the state (nx,) of the mechanism for these readings, and its sd (nx,).
+    """Return the state (nx,) of the mechanism for given readings, and its sd (nx,).
 
     Args:
         p: (n_p,) parameters; u: (n_u,) inputs; reading_sd: (n_q,) of a position.
-        q: positions that the encoders read, (n_q,); qd, speed_sd: rates of the mechanism, (n_q,).
+        q: positions read by the encoders, (n_q,); qd, speed_sd: rates of the mechanism, (n_q,).
     """
     offset = system.offset(q[None], u[None], p)[0]
     memory = system.initial_memory(q + offset, u, p)
@@ -206,14 +207,11 @@ def infer_initial_state(
 
 
 def clear_of_reversal_mask(motion: Motion, system: System, t: Array) -> Flags:
-    """Tell where each axis moves well clear of standstill and reversal, (T, n_q).
+    """Find the samples, at times ``t`` (T,), s, at which each axis moves well clear of reversal.
 
-    Within a few widths of the smoothed sign, friction changes faster than the spread of the state,
-    and no Gaussian describes the readings of an axis at rest, so that innovations cannot be tested
-    there.
-
-    Args:
-        t: (T,) times at which it is wanted, s since the start of the trial.
+    Within a few widths of the smoothed sign, friction changes over less than the spread of the
+    state, and the readings of an axis at rest are not Gaussian, so that innovations cannot be
+    tested there. Returns (T, n_q).
     """
     slow = np.abs(motion.qd) < _REVERSAL_WIDTHS * system.sign_widths
     rate = (len(motion.t) - 1) / float(motion.t[-1] - motion.t[0])
@@ -230,10 +228,10 @@ def build_filter_model(
     """Return the filter's model.
 
     Args:
-        trials: whose sampling interval bounds the timing.
-        start: (n_p,) values of the parameters, those that are not estimated included.
-        timing: whether the timing of the inputs is estimated, as the last parameter. A model with a
-            delay of its own cannot separate the two. late_s: the timing if it is not estimated.
+        trials: their sampling interval bounds the input delay.
+        start: (n_p,) values of all parameters, including those that are not estimated.
+        timing: whether the input delay is estimated, as the last parameter; a model with a delay of
+            its own cannot separate the two. late_s: the input delay otherwise.
     """
     places = [i for i, item in enumerate(system.parameters) if not item.fixed]
     lower = [system.parameters[i].lower for i in places]
@@ -257,9 +255,9 @@ class TrialFilter:
     """The filter over all trials of a session.
 
     Attributes:
-        model, trials, choice: of the filter; names: of the trials; axes: of the readings. where,
-        remedy: of the error if the motion is lost.
-        report_progress: called with the share of the trials that is done and the next one's name.
+        model, trials, choice: of the filter; names: of the trials; axes: of the readings.
+        where, remedy: of the error if the motion is lost.
+        report_progress: called with the fraction of the trials done and the name of the next one.
     """
 
     model: FilterModel
@@ -272,14 +270,11 @@ class TrialFilter:
     report_progress: Progress
 
     def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
-        """Converge on the first trial, then filter all trials; the first attempt that holds counts.
+        """Search on the first trial, then filter all, from the first attempt that succeeds.
 
-        A filter that trusts its model far from the truth does not recover. The first trial is
-        therefore filtered with high process noise, which adds almost no information, and again at
-        the end.
-
-        Args:
-            attempts: starts, tried in order.
+        A filter that starts far from the truth but trusts its model does not recover. The first
+        trial is therefore filtered with high process noise, which adds almost no information, and
+        filtered again at the end.
 
         Raises:
             MotionLost: no attempt followed the motion.
@@ -304,7 +299,7 @@ class TrialFilter:
                     passes.append(self._summarise(one, place))
                     self._report(done, place)
                     if _is_lost(passes[-1]):
-                        break  # whatever the other trials say
+                        break  # other trials cannot rescue it
             except FilterFailure as lost:
                 t = trials[place].t[min(lost.sample, trials[place].t.size - 1)]
                 why = f"the filter lost the motion of trial {self.names[place]} at {t:.2f} s:"
@@ -330,7 +325,7 @@ class TrialFilter:
         self.report_progress(done / (len(self.names) + 1), self.names[place])
 
     def _summarise(self, filtered: FilterOutcome, place: int) -> Pass:
-        """Return the summary of a filtered trial for later steps; ``place`` is its number."""
+        """Summarise a filtered trial, whose number is ``place``, for later steps."""
         one, trial = filtered.trials[0], self.trials[place]
         size = np.asarray(one.innovation / one.innovation_sd)
         present = ~np.isnan(one.nis)

@@ -27,16 +27,16 @@ from bampipe.trials.motion import Motion, trial_names
 from bampipe.trials.residuals import ModelOnTrial
 
 _LAGS_S = (0.0, 0.25, 0.5)
-"""Lags at which inputs are taken."""
+"""Lags of the inputs in the test of independence."""
 WHITE_SHARE = 0.2
-"""A channel is white if the past predicts less than this share."""
+"""A channel counts as white if the past predicts less than this fraction of its variance."""
 INPUT_SHARE = 0.05
-"""A channel is independent of the inputs if they predict less than this share."""
+"""A channel counts as independent if the inputs predict less than this fraction of its variance."""
 _SIGNIFICANT = 0.01
 
 
 def tabulate_nis(found: FilterRun, motions: Sequence[Motion]) -> Consistency:
-    """Return the normalised innovation squared, near 1 if the noise levels are right."""
+    """Return the normalised innovation squared, which is near 1 if the noise levels are right."""
     names, of_parts = trial_names(motions), dict[str, list[Pass]]()
     for place, trial in zip(found.order, found.trials, strict=True):
         of_parts.setdefault(names[place], []).append(trial)
@@ -65,7 +65,7 @@ def convergence(
 ) -> Convergence:
     """Return the time after which every estimate stays within 2 % or 3 sd of its final value.
 
-    Time counts from the real start. Convergence is judged by the last run.
+    Time counts from the start of the first run; the last run alone decides on convergence.
     """
     nx = model.n_states
     value, slope = model.to_physical(np.concatenate([p.mean[:, nx:] for p in found.passes]))
@@ -102,7 +102,7 @@ def _thinned(count: int, rows: int) -> Indices:
 def tabulate_states(
     system: System, motions: Sequence[Motion], found: FilterRun, p: Array, rows: int
 ) -> pd.DataFrame:
-    """The filtered motion of every trial, at most ``rows`` rows each; ``p`` (n_p,) are found."""
+    """Tabulate the filtered motion of every trial, at most ``rows`` rows each, at ``p`` (n_p,)."""
     n = len(system.coordinates)
     frames: dict[int, pd.DataFrame] = {}
     for place, trial in zip(found.order, found.trials, strict=True):
@@ -120,9 +120,9 @@ def tabulate_states(
 def with_torques(
     system: System, motion: Motion, t: Array, columns: Mapping[str, Array], p: Array
 ) -> pd.DataFrame:
-    """Return the motion with the trial, the torque of the hand and that against gravity (Fig. 6).
+    """Add the trial, the torque of the hand and that against gravity to a motion (Fig. 6).
 
-    Rows are at times ``t`` (K,), as are the columns, each (K,).
+    Rows are at times ``t`` (K,), and so are the columns, each (K,).
     """
     found = ModelOnTrial(system, p, [motion])
     true, hand = found.mechanism, found.applied
@@ -137,7 +137,7 @@ def with_torques(
 
 
 def as_filtered(system: System, motion: Motion, p: Array) -> pd.DataFrame:
-    """Return the states of a trial whose motion the estimate, ``p`` (n_p,), does not change."""
+    """Tabulate the states of a trial whose motion the estimate, ``p`` (n_p,), does not change."""
     columns = {}
     for i, axis in enumerate(system.coordinates):
         columns[f"q_{axis}"], columns[f"qd_{axis}"] = motion.q[:, i], motion.qd[:, i]
@@ -148,11 +148,10 @@ def as_filtered(system: System, motion: Motion, p: Array) -> pd.DataFrame:
 def tabulate_trace(
     names: Sequence[str], model: FilterModel, motions: Sequence[Motion], found: FilterRun, rows: int
 ) -> pd.DataFrame:
-    """Return how the parameters converged, trial by trial, the search first.
+    """Tabulate how the parameters converged, trial by trial, starting with the search.
 
-    The column ``run`` is 0 from the real start on, 1 in the last run around the answer.
-
-    The first ``len(names)`` of the filter's parameters are stored, in ``rows`` a trial at most.
+    The first ``len(names)`` of the filter's parameters are stored, at most ``rows`` rows per trial.
+    The column ``run`` is 0 in the first run and 1 in the restart around its answer.
     """
     frames, trial_ids = [], trial_names(motions)
     passes = zip(found.steps, found.passes, _elapsed(found.passes), strict=True)
@@ -175,8 +174,8 @@ def check_innovations(
 ) -> dict[str, InnovationTests]:
     """Test innovations of each position for whiteness and independence of the inputs.
 
-    ``moving`` gives, for the place of a trial, where each axis is clear of standstill and reversal,
-    (T, n_q).
+    ``moving`` returns, for the index of a trial, the samples at which each axis is clear of
+    standstill and reversal, (T, n_q).
     """
     n, lags = len(system.coordinates), [round(lag / STRETCH_S) for lag in _LAGS_S]
     channels = [i for i, name in enumerate(system.inputs) if name != "t"]
@@ -204,7 +203,7 @@ def _fails(test: InnovationTest, limit: float) -> bool:
 
 
 def _sentence(own: InnovationTest | None, driven: InnovationTest | None) -> str:
-    """Return both outcomes in words."""
+    """Describe both outcomes in a sentence."""
     if own is None or driven is None:
         return "Too little motion to test the innovations."
     past = f"their past predicts {100.0 * own.share:.0f} % of their variance"

@@ -1,11 +1,11 @@
-"""Free runs: the identified model simulated freely, against the measured position.
+"""Free runs: simulations by the identified model, compared with the measured position.
 
 If the device declares its controller and the session recorded its channels, machine and controller
-run together over whole trials from the reference (closed loop). Otherwise the recorded inputs alone
-drive the model (open loop). Over a whole trial this is meaningful only if the mechanism forgets its
-start: without a restoring force any error of the force is integrated for ever. Over a tenth of a
-second to two seconds it is always meaningful (drift): from the filtered state at many moments, the
-model runs under the recorded inputs.
+are simulated together over whole trials, driven by the reference (closed loop). Otherwise the
+recorded inputs alone drive the model (open loop). Over a whole trial this is meaningful only if the
+mechanism forgets its start: without a restoring force, any force error is integrated for ever. Over
+a tenth of a second to two seconds it is always meaningful (drift): from the filtered state at many
+instants, the recorded inputs drive the model.
 """
 
 import contextlib
@@ -26,39 +26,38 @@ from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.results.ingest import IngestResult
 from bampipe.results.validate import AxisDrift, CommandError, Drift, FreeRun, FreeRunError
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import is_stiff
+from bampipe.trials.replicates import is_stiff
 
 CLOSED: Final = "closed_loop"
 OPEN: Final = "open_loop"
 _PUSHED = 0.1
-"""Displacement of the start that tests whether it is forgotten, in spreads of the motion."""
+"""Displacement of the start in the test whether it is forgotten, in deviations of the motion."""
 _FORGOTTEN = 0.5
-"""Share of the displacement that may remain over the last fifth of a trial."""
+"""Largest fraction of the displacement that may remain over the last fifth of a trial."""
 HORIZONS_S = (0.1, 0.5, 2.0)
-"""A reversal, a movement, several movements of a hand."""
+"""Durations of a reversal, a movement and several movements of a hand."""
 _STARTS = 100
-"""Most starts over all trials; neighbours overlap, so that more add little."""
+"""Largest number of starts over all trials; neighbours overlap, so that more add little."""
 _STARTS_OF_ROBOT = 20
-"""Most starts of a robot, whose light joints take a hundred times longer to integrate: 0.3 s
-each."""
+"""The same for a robot, whose light joints take a hundred times longer to integrate: 0.3 s each."""
 _LEAST = 10
-"""Fewest windows in which an axis moves, for meaningful quantiles."""
+"""Smallest number of windows in which an axis moves, for meaningful quantiles."""
 _MARGIN_S = 0.2
-"""Lost to the filters at both ends of a trial."""
+"""Time lost to the filters at both ends of a trial."""
 _MOVES = 0.01
-"""Share of its range in the trial by which an axis must move within a window to count there."""
+"""Smallest motion, relative to the range in the trial, at which an axis counts in a window."""
 _RUNS_AWAY = 0.1
-"""Share of windows that may diverge."""
+"""Largest fraction of windows that may diverge."""
 _RUN_AWAY_PERCENT = 1000.0
 """A free run is meaningless if its error exceeds this percentage of the motion."""
 _STEPS_S = (1e-3, 1e-4)
-"""Longest integration steps; the next is tried if a motion diverges with one: friction that builds
-up within micrometres is stiffer than an axis, and diverges by the step alone."""
+"""Longest integration steps. The second is tried if a motion diverges with the first: friction that
+builds up within micrometres is stiffer than an axis, and diverges because of the step alone."""
 
 
 _Reach = tuple[Array, Array, Flags]
-"""A run at one horizon: error, infinite if diverged; displacement; whether it moves, (n_q,)
-each."""
+"""A run at one horizon, (n_q,) each: error, infinite if diverged; displacement; whether the axis
+moves."""
 
 
 @dataclass(frozen=True)
@@ -79,30 +78,29 @@ def free_runs(
     parameters: Sequence[Array],
     judged: Sequence[bool],
 ) -> FreeRun:
-    """Run the model freely over every trial and say how far it ends up from the measurement.
+    """Run the model freely over every trial and compare it with the measurement.
 
-    Args:
-        run: the run folder, for the channels of the controller.
-        parameters: for each trial, (>= n_p,) parameters that have not seen it. judged: which trials
-        count; all if none does.
-
-    Returns:
-        Errors in closed loop, else in open loop; only a ``reason`` where no free run is possible
-        or meaningful.
+    ``parameters`` of each trial, (>= n_p,), are fitted without it; ``judged`` says which trials
+    count, all if none does. The run folder has the channels of the controller. Returns errors in
+    closed loop, otherwise in open loop; only a ``reason`` if no free run is possible or meaningful.
     """
     why_not = why_not_free(system, motions, parameters)
     if why_not and not system.model.device.prescribed:
         return FreeRun(reason=why_not)
     law = compile_law(system.model.device)
-    reason = "the device file declares no [controller]" if law is None else _lacks(run, system, law)
+    reason = (
+        "the device file declares no [controller]"
+        if law is None
+        else _why_not_closed(run, system, law)
+    )
     mode: Literal["closed_loop", "open_loop"] = OPEN if law is None or reason else CLOSED
     runs = []
     try:
         for motion, p in zip(motions, parameters, strict=True):
             if law is not None and mode == CLOSED:
-                runs.append(_closed(run, system, motion, p, law))
+                runs.append(_run_closed_loop(run, system, motion, p, law))
             elif runs or _forgets(system, motion, p):
-                runs.append(_open(system, motion, p))
+                runs.append(_run_open_loop(system, motion, p))
             else:
                 return FreeRun(
                     reason=f"{reason}, and under its recorded inputs alone the mechanism does not"
@@ -111,7 +109,7 @@ def free_runs(
     except InputError as error:
         return FreeRun(reason=f"{mode.replace('_', ' ')}: {error}.")
     counted = [r for r, j in zip(runs, judged, strict=True) if j] or runs
-    axes = _axes(system, counted)
+    axes = _tabulate_axes(system, counted)
     if any(axis.relative_error_percent > _RUN_AWAY_PERCENT for axis in axes.values()):
         return FreeRun(reason="The simulated motion diverges.")
     given = np.concatenate([r.force for r in counted])
@@ -125,13 +123,13 @@ def free_runs(
         reason="" if mode == CLOSED else reason,
         mode=mode,
         axes=axes,
-        trials={r.trial_id: _axes(system, [r]) for r in runs},
+        trials={r.trial_id: _tabulate_axes(system, [r]) for r in runs},
         forces=forces,
     )
 
 
-def _lacks(run: RunFolder, system: System, law: ControlLaw) -> str:
-    """Return why this session and model have no closed loop to run, or ""."""
+def _why_not_closed(run: RunFolder, system: System, law: ControlLaw) -> str:
+    """Return why this session and model have no closed loop to simulate, or ""."""
     recorded = run.read(IngestResult).channels
     missing = [n for n in law.inputs if n != "t" and n not in recorded]
     if missing:
@@ -141,8 +139,10 @@ def _lacks(run: RunFolder, system: System, law: ControlLaw) -> str:
     return "the model uses time derivatives of the force, which a command lacks" if rates else ""
 
 
-def _closed(run: RunFolder, system: System, motion: Motion, p: Array, law: ControlLaw) -> _Run:
-    from bampipe.estimate.closed_loop import simulate_controlled  # compiles: for few machines
+def _run_closed_loop(
+    run: RunFolder, system: System, motion: Motion, p: Array, law: ControlLaw
+) -> _Run:
+    from bampipe.estimate.closed_loop import simulate_controlled  # compiled only for few machines
 
     path = run.require("filter/kinematics.parquet", "filter")
     frame = read_parquet(path, trial=motion.trial_id)
@@ -152,7 +152,7 @@ def _closed(run: RunFolder, system: System, motion: Motion, p: Array, law: Contr
     u = motion.inputs(system.inputs)
     force = [system.inputs.index(name) for name in law.forces]
     _, total, readings = simulate_controlled(
-        system.derivative, system.measure, law.command, _start(system, motion, p), u, r,
+        system.derivative, system.measure, law.command, _initial_state(system, motion, p), u, r,
         p[: len(system.parameters)], float(motion.t[1] - motion.t[0]),
         width=system.sign_widths, n_noise=len(system.noise), force=force, rate_hz=law.rate_hz,
         limits=law.limits,
@@ -161,8 +161,8 @@ def _closed(run: RunFolder, system: System, motion: Motion, p: Array, law: Contr
     return _Run(motion.trial_id, measured, readings, u[:, force], total[:, force])
 
 
-def _open(system: System, motion: Motion, p: Array, push: Array | None = None) -> _Run:
-    start, u = _start(system, motion, p), motion.inputs(system.inputs)
+def _run_open_loop(system: System, motion: Motion, p: Array, push: Array | None = None) -> _Run:
+    start, u = _initial_state(system, motion, p), motion.inputs(system.inputs)
     if push is not None:
         start[: len(push)] += push
     x = _simulate(system, start, u, p, float(motion.t[1] - motion.t[0]), system.forced, MAX_STEP_S)
@@ -175,20 +175,20 @@ def _forgets(system: System, motion: Motion, p: Array) -> bool:
     """Return whether the mechanism forgets a displaced start under the recorded inputs."""
     push = _PUSHED * motion.q.std(axis=0)
     n = len(push)
-    near, far = _open(system, motion, p), _open(system, motion, p, push)
+    near, far = _run_open_loop(system, motion, p), _run_open_loop(system, motion, p, push)
     late = slice(-(len(motion.t) // 5) or None, None)
     left = (far.simulated - near.simulated)[late, :n]
     return bool(np.all(np.sqrt(np.mean(left**2, axis=0)) < _FORGOTTEN * push))
 
 
-def _start(system: System, motion: Motion, p: Array) -> Array:
+def _initial_state(system: System, motion: Motion, p: Array) -> Array:
     u = motion.inputs(system.inputs)
     true = motion.of_mechanism(system, u, p[: len(system.parameters)])
     memory = system.initial_memory(true.q[0], u[0], p)
     return np.concatenate([true.q[0], true.qd[0], memory])
 
 
-def _axes(system: System, runs: Sequence[_Run]) -> dict[str, FreeRunError]:
+def _tabulate_axes(system: System, runs: Sequence[_Run]) -> dict[str, FreeRunError]:
     n = len(system.coordinates)
     error = np.concatenate([r.simulated - r.measured for r in runs])
     measured = np.concatenate([r.measured for r in runs])
@@ -213,14 +213,9 @@ def _percent(error: Array, size: Array) -> float:
 def find_drift(
     system: System, motions: Sequence[Motion], parameters: Sequence[Array], judged: Sequence[bool]
 ) -> dict[str, AxisDrift]:
-    """Run the model from many starts of every trial and say how far it drifts.
+    """Run the model from many starts of every trial and measure its drift, by axis and horizon.
 
-    Args:
-        parameters: for each trial, (>= n_p,) parameters that have not seen it. judged: which trials
-        count; all if none does.
-
-    Returns:
-        By axis: the drift at each horizon, and why some horizons are absent.
+    ``parameters`` and ``judged`` are as in `free_runs`; a ``reason`` says why horizons are absent.
     """
     axes = list(zip(system.coordinates, system.coordinate_units, strict=True))
     why = why_not_free(system, motions, parameters)
@@ -228,12 +223,12 @@ def find_drift(
         return {axis: AxisDrift(unit=unit, horizons=(), reason=why) for axis, unit in axes}
     chosen = [k for k, counts in enumerate(judged) if counts] or range(len(motions))
     starts = _STARTS_OF_ROBOT if system.model.device.robot is not None else _STARTS
-    if len(chosen) > starts:  # one from each of so many, spread over the session
+    if len(chosen) > starts:  # one start in each of so many trials, spread over the session
         chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, starts).round().astype(int)]
     usable = [max(motions[k].t[-1] - motions[k].t[0] - 2.0 * _MARGIN_S, 0.0) for k in chosen]
     spacing = sum(usable) / starts
     runs = [
-        _let_go(
+        _run_from_starts(
             system, motions, k, parameters[k], length, length if len(chosen) == starts else spacing
         )
         for k, length in zip(chosen, usable, strict=True)
@@ -245,7 +240,7 @@ def find_drift(
         reached = [reach for run in runs for reach in next(run, [])]
         for i, (axis, _) in enumerate(axes):
             if not found[axis].reason:
-                update = _drift(reached, i, horizon, found[axis])
+                update = _summarise_drift(reached, i, horizon, found[axis])
                 found[axis] = found[axis].model_copy(update=update)
     return found
 
@@ -263,10 +258,10 @@ def why_not_free(system: System, motions: Sequence[Motion], parameters: Sequence
     return ""
 
 
-def _let_go(
+def _run_from_starts(
     system: System, motions: Sequence[Motion], trial: int, p: Array, length: float, spacing: float
 ) -> Iterator[list[_Reach]]:
-    """Run from many samples of a trial, by horizon; ``length``, ``spacing`` of the starts, s."""
+    """Yield runs from many starts in a trial by horizon; ``length``, ``spacing`` of starts in s."""
     motion, p = motions[trial], np.ascontiguousarray(p[: len(system.parameters)])
     u, dt = motion.inputs(system.inputs), float(motion.t[1] - motion.t[0])
     true = motion.of_mechanism(system, u, p)
@@ -277,7 +272,7 @@ def _let_go(
     running: list[Array | None] = [states[k].copy() for k in starts]
     travel, done, longest = np.ptp(motion.q, axis=0), 0, round(HORIZONS_S[-1] / dt) + 1
     seen = [(u[k : k + longest].copy(), motion.q[k : k + longest].copy()) for k in starts]
-    del motion, true, u, states  # of a hundred trials, these windows alone are kept
+    del motion, true, u, states  # only these windows of a hundred trials stay in memory
     for horizon in HORIZONS_S:
         steps = round(horizon / dt)
         inside = [both for k, both in zip(starts, seen, strict=True) if k + steps <= last]
@@ -317,10 +312,10 @@ def _simulate(
     )  # fmt: skip
 
 
-def _drift(
+def _summarise_drift(
     reached: Sequence[_Reach], axis: int, horizon: float, shorter: AxisDrift
 ) -> dict[str, object]:
-    """Return the update of one axis' drift by a horizon, s, or why there is none."""
+    """Return the update of one axis' drift by a horizon, s, or the reason why there is none."""
     used = [(error[axis], way[axis]) for error, way, moves in reached if moves[axis]]
     error = np.array([error for error, _ in used])
     if len(used) < _LEAST:

@@ -1,4 +1,4 @@
-"""Identifiability of a model's numbers on these trials, in numbers and in words."""
+"""Identifiability of a model's parameters on given trials, as records and sentences."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -30,19 +30,19 @@ from bampipe.results.identify import (
 from bampipe.trials.motion import Motion, trial_names
 
 _LISTED = 4
-"""Trials named in a sentence."""
+"""Largest number of trials named in a sentence."""
 _NOTHING = 0.01
-"""A trial adds nothing if no bound would grow by this share without it."""
+"""A trial adds nothing if no bound would grow by more than this fraction without it."""
 _CLOSE = 0.9
 """Numbers with a higher correlation are reported to move together."""
 _LITTLE = 0.5
-"""The data add little if they leave more than this share of the prior standard deviation."""
+"""The data add little if they leave more than this fraction of the prior standard deviation."""
 _MOVES = 0.5
-"""Change of an estimate by an error of one per cent, from which on it is reported, per cent."""
+"""Smallest reported change of an estimate by an error of one per cent, per cent."""
 _KNOWN = 0.1
-"""Changes are relative only if the least relative standard deviation of an estimate is lower."""
+"""Relative changes are reported only of estimates whose relative standard deviation is smaller."""
 _MOST_MOVED = 5
-"""Estimates named for one number."""
+"""Largest number of estimates named for one number."""
 _SHIFT = 1e-6
 """Finite difference of a position, rad or m, for the slope of a force."""
 TIMING = "input_timing"
@@ -51,14 +51,10 @@ TIMING = "input_timing"
 def assess_identifiability(
     system: System, motions: Sequence[Motion], problem: Problem, p: Array, noise: Noise
 ) -> tuple[IdentifiabilityReport, Array]:
-    """Return the uncertainty of the parameters at ``p`` by sensor noise alone.
+    """Assess the uncertainty of the parameters due to sensor noise alone.
 
-    Args:
-        problem: the inverse dynamics of the trials; p: (n_p + 1,) estimates, the timing of the
-            inputs last.
-
-    Returns: The report, and the covariance (n_parameters, n_parameters) of the priors in directions
-    without information.
+    ``p`` (n_p + 1,) are estimates, the input delay last. Returns the report, and the covariance
+    (n_parameters, n_parameters) of the priors in directions without information.
     """
     known = structure(system)
     n_p = len(system.parameters)
@@ -74,7 +70,7 @@ def assess_identifiability(
     covariance = cramer_rao_bound(own)
     value = p[problem.free]
     estimated = [i for i, name in enumerate(names) if name != TIMING]
-    # For inertial numbers, which all compensate each other, see `BaseEstimate`.
+    # Inertial parameters all compensate each other: `BaseEstimate` reports them.
     drawn = set(np.flatnonzero(problem.precision))
     own_words = [i for i in estimated if i not in drawn]
     weak = [
@@ -90,7 +86,7 @@ def assess_identifiability(
         _describe_number(number, total, n, n + j, names, value, estimated)
         for j, number in enumerate(known.numbers)
     )
-    half = problem.upper[-1]  # of a sample: the prior of the timing
+    half = problem.upper[-1]  # of a sample: the prior of the input delay
     assumed = np.array([system.parameters[i].sd if i < n_p else half for i in problem.free])
     trials = {
         name: TrialGrowth(
@@ -131,16 +127,12 @@ def find_information(
     noise: Noise,
     further: Callable[..., Array] | None = None,
 ) -> Array:
-    """Return the information of one trial on the estimated parameters, by sensor noise alone.
+    """Return the information of one trial on the estimated parameters, with sensor noise alone.
 
-    Args:
-        problem: inverse dynamics in which the motion has the number ``trial``.
-        p: (n_p + 1,) parameters, the timing of the inputs last.
-        further: slopes (T, n_q, m) of the residual by further numbers at a motion, internal states,
-            inputs and parameters.
-
-    Returns:
-        (n, n), or (n + m, n + m) with those numbers last.
+    The motion has the number ``trial`` in ``problem``, and the input delay comes last in ``p``
+    (n_p + 1,). ``further`` returns slopes (T, n_q, m) of the residual by further numbers, given
+    motion, internal states, inputs and parameters. Returns (n, n), or (n + m, n + m) with those
+    numbers last.
     """
     own = p[:-1]
     n = len(system.coordinates)
@@ -169,7 +161,7 @@ def find_information(
 
 
 def _stiffness(system: System, motion: Motion, z: Array, u: Array, p: Array) -> Array:
-    """Return the slope of the required force by the position, RMS, (n_q,)."""
+    """Return the root mean square slope of the required force by the position, (n_q,)."""
     found = np.zeros(len(system.coordinates))
     here = system.required(*motion.kinematics, z, u, p)
     for i in range(len(found)):
@@ -181,7 +173,7 @@ def _stiffness(system: System, motion: Motion, z: Array, u: Array, p: Array) -> 
 
 
 def _describe_bound(own: Array, covariance: Array, i: int, names: Sequence[str]) -> ParameterBound:
-    """Return bound, bound with all others known, and the parameter that is most similar."""
+    """Return the bound, the bound with all others known, and the most correlated parameter."""
     partner, correlation = _partner(covariance, i, names)
     return ParameterBound(
         bound_sd=_finite_sd(covariance[i, i]),
@@ -217,7 +209,7 @@ def _describe_number(
     value: Array,
     estimated: Sequence[int],
 ) -> DeviceNumber:
-    """Return the information on one number of the device if it were estimated too."""
+    """Return the information on one number of the device as if it were estimated too."""
     rows = [*range(n), place]
     covariance = cramer_rao_bound(total[np.ix_(rows, rows)])
     partner, correlation = _partner(covariance, n, names)
@@ -239,7 +231,7 @@ def _describe_number(
 
 
 def _describe_weak(weak: Weak, names: Sequence[str], value: Array, covariance: Array) -> str:
-    """Say which parameters move together; for a pair, how well sum and difference are known."""
+    """Report parameters that move together; for a pair, how well sum and difference are known."""
     pair = list(weak.members)
     start = f"{_list([names[i] for i in pair])} move together here"
     if (
@@ -284,7 +276,7 @@ def _describe_idle(trials: Mapping[str, TrialGrowth]) -> list[str]:
 
 
 def _describe_leaning(numbers: Sequence[DeviceNumber]) -> list[str]:
-    """Say on which numbers of the device file the estimates depend, and which they resemble."""
+    """Report the device's numbers on which estimates depend, and those they resemble."""
     sentences = []
     for number in numbers:
         moved = {name: size for name, size in number.moves_percent.items() if abs(size) >= _MOVES}

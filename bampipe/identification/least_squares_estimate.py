@@ -1,7 +1,7 @@
 """Least squares on the inverse dynamics under the likelihood by which models are judged.
 
-Weights of samples, the bias of filters and of stopping friction, and the timing of the inputs are
-those of `bampipe.trials.likelihood`, with the same nuisance parameters.
+Weights of samples, biases of filters and of stopping friction, the input delay and the nuisance
+parameters are those of `bampipe.trials.likelihood`.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -39,22 +39,22 @@ from bampipe.trials.residuals import problem_of, rms
 
 _REPLICATES = 6
 _LACKING = 3.0
-"""Weights are meaningless if the residual exceeds the part of sensors, filters and discrepancy by
-this factor: by the verdict, something unknown then remains."""
+"""Ratio of the residual to the part due to sensors, filters and discrepancy above which weights are
+meaningless: the verdict then says that something unknown remains."""
 _PASSES = 6
-"""Most fits of a model that is nonlinear in its parameters, each with replicates of the last."""
+"""Largest number of fits of a nonlinear model, each with replicates of the one before."""
 _SETTLED = 1.0
-"""Such a fit is the last if it gains fewer nats of log likelihood; the most likely one counts."""
+"""Such fits end when one gains fewer nats of log likelihood; the most likely one is taken."""
 _FARTHEST = 3.0
-"""Largest change of a nonlinear fit without a trial, in standard deviations."""
+"""Largest change of a nonlinear fit when a trial is left out, in standard deviations."""
 _PERIODS = 10
-"""Periods of the band in the shortest independent block."""
+"""Length of the shortest independent block, in periods of the band."""
 _TAILED = 0.75
 """Mean slope of a sample's score under Student's t distribution over its weight, for normal errors
-and four degrees of freedom: weights that follow the errors overstate the information."""
+and four degrees of freedom: weights that depend on the errors overstate the information."""
 _STRETCH_S = 1.0
 _STATES = 500_000
-"""Number of samples, spread over all, that give the typical uncertainty of a state."""
+"""Number of samples, spread over all trials, for the typical uncertainty of a state."""
 
 
 @dataclass(frozen=True)
@@ -62,27 +62,29 @@ class SquaresFit:
     """A model fitted to trials under the likelihood.
 
     Attributes:
-        fit: the fit; trials: fitted; problem: their inverse dynamics, for other estimators.
-        replayed: whether the model could be simulated; otherwise all samples have equal weight.
-        p: (n_p + 1,) parameters, the timing of the inputs last, s, from what ``trials`` have.
+        fit: the fit; trials: the fitted trials; problem: their inverse dynamics, for other
+            estimators.
+        has_replicates: whether the model could be simulated; otherwise all samples have equal
+            weight.
+        p: (n_p + 1,) parameters, the change of the input delay from that of ``trials`` last, s.
         block_s: longest independent block of time, s.
     """
 
     fit: Fit
     trials: MeasuredTrials
     problem: Problem
-    replayed: bool
+    has_replicates: bool
     p: Array
     block_s: float
 
     @property
     def free(self) -> Indices:
-        """(n,) places in ``p`` of the estimated parameters, the timing last if estimated."""
+        """(n,) indices in ``p`` of the estimated parameters, the input delay last if estimated."""
         return self.problem.free
 
     @property
     def at_bound(self) -> Flags:
-        """(n,) which of them are at the limit of their range."""
+        """(n,) which of them are at a bound."""
         value, slack = self.p[self.free], 1e-9 * (self.problem.upper - self.problem.lower)
         slack = np.where(np.isfinite(slack), slack, 0.0)
         low, high = self.problem.lower + slack, self.problem.upper - slack
@@ -102,21 +104,20 @@ class SquaresFit:
     def rows(self) -> Iterator[tuple[Array, Array]]:
         """By axis: slopes (n, P) by the determined unknowns, and residual (n,); both weighted.
 
-        They are computed anew each time, because keeping them would double the memory of the
-        problem.
+        They are computed on each access, because storing them would double the problem's memory.
         """
         pairs = zip(self.fit.problem.base, self._left, strict=True)
         return ((x / scale, left / scale) for x, (left, scale) in pairs)
 
     @cached_property
     def normal(self) -> Array:
-        """Normal equations by the determined unknowns, priors among them, (P, P)."""
+        """Normal equations by the determined unknowns, including priors, (P, P)."""
         products = sum(x.T @ x for x, _ in self.rows)
         return np.asarray(products + self.fit.problem.precision)
 
     @cached_property
     def information(self) -> Array:
-        """The same by the free parameters, then the nuisance parameters, (m, m)."""
+        """Normal equations by the free parameters, then the nuisance parameters, (m, m)."""
         back = np.linalg.pinv(self.fit.problem.to_parameters)
         return np.asarray(back.T @ self.normal @ back)
 
@@ -124,8 +125,8 @@ class SquaresFit:
         """Return the first-order change of the parameters (n,) by changes of the measurement.
 
         Args:
-            changes: of the residual, by axis, each (n,), N.m or N.
-            held: places of parameters that stay, nuisance parameters behind the others.
+            changes: changes of the residual, by axis, each (n,), N.m or N.
+            held: indices of parameters that stay; nuisance parameters follow the others.
         """
         parts = zip(self.rows, self._left, self.fit.likelihood.root, changes, strict=True)
         score = sum(x.T @ (root / scale * c) for (x, _), (_, scale), root, c in parts)
@@ -135,7 +136,7 @@ class SquaresFit:
         return np.asarray(-(to @ step)[:count])
 
     def residual_change(self, residual: Iterable[Array]) -> list[Array]:
-        """Return the additions of unfiltered residuals (T, n_q) to its own, by axis, each (n,)."""
+        """Return the differences of unfiltered residuals (T, n_q) from its own, by axis, (n,)."""
         evidence, samples = self.fit.evidence, self.fit.likelihood.samples
         thin = evidence.band.thin_trials(residual, range(len(samples)))
         change = [there - here for there, here in zip(thin, evidence.residual, strict=True)]
@@ -147,7 +148,7 @@ class SquaresFit:
         pose = self.fit.problem
         inverse = invert_scaled(self.normal)
         fitted = float(np.trace(inverse @ (self.normal - pose.precision)))
-        # Shorter blocks if there are fewer than three per parameter.
+        # With fewer than three blocks per parameter, use shorter blocks.
         band, seconds = self.trials.band, sum(self.fit.evidence.sizes) / self.trials.band.rate_hz
         most = max(
             seconds / (BLOCKS_A_PARAMETER * max(fitted, 1.0)), _PERIODS / min(band.cutoff_hz)
@@ -172,7 +173,7 @@ class SquaresFit:
         return self.fit.problem.sums_of(trials, len(self.trials.motions))
 
     def refit(self, xx: Array, xy: Array, yy: Array) -> Array:
-        """Return parameters (n_p + 1,) from sums of some samples, to first order."""
+        """Return the parameters (n_p + 1,) from sums of some samples, to first order."""
         pose, count = self.fit.problem, self.free.size
         lower, upper = pose.lower.copy(), pose.upper.copy()
         if not self.problem.linear:
@@ -196,9 +197,9 @@ class SquaresFit:
 
     @cached_property
     def moves(self) -> list[Array]:
-        """Change of the estimates, (n,), without each part; see `Influence`.
+        """Change of the estimates, (n,), if each part is left out; see `Influence`.
 
-        In a single trial a period of the band on either side is left out, too.
+        In a single trial, a period of the band on either side is left out as well.
         """
         band, groups = self.trials.band, self.trials.folds.groups
         if len(self.parts) == 1:
@@ -223,9 +224,9 @@ class SquaresFit:
         return np.asarray((self.refit(*sums) - self.p)[self.free])
 
     def held_out_rmse(self, p: Array) -> Array:
-        """Return the error of an estimate on each part held out, by axis, (n_q,), N.m or N.
+        """Return the error of an estimate on held-out parts, by axis, (n_q,), N.m or N.
 
-        ``p`` (n_p + 1,) is the estimate, by any method; it changes as least squares do.
+        ``p`` (n_p + 1,) is the estimate, by any method; it is moved as least squares are.
         """
         trials, limits = self.trials, (self.problem.lower, self.problem.upper)
         problem = problem_of(self.fit.evidence.system, self.parts, trials.band, timing=trials.timed)
@@ -257,7 +258,7 @@ class SquaresFit:
 
     @property
     def bias(self) -> Array:
-        """Return the bias of the parameters, (n,), by filters and stopping friction."""
+        """Bias of the parameters due to filters and stopping friction, (n,)."""
         unknowns = self.fit.problem.to_parameters.shape[0]
         factors = range(unknowns - 2 * len(self._left), unknowns)
         return self.respond(self.fit.bias, factors)
@@ -271,19 +272,17 @@ def fit_squares(
     block_s: float,
     remove_bias: bool = True,
 ) -> SquaresFit:
-    """Fit a model under the likelihood.
+    """Fit a model under the likelihood, from the parameters ``start`` (n_p,).
 
-    Args:
-        trials: to be fitted, whose `timing` says how late inputs may be.
-        start: (n_p,) parameters to start from.
-        block_s: see `SquaresFit`; remove_bias: whether replicates give weights and bias.
+    The `timing` of the trials bounds the input delay; ``block_s`` is as in `SquaresFit`; with
+    ``remove_bias``, replicates give weights and bias.
 
     Raises:
         ValueError: fewer samples are clear of standstill than there are parameters.
     """
     session = Session(trials, Criteria(replicates=_REPLICATES))
     problem = problem_of(system, trials.motions, trials.band, timing=trials.timed)
-    # Shapes of effects keep their searched values, which stopping friction would bias.
+    # Shapes of effects keep the values of their search, which stopping friction would bias here.
     effects = () if problem.linear else system.model.effects
     plain = problem_of(
         system, trials.motions, trials.band, held=[q.name for e in effects for q in e.parameters]
@@ -295,7 +294,7 @@ def fit_squares(
             again = _with_values(
                 session.fit(recipe, at, lacking=_LACKING), trials, problem, block_s
             )
-            # Replicates of a model with an error one way push the fit the other way.
+            # Replicates of a model with an error push the next fit the opposite way, so average.
             there = again.fit.evidence.p
             at = there if found is None else 0.5 * (at + there)
             gain = again.fit.log_likelihood - found.fit.log_likelihood if found else np.inf
@@ -303,13 +302,14 @@ def fit_squares(
             if number > 1 and gain < _SETTLED:
                 break
     if found is None:
-        alike = session.fit_plainly(recipe, begun)
-        found = replace(_with_values(alike, trials, problem, block_s), replayed=False)
+        plain_fit = session.fit_plainly(recipe, begun)
+        squares = _with_values(plain_fit, trials, problem, block_s)
+        found = replace(squares, has_replicates=False)
     return found
 
 
 def _with_values(fit: Fit, trials: MeasuredTrials, problem: Problem, block_s: float) -> SquaresFit:
-    """Return the fit with its parameters, including the last small step of its linear problem."""
+    """Return the fit with its parameters, including the last step of its linear problem."""
     change = (fit.problem.to_parameters @ fit.solved.base)[: problem.free.size]
     p = np.append(fit.evidence.p, 0.0)
     p[problem.free] = np.clip(p[problem.free] + change, problem.lower, problem.upper)
@@ -317,7 +317,7 @@ def _with_values(fit: Fit, trials: MeasuredTrials, problem: Problem, block_s: fl
 
 
 def estimate_by_least_squares(system: System, squares: SquaresFit) -> Estimate:
-    """Return the least-squares estimate; its trace is the fit to the trials so far."""
+    """Return the least-squares estimate; its trace is the fit to the trials up to each time."""
     motions: Sequence[Motion] = squares.trials.motions
     count = int(np.sum(squares.free < len(system.parameters)))
     stride = -(-sum(squares.fit.evidence.sizes) // _STATES)

@@ -1,4 +1,4 @@
-"""Settings of the filter, noise of the sensors, and the noise levels of the highest likelihood."""
+"""Settings of the filter, noise of the sensors, and tuning of noise levels by the likelihood."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,11 +24,11 @@ from bampipe.trials.motion import Motion
 from bampipe.trials.sensors import Sensors
 
 TUNING_SAMPLES = 3000
-"""Samples on which the noise levels are tuned."""
+"""Number of samples on which the noise levels are tuned."""
 _TUNING_TRIALS = 6
-"""Trials that they are taken from: in a single one, the missing effect may be small."""
+"""Number of trials that they stem from: in a single one, a missing effect may be small."""
 _TUNING_STEP_S = 2e-3
-"""Longest Runge-Kutta step while tuning, s: sufficient for noise levels."""
+"""Longest Runge-Kutta step while tuning, s, which is sufficient for noise levels."""
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -36,19 +36,20 @@ class FilterChoice:
     """Settings of the filter.
 
     Attributes:
-        engine: ``compiled``, or ``filterpy``: slow, gives the same numbers.
+        engine: ``compiled``, or ``filterpy``: slow, with the same results.
         measure: ``position``, or ``position_velocity`` as in the paper; filtered velocities are
             not white, so intervals from them are too narrow.
         random_walk: of the parameters, in prior standard deviations per square root of a
-            second; 0 takes them as constant, and only then are the intervals calibrated.
-        reading_noise: standard deviation of a position reading in encoder steps; 0 takes it
-            from the data.
-        force_noise: of a force sample, N, model error included; 0 takes it from the data, or
-            from the identification where the model has been identified.
+            second; with 0 they are constant, and only then are the intervals calibrated.
+        reading_noise: standard deviation of a position reading in encoder steps; 0 measures it
+            in the data.
+        force_noise: of a force sample, N, including model error; 0 measures it in the data, or
+            takes that of the identification if the model has been identified.
         longest_step_s: longest Runge-Kutta step, s.
-        block_s: length of the blocks that are taken as independent of each other, s; shorter
-            in short sessions, for three a parameter at least.
-        trace_rows: most rows a trial in tables of states and of parameters along the data.
+        block_s: length of the blocks that are treated as independent of each other, s; shorter
+            in short sessions, so that there are at least three per parameter.
+        trace_rows: largest number of rows per trial in tables of states and of parameters along
+            the data.
     """
 
     engine: Literal["compiled", "filterpy"] = "compiled"
@@ -63,11 +64,11 @@ class FilterChoice:
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the sensors before any tuning.
+    """Noise of the sensors before tuning.
 
     Attributes:
-        reading_sd: (ny,) of position, and velocity where measured.
-        process_sd: (nw,) of the model's process noise, one sample.
+        reading_sd: (ny,) of positions, and of velocities if they are measured.
+        process_sd: (nw,) of the model's process noise, per sample.
         is_force: (nw,) which of these are a measured force.
     """
 
@@ -79,10 +80,10 @@ class Noise:
 def sensor_noise(
     sensors: Sensors, system: System, motions: Sequence[Motion], p: Array, choice: FilterChoice
 ) -> Noise:
-    """Return the noise of the session's sensors for the filter.
+    """Return the noise of the session's sensors, as the filter needs it.
 
-    Process noise other than of a force starts as the torque of the smallest force noise at an arm
-    of 1 m. If the load moves the encoder against the handle, the noise of a force adds to the
+    Process noise that is not of a force starts as the torque of the smallest force noise at an arm
+    of 1 m. If the load moves the encoder relative to the handle, the noise of a force adds to the
     modelled reading.
 
     ``p`` (n_p,) are parameters near the answer; ``choice`` may fix levels.
@@ -109,7 +110,7 @@ def sensor_noise(
 
 
 def _force_in_positions(system: System, motions: Sequence[Motion], p: Array, noise: Noise) -> Array:
-    """Return the motion of the encoders by the noise of the forces in the model, RMS, (n_q,)."""
+    """Return the RMS motion of the encoders that force noise causes in the model, (n_q,)."""
     square, count = np.zeros(len(system.coordinates)), 0
     for motion in motions:
         given = motion.inputs(system.inputs)
@@ -123,7 +124,7 @@ def _force_in_positions(system: System, motions: Sequence[Motion], p: Array, noi
 
 
 def untuned_settings(system: System, noise: Noise, choice: FilterChoice) -> FilterSettings:
-    """Return the settings of the filter with the stated noise of the sensors."""
+    """Return the settings of the filter with the noise of the sensors, before tuning."""
     n = len(system.coordinates)
     free = [item for item in system.parameters if not item.fixed]
     return FilterSettings(
@@ -136,13 +137,13 @@ def untuned_settings(system: System, noise: Noise, choice: FilterChoice) -> Filt
 
 
 def choose_tuning_trials(sizes: Sequence[int]) -> tuple[list[int], int]:
-    """Choose trials on whose beginnings the noise levels are tuned, `TUNING_SAMPLES` together.
+    """Choose trials on whose beginnings the noise levels are tuned, `TUNING_SAMPLES` in all.
 
-    A filter can start at the beginning of a trial, at rest and cold; in its middle, the internal
-    states of friction are unknown.
+    A filter can start at the beginning of a trial, where the machine is at rest; in the middle, the
+    internal states of friction are unknown.
 
     Returns:
-        Numbers of the trials, spread over all, and how many samples of each.
+        Numbers of the trials, evenly spread, and the number of samples from each.
     """
     usual = int(np.median(sizes))
     count = min(len(sizes), max(_TUNING_TRIALS, -(-TUNING_SAMPLES // usual)))
@@ -159,20 +160,20 @@ def tune_noise(
     noise: Noise,
     choice: FilterChoice,
 ) -> FilterSettings:
-    """Set the noise levels at the maximum of the filter's likelihood on parts of trials.
+    """Maximise the filter's likelihood over the noise levels, on parts of trials.
 
     The noise of a measured force is at least that of its sensor; the excess is model error.
-    Reversals are left out: there the filter's Gaussian fits at no noise level, and the tuning would
+    Reversals are left out: there the filter's Gaussian fits at no noise level, and tuning would
     double the noise everywhere else.
 
     Args:
-        settings: with the levels to start from; records: the beginnings of trials.
-        clear: (T,) of each, its samples at which no axis reverses; all count where none is clear.
-        near: (nt,) parameters near the answer, physical, and (nt,) their sd. choice: fixes some
-        levels.
+        settings: with the initial levels; records: the beginnings of trials.
+        clear: (T,) by record, the samples at which no axis reverses; if there are none, all count.
+        near: (nt,) parameters near the answer, physical, and (nt,) their sd.
+        choice: may fix some levels.
     """
     longest = max(settings.longest_step, _TUNING_STEP_S)
-    quick = replace(settings, longest_step=longest, stride=TUNING_SAMPLES)  # no distributions
+    quick = replace(settings, longest_step=longest, stride=TUNING_SAMPLES)  # store no distributions
     counts = np.concatenate(clear)
     counts = counts if counts.any() else np.ones(counts.size, dtype=bool)
     value, sd = near
@@ -205,7 +206,7 @@ def tune_noise(
 
 
 def noise_levels(system: System, settings: FilterSettings, noise: Noise) -> NoiseLevels:
-    """Return the levels used and those of the sensors, by name."""
+    """Return the tuned levels and those of the sensors, by name."""
     names = [*system.coordinates, *(f"{axis}_rate" for axis in system.coordinates)]
     return NoiseLevels(
         reading_sd=dict(zip(names, settings.reading_sd, strict=False)),

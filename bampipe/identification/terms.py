@@ -1,4 +1,4 @@
-"""Contribution of each term of an identified model to the force, by sample and in bins."""
+"""Force of each term of an identified model, by sample and as a binned curve."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,15 +21,15 @@ from bampipe.trials.residuals import ModelOnTrial, rms
 
 _BINS = 24
 _FEWEST = 8
-"""Samples of a bin."""
+"""Smallest number of samples in a bin."""
 _LEAST_SHARE = 0.02
-"""A curve is meaningless if the force of its term over the axis' error is below this."""
+"""Smallest force of a term, relative to the axis' error, for which a curve is meaningful."""
 _STEP = 1e-4
-"""Finite difference as a share of a parameter's size."""
+"""Finite difference relative to a parameter's size."""
 
 
 class _Part(NamedTuple):
-    """Some parameters by number; with ``strengths`` at 0 the term is absent from the model."""
+    """Some parameters, by index; the term vanishes if all ``strengths`` are zero."""
 
     name: str
     text: EffectText
@@ -42,7 +42,7 @@ class _Samples:
     """A model on the trials that are binned.
 
     Attributes:
-        fitted: by trial; used: which of their thinned samples count, (K, n_q).
+        fitted: the model by trial; used: which of the thinned samples count, (K, n_q).
         error: of the model, by axis, (n_q,), N.m or N.
     """
 
@@ -67,10 +67,10 @@ def describe_terms(
 ) -> TermsResult:
     """Return the equations of a model with its numbers, and the curve of each term.
 
-    A curve is the force that the term takes: the residual of the model without it minus that of the
+    A curve is the force of the term, the residual of the model without it minus that of the full
     model, in bins of the variable that explains most of its variance. Nothing is low-pass filtered:
-    measured forces cancel in the difference, and filtering the force alone would distort the curve.
-    Of a long session, trials drawn from all are binned (`draw_trials`).
+    measured forces cancel in the difference, and filtering only the term's force would distort the
+    curve. Of a long session, a random selection of trials is binned (`draw_trials`).
 
     ``p`` (n_p,) and ``covariance`` are those published for the model of that name; ``compared`` are
     all trials.
@@ -85,7 +85,7 @@ def describe_terms(
     values = {item.name: float(value) for item, value in zip(system.parameters, p, strict=True)}
     try:
         equations = model_equations(system.model, values)
-    except InputError:  # they take too long to derive
+    except InputError:  # deriving them takes too long
         equations = ()
     known = {
         axis: [v for v in variables(fitted, trials.band, axis) if v.name not in ("trial", "time")]
@@ -188,7 +188,7 @@ def _means(values: Array, which: Indices, bins: Sequence[int]) -> Array:
 
 
 def _explained(values: Array, which: Indices) -> float:
-    """Return the share of the variance of ``values`` that the means of bins carry."""
+    """Return the fraction of the variance of ``values`` between the bins."""
     count = np.bincount(which)
     means = np.bincount(which, values) / np.maximum(count, 1)
     total = float(np.sum((values - values.mean()) ** 2))

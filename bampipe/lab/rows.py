@@ -124,7 +124,7 @@ def _add_session(
     run_record = record.read(root)
     states = [trial["status"] for trial in rows.tables.get("quality", ())]
     verdicts = [gate.state for gate in run_record.gates]
-    counting = models.counting_model(root)
+    counting = models.default_model(root)
     had, has = (models.read(root, m).effects if m in made else () for m in (models.BASE, counting))
     rows.add(
         "sessions",

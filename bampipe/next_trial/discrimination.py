@@ -1,4 +1,4 @@
-"""How well trials distinguish alternative effects: the error of the wrong one, refitted."""
+"""Discrimination of alternative effects by trials: the error of the wrong one after a refit."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Alternative:
     """Effects that a model may lack.
 
     Attributes:
-        items: the candidates; none where nothing is missing.
+        items: the candidates; empty if nothing is missing.
         values: the parameters of each, in the order of its file.
         odds: probability of this alternative.
         slopes: fitted parameters: index of the item, and of the parameter in it.
@@ -99,7 +99,7 @@ class Remainder:
 
 @dataclass(frozen=True)
 class Contrast:
-    """How two alternatives differ on some trials.
+    """Difference between two alternatives on some trials.
 
     Attributes:
         distance: expected log likelihood ratio of the right one over the wrong one refitted, nats;
@@ -185,7 +185,7 @@ class Comparison:
             order = np.argsort(speed)
             # An axis that never moves has no samples and does not count.
             known = speed[order], noise.variance[axis][order], noise.speed[axis][order]
-            found.append(known if speed.size else (_ZERO, _ZERO, np.zeros(1, dtype=np.int64)))
+            found.append(known if speed.size else (np.zeros(1), np.zeros(1), np.zeros(1, np.int64)))
         return found
 
     def _sums_of(self, evidence: Evidence, likelihood: Likelihood) -> Sums:
@@ -358,9 +358,6 @@ class Comparison:
                 )
             )
         return tuple(expected)
-
-
-_ZERO = np.zeros(1)
 
 
 def chance_of_confusion(first: float, second: float, gained: float) -> float:

@@ -19,9 +19,9 @@ from bampipe.next_trial.ranking import RankedDesign
 from bampipe.results.next import Plan, PlannedConfusion, PlannedSd, PlannedTrial
 
 _MOST_DESIGNS = 8
-"""Most designs in a plan: a new plan after these trials is better than a longer one."""
+"""Largest number of designs: a new plan after these trials is better than a longer one."""
 _LEAST_PROGRESS = 0.01
-"""Least progress towards the goal, nats, that makes a further trial worth recording."""
+"""Smallest progress towards the goal, nats, that makes a further trial worth recording."""
 _SHORTENED_TO = 0.5
 _SHORTEST_TRIAL_S = 5.0
 """Shortest trial; strokes need the time of a few of them as well."""
@@ -60,7 +60,7 @@ class _Option:
 
 @dataclass(frozen=True)
 class TrialPlan:
-    """Trials to record, in order, and what is expected in the end.
+    """Trials to record, in order, and the expected outcome.
 
     Attributes:
         confusion: chance of confusing each pair of alternatives.

@@ -21,7 +21,7 @@ _BLOCK_S = FilterChoice.block_s
 _SCATTER_SPREAD = 0.2
 """Spread between parameters of the ratio of block scatter to formal uncertainty, log scale."""
 _NORMAL_80 = 1.28
-"""Standard deviations on either side that hold 80 % of a normal distribution."""
+"""Standard deviations on either side of the mean that contain 80 % of a normal distribution."""
 _RESIDUAL_DOMINATES = 2.0
 """Ratio of uncertainties by the residual to those by the sensors above which the residual, not the
 sensor noise, counts as noise."""
@@ -47,11 +47,11 @@ class Precision:
         irreducible_sd: (n,) the part that no further trial reduces: calibration of the sensors and
             smoothing of friction.
         blocks: number of blocks of time in the trials at hand, whose scatter is in ``sd``.
-        information: (m, m) of the trials at hand and the priors; the timing of the inputs comes
-            last if it is estimated, m is then n + 1.
-        prior_precision: (m,) part of its diagonal that the fit weighs as data; zero for parameters
+        information: (m, m) of the trials at hand and the priors, with the input delay last if it is
+            estimated; m is then n + 1.
+        prior_precision: (m,) part of its diagonal that the fit treats as data; zero for parameters
             that the trials alone determine.
-        of_motion: gives the information (m, m) of a motion.
+        of_motion: returns the information (m, m) of a motion.
     """
 
     names: tuple[str, ...]
@@ -185,12 +185,12 @@ class Precision:
         taken = max(blocks, 2 * self._free_count)
         return float(np.sqrt(taken / (taken - self._free_count)))
 
-    def worth(self, added: Array, seconds: float, parameter: str = "") -> float:
-        """Return the worth of trials in nats, for one parameter or for all together.
+    def utility(self, added: Array, seconds: float, parameter: str = "") -> float:
+        """Return the utility of trials in nats, for one parameter or for all together.
 
         Args:
             added: (m, m) information of the trials; seconds: their total length.
-            parameter: the worth is the fall of the logarithm of its standard deviation; "" for all.
+            parameter: if given, the utility is the drop of the logarithm of its sd.
         """
         if not parameter:
             return self.gain(added)

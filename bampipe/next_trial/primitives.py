@@ -68,7 +68,7 @@ class Envelope:
         usual: median position, (n_q,).
         speed: (n_q,), rad/s or m/s; acceleration: (n_q,), per s squared.
         field: brake command over speed in the viscous trials by axis, (n_q,); zero without them.
-        levels: lowest, usual and highest value of each further channel.
+        levels: low, median and high value of each further channel.
         wider: the wider envelope that the device allows; None if it allows nothing more.
     """
 
@@ -109,11 +109,8 @@ class Envelope:
     def widen(self, bounds: Array, speeds: Array) -> Envelope:
         """Return the envelope with a wider one within the limits of the device.
 
-        The acceleration stays that of the trials, also for faster motion.
-
-        Args:
-            bounds: (n_q, 2) range of each axis, infinite if none is stated.
-            speeds: (n_q,) highest speed, NaN if none is known.
+        ``bounds`` (n_q, 2) of the range are infinite, and ``speeds`` (n_q,) NaN, if not stated. The
+        acceleration stays that of the trials, also for faster motion.
         """
         stated = np.isfinite(bounds[:, 0]) & np.isfinite(bounds[:, 1])
         bounds = np.where(stated[:, None], bounds, np.column_stack([self.low, self.high]))

@@ -1,4 +1,4 @@
-"""Ranking of designs: followed exactly, in other surroundings, and roughly, as people do."""
+"""Ranking of designs, as followed exactly, in other surroundings, and roughly by people."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -84,7 +84,7 @@ def count_affordable(rehearsal: Rehearsal, seconds: float) -> int:
 class RankedDesign:
     """A design that has been tried, with the quantile of the utility over its versions.
 
-    Of the motions the hasty one is last.
+    The last of the motions is the hasty one.
     """
 
     design: Primitive

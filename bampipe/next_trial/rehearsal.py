@@ -1,7 +1,7 @@
-"""A design as the fitted model would record it: prescribed motion and the force that it needs.
+"""Simulation of a design by the fitted model: prescribed motion and the force that it requires.
 
-People follow a sentence roughly: each version of a design has its own speeds, turns and drift. It
-passes through the sensors and filters of the session.
+People follow a sentence roughly, so each version of a design has its own speeds, turns and drift.
+The result passes the sensors and filters of the session.
 """
 
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from bampipe.physics import System
 from bampipe.physics.device import LAST_ORDER, derivative
 from bampipe.trials.kinematics import Kinematics
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import read_by_sensors
+from bampipe.trials.replicates import read_by_sensors
 from bampipe.trials.sensors import Sensors
 
 _SPEED_SPREAD, _RANGE_SPREAD, _TURN_SPREAD, _DRIFT_SHARE = 0.2, 0.15, 0.1, 0.05

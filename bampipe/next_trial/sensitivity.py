@@ -1,4 +1,4 @@
-"""The smallest strength of each effect that a diagnosis of these trials would have found."""
+"""Smallest strength of each effect that a diagnosis of the present trials would have found."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
 
 _STRENGTHS = np.geomspace(1e-4, 100.0, 241)
-"""Strengths tried, as factors of the typical one, with straight lines between them. No machine has
-an effect of the largest size."""
+"""Strengths tried, relative to the typical one, with linear interpolation between them. No machine
+has an effect of the largest size."""
 _MOST_JUMP_GROWTH = 0.15
 """Largest growth of the jump of friction at a reversal for which a strength is promised. On a
 simulated joint, load-dependent friction (growth 0.07 and 0.08) was found at the promised strength
@@ -34,7 +34,7 @@ _JUMP_POSES, _JUMP_SPEED = 50, 5.0
 
 @dataclass(frozen=True)
 class DetectionLimit:
-    """The strength from which on an effect is found.
+    """The smallest strength at which an effect is found.
 
     Attributes:
         alternative: the effect with its typical strengths and shape.
@@ -103,10 +103,10 @@ def make_typical_alternative(item: Candidate, scale: MachineScale) -> Alternativ
 
 
 def find_limits(comparison: Comparison, sums: Sums, needed: float) -> list[DetectionLimit]:
-    """Return the strength from which on each alternative of ``comparison`` is called missing.
+    """Return the smallest strength at which each alternative of ``comparison`` is called missing.
 
     Its log evidence, nats, less the penalties of `SetCosts`, must reach ``needed`` with the
-    probability that the criteria ask for, and its size must matter.
+    probability that the criteria require, and its size must matter.
 
     The alternatives are effects at their typical strengths.
     """
@@ -175,15 +175,15 @@ class Detectability:
         return Detectability(comparison, limits, self.needed)
 
     def gain(self, motion: Motion) -> float:
-        """Return by how much a trial lowers the limits of these effects: sum of the logarithms."""
+        """Return the sum of the logarithms of the ratios by which a trial lowers the limits."""
         now = np.minimum([one.factor for one in self.limits], _STRENGTHS[-1])
         then = np.clip(self.factors_with(motion), 1.0, now)
         return float(np.sum(np.log(now / then)))
 
     def tabulate(self, motions: Sequence[Motion]) -> dict[str, Detectable]:
-        """Return the smallest strength of each effect that shows, without and with a trial.
+        """Return the smallest detectable strength of each effect, without and with a trial.
 
-        Of the versions of the trial the median counts.
+        The latter is the median over the versions of the trial.
         """
         after = np.median([self.factors_with(motion) for motion in motions], axis=0)
         axes = self.comparison.fit.evidence.system.coordinates
@@ -201,7 +201,7 @@ class Detectability:
         }
 
     def factors_with(self, motion: Motion) -> Array:
-        """Return the factor from which on each effect is found once ``motion`` is recorded."""
+        """Return the factor at which each effect is found once ``motion`` is recorded."""
         now = np.array([one.factor for one in self.limits])
         before = self._factors(self.comparison.sums_now)
         after = self._factors(self.comparison.sums_now + self.comparison.sums([motion]))

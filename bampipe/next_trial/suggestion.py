@@ -56,7 +56,7 @@ def compare_alternatives(session: Session, final: Fit, odds: Odds) -> Comparison
     known = {q.name: v for q, v in zip(e.system.parameters, e.p, strict=True)}
     start = np.array([known[q.name] for q in system_of(recipe).parameters])
     evidence = session.linearise(recipe, start)
-    bare = Fit(recipe, evidence, final.likelihood, final.likelihood.pose(evidence))
+    bare = Fit(recipe, evidence, final.likelihood, final.likelihood.pose_problem(evidence))
     others = {*session.candidate_names(recipe)} - members
     with open_search(session, bare, others) as search:
         found = [_fit_alternative(search, recipe, *pair) for pair in odds.items()]

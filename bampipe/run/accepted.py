@@ -1,6 +1,6 @@
-"""The values of a device that a lab has accepted: what later sessions are held against.
+"""Accepted values of a device: the reference for later sessions.
 
-They stand in ``accepted/<device>.json`` beside the runs, one small file to keep under version
+They lie in ``accepted/<device>.json`` beside the runs, one small file to keep under version
 control. `bampipe accept RUN` writes it; gates with ``against = "accepted"`` read it.
 """
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from bampipe.declarations.accepted import Accepted
 
 ACCEPTED = "accepted"
-"""Name of the folder, and what a gate's ``against`` says."""
+"""Name of the folder, and value of a gate's ``against``."""
 
 
 def accepted_folder(runs: Path) -> Path:
@@ -33,7 +33,7 @@ def file_of(folder: Path, device: str) -> Path:
 
 
 def read(folder: Path, device: str) -> Accepted | None:
-    """Return what was accepted for ``device``; None where nothing was."""
+    """Return the values accepted for ``device``; None if there are none."""
     path = file_of(folder, device)
     if not path.is_file():
         return None
@@ -48,12 +48,9 @@ def read(folder: Path, device: str) -> Accepted | None:
 
 
 def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
-    """Keep the values of ``model`` in the run ``root`` as those to hold later sessions against.
+    """Store the values of ``model`` in the run ``root`` as the reference for later sessions.
 
-    Returns the file written.
-
-    Args:
-        folder: of accepted values; force: even if a gate failed.
+    With ``force``, they are accepted even if a gate failed. Returns the file written.
 
     Raises:
         InputError: the model is not identified, a gate failed, or a result was changed by hand.
@@ -107,7 +104,7 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
 
 
 def doubts(run: RunFolder, model: str) -> list[str]:
-    """Return what speaks against holding later sessions against ``model``, a line each."""
+    """Return reasons, one line each, not to use ``model`` as the reference for later sessions."""
     from bampipe.phrases.results import STANDINGS
     from bampipe.results.validate import ValidateResult
 

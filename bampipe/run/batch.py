@@ -1,4 +1,4 @@
-"""Several sessions: one after another, or in worker processes; one failure stops no other."""
+"""Several sessions, in sequence or in worker processes; a failure of one stops no other."""
 
 import os
 import traceback
@@ -20,10 +20,10 @@ def share(jobs: int) -> int:
 
 
 def limit_threads(jobs: int) -> None:
-    """Give each of ``jobs`` processes its share of the cores, unless the user has said otherwise.
+    """Give each of ``jobs`` processes its share of the cores, unless the user has set a number.
 
-    Linear algebra gets one thread in any case: how many there are changes the last bits of a sum,
-    and the same inputs must give the same bytes. To be called before numpy is imported.
+    Linear algebra always gets one thread: the number of threads changes the last bits of a sum, but
+    the same inputs must give the same bytes. To be called before numpy is imported.
     """
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
@@ -32,7 +32,7 @@ def limit_threads(jobs: int) -> None:
 
 
 def run_and_publish(request: Request, listen: Listener) -> Outcome:
-    """Run one session and, where asked, publish its run folder."""
+    """Run one session and, if requested, publish its run folder."""
     if request.publish:
         open_place(request.publish)  # an address may be refused before hours of work
     outcome = run_session(request, listen)
@@ -43,7 +43,7 @@ def run_and_publish(request: Request, listen: Listener) -> Outcome:
 
 
 def guarded(request: Request, listen: Listener) -> Outcome:
-    """Run one session; whatever goes wrong becomes part of its outcome."""
+    """Run one session; any error becomes part of its outcome."""
     try:
         return run_and_publish(request, listen)
     except InputError as error:
@@ -56,8 +56,8 @@ def guarded(request: Request, listen: Listener) -> Outcome:
 def run_sessions(requests: Sequence[Request], jobs: int, listen: Listener) -> list[Outcome]:
     """Run several sessions, no two of which share a run folder; return their outcomes in order.
 
-    A worker process that dies (killed, out of memory) costs only the session it was at work on,
-    whose run folder the next run completes. With one job everything runs in this process.
+    A worker process that dies (killed, out of memory) costs only its current session, whose run
+    folder the next run completes. With one job everything runs in this process.
     """
     if jobs <= 1 or len(requests) <= 1:
         return [guarded(request, listen) for request in requests]

@@ -1,8 +1,8 @@
 """Sessions on the workers of a Dask cluster: one session is one task.
 
-Workers read sessions and write run folders themselves, so both must lie on a file system that
-every worker sees under the same path. Where only the sessions do, a request's ``publish`` takes
-the finished run folders elsewhere (see :mod:`bampipe.run.publish`).
+Workers read sessions and write run folders themselves, so both must lie on a file system that every
+worker sees under the same path. If only the sessions do, ``publish`` of a request takes the
+finished run folders elsewhere (see :mod:`bampipe.run.publish`).
 """
 
 from __future__ import annotations
@@ -19,30 +19,26 @@ from typing import TYPE_CHECKING, TypeVar
 
 from bampipe.errors import InputError
 from bampipe.run.batch import guarded
-from bampipe.run.events import Event, Listener, unheard
+from bampipe.run.events import Event, Listener, ignore_event
 from bampipe.run.request import Outcome, Request
 
 if TYPE_CHECKING:
     from distributed import Client, Future
 
 PATIENCE_S = 10.0
-"""How long a scheduler may be silent, or without workers."""
+"""Time for which a scheduler may be silent or without workers."""
 POLL_S = 1.0
 
 Answer = TypeVar("Answer")
 
 
 def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener) -> list[Outcome]:
-    """Run several sessions on a Dask cluster.
+    """Run several sessions, no two of which share a run folder, on a Dask cluster.
 
-    A session whose worker dies is run again on another; one that kills worker after worker is
-    reported as crashed. Where the cluster is lost, what was not done is refused.
-
-    Args:
-        requests: one for each session; no two may share a run folder.
-        scheduler: its address, ``tcp://host:port``; "" starts a cluster of worker processes on this
-            machine for the time of the run.
-        listen: called when a session is done.
+    A session whose worker dies is run again on another; one that kills several workers is reported
+    as crashed. If the cluster is lost, sessions that were not finished are refused. The scheduler
+    has the address ``tcp://host:port``; "" starts a cluster of worker processes on this machine for
+    the duration of the run.
 
     Raises:
         InputError: Dask is not installed, the scheduler does not answer, or has no workers.
@@ -53,14 +49,14 @@ def run_on_cluster(requests: Sequence[Request], scheduler: str, listen: Listener
         raise InputError(
             "--engine dask needs Dask", remedy="pip install 'bampipe[dask]'"
         ) from error
-    # What it logs of lost connections is said below, once.
+    # Lost connections are reported once, below, not by Dask's log.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     client = _connect(scheduler) if scheduler else Client(threads_per_worker=1)
     outcomes: dict[int, Outcome] = {}
     lost = ""
     try:
         tasks = {
-            client.submit(guarded, _placed(request), unheard, pure=False): number
+            client.submit(guarded, _placed(request), ignore_event, pure=False): number
             for number, request in enumerate(requests)
         }
         watch = _Watch(client)
@@ -90,7 +86,7 @@ def _connect(scheduler: str) -> Client:
     """Return a client of the scheduler at this address.
 
     Raises:
-        InputError: nothing answers there, or something that is no scheduler.
+        InputError: nothing answers there, or something other than a scheduler.
     """
     from distributed import Client
 
@@ -100,14 +96,14 @@ def _connect(scheduler: str) -> Client:
         raise InputError(
             f"no Dask scheduler answers within {PATIENCE_S:g} s", where=scheduler
         ) from error
-    # What is at the other end decides what is raised: no memory for what it announces, say.
+    # The other end decides which exception is raised, such as MemoryError for a bogus message.
     except Exception as error:
         what = str(error).partition("\n")[0] or type(error).__name__
         raise InputError(f"no Dask scheduler answers: {what}", where=scheduler) from error
 
 
 def _within(seconds: float, call: Callable[[], Answer]) -> Answer:
-    """Return what ``call`` returns; Dask itself waits without end for a connection that is silent.
+    """Return the result of ``call``; Dask itself waits for ever for a silent connection.
 
     Raises:
         TimeoutError: it takes longer.
@@ -120,20 +116,20 @@ def _within(seconds: float, call: Callable[[], Answer]) -> Answer:
         except Exception as error:
             answer.set_exception(error)
 
-    # Not an executor's thread, for which the program would wait at its end.
+    # An executor's thread would keep the program from ending.
     threading.Thread(target=ask, daemon=True).start()
     return answer.result(timeout=seconds)
 
 
 class _Watch:
-    """Asks the scheduler now and then whether it is there and has workers."""
+    """Checks periodically that the scheduler answers and has workers."""
 
     def __init__(self, client: Client) -> None:
         self._client = client
         self._asked = self._manned = time.monotonic()
 
     def fault(self) -> str:
-        """What is wrong with the cluster, "" while it works."""
+        """Return the fault of the cluster; "" if there is none."""
         now = time.monotonic()
         if now - self._asked < POLL_S:
             return ""
@@ -150,7 +146,7 @@ class _Watch:
 
 
 def _outcome(task: Future[Outcome], root: Path) -> Outcome:
-    """What came of a task that is done; what its worker could not even begin is crashed."""
+    """Return the outcome of a finished task; a task that its worker could not start has crashed."""
     try:
         found: Outcome = task.result()
         return replace(found, root=root)

@@ -1,4 +1,4 @@
-"""Events of a run, for display."""
+"""Progress of a run as events."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,16 +6,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Event:
-    """An event of a run, for display.
+    """An event of the run of a folder called ``run``.
 
     Attributes:
-        run: name of the run folder.
         step: a stage, or ``stage:model``.
         kind: "waiting", "taken over", "compiling", "start", "progress", "done", "unchanged" or
             "failed".
-        fraction: how much of the step is done, 0 to 1.
-        message: the work in progress, the reason of the step, the fault, or the holder of the run
-            folder.
+        fraction: completed fraction of the step, 0 to 1.
+        message: current work, reason of the step, fault, or holder of the run folder.
     """
 
     run: str
@@ -28,5 +26,5 @@ class Event:
 Listener = Callable[[Event], None]
 
 
-def unheard(event: Event) -> None:
+def ignore_event(event: Event) -> None:
     """A listener that shows nothing."""

@@ -1,4 +1,4 @@
-"""Content hashes: of files, of configuration, of sessions, of the code that made a result."""
+"""Content hashes of files, configurations, sessions, and of the code that made a result."""
 
 import importlib.metadata
 import importlib.util
@@ -40,16 +40,17 @@ SHARED_CODE = (
     "diagnosis",
     "next_trial",
 )
-"""Sub-packages that stages call, beside the single files; a change in one reruns every stage."""
+"""Sub-packages that stages call, beside single files; a change in one reruns every stage."""
 
 ABSENT = "absent"
 
 
 def session_files(folder: Path) -> dict[str, Path]:
-    """Return the files a session consists of, by the name the session file gives them.
+    """Return the files of a session, by the name that the session file gives them.
 
-    These are ``session.toml``, the trial files and, where the device is a file, that file and the
-    URDF that it names. Only files inside the session folder count, since ingest refuses others.
+    These are ``session.toml``, the trial files and, if the session has its own device file, that
+    file and the URDF that it names. Only files inside the session folder count, since ingest
+    refuses others.
     """
     session = folder / "session.toml"
     files = {"session.toml": session}
@@ -70,7 +71,7 @@ def session_files(folder: Path) -> dict[str, Path]:
 
 
 def _urdf_of(folder: Path, device: str) -> list[str]:
-    """The URDF that a device file of the session names, by its path in the session folder."""
+    """Return the URDF that a session's device file names, as a path in the session folder."""
     try:
         robot = read_toml(folder / device).get("robot")
     except InputError:  # ingest reports its fault
@@ -80,7 +81,7 @@ def _urdf_of(folder: Path, device: str) -> list[str]:
 
 
 def digest_session(folder: Path) -> dict[str, str]:
-    """Return the hash of each file of a session, ``"absent"`` where there is none."""
+    """Return the hash of each file of a session; ``"absent"`` if it is missing."""
     return {
         f"{SESSION}{name}": digest_input(path) if path.is_file() else ABSENT
         for name, path in sorted(session_files(folder).items())

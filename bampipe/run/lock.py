@@ -1,4 +1,4 @@
-"""One process at a time in a folder; a lock whose holder was killed is free, with a notice."""
+"""Exclusive access to a folder; the lock of a killed process is free, with a notice."""
 
 import contextlib
 import os
@@ -15,7 +15,7 @@ _held: set[int] = set()
 
 
 def _close_in_child() -> None:
-    # A lock belongs to the open file, which a forked worker shares: it would outlive its holder.
+    # A lock belongs to the open file. A forked worker shares that, and would keep the lock alive.
     for handle in _held:
         os.close(handle)
     _held.clear()
@@ -32,15 +32,12 @@ def hold(
     waiting: Callable[[str], None] = lambda holder: None,
     taking_over: Callable[[str], None] = lambda holder: None,
 ) -> Iterator[None]:
-    """Hold the lock that the file ``path`` stands for.
+    """Hold the lock of the file ``path``.
 
-    The system frees it when its holder ends, killed or not. The holder writes its name into the
-    file and empties it at the end: a name that is left is that of a process that was killed.
-
-    Args:
-        wait: wait while another process holds it; else refuse.
-        waiting: called once, before waiting, with the name of the holder.
-        taking_over: called with the name of a holder that was killed.
+    The operating system frees it when its holder ends, even if killed. The holder writes its name
+    into the file and removes it at the end, so a remaining name is that of a killed process.
+    ``waiting`` is called once, before waiting, with the name of the holder, and ``taking_over``
+    with the name of one that was killed.
 
     Raises:
         InputError: another process holds it and ``wait`` is false.
@@ -73,7 +70,7 @@ def hold(
 
 
 def _write_name(handle: int, name: str) -> None:
-    with contextlib.suppress(OSError):  # a full disk: the lock holds without a name
+    with contextlib.suppress(OSError):  # on a full disk, the lock holds without a name
         os.ftruncate(handle, 0)
         os.lseek(handle, 0, os.SEEK_SET)
         os.write(handle, name.encode())

@@ -8,7 +8,7 @@ from bampipe.run.request import Outcome
 
 STATES = {0: "passed", 1: "**gate failed**", 2: "**bad input**", 3: "**crashed**"}
 MOST = 30
-"""Most lines of one table: a summary must be short enough to be read."""
+"""Largest number of rows in a table, so that a summary is short enough to be read."""
 
 
 def summary(outcomes: Sequence[Outcome]) -> str:
@@ -62,7 +62,7 @@ def _session(outcome: Outcome) -> tuple[str, ...]:
 
 
 def _errors(run: RunFolder, model: str) -> str:
-    """Return held-out error over floor, axis by axis."""
+    """Return the ratio of held-out error to noise floor of each axis."""
     from bampipe.results.validate import ValidateResult
 
     try:
@@ -86,7 +86,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _cell(text: str) -> str:
-    """Return ``text`` so that it cannot break the table or become markup."""
+    """Escape ``text`` so that it can neither break the table nor become markup."""
     if text in STATES.values():
         return text
     for mark in "\\|`*_<>[]&~":

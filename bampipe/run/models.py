@@ -20,7 +20,7 @@ BASE = "base"
 _LONGEST = 160
 """Characters of a name that lists its effects; a file system takes 255."""
 ADOPTED = "effects"
-"""Folder beside the run folders: effect files of the lab's own, for every run."""
+"""Folder beside the run folders with the lab's own effect files, for every run."""
 
 
 def names(root: Path) -> tuple[str, ...]:
@@ -40,13 +40,13 @@ def read(root: Path, name: str) -> ModelFile:
 
 
 def choose_model(root: Path, name: str) -> str:
-    """Return ``name``, else the model that counts."""
+    """Return ``name``, or the default model if it is empty."""
     if name:
         read(root, name)
-    return name or counting_model(root)
+    return name or default_model(root)
 
 
-def counting_model(root: Path) -> str:
+def default_model(root: Path) -> str:
     """Return the default model: the best confirmed one.
 
     The stage compare stores it; without a comparison it is the base model.
@@ -55,7 +55,7 @@ def counting_model(root: Path) -> str:
 
     try:
         best = RunFolder(root).read(CompareResult).best
-    except InputError:  # not there yet, or damaged: then it is made again
+    except InputError:  # it is missing or damaged, and compare will make it again
         return BASE
     return best if best in names(root) else BASE
 
@@ -74,11 +74,11 @@ def write(root: Path, model: ModelFile) -> None:
 
 
 def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
-    """Write the base model: the device that the pipeline or else the session names.
+    """Write the base model, with the device of the pipeline or else of the session.
 
     Args:
-        device: the pipeline's device; "" takes that of ``ingest/session.json``.
-        effects: the pipeline's; without any, those that the device file gives the base model.
+        device: the pipeline's device; "" for that of ``ingest/session.json``.
+        effects: the pipeline's effects; if there are none, those of the device file.
     """
     from bampipe.declarations.model import ModelFile
     from bampipe.results.ingest import IngestResult
@@ -92,7 +92,7 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
 
 
 def _bring_adopted_effects(root: Path) -> None:
-    """Copy the effects that the lab has adopted to the base model: diagnoses weigh them."""
+    """Copy the effects that the lab has adopted to the base model, for the diagnosis."""
     for source in sorted((root.parent / ADOPTED).glob("*.toml")):
         if source.is_symlink():
             continue

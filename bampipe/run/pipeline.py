@@ -1,4 +1,4 @@
-"""Pipelines: stages to run, their settings, and limits of results.
+"""Reading of pipelines: stages to run, their settings, and limits of results.
 
 A missing or invalid pipeline raises `InputError`.
 """
@@ -38,7 +38,7 @@ def whole(root: Path, name: str = "") -> Pipeline:
 
 
 _PACKAGE = Path(bampipe.__file__).parent
-# In a wheel the folder lies inside the package; in a working copy beside it.
+# A wheel has the folder inside the package, a working copy beside it.
 _FOLDERS = (_PACKAGE / "_pipelines", _PACKAGE.parent / "pipelines")
 
 

@@ -1,15 +1,15 @@
-"""Finished runs on any file system that fsspec knows: object stores, HDFS, SFTP, a plain folder.
+"""Publication of finished runs on any file system that fsspec knows.
 
-A run needs renames and locks while it is made, which object stores lack, so it is made on a local
-or shared folder and published whole:
+Examples are object stores, HDFS, SFTP and plain folders. Object stores lack the renames and locks
+that a run needs while it is made, so it is made in a local or shared folder and published whole:
 
     <url>/<session>/<version>/...     every file of the run; a version is named by its content
-    <url>/<session>/current.json      which version counts, and the hash of each of its files
+    <url>/<session>/current.json      the current version, and the hash of each of its files
 
-``current.json`` is written last, in one piece. Whoever reads it first sees the old version or the
-new one, never a mixture; an upload that was cut short is not seen at all, and the next one
-completes it. Older versions are kept, because somebody may be reading them. A refusal by fsspec, by
-the driver of a file system or by the place itself is an `InputError`.
+``current.json`` is written last, in one piece. A reader therefore sees the old version or the new
+one, never a mixture; an interrupted upload is invisible, and the next one completes it. Older
+versions are kept, because somebody may be reading them. Any refusal by fsspec, by the driver of a
+file system or by the place itself is an `InputError`.
 """
 
 from __future__ import annotations
@@ -67,30 +67,25 @@ def publish(root: Path, url: str) -> str:
 
 
 def published(url: str) -> list[str]:
-    """Return the sessions published below ``url``, sorted."""
+    """Return the names of the sessions published below ``url``, sorted."""
     system, base = open_place(url)
     with _driver("cannot be read", url):
         if not system.exists(base):
             return []
         system.invalidate_cache()
         names = [str(path).rstrip("/").rpartition("/")[2] for path in system.ls(base, detail=False)]
-        # Other names are no sessions of ours, and ".." would lead out of the folder.
+        # Other names are not sessions of bampipe, and ".." would lead out of the folder.
         sessions = [name for name in names if is_name(name)]
         return sorted(name for name in sessions if system.exists(f"{base}/{name}/{CURRENT}"))
 
 
 def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
-    """Fetch the published run of ``session`` into ``runs``, every file checked against its hash.
+    """Fetch the published run of ``session`` into the folder ``runs``; return its run folder.
 
-    Args:
-        url: as for :func:`publish`; session: as `published` lists it; runs: folder of run folders.
-        force: replace a run folder with other content.
-
-    Returns:
-        The run folder.
+    Every file is checked by its hash. ``force`` replaces a run folder with other content.
 
     Raises:
-        InputError: nothing published, a file does not match its hash, or there is another run.
+        InputError: nothing is published, a file does not match its hash, or there is another run.
     """
     system, base = open_place(url)
     here, root = f"{base}/{session}", runs / session
@@ -129,7 +124,7 @@ def fetch(url: str, session: str, runs: Path, force: bool = False) -> Path:
 
 
 def open_place(url: str) -> tuple[Any, str]:
-    """Return the file system and the path on it; InputError for an impossible place."""
+    """Return the file system and the path on it; an impossible place raises `InputError`."""
     try:
         from fsspec.core import url_to_fs
     except ImportError as error:
@@ -143,7 +138,7 @@ def open_place(url: str) -> tuple[Any, str]:
 
 @contextlib.contextmanager
 def _driver(what: str, url: str) -> Iterator[None]:
-    """Turn any exception of an fsspec driver into one line: each driver has its own."""
+    """Turn any exception of an fsspec driver into one line, since each driver has its own."""
     try:
         yield
     except InputError:

@@ -1,4 +1,4 @@
-"""``run.json``: inputs, settings and results of every step; and the lock of a run."""
+"""``run.json``, the record of inputs, settings and results of every step; and the run's lock."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from bampipe.errors import InputError
 from bampipe.files import STORAGE_FAULTS, digest_file, write_json
-from bampipe.run.events import Event, Listener, unheard
+from bampipe.run.events import Event, Listener, ignore_event
 from bampipe.run.lock import hold
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ SESSION = "session:"
 def read(root: Path) -> RunResult:
     """Return ``run.json`` in ``root``, or an empty record.
 
-    A damaged one counts as missing: all stages run again, and the file is rebuilt.
+    A damaged file counts as missing: all stages run again, and the file is rebuilt.
     """
     from bampipe.results.run import RunResult
 
@@ -34,7 +34,7 @@ def read(root: Path) -> RunResult:
 
 
 def is_damaged(root: Path) -> bool:
-    """Whether there is a ``run.json`` in ``root`` that is damaged."""
+    """Return whether ``root`` has a damaged ``run.json``."""
     return (root / FILE).exists() and _sound(root) is None
 
 
@@ -48,13 +48,10 @@ def _sound(root: Path) -> RunResult | None:
 
 
 def require_untouched(root: Path, names: Iterable[str]) -> None:
-    """Compare results with their hashes in ``run.json``.
+    """Compare results, paths in the run folder ``root``, with their hashes in ``run.json``.
 
-    Args:
-        root: the run folder; names: paths in it, passed over if not there or not recorded.
-
-    Raises:
-        InputError: a file was changed or damaged since it was written; says which.
+    Missing and unrecorded files are ignored; the first one that was changed or damaged since it was
+    written raises `InputError`.
     """
     written = {
         name: (step, known)
@@ -74,21 +71,21 @@ def touched(root: Path, name: str, step: str) -> InputError:
 
 
 def write(root: Path, content: RunResult) -> None:
-    """Write ``run.json``, in one step: it appears complete or not at all."""
+    """Write ``run.json`` in one step, so that it appears complete or not at all."""
     write_json(root / FILE, content.model_dump(mode="json"))
 
 
 @contextlib.contextmanager
-def lock(root: Path, wait: bool, listen: Listener = unheard) -> Iterator[None]:
-    """Hold the run folder ``root``, made if need be; faults of the disk are `InputError`.
+def lock(root: Path, wait: bool, listen: Listener = ignore_event) -> Iterator[None]:
+    """Hold the run folder ``root``, creating it if needed; faults of the disk are `InputError`.
 
     Args:
-        wait: wait while another process holds it; else refuse. listen: called before waiting, and
-        if the last holder was killed.
+        wait: whether to wait while another process holds it; otherwise refuse.
+        listen: called before waiting, and if the last holder was killed.
 
     Raises:
         InputError: another process holds it and ``wait`` is false; or the disk is full, read-only
-            or the like.
+            or otherwise faulty.
     """
 
     def tell(kind: str) -> Callable[[str], None]:

@@ -35,17 +35,17 @@ class Request:
     Attributes:
         root: the run folder.
         pipeline: the pipeline.
-        session: the session folder; None takes the one recorded in the run folder.
-        settings: settings by stage and field, before those of the pipeline.
-        first: first stage that runs; earlier ones are taken as they stand. "" for the first.
-        last: last stage that runs, "" for the last.
+        session: the session folder; None for the one recorded in the run folder.
+        settings: settings by stage and field, which override those of the pipeline.
+        first: first stage to run, on the present results of earlier ones; "" for the first of all.
+        last: last stage to run; "" for the last of all.
         force: run every selected step, changed or not.
-        model: the only model to run; "" for the base model and what was run of the others.
-        judge: whether the gates judge `model` instead of the model that counts.
+        model: the only model to run; "" for the base model and others that have been run.
+        judge: whether the gates judge `model` instead of the default model.
         accepted: folder of accepted values; None for ``accepted`` beside the folder of runs.
-        processes: share of the machine for stages that use several processes; 0 for all of it.
-        publish: where to publish the run folder once it is done, a URL for fsspec; "" for nowhere.
-        wait: wait while another process holds the run folder, else refuse.
+        processes: number of processes for stages that use several; 0 for all cores.
+        publish: URL for fsspec at which to publish the finished run folder; "" for nowhere.
+        wait: whether to wait while another process holds the run folder; otherwise refuse.
     """
 
     root: Path
@@ -84,9 +84,9 @@ class Outcome:
 
     Attributes:
         state: "done", "refused" (bad input) or "crashed" (a fault of bampipe).
-        verdicts: of the gates. error: one line on the fault, or "". traceback: of a fault of
-        bampipe, or "".
-        model: which model the gates judged, or "".
+        verdicts: of the gates. error: one line on the fault, or "".
+        traceback: of a fault of bampipe, or "".
+        model: model that the gates judged, or "".
     """
 
     root: Path
@@ -119,8 +119,8 @@ class Outcome:
         }
 
 
-def selected(request: Request) -> tuple[str, ...]:
-    """Return the stages between ``first`` and ``last`` of ``request``, in order.
+def select_stages(request: Request) -> tuple[str, ...]:
+    """Return the stages from ``first`` to ``last`` of ``request``, in order.
 
     Raises:
         InputError: the pipeline has no such stage, or nothing lies between the two.

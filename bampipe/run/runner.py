@@ -1,4 +1,4 @@
-"""Run the stages of one session: order, cache by content, whole files, provenance."""
+"""Runs the stages of one session: order, cache by content, complete files, provenance."""
 
 import json
 import shutil
@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from bampipe.compile_ahead import compiling_ahead
 from bampipe.errors import InputError, MissingResultError, NothingToDoError
 from bampipe.run import accepted, hashing, models, record, staging
-from bampipe.run.events import Event, Listener, unheard
+from bampipe.run.events import Event, Listener, ignore_event
 from bampipe.run.gates import judge_gates
-from bampipe.run.request import Outcome, Request, Step, StepResult, selected
+from bampipe.run.request import Outcome, Request, Step, StepResult, select_stages
 from bampipe.run.state import FIRST_TIME, RunState, lasting
 from bampipe.stages import base
 
@@ -47,7 +47,7 @@ class _Runner:
             self.listen(Event(name, step.name, "progress", fraction, message))
 
         summary = module.execute(state.folder, out, config, progress)
-        written = staging.written(out, outputs, step)
+        written = staging.digest_outputs(out, outputs, step)
         settings = lasting(config)
         previous = state.records[step.name].outputs if step.name in state.records else {}
         made = StepRecord(
@@ -90,7 +90,7 @@ class _Runner:
             self.failed(step, str(error), noted=False)
             raise
         except InputError as error:
-            # A setting or a session that is refused is no failure of results made without it.
+            # A refused setting or session is no failure of results made without it.
             given = step.stage in base.READS_SESSION or self.request.settings.get(step.stage)
             self.failed(step, str(error), noted=not (given and step.name in self.state.records))
             raise
@@ -103,12 +103,13 @@ class _Runner:
         return StepResult(step.name, "unchanged", "", 0.0, summary)
 
     def run(self) -> Outcome:
-        for step in (one for stage in selected(self.request) for one in self.state.steps(stage)):
+        stages = select_stages(self.request)
+        for step in (one for stage in stages for one in self.state.steps(stage)):
             if self.state.settings(step).keys() - {"model"}:
                 self.state.declared(step)  # a mistake is refused before any stage runs
         results: list[StepResult] = []
         pipeline = self.request.pipeline
-        for stage in selected(self.request):
+        for stage in stages:
             if stage in base.PER_MODEL:
                 models.ensure_base(self.root, *pipeline.base_model)
                 if self.request.model:
@@ -118,7 +119,7 @@ class _Runner:
         verdicts: list[GateVerdict] = []
         judged = ""
         if self.request.judge:
-            judged = self.request.model or models.counting_model(self.root)
+            judged = self.request.model or models.default_model(self.root)
             baseline = self.request.accepted or accepted.accepted_folder(self.root.parent)
             for gate in pipeline.gates:
                 verdicts += judge_gates(gate, self.root, judged, baseline)
@@ -126,9 +127,9 @@ class _Runner:
         return Outcome(self.root, "done", tuple(results), tuple(verdicts), model=judged)
 
 
-def run_session(request: Request, listen: Listener = unheard) -> Outcome:
+def run_session(request: Request, listen: Listener = ignore_event) -> Outcome:
     """Run the selected stages of one session; bad input leaves earlier results as they were."""
-    stages = selected(request)
+    stages = select_stages(request)
     fresh = not request.root.exists()
     with record.lock(request.root, request.wait, listen):
         runner = _Runner(request, listen)

@@ -1,4 +1,4 @@
-"""The name of a session, after which its run folder is called."""
+"""Names of sessions and of their run folders."""
 
 import re
 from pathlib import Path
@@ -8,17 +8,17 @@ from bampipe.files import read_toml
 
 
 def is_name(text: str) -> bool:
-    """Whether ``text`` can name a run folder: no path, nothing hidden, no control character."""
+    """Return whether ``text`` can name a run folder: no path, no hidden or control character."""
     return re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._+-]{0,127}", text) is not None
 
 
 def session_folder(path: str | Path) -> Path:
-    """Return the folder of a session, which may be named by its ``session.toml`` too."""
+    """Return the folder of a session, given that folder or its ``session.toml``."""
     return Path(path).parent if Path(path).name == "session.toml" else Path(path)
 
 
 def session_id(session: Path) -> str:
-    """Return the name of the run folder for ``session``: the id in its session file."""
+    """Return the name of the run folder for ``session``: the ``session_id`` in its file."""
     try:
         str(session.resolve()).encode()
     except UnicodeEncodeError as error:

@@ -1,4 +1,4 @@
-"""Typed configuration of a stage, from settings in a file or on the command line."""
+"""Configuration of a stage, from settings in a file or on the command line."""
 
 import dataclasses
 import tomllib
@@ -12,9 +12,7 @@ from bampipe.stages import base
 def configure(stage: str, settings: Mapping[str, object], where: str = "") -> Any:
     """Return the configuration of ``stage`` with ``settings`` in place of the defaults.
 
-    Args:
-        settings: values by field name, as TOML or the command line gives them.
-        where: the file they come from, for messages.
+    Settings are as TOML or the command line gives them; ``where`` names their file in messages.
 
     Raises:
         InputError: an unknown field, a value of the wrong type, or one the stage refuses.
@@ -41,7 +39,7 @@ def plain(config: object) -> dict[str, object]:
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
-    """Return name and value of ``name=value``; the value is read as TOML, else taken as text.
+    """Return name and value of ``name=value``; the value is read as TOML, or else as text.
 
     Raises:
         InputError: there is no ``=``.

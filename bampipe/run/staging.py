@@ -1,6 +1,6 @@
-"""Staging of a step's outputs: results reach the run folder whole or not at all.
+"""Staging of a step's outputs, so that results reach the run folder complete or not at all.
 
-A step writes below ``.bampipe/staging/``. When it is done, a commit file lists its outputs; from
+A step writes below ``.bampipe/staging/``. When it is done, a commit file lists its outputs. From
 then on a kill loses nothing, since the next run repeats the moves of the commit file.
 """
 
@@ -45,7 +45,7 @@ def prepare(root: Path, step: Step, outputs: tuple[str, ...]) -> Path:
     return staging
 
 
-def written(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, str]:
+def digest_outputs(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, str]:
     """Hash the outputs of a stage, and compare them with its declaration."""
     files = {
         path.relative_to(staging).as_posix(): path
@@ -64,7 +64,7 @@ def written(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, s
 
 
 def seal(staging: Path, sealed: Commit) -> None:
-    """Write the commit file: from here on the step counts as done."""
+    """Write the commit file, from which on the step counts as done."""
     write_json(staging / COMMIT, sealed.model_dump(mode="json"))
 
 

@@ -1,4 +1,4 @@
-"""The record of a run folder, the dependencies of each step, and whether it must run again."""
+"""State of a run folder: its record, the dependencies of each step, and which must run again."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FIRST_TIME = "never run"
 """Reason of a step without a result."""
 NEUTRAL = ("session", "jobs")
-"""Fields of a configuration that no result depends on: a place, and a number of processes."""
+"""Fields of a configuration that affect no result: a place, and a number of processes."""
 
 
 class RunState:
@@ -42,7 +42,7 @@ class RunState:
     # Dependencies of a step
 
     def digest(self, relative: str) -> str:
-        """Hash of a file in the run folder, read once as long as it is the same file."""
+        """Hash of a file in the run folder, computed once as long as it is the same file."""
         path = self.root / relative
         status = path.stat()
         key = (relative, status.st_ino, status.st_size, status.st_mtime_ns)
@@ -51,7 +51,7 @@ class RunState:
         return self.digests[key]
 
     def settings(self, step: Step) -> dict[str, object]:
-        """Settings of the step as given, without the session: its content counts, not its place."""
+        """Settings of the step as given, without the session, whose content counts instead."""
         settings = dict(self.request.pipeline.settings.get(step.stage, {}))
         settings.update(self.request.settings.get(step.stage, {}))
         if step.model:
@@ -90,7 +90,7 @@ class RunState:
                 raise self.missing(pattern)
             for name in names:
                 if name == record.FILE:
-                    # Only its entries on other steps count; times and places do not.
+                    # Only its entries on other steps count, not times and places.
                     others = {k: made.key for k, made in self.records.items() if k != step.name}
                     found[name] = digest_content(others)
                     continue
@@ -128,8 +128,8 @@ class RunState:
     def declared(self, step: Step) -> tuple[dict[str, object], tuple[str, ...]]:
         """Configuration as recorded, and declared inputs.
 
-        If the settings and the code are those of the record, it supplies them, and the module of
-        the stage (which may import much) stays unloaded.
+        If the settings and the code are those of the record, the record supplies both, and the
+        module of the stage (which may import much) stays unloaded.
         """
         made = self.records.get(step.name)
         code = hashing.digest_code(step.stage)
@@ -168,7 +168,7 @@ class RunState:
             return (Step(stage),)
         if self.request.model:
             return (Step(stage, self.request.model),)
-        counting = models.counting_model(self.root)
+        counting = models.default_model(self.root)
         children = (
             name
             for name in models.names(self.root)
@@ -228,5 +228,5 @@ def _maker(name: str) -> str:
 
 
 def lasting(config: object) -> dict[str, object]:
-    """Return the fields of a configuration that a result depends on: all but `NEUTRAL`."""
+    """Return the fields of a configuration that affect a result: all but `NEUTRAL`."""
     return {name: value for name, value in plain(config).items() if name not in NEUTRAL}

@@ -21,8 +21,9 @@ class StepStatus:
 
     Attributes:
         state: "current", "stale", "failed" or "not run".
-        reason: why it would run again, or its fault. started_at: time of its last run, UTC, or "".
-        seconds: how long it took, or None.
+        reason: why it would run again, or its fault.
+        started_at: time of its last run, UTC, or "".
+        seconds: duration of its last run, or None.
     """
 
     step: str
@@ -57,7 +58,7 @@ def status(root: Path, pipeline: Pipeline) -> list[StepStatus]:
                 if not reason and stale:
                     reason = "an earlier stage is stale"
                 state = "stale" if reason else "current"
-            # A stage outside the pipeline does not run with it: later results stay as they are.
+            # A stage outside the pipeline does not run with it, so later results stay valid.
             stale = stale or (state != "current" and stage in pipeline.stages)
             last_run = (timing.started_at, timing.seconds) if timing else ("", None)
             found.append(StepStatus(step.name, state, reason, *last_run))

@@ -1,1 +1,1 @@
-"""Mistakes in session and device files: found before any physics, and named as what they are."""
+"""Detection of mistakes in session and device files, before any physics is identified."""

@@ -1,8 +1,8 @@
-"""Drives of a robot held against its bodies as they are drawn: the measure of every hypothesis.
+"""Comparison of a robot's drives with its drawn bodies, the measure of every hypothesis.
 
-Bodies that are free take on much of a mistake: with a reversed drive they come out turned over,
-within what is not known of them, and little is left. Drawn bodies cannot. A body that is far
-heavier than drawn is found by its share in all drives.
+Fitted bodies absorb much of a mistake: with a reversed drive they turn over, within their prior
+uncertainty, and leave little error. Drawn bodies cannot. A body that is far heavier than drawn is
+found by its share in all drives.
 """
 
 from __future__ import annotations
@@ -21,36 +21,36 @@ from bampipe.setup.mounting import Mounting
 Bounds = tuple[float, float]
 
 WIDE: Bounds = (-np.inf, np.inf)
-"""What a drive may be of what is required, where neither its sign nor its unit is stated."""
+"""Range of the share of a drive whose sign and unit are not stated."""
 _SURE = 5.0
-"""Standard errors from which on the sign of a drive is known."""
+"""Standard errors beyond which the sign of a drive is certain."""
 _LEAST_LEFT = 3e-3
-"""Part of a drive's variance below which no drawing is believed to be better than another."""
+"""Fraction of a drive's variance below which drawings are not distinguished."""
 _CONTRADICTED = 2.0 * np.log(2.0)
-"""What a drive counts for against a mounting with which its friction would drive the joint."""
+"""Penalty, in nats, of a mounting for each drive whose friction would then drive the joint."""
 _MOST_LEFT = 0.05
-"""Of the drives' variance: what a drawing with the right reductions leaves at most."""
+"""Largest fraction of the drives' variance that a drawing with the right reductions leaves."""
 _TURNING = 0.02
-"""Of the largest velocity: width of its sign."""
+"""Width of the smoothed sign of a velocity, relative to the largest velocity."""
 _FAR = 2.0
-"""Factor from which a mass is no longer what a drawing is wrong by."""
+"""Ratio of masses beyond which a drawing is not merely inaccurate."""
 _WORTH = np.log(4.0)
-"""What a body must gain of the sum over the joints of the logarithm of what is left."""
+"""Smallest gain by a heavier body: drop of the sum over joints of the log of the fraction left."""
 _EXPLAINED = 0.3
-"""Share of the mean square of all drives together that it leaves at most."""
+"""Largest fraction of the mean square of all drives that a heavier body may leave."""
 
 
 @dataclass(frozen=True)
 class Drive:
-    """How the drive of a joint goes with what its motion requires by the drawing.
+    """Regression of a joint's drive on the force that its motion requires by the drawing.
 
     Attributes:
-        share: of the drive, for one of what is required; 1 where both are of the joint.
-        error: its standard error by the scatter alone; the drawing has another.
-        left: part of the drive's variance that drawing, drive's inertia and friction leave, with a
-            share within the bounds that were given.
-        losses: mean power that friction takes from the drive, in its standard errors: negative
-            where the drive, or the joint, is logged with the other sign.
+        share: ratio of the drive to the required force; 1 if both refer to the joint.
+        error: its standard error by the scatter alone; the drawing adds its own.
+        left: fraction of the drive's variance left by drawing, drive inertia and friction, with a
+            share within the given bounds.
+        losses: mean power that friction takes from the drive, in its standard errors; negative if
+            the drive or the joint is logged with the wrong sign.
     """
 
     share: float
@@ -60,23 +60,23 @@ class Drive:
 
     @property
     def is_contradicted(self) -> bool:
-        """Whether weight tells a sign with which friction would drive the joint."""
+        """Whether weight suggests a sign with which friction would drive the joint."""
         against = self.is_dissipative if self.share < 0.0 else self.losses < -_SURE
         return abs(self.share) > _SURE * self.error and against
 
     @property
     def is_sure(self) -> bool:
-        """Whether weight and inertia tell the sign: friction gives no power, whatever they say."""
+        """Whether weight and inertia determine the sign, without contradiction by friction."""
         return abs(self.share) > _SURE * self.error and not self.is_contradicted
 
     @property
     def is_dissipative(self) -> bool:
-        """Whether friction surely takes power from the drive."""
+        """Whether friction certainly takes power from the drive."""
         return self.losses > _SURE
 
     @property
     def is_turned(self) -> bool:
-        """Whether it is surely logged with the other sign, by weight and inertia or by friction."""
+        """Whether it certainly has the wrong sign, by weight and inertia or by friction."""
         return self.share < 0.0 if self.is_sure else self.losses < -_SURE
 
 
@@ -89,35 +89,35 @@ class JointMotion:
     change: Array
 
     def reread(self, gain: Array, time: float = 1.0) -> JointMotion:
-        """The same of joints that are ``gain``, (n, n), times these, by a clock ``time`` slower."""
+        """Motion of joints that are ``gain`` (n, n) times these, by a clock ``time`` slower."""
         return JointMotion(
             self.position @ gain.T, self.rate @ gain.T / time, self.change @ gain.T / time**2
         )
 
     def scaled(self, factor: Array) -> JointMotion:
-        """The same of joints that move ``factor``, (n,), times as far."""
+        """Motion of joints that move ``factor`` (n,) times as far."""
         return self.reread(np.diag(factor))
 
 
 def keep(values: Array, axes: Sequence[int]) -> Array:
-    """Columns as they are: what is compared at every sample."""
+    """Return the columns unchanged: a `Comparison.thin` that compares every sample."""
     return values
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Drives beside what the drawn bodies require along the motion of some trials.
+    """Drives, and the forces that the drawn bodies require along the motion of some trials.
 
     Attributes:
-        robot: whose bodies are drawn; turning: whether each of its joints turns.
-        motions: of the joints as their readings have it, one a trial.
+        robot: its drawn bodies; turning: whether each of its joints is rotary.
+        motions: of the joints as read, one per trial.
         drives: (K, n), N.m, N or A.
-        ratio: turns of each drive for one of its joint, (n,).
-        thin: makes of columns (T, m) those that are compared, given the joint of each.
+        ratio: turns of each drive per turn of its joint, (n,).
+        thin: maps columns (T, m), given the joint of each, to the samples that are compared.
         used: which samples of each joint are compared, (K, n); None for all.
-        shared: turns by joint, (n,), of motors that turn several: their friction acts on all.
-        has_offset: whether a drive may read something at rest. It takes on weight of the wrong
-            sign, so where signs are stated it must not.
+        shared: turns by joint, (n,), of each motor that turns several: its friction acts on all.
+        has_offset: whether a drive may have an offset. It absorbs weight of the wrong sign, so it
+            must have none if signs are stated.
     """
 
     robot: Robot
@@ -134,30 +134,30 @@ class Comparison:
 
     @property
     def drawn(self) -> Mounting:
-        """All as it is drawn, under gravity as it is stated."""
+        """The mounting as drawn, under the stated gravity."""
         n, gravity = len(self.ratio), np.array(self.robot.gravity, dtype=float)
         return Mounting(np.ones(n), np.zeros(n), gravity)
 
     def reread(self, gain: Array, time: float = 1.0) -> Comparison:
-        """With other readings of the joints, see `JointMotion.reread`."""
+        """The comparison with other readings of the joints; see `JointMotion.reread`."""
         motions = [m.reread(gain, time) for m in self.motions]
         return replace(self, motions=motions, _required={})
 
     def driven(self, gain: Array) -> Comparison:
-        """With drives that are ``gain``, (n, n), times these."""
+        """The comparison with drives that are ``gain``, (n, n), times these."""
         return replace(self, drives=self.drives @ gain.T)
 
     def _rows(self, values: Array, k: int) -> Array:
-        """Of ``values``, (K, ...), the samples of joint ``k``."""
+        """Samples of ``values``, (K, ...), that are compared on joint ``k``."""
         return values if self.used is None else values[self.used[:, k]]
 
     def _thinned(self, columns: Sequence[Array], k: int) -> Array:
-        """Columns (K, m) of joint ``k`` of all trials, each given as (T, m)."""
+        """Thinned columns (K, m) of joint ``k`` over all trials, each given as (T, m)."""
         parts = [self.thin(one, [k] * one.shape[1]) for one in columns]
         return self._rows(np.concatenate(parts), k)
 
     def _require(self, mounting: Mounting) -> Array:
-        """Drives (4, K, n) required without gravity, and by 1 m/s2 of it along each axis."""
+        """Drives (4, K, n) required without gravity, and by 1 m/s2 along each axis of the base."""
         n, found = len(self.ratio), []
         for motion in self.motions:
             moved = motion.scaled(mounting.direction)
@@ -171,7 +171,7 @@ class Comparison:
         return np.concatenate(found).reshape(-1, 4, n).transpose(1, 0, 2)
 
     def by_body(self, mounting: Mounting) -> list[Array]:
-        """By joint, what losses leave of the drive that each drawn body asks for, (K, bodies)."""
+        """By joint, the drive that each drawn body requires, less the losses, (K, bodies)."""
 
         def forces(q: Array, qd: Array, qdd: Array) -> list[Array]:
             bodies, down = range(len(self.robot.joints)), mounting.gravity
@@ -181,7 +181,7 @@ class Comparison:
         return self._left_of(mounting, forces)
 
     def by_number(self, mounting: Mounting, place: int) -> list[Array]:
-        """By joint, what losses leave of one of each inertial number of a body, (K, 10)."""
+        """By joint, the drive per unit of each inertial number of a body, less losses, (K, 10)."""
         under = self.robot.model_copy(update={"gravity": tuple(mounting.gravity)})
 
         def numbers(q: Array, qd: Array, qdd: Array) -> list[Array]:
@@ -193,7 +193,7 @@ class Comparison:
     def _left_of(
         self, mounting: Mounting, columns: Callable[[Array, Array, Array], list[Array]]
     ) -> list[Array]:
-        """By joint, what losses leave of columns (K, m): of forces (T, m) along each motion."""
+        """By joint, columns (K, m) less the losses, from forces (T, m) along each motion."""
         found: list[list[Array]] = [[] for _ in self.ratio]
         for motion in self.motions:
             moved = motion.scaled(mounting.direction)
@@ -207,7 +207,7 @@ class Comparison:
 
     @cached_property
     def losses(self) -> list[Losses]:
-        """Of each drive, which a motor that turns the other way counts so."""
+        """Losses of each drive; the sign is that of the joint, whichever way the motor turns."""
         found = []
         for k, way in enumerate(np.sign(self.ratio)):
             turns = [way * np.eye(len(self.ratio))[k], *(t for t in self.shared if t[k])]
@@ -217,11 +217,9 @@ class Comparison:
                 for by in turns
             ]
             for motion in self.motions:
-                rates = [motion.rate @ by for by in turns]
+                changes, rates = ([x @ by for by in turns] for x in (motion.change, motion.rate))
                 signs = [np.tanh(r / max(w, 1e-9)) for r, w in zip(rates, widest, strict=True)]
-                columns.append(
-                    np.column_stack([*(motion.change @ by for by in turns), *rates, *signs])
-                )
+                columns.append(np.column_stack([*changes, *rates, *signs]))
             thinned, m = self._thinned(columns, k), len(turns)
             rate, sign = thinned[:, m : 2 * m], thinned[:, 2 * m :]
             powers[m : 2 * m] = np.mean(rate**2, axis=0) if len(rate) else 0.0
@@ -232,7 +230,7 @@ class Comparison:
         return found
 
     def hold(self, mounting: Mounting, bounds: Bounds = WIDE) -> list[Drive]:
-        """How each drive goes with the drawing, the joints counted and the base mounted so."""
+        """Regress each drive on the drawing in a given mounting."""
         key = mounting.direction.tobytes() + mounting.zero.tobytes()
         if key not in self._sums:
             if key not in self._required:
@@ -249,7 +247,7 @@ class Comparison:
         ]
 
     def misfit(self, mounting: Mounting) -> float:
-        """What `find_mounting` makes small: more where friction contradicts weight."""
+        """The quantity that `find_mounting` minimises; friction that contradicts weight adds."""
         drives = self.hold(mounting)
         left = np.log([drive.left + _LEAST_LEFT for drive in drives])
         return float(left.sum() + _CONTRADICTED * sum(drive.is_contradicted for drive in drives))
@@ -257,14 +255,15 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Losses:
-    """What its own inertia, friction and an offset take of a drive (K,), and what they leave.
+    """The part of a drive (K,) that its inertia, friction and offset explain, and the rest.
 
     Attributes:
-        basis: of their columns, (K, m) and orthonormal.
-        power: the mean power of friction is its product with what is not required, (K,).
-        drive: what they leave of the drive, (K,); size: mean square of the drive without an offset.
-        taken: mean power of friction where nothing is required.
-        known: whether they are distinguishable.
+        basis: orthonormal basis of their columns, (K, m).
+        power: vector whose product with the force that is not required is the mean power of
+            friction, (K,).
+        drive: drive less the losses, (K,); size: mean square of the drive without its offset.
+        taken: mean power of friction if nothing is required.
+        known: whether the columns are independent.
     """
 
     basis: Array
@@ -276,7 +275,7 @@ class Losses:
 
     @classmethod
     def of(cls, columns: Array, powers: Array, drive: Array, has_offset: bool) -> Losses:
-        """With columns (K, m), the mean power of one of each, (m,), and the drive (K,)."""
+        """Compute losses from columns (K, m), the mean power per unit of each, and the drive."""
         if has_offset:
             columns, powers = np.column_stack([columns, np.ones(len(drive))]), np.append(powers, 0)
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -295,20 +294,20 @@ class Losses:
         )
 
     def sums(self, parts: Array) -> tuple[Array, ...]:
-        """Products of what is required, in ``parts`` (m, K), by which `beside` needs no samples."""
+        """Products of the required forces, ``parts`` (m, K), so that `beside` needs no samples."""
         own = self.without(parts)
         return own @ own.T, parts @ parts.T, own @ self.drive, parts @ self.power
 
     def without(self, columns: Array) -> Array:
-        """What the losses leave of columns, (m, K)."""
+        """Columns, (m, K), less the losses."""
         return np.asarray(columns - (columns @ self.basis) @ self.basis.T)
 
     def beside(
         self, sums: tuple[Array, ...], by_part: Array, direction: float, bounds: Bounds
     ) -> Drive:
-        """A regression of the drive on what is required too, the sum of ``by_part`` (m,) parts.
+        """Regress the drive on losses and the required force, the sum of ``by_part`` (m,) parts.
 
-        Of a joint that counts in ``direction``; ``sums``: of the parts; ``bounds``: of the share.
+        ``sums`` are those of the parts, ``direction`` is the joint's, ``bounds`` limit the share.
         """
         square, whole = (float(by_part @ of @ by_part) for of in sums[:2])
         along, power = (float(of @ by_part) for of in sums[2:])
@@ -317,7 +316,7 @@ class Losses:
             return Drive(0.0, np.inf, left / count / self.size, 0.0)
         share = along / square
         mean_square = max(left - share * along, 0.0) / count
-        # Neighbouring samples err alike: about one in ten counts.
+        # Errors of neighbouring samples are correlated: about one sample in ten is independent.
         variance = 10.0 * mean_square
         power_sd = np.sqrt(variance * (float(self.power @ self.power) + power**2 / square))
         taken = direction * (self.taken - share * power)
@@ -332,27 +331,27 @@ class Losses:
 
 
 def fits(drives: Sequence[Drive]) -> bool:
-    """Whether drawing and log are of the same joints."""
+    """Whether drawing and log describe the same joints."""
     return mean_left(drives) < _MOST_LEFT
 
 
 def mean_left(drives: Sequence[Drive]) -> float:
-    """Part of the drives' variance that is left, on average."""
+    """Mean fraction of the drives' variance that is left."""
     return float(np.mean([drive.left for drive in drives]))
 
 
 @dataclass(frozen=True)
 class HeavierBody:
-    """The number of a body, and how many times its mass and inertia are those drawn."""
+    """The index of a body, and the ratio of its mass and inertia to the drawn ones."""
 
     place: int
     factor: float
 
 
 def find_heavy(compared: Comparison, mounting: Mounting) -> HeavierBody | None:
-    """The one body whose mass lets the drawing explain all drives, N.m or N; None where none does.
+    """Find the one body whose mass lets the drawing explain all drives, N.m or N; or None.
 
-    A drive in another unit, or all of them, is one number, too: a body must explain more.
+    It must explain more than another unit of one or all drives, which is a single number, too.
     """
     if not mounting.gravity.any():
         return None
@@ -383,7 +382,7 @@ def find_heavy(compared: Comparison, mounting: Mounting) -> HeavierBody | None:
 def _fitted(
     rest: Sequence[Array], columns: Sequence[Array], size: Sequence[float]
 ) -> tuple[float, list[Array]]:
-    """How much of a column, (K,) by joint, brings ``rest`` closest to zero, and what it leaves."""
+    """Return the coefficient of a column, (K,) by joint, nearest to ``rest``, and the remainder."""
     weights = [1.0 / (s * len(one)) for s, one in zip(size, rest, strict=True)]
     along = sum(w * float(c @ r) for w, c, r in zip(weights, columns, rest, strict=True))
     square = sum(w * float(c @ c) for w, c in zip(weights, columns, strict=True))
@@ -394,12 +393,12 @@ def _fitted(
 def _fit_point_mass(
     rest: Sequence[Array], columns: Sequence[Array], mass: float, center: Array
 ) -> tuple[float, Array]:
-    """Mass, kg, and place, (3,), m, of a point on a body that explains most of the drives.
+    """Return mass, kg, and position, (3,), m, of the point mass that explains most of the drives.
 
     Args:
-        rest: by joint, what is left of its drive, (K,).
-        columns: by joint, what one of each of the body's ten inertial numbers adds, (K, 10).
-        mass, center: where to start.
+        rest: by joint, the remainder of its drive, (K,).
+        columns: by joint, the drive per unit of each of the body's ten inertial numbers, (K, 10).
+        mass, center: initial values.
     """
     size = [max(float(np.linalg.norm(one)), np.finfo(float).tiny) for one in rest]
 
@@ -424,9 +423,9 @@ def _signed_drives(compared: Comparison, mounting: Mounting) -> list[Array]:
 def describe_heavy(
     compared: Comparison, mounting: Mounting, found: HeavierBody, in_tip: Callable[[Array], Array]
 ) -> str:
-    """Say which body is heavier than drawn; of the last one, with the payload that it suggests.
+    """Describe a body that is heavier than drawn; for the last one, suggest a payload.
 
-    ``in_tip`` makes of a place in the frame of the last joint, (3,), one in that of the tip.
+    ``in_tip`` maps a position in the frame of the last joint, (3,), to that of the tip.
     """
     robot = compared.robot
     said, joint = robot.describe_mass(found.place, found.factor), robot.joints[found.place]
@@ -444,7 +443,7 @@ def describe_heavy(
 
 
 def with_heavier_body(robot: Robot, found: HeavierBody) -> Robot:
-    """The robot with that body as heavy as it was found."""
+    """The robot with the mass and inertia of a body multiplied by the factor found."""
     joints = list(robot.joints)
     one = joints[found.place]
     joints[found.place] = one.model_copy(

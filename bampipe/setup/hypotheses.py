@@ -1,8 +1,8 @@
-"""Set-ups that a person may have meant: what each says of the signals, cheapest mistakes first."""
+"""Hypotheses about mistakes in a set-up, each as a change of the signals with its cost."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import combinations, permutations
 
@@ -20,30 +20,31 @@ FACTORS: dict[str, tuple[tuple[str, float], ...]] = {
     "A": (("mA", 1e-3),),
     "V": (("mV", 1e-3),),
 }
-"""Units that are taken for the SI unit, and that for them, by SI unit."""
+"""By SI unit, units that are mistaken for it or it for them, with their factors."""
 PLAIN = (10.0, 100.0, 1000.0, 2.0, 4.0)
-"""Gains of an amplifier and edges of an encoder that are forgotten, or counted twice."""
+"""Factors of amplifier gains and of encoder edges that are forgotten or applied twice."""
 MOST_TRAVEL = 4.0 * math.pi
-"""Beyond two turns, rad, an angle is rather that of a motor before its gear."""
+"""Travel beyond which an angle is probably that of a motor before its gear: two turns, rad."""
 JOINT_SPANS = np.geomspace(0.5, MOST_TRAVEL, 20)
-"""What a joint may travel then, rad: weight goes with the sine of the angle, so that only a factor
-near the right one explains more."""
+"""Candidates for the joint's travel in that case, rad: weight varies with the sine of the angle, so
+that only a factor near the right one explains more."""
 _ALIKE = 0.2
-"""Logarithm within which a factor that a drawing suggests is that of a unit or a gain."""
+"""Largest difference of logarithms at which a factor is taken for that of a unit or a gain."""
 CLOCKS = (1e-3, 1e3, 1e-6, 1e6, 1e-9, 1e9)
 USUAL = ("deg", "mm", "mN", "kN", "mA", "mV", "mN.m", "kN.m", "kgf")
 
 
 @dataclass(frozen=True)
 class Correction:
-    """One mistake, as the change of the signals that sets it right.
+    """A mistake in a set-up, with the change of the signals that corrects it.
 
     Attributes:
-        kind: what kind of mistake; signals: which it concerns, none for a clock.
-        change: what it makes of the readings.
-        cost: how unlikely a person is to make it, in the unit of the score.
+        kind: of the mistake; signals: those it concerns, none for a clock.
+        change: the change of the readings.
+        cost: improbability of the mistake, in units of the score.
         factor, offset: of a scale or clock; of a zero, rad or m.
-        meant, stated: unit of the readings, and the one written; "" where no unit explains it.
+        meant, stated: the actual unit of the readings, and the stated one; "" if no unit
+            explains the factor.
     """
 
     kind: Kind
@@ -57,63 +58,60 @@ class Correction:
 
 
 def combine(signals: Signals, corrections: Sequence[Correction]) -> Change:
-    """What all corrections make of the signals, the first one first."""
+    """Return the change of the signals by all corrections, the first one applied first."""
     none = Change.none(len(signals.names))
     return reduce(lambda first, one: one.change.after(first), corrections, none)
 
 
-def scaled(
+def scale_correction(
     signals: Signals,
     names: Sequence[str],
     factor: float,
     cost: float,
     units: tuple[str, str] = ("", ""),
 ) -> Correction:
-    """Signals ``names`` read 1/``factor`` times what they should."""
-    gain = np.eye(len(signals.names))
-    for place in signals.places(names):
-        gain[place, place] = factor
-    none = np.zeros(len(signals.names))
-    return Correction("scale", tuple(names), Change(gain, none), cost, factor, 0.0, *units)
+    """Signals ``names`` must be multiplied by ``factor``."""
+    change, places = Change.none(len(signals.names)), signals.places(names)
+    change.gain[places, places] = factor
+    return Correction("scale", tuple(names), change, cost, factor, 0.0, *units)
 
 
-def shifted(signals: Signals, axis: str, offset: float, cost: float) -> Correction:
-    """The zero of ``axis`` is off: ``offset`` must be added, rad or m."""
+def zero_correction(signals: Signals, axis: str, offset: float, cost: float) -> Correction:
+    """The zero of ``axis`` is wrong: ``offset`` must be added, rad or m."""
     change = Change.none(len(signals.names))
     change.offset[signals.places([axis])] = offset
     return Correction("zero", (axis,), change, cost, offset=offset)
 
 
-def turned(signals: Signals, names: Sequence[str], cost: float = 0.0) -> Correction:
+def sign_correction(signals: Signals, names: Sequence[str], cost: float = 0.0) -> Correction:
     """Signals ``names`` have the wrong sign."""
-    change = scaled(signals, names, -1.0, 0.0).change
+    change = scale_correction(signals, names, -1.0, 0.0).change
     return Correction("sign", tuple(names), change, cost, -1.0)
 
 
-def under_gravity(signals: Signals, gravity: Iterable[float], cost: float) -> Correction:
-    """Gravity is another in the frame of the base, m/s2, (3,)."""
-    none = Change.none(len(signals.names))
+def gravity_correction(signals: Signals, gravity: Iterable[float], cost: float) -> Correction:
+    """Gravity has another direction in the frame of the base, m/s2, (3,)."""
     x, y, z = (float(v) for v in gravity)
-    change = Change(none.gain, none.offset, gravity=(x, y, z))
+    change = replace(Change.none(len(signals.names)), gravity=(x, y, z))
     return Correction("gravity", (), change, cost)
 
 
-def resized(signals: Signals, names: Sequence[str], factor: float) -> Correction:
-    """Signals ``names`` read about 1/``factor`` times what they should: by a unit, if one is near.
+def nearest_scale_correction(signals: Signals, names: Sequence[str], factor: float) -> Correction:
+    """Signals ``names`` must be multiplied by about ``factor``.
 
-    Or by a gain of those that are usual.
+    The factor of a unit or of a usual gain is taken if one is near.
     """
     place = signals.places(names)[0]
     known = [*_units_taken(signals.units[place], signals.stated[place])]
     known += [(gain, 2.0, ("", "")) for plain in PLAIN for gain in (plain, 1.0 / plain)]
     nearest = min(known, key=lambda one: abs(math.log(one[0] / factor)))
     if abs(math.log(nearest[0] / factor)) > _ALIKE:
-        return scaled(signals, names, float(factor), 2.0)
-    return scaled(signals, names, *nearest)
+        return scale_correction(signals, names, float(factor), 2.0)
+    return scale_correction(signals, names, *nearest)
 
 
 def _units_taken(si: str, stated: str) -> Iterator[tuple[float, float, tuple[str, str]]]:
-    """Factor, cost, and units meant and stated, where a unit is taken for another."""
+    """Yield factor, cost, and (meant, stated) for units that are mistaken for each other."""
     for unit, factor in FACTORS.get(si, ()):
         cost = 0.5 if unit in USUAL else 2.0
         if stated == si:
@@ -122,8 +120,8 @@ def _units_taken(si: str, stated: str) -> Iterator[tuple[float, float, tuple[str
             yield 1.0 / factor, cost, (si, unit)
 
 
-def groups_of_like(signals: Signals) -> tuple[tuple[str, ...], ...]:
-    """Signals that share a mistake: each alone, then all axes of one unit, then all forces."""
+def group_signals(signals: Signals) -> tuple[tuple[str, ...], ...]:
+    """Groups of signals that share a mistake: each alone, all axes of one unit, all forces."""
     alone = [(name,) for name in (*signals.axes, *signals.forces, *signals.channels)]
     together = [
         tuple(a for a, u in zip(signals.axes, signals.units, strict=False) if u == unit)
@@ -133,7 +131,7 @@ def groups_of_like(signals: Signals) -> tuple[tuple[str, ...], ...]:
 
 
 def sign_corrections(signals: Signals) -> Iterator[Correction]:
-    """Reversed encoders, forces, channels and brake commands."""
+    """Signs of encoders, forces, channels and brake commands."""
     groups: list[tuple[str, ...]] = [
         (name,) for name in (*signals.axes, *signals.forces, *signals.channels)
     ]
@@ -141,11 +139,11 @@ def sign_corrections(signals: Signals) -> Iterator[Correction]:
         groups += [many] if len(many) > 1 else []
     groups += [(name,) for name in signals.brakes]
     for names in groups:
-        yield turned(signals, names, 0.0 if len(names) == 1 else 1.0)
+        yield sign_correction(signals, names, 0.0 if len(names) == 1 else 1.0)
 
 
 def exchange_corrections(signals: Signals) -> Iterator[Correction]:
-    """Columns that stand for each other: as raw readings, or with all that belongs to them."""
+    """Columns that are exchanged: only their raw readings, or with their calibration."""
     count = len(signals.names)
     inverse = np.linalg.inv(signals.gain)
     pools = [*combinations(signals.names[: count - len(signals.brakes)], 2)]
@@ -166,26 +164,26 @@ def exchange_corrections(signals: Signals) -> Iterator[Correction]:
 
 
 def clock_corrections(signals: Signals) -> Iterator[Correction]:
-    """Time stamps in another unit than stated, the stated rate as well."""
+    """Time stamps in another unit than stated, with the stated rate wrong by the same factor."""
     for factor in CLOCKS:
-        none = Change.none(len(signals.names))
-        yield Correction("clock", (), Change(none.gain, none.offset, factor), 2.0, factor)
+        change = replace(Change.none(len(signals.names)), time=factor)
+        yield Correction("clock", (), change, 2.0, factor)
 
 
 def unit_corrections(signals: Signals) -> Iterator[Correction]:
-    """Units taken for others, and factors of gains and counters."""
-    for names in groups_of_like(signals):
+    """Units that are mistaken for others, and factors of gains and counters."""
+    for names in group_signals(signals):
         place = signals.places(names)[0]
         for taken in _units_taken(signals.units[place], signals.stated[place]):
-            yield scaled(signals, names, *taken)
+            yield scale_correction(signals, names, *taken)
         for factor in PLAIN:
-            yield scaled(signals, names, factor, 2.0)
-            yield scaled(signals, names, 1.0 / factor, 2.0)
+            yield scale_correction(signals, names, factor, 2.0)
+            yield scale_correction(signals, names, 1.0 / factor, 2.0)
 
 
 def quarter_turns(signals: Signals) -> Iterator[Correction]:
-    """A rotary axis counted from another of its four main directions."""
+    """A rotary axis whose zero is wrong by quarter turns."""
     for axis, unit in zip(signals.axes, signals.units, strict=False):
         if unit == "rad":
             for turn in (-0.5, 0.5, 1.0):
-                yield shifted(signals, axis, turn * math.pi, 1.0)
+                yield zero_correction(signals, axis, turn * math.pi, 1.0)

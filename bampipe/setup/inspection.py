@@ -1,4 +1,4 @@
-"""The set-up of a session held against its trials: mistakes in words, for stages and readers."""
+"""Inspection of a session's set-up by its trials, with mistakes as sentences and records."""
 
 import ast
 import json
@@ -16,17 +16,17 @@ from bampipe.results.setup import AxisSetup, AxisState, PossibleMistake, SetupMi
 from bampipe.setup.hypotheses import Correction
 from bampipe.setup.plausibility import LEAST_MOVING, Plausibility, distance_from_prior
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, drawn_robot, is_drawn
-from bampipe.setup.search import EXPLAINED, Finding, Search, shorten, spoilt_axes, spread
+from bampipe.setup.search import EXPLAINED, Finding, Search, shorten, spoilt_axes, spread_trials
 from bampipe.setup.turned_trials import TurnedTrial, find_turned_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
 
 _FARTHEST = {"rotary": (62.8, "degrees"), "linear": (20.0, "millimetres")}
-"""By kind: ten turns, rad, and a long hall, m, which an axis rarely moves through while it is
-logged; and the unit that such a number usually is in."""
+"""By kind: the largest plausible travel of an axis, ten turns, rad, or a long hall, m; and the unit
+that larger numbers usually have."""
 _MANY = 8
-"""Most names that a message lists."""
+"""Largest number of names in a message."""
 
 
 def inspect_setup(
@@ -37,9 +37,9 @@ def inspect_setup(
     folds: Folds,
     names: Sequence[str] = (),
 ) -> SetupResult:
-    """Hold the set-up of a session against its trials ``names``, with every input of the device.
+    """Inspect the set-up of a session by its trials ``names``, with every input of the device.
 
-    Some of them, spread over the session, tell of mistakes in all; each tells of its own.
+    Some trials, spread over the session, show mistakes that all share; each shows its own.
 
     Raises:
         InputError: the device leaves the scale of its equation open.
@@ -47,7 +47,7 @@ def inspect_setup(
     signals = Signals.of_session(system, session)
     _require_scale(system, motions[:1])
     of_kind = [[k for k, fits in enumerate(folds.fitted) if fits == kind] for kind in (True, False)]
-    chosen = [some[k] for some in of_kind for k in spread(len(some))]
+    chosen = [some[k] for some in of_kind for k in spread_trials(len(some))]
     part = folds.subset(chosen)
     placeholders = _find_placeholders(system, session)
     ones = tuple(n for names in placeholders.values() for n in names)
@@ -61,7 +61,7 @@ def inspect_setup(
         return search, held
 
     search, held = search_in(motions)
-    # First: what is turned in some trials looks like another mistake in all.
+    # Reversed signs in some trials come first: in all trials together they look like others.
     odd = find_turned_trials(system, motions, band, folds, signals)
     if odd:
         changes = {one.place: one.corrections[0].change for one in odd}
@@ -80,15 +80,15 @@ def inspect_setup(
     }
     warnings = [
         f"{axis} hardly moves: it stands still in {100.0 * (1.0 - entry.moving_share):.0f} % of the"
-        " samples, and its parameters rest on little"
+        " samples, so its parameters are poorly determined"
         for axis, entry in axes.items()
         if entry.state == "hardly_moves"
     ]
     if held is not None and not mistakes and search.over_position is None:
         warnings += [
-            f"{axis}: of how the applied force varies, the bare device explains"
-            f" {100.0 * max(1.0 - left, 0.0):.0f} %, too little to tell whether the signals mean"
-            " what is stated: does what is logged drive this axis, and does it vary?"
+            f"{axis}: the bare device explains {100.0 * max(1.0 - left, 0.0):.0f} % of how the"
+            " applied force varies, too little to check the meaning of the signals; do the logged"
+            " inputs drive this axis, and do they vary?"
             for (axis, entry), left in zip(axes.items(), held.left, strict=True)
             if entry.state == "unexplained"
         ]
@@ -100,7 +100,7 @@ def inspect_setup(
         warnings += describe_lack(system, held, search.over_position)
     named = " ".join(mistake.sentence for mistake in mistakes)
     warnings += [
-        f"{sentence}: the scale of all estimates rests on it"
+        f"{sentence}: the scale of all estimates depends on it"
         for sentence in placeholders
         if sentence not in named
     ]
@@ -114,7 +114,7 @@ def inspect_setup(
 
 
 def _describe_travel(system: System, session: IngestResult, motions: Sequence[Motion]) -> list[str]:
-    """Say which axes move farther than machines do, as in degrees that pass for radians."""
+    """Report axes that move implausibly far, as if degrees were taken for radians."""
     travel = np.max([np.ptp(motion.q, axis=0) for motion in motions], axis=0)
     found = []
     for coordinate, size in zip(system.model.device.coordinates, travel, strict=True):
@@ -156,11 +156,8 @@ def _record(
     left = [s for s, names in placeholders.items() if set(correction.signals) <= set(names)]
     rivals = found.rivals
     if correction.kind == "scale" and left:
-        off = correction.factor
-        size = (
-            f"{number(off)} times too small" if off > 1.0 else f"{number(1 / off)} times too large"
-        )
-        sentence = f"{left[0]}, a placeholder: what drives the device is about {size} with it"
+        size = _describe_factor(correction.factor, "small", "large")
+        sentence = f"{left[0]}, a placeholder: it makes the drive of the device about {size}"
         rivals = tuple(r for r in rivals if not set(r.signals) <= set(placeholders[left[0]]))
 
     def errors(of: Plausibility) -> dict[str, float]:
@@ -184,7 +181,7 @@ def _record(
 def _record_turned(
     system: System, session: IngestResult, odd: Sequence[TurnedTrial], names: Sequence[str]
 ) -> Iterator[SetupMistake]:
-    """Trials with a sign of their own, those with the same one as one mistake."""
+    """Record trials with a sign of their own; those with the same sign are one mistake."""
     alike: dict[tuple[tuple[str, ...], ...], list[TurnedTrial]] = {}
     for each in odd:
         alike.setdefault(tuple(one.signals for one in each.corrections), []).append(each)
@@ -219,17 +216,17 @@ def _require_scale(system: System, motions: Sequence[Motion]) -> None:
             return
     names = join_names((system.parameters[i].name for i in free), _MANY)
     raise InputError(
-        f"the scale of its equation is undetermined: with {names} all at zero, nothing is left to"
+        f"the scale of its equation is undetermined: if {names} are all zero, no force is left to"
         " explain",
         where=f"device {system.model.device.name!r}",
-        remedy="make a constant of one that is known, such as the gain of the input",
+        remedy="make a known one a constant, such as the gain of the input",
     )
 
 
 def _find_placeholders(system: System, session: IngestResult) -> dict[str, tuple[str, ...]]:
-    """Scales of exactly 1 that nobody has filled in, in words, and the signals that they scale.
+    """Find scales of exactly 1 that nobody has filled in, as clauses, with the signals they scale.
 
-    Counts of an encoder, calibrations, and constants that the input goes through.
+    These are counts of encoders, calibrations, and constants that multiply an input.
     """
     found: dict[str, tuple[str, ...]] = {
         f"counts_per_unit of {axis} is 1": (axis,)
@@ -257,14 +254,14 @@ def _find_placeholders(system: System, session: IngestResult) -> dict[str, tuple
 
 
 def describe_correction(correction: Correction, session: IngestResult) -> str:
-    """One sentence without a full stop: the mistake, a colon, what to write in session.toml."""
+    """Describe a mistake without a full stop: the fault, a colon, the remedy in session.toml."""
     if correction.kind == "clock":
         return _clock(correction, session)
     if correction.change.gravity is not None:
         shown = ", ".join(f"{v:.4g}" for v in correction.change.gravity)
         return (
-            "gravity points elsewhere in the frame of the base: if the robot is mounted so, write"
-            f" gravity = [{shown}] into [robot] of the device file"
+            "gravity has another direction in the frame of the base: if the robot is mounted so,"
+            f" write gravity = [{shown}] into [robot] of the device file"
         )
     if correction.kind == "zero":
         return _zero(correction, session)
@@ -276,7 +273,7 @@ def describe_correction(correction: Correction, session: IngestResult) -> str:
 def describe_evidence(
     system: System, axes: list[int], before: Plausibility, after: Plausibility, drawn: bool
 ) -> str:
-    """What setting it right changes: errors of ``axes``, and parameters that were unbelievable."""
+    """Describe the effect of a correction: errors of ``axes``, and implausible parameters."""
     parts = [
         f"error of {system.coordinates[i]} falls from {_fall(i, before, after)}"
         for i in axes
@@ -291,15 +288,15 @@ def describe_evidence(
     said = "; ".join(parts or back[:3])
     if not drawn:
         return said
-    return f"with bodies as drawn, {said or 'all drives are off by one factor'}"
+    return f"with bodies as drawn, {said or 'all drives differ by one factor'}"
 
 
 def describe_lack(system: System, before: Plausibility, after: Plausibility) -> list[str]:
-    """A sentence without a full stop for each axis on which a torque over position is missing."""
+    """Report, without a full stop, each axis on which a torque over position is missing."""
     return [
-        f"a torque that follows the position of {axis}, as of gravity or a spring, takes its error"
-        f" from {_fall(i, before, after)}, and the device has none there: put it into [energy]"
-        " potential of the device file, or let diagnose name it"
+        f"a torque that follows the position of {axis}, as by gravity or a spring, lowers its error"
+        f" from {_fall(i, before, after)}, but the device has none: add it to [energy] potential of"
+        " the device file, or let the diagnosis name it"
         for i, axis in enumerate(system.coordinates)
         if after.error[i] < before.error[i] / 1.5
     ]
@@ -308,14 +305,20 @@ def describe_lack(system: System, before: Plausibility, after: Plausibility) -> 
 def _fall(axis: int, before: Plausibility, after: Plausibility) -> str:
     shares = before.error[axis], after.error[axis]
     said = [f"{100.0 * x:.0f} %" if x >= 0.1 else f"{100.0 * x:.2g} %" for x in shares]
-    # No more than a reader wants of a very large one.
+    # Very large percentages are not given in full.
     said = ["over 1000 %" if x >= 10.0 else text for x, text in zip(shares, said, strict=True)]
     return f"{' to '.join(said)} of the applied force"
 
 
-def number(value: float) -> str:
-    """A factor, three digits, without powers of ten as long as that is short."""
+def format_factor(value: float) -> str:
+    """Format a factor with three digits, without powers of ten if it is short."""
     return f"{value:.0f}" if 1000.0 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
+def _describe_factor(factor: float, more: str, less: str) -> str:
+    """Say that something is ``factor`` times too ``more``, or the inverse times too ``less``."""
+    size, word = (factor, more) if factor > 1.0 else (1.0 / factor, less)
+    return f"{format_factor(size)} times too {word}"
 
 
 def _sign(correction: Correction, session: IngestResult) -> str:
@@ -323,8 +326,8 @@ def _sign(correction: Correction, session: IngestResult) -> str:
     if len(names) > 1:
         if names[0] in session.force.columns:
             return (
-                f"{join_names(names)} all have the wrong sign, as forces on the hand taken for"
-                f" those of the hand have: negate {_force_entry(session)}"
+                f"{join_names(names)} all have the wrong sign, as if forces on the hand were taken"
+                f" for those of the hand: negate {_force_entry(session)}"
             )
         return f"{join_names(names)} have the wrong sign: negate their columns"
     name = names[0]
@@ -344,11 +347,10 @@ def _scale(correction: Correction, session: IngestResult) -> str:
     fixes = dict.fromkeys(_scale_fix(name, correction, session) for name in correction.signals)
     channels = [f"channels.{name}" for name in correction.signals if name in session.channels]
     if len(channels) == len(correction.signals) > 1:
-        fixes = {f"multiply scale of {join_names(channels)} by {number(correction.factor)}": None}
-    factor, verb = correction.factor, "read" if len(correction.signals) > 1 else "reads"
-    off = f"{number(factor)} times too little"
-    if factor <= 1.0:
-        off = f"{number(1.0 / factor)} times too much"
+        factor = format_factor(correction.factor)
+        fixes = {f"multiply scale of {join_names(channels)} by {factor}": None}
+    verb = "read" if len(correction.signals) > 1 else "reads"
+    off = _describe_factor(correction.factor, "little", "much")
     like = f", as {correction.meant} read as {correction.stated}" if correction.meant else ""
     return f"{join_names(correction.signals)} {verb} about {off}{like}: {'; '.join(fixes)}"
 
@@ -359,17 +361,17 @@ def _scale_fix(name: str, correction: Correction, session: IngestResult) -> str:
         encoder = session.axes[name]
         if encoder.counts_per_unit:
             stated = encoder.counts_per_unit
-            right = number(stated / factor)
-            return f"counts_per_unit of {name} should be about {right}, not {number(stated)}"
+            right = format_factor(stated / factor)
+            return f"counts_per_unit of {name} should be about {right}, not {format_factor(stated)}"
         if correction.meant and encoder.raw_unit == correction.stated:
             return f'unit = "{correction.meant}"'
-        return f"gear_ratio = {number(1.0 / factor)}"
+        return f"gear_ratio = {format_factor(1.0 / factor)}"
     if name in session.force.columns:
         if correction.meant and session.force.raw_unit == correction.stated:
             return f'unit = "{correction.meant}" of [force]'
         row = " of its row" if len(correction.signals) < len(session.force.columns) else ""
-        return f"multiply {_force_entry(session)}{row} by {number(factor)}"
-    return f"multiply scale of channels.{name} by {number(factor)}"
+        return f"multiply {_force_entry(session)}{row} by {format_factor(factor)}"
+    return f"multiply scale of channels.{name} by {format_factor(factor)}"
 
 
 def _force_entry(session: IngestResult) -> str:
@@ -386,9 +388,8 @@ def _zero(correction: Correction, session: IngestResult) -> str:
 
 
 def _clock(correction: Correction, session: IngestResult) -> str:
-    factor = correction.factor
-    how = f"{1.0 / factor:.4g} times too slowly" if factor < 1.0 else f"{factor:.4g} times too fast"
+    how = _describe_factor(correction.factor, "fast", "slowly")
     return (
         f"the clock runs {how}: correct the unit of the time column, and sample_rate_hz, which"
-        f" would be {session.sample_rate_hz / factor:.4g}"
+        f" would be {session.sample_rate_hz / correction.factor:.4g}"
     )

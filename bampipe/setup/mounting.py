@@ -1,9 +1,9 @@
-"""How the joints of a robot are counted, and how its base hangs, where that is not as it is drawn.
+"""Zeros and directions of a robot's joints, and the mounting of its base, if not as drawn.
 
-A file draws a robot upright in one posture; a controller counts from another, counts a joint the
-other way round, and serves a robot on a wall, under a ceiling or on the side of a torso. Weight
-goes with the sines of the angles, so only the right zeros and the right gravity let the drawn
-bodies explain the drives.
+A file draws a robot upright in one posture. A controller may count from another posture, count a
+joint in the opposite direction, and serve a robot on a wall, under a ceiling or on the side of a
+torso. Weight varies with the sines of the angles, so drawn bodies explain the drives only with the
+right zeros and the right gravity.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from bampipe.arrays import Array
 
 _TURNS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
 _DOWN = tuple(np.array(v) for v in product((-1.0, 0.0, 1.0), repeat=3) if any(v))
-"""Directions of gravity in the frame of a base that stands, hangs or lies, or half of two."""
+"""Directions of gravity in the frame of a base that stands, hangs or lies, or half-way between."""
 _WORTH = np.log(2.0)
-"""What each change must gain of the sum over the joints of the logarithm of what is left."""
+"""Smallest gain by each change: drop of the sum over joints of the log of the fraction left."""
 _HANGING, _LEANING = 2.0, 4.0
-"""Changes of joints that another gravity must be worth, along an axis of the base and along none:
-far more robots stand than hang, and drawn bodies that are wrong tilt it a little."""
+"""Number of joint changes to which another gravity is equivalent, along an axis of the base and
+otherwise: far more robots stand than hang, and errors of the drawn bodies tilt it a little."""
 _LEAST_TILT = np.radians(10.0)
-"""Angle below which a gravity that explains more is put down to the drawing of the bodies."""
+"""Angle below which a gravity that explains more is attributed to errors of the drawn bodies."""
 _FIRST_TILT = 0.2
+"""Initial angle of the search for a gravity along no axis, rad."""
 """Angle by which the search for one along no axis begins, rad."""
 _MOST_ROUNDS = 6
 _ROUNDING = 1e-9
@@ -35,13 +36,13 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Mounting:
-    """How the joints are counted, and where gravity points.
+    """Directions and zeros of the joints, and the direction of gravity.
 
     Attributes:
         direction: 1 or -1 by joint, (n,).
-        zero: what is added to direction times the reading, rad, (n,); 0 where a joint slides.
+        zero: added to direction times the reading, rad, (n,); 0 for a sliding joint.
         gravity: in the frame of the base, m/s2, (3,).
-        hangs: whether that is not the gravity that is stated.
+        hangs: whether gravity differs from the stated one.
     """
 
     direction: Array
@@ -51,17 +52,17 @@ class Mounting:
 
     @property
     def changed(self) -> list[int]:
-        """Numbers of the joints that are not counted as they are drawn."""
+        """Numbers of the joints that are not counted as drawn."""
         return [k for k, _ in enumerate(self.zero) if self.direction[k] < 0.0 or self.zero[k]]
 
     @property
     def is_changed(self) -> bool:
-        """Whether anything is not as it is drawn or stated."""
+        """Whether anything differs from the drawing or the stated gravity."""
         return self.hangs or bool(self.changed)
 
     @property
     def changes(self) -> float:
-        """How many changes of joints all of it is as unlikely as."""
+        """Number of joint changes to which the mounting is equivalent in probability."""
         size = np.abs(self.gravity)
         leans = size.max() < (1.0 - _ROUNDING) * np.linalg.norm(size)
         return len(self.changed) + self.hangs * (_LEANING if leans else _HANGING)
@@ -73,13 +74,13 @@ class Mounting:
         return [(float(direction), float(zero)) for direction, zero in pairs]
 
     def under(self, down: Array) -> Mounting:
-        """The same under a gravity as large as this one along ``down``, (3,)."""
+        """The same mounting with its gravity along ``down``, (3,)."""
         size = float(np.linalg.norm(self.gravity))
         gravity = size * down / np.linalg.norm(down)
         return Mounting(self.direction, self.zero, gravity, hangs=True)
 
     def counted(self, options: dict[int, tuple[float, float]]) -> Mounting:
-        """The same with other directions and zeros of some joints, by their numbers."""
+        """The same mounting with other directions and zeros of some joints, by their numbers."""
         direction, zero = self.direction.copy(), self.zero.copy()
         for k, option in options.items():
             direction[k], zero[k] = option
@@ -92,14 +93,14 @@ Judge = Callable[[Mounting], float]
 def find_mounting(
     turning: Sequence[bool], drawn: Mounting, judge: Judge, stands: bool = False
 ) -> Mounting:
-    """The quarter turns, directions and gravity that let the drawing explain most.
+    """Find the quarter turns, directions and gravity with which the drawing explains most.
 
-    One of them is changed at a time, or two: the second of two that are off hides what the first
-    gains. Joints that do not turn can only be counted the other way round.
+    They are changed one or two at a time, because of two wrong joints the second hides the gain of
+    the first. Joints that do not turn can only change direction.
 
     Args:
-        drawn: as everything is stated; judge: what `Comparison.misfit` gives.
-        stands: whether gravity is as stated, as where reductions are unknown, too.
+        drawn: the mounting as stated; judge: returns its `Comparison.misfit`.
+        stands: whether gravity is fixed, as it must be if reductions are unknown too.
     """
 
     def cost(mounting: Mounting) -> float:
@@ -125,9 +126,9 @@ def _alike(one: Mounting, other: Mounting) -> float:
 
 
 def _tilted(mounting: Mounting, judge: Judge) -> Mounting:
-    """The same under the gravity of any direction near its own that leaves least.
+    """Return the mounting with the best direction of gravity near its own.
 
-    That itself where it is closer than `_LEAST_TILT`.
+    If that is closer than `_LEAST_TILT`, the mounting itself is returned.
     """
     down = mounting.gravity / max(float(np.linalg.norm(mounting.gravity)), _ROUNDING)
     aside = np.linalg.svd(down[None, :])[2][1:]
@@ -160,7 +161,7 @@ def _neighbours(
         if drawn.gravity.any() and not stands:
             yield replace(single, gravity=drawn.gravity, hangs=False)
             yield from (single.under(down) for down in _DOWN)
-    # Two joints that are both off are off by their zeros: that is what a maker's zero posture is.
+    # Two joints that are both wrong differ in their zeros, as a maker's zero posture does.
     for a, b in combinations(one, 2):
         for first, second in product(one[a], one[b]):
             if first[0] == best.direction[a] and second[0] == best.direction[b]:

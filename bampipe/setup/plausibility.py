@@ -1,4 +1,4 @@
-"""How well a set-up explains the trials, and how believable the parameters are that it asks for."""
+"""Plausibility of a set-up: the error that it leaves, and the parameters that it implies."""
 
 from __future__ import annotations
 
@@ -20,34 +20,35 @@ from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial, rms
 
 WEIGHT = 8.0
-"""Of the logarithm of an axis' error: its third counts as much as a parameter that comes back from
-beyond `FARTHEST` deviations of its prior."""
+"""Weight of the logarithm of an axis' error: a third of the error counts as much as a parameter
+that returns from beyond `FARTHEST` deviations of its prior."""
 FARTHEST = 4.0
-"""Standard deviations beyond which a parameter is as unbelievable as it can be."""
+"""Prior standard deviations beyond which parameters are equally implausible."""
 CERTAIN = 5.0
-"""Standard deviations of the fit within which a parameter is taken to be where its prior is: those
-of a model that lacks something are too small."""
+"""Standard deviations of the fit within which a parameter may have its prior value: those of a
+model that lacks something are too small."""
 VAGUE = 100.0
-"""Deviations of its prior within which a parameter is even where the trials say nothing of it."""
+"""Largest uncertainty of a parameter, in prior deviations, if the trials contain no information."""
 LEAST_MOVING = 0.05
-"""Share of the samples in which an axis must move for its equation to be judged."""
+"""Smallest fraction of samples in motion with which an axis can be judged."""
 _EVEN = 1e-6
-"""Deviation of a force over its root mean square below which there is none to explain."""
+"""Relative deviation of a force from its mean below which there is no variation to explain."""
 
 
 @dataclass(frozen=True)
 class Plausibility:
-    """What least squares with the bare device says of one set-up.
+    """Result of a least-squares fit of the bare device under one set-up.
 
     Attributes:
-        error: of the fit by axis as a share of the applied force, (n_q,); 1 where the axis hardly
-            moves, 0 where nothing is applied. Gross as mistakes are, they show there; a trial left
-            out would only be extrapolated to where a few slow ones determine little.
-        moving: share of the samples in which each axis moves, (n_q,).
+        error: of the fit by axis, relative to the applied force, (n_q,); 1 if the axis hardly
+            moves, 0 if nothing is applied. Mistakes are so gross that the fit shows them; held-out
+            trials would be extrapolated from a few slow ones that determine little.
+        moving: fraction of the samples in which each axis moves, (n_q,).
         p: parameters, (n_p,).
-        objections: half the squared distance of each from its prior, in its deviations, (n_p,).
-        unexplained: the error as a share of the applied force's deviation from its mean, (n_q,);
-            None where it is that of bodies as drawn.
+        objections: half the squared distance of each parameter from its prior, in prior
+            deviations, (n_p,).
+        unexplained: the error relative to the applied force's standard deviation, (n_q,); None for
+            a comparison with drawn bodies.
     """
 
     error: Array
@@ -58,21 +59,21 @@ class Plausibility:
 
     @property
     def worst_error(self) -> float:
-        """Of the axes that move."""
+        """Largest error among the axes that move."""
         return float(self.error[self.moving >= LEAST_MOVING].max(initial=0.0))
 
     @property
     def left(self) -> Array:
-        """Share (n_q,) of the applied force, or of how it varies where that is more."""
+        """Error relative to the applied force or to its variation, whichever is larger, (n_q,)."""
         return self.error if self.unexplained is None else np.maximum(self.error, self.unexplained)
 
     def score(self, least: float) -> float:
-        """The lower, the better; errors below ``least`` are as good as each other."""
+        """Score of the set-up, lower being better; errors below ``least`` count as equal."""
         errors = np.log(np.hypot(self.error, least))
         return float(WEIGHT * errors.sum() + self.objections.sum())
 
     def with_nothing_explained(self) -> Plausibility:
-        """The same device with a set-up that it cannot be computed with."""
+        """The plausibility of a set-up under which the device cannot be computed."""
         nothing, objections = np.full_like(self.error, 1e3), np.full_like(self.objections, 0.5)
         return replace(self, error=nothing, moving=np.ones_like(nothing), objections=objections)
 
@@ -85,11 +86,11 @@ def judge_setup(
     steps: int,
     posed: Sequence[int] = (),
 ) -> Plausibility | None:
-    """Fit the bare device by least squares; None where it cannot be computed with.
+    """Fit the bare device by least squares; None if it cannot be computed.
 
     Args:
-        system: the bare device; band: of the residual; steps: of the fit, the most.
-        posed: numbers of axes that are given a torque over their own position beside the device.
+        system: the bare device; band: of the residual; steps: largest number of steps.
+        posed: numbers of axes that get a torque over their own position beside the device.
     """
     with np.errstate(all="ignore"):
         try:
@@ -118,7 +119,7 @@ def judge_setup(
 
 
 def axes_without_pose(system: System, motions: Sequence[Motion]) -> list[int]:
-    """Numbers of the axes at which no torque of the device follows their own position."""
+    """Numbers of the axes on which no torque of the device depends on their own position."""
     p = system.prior + np.array([item.sd for item in system.parameters])
     free = set(range(len(system.coordinates)))
     for motion in motions:
@@ -134,7 +135,7 @@ def axes_without_pose(system: System, motions: Sequence[Motion]) -> list[int]:
 
 
 def _errors_with_pose(evidence: Evidence, posed: Sequence[int]) -> Array:
-    """Errors (n_q,) of the fit with a torque over the position of the axes ``posed`` beside it."""
+    """Errors (n_q,) of the fit with an additional torque over position on the axes ``posed``."""
     count = len(evidence.free)
     wide = np.full(4 * len(posed), np.inf)
     columns = [
@@ -154,9 +155,10 @@ def _errors_with_pose(evidence: Evidence, posed: Sequence[int]) -> Array:
 
 
 def _pose_columns(evidence: Evidence, trial: int, posed: Sequence[int]) -> Array:
-    """What a torque over the own position of each axis ``posed`` is made of, (K, n_q, P).
+    """Columns of a torque over its own position on each axis ``posed``, (K, n_q, P).
 
-    A constant and a line; with a wave a turn long where the axis turns, a cubic where it slides.
+    They are a constant and a line, with sine and cosine for a rotary axis, or square and cube for a
+    linear one.
     """
     motion = evidence.motions[trial]
     found = np.zeros((*evidence.residual[trial].shape, 4 * len(posed)))
@@ -171,23 +173,23 @@ def _pose_columns(evidence: Evidence, trial: int, posed: Sequence[int]) -> Array
 
 
 def _standard_errors(evidence: Evidence) -> Array:
-    """Of the fit, (n_p,), as if samples were independent; zero of what is held."""
+    """Standard errors of the fit for independent samples, (n_p,); zero for fixed parameters."""
     free, found = list(evidence.free), np.zeros(len(evidence.p))
     prior_sd = np.array([evidence.system.parameters[i].sd for i in free])
     size = np.maximum(prior_sd, np.finfo(float).tiny)
     normal = np.einsum("q,kqij->ij", evidence.weight, evidence.sums.xx) * np.outer(size, size)
     values, directions = np.linalg.eigh(normal + VAGUE**-2.0 * np.eye(len(free)))
-    # Rounding may give less than nothing to combinations that do not show.
+    # Rounding may give negative information to combinations that the trials do not show.
     found[free] = size * np.sqrt(directions**2 @ (1.0 / np.maximum(values, VAGUE**-2.0)))
     return found
 
 
 def distance_from_prior(item: Parameter, value: float) -> float:
-    """How far a value is from what the device file expects, in deviations of that.
+    """Distance of a value from its prior in the device file, in prior deviations.
 
-    What cannot be negative and is expected to be something is compared by its logarithm: a tenth
-    is as far as ten times. Where nothing is expected of it, its deviation is no more than a size
-    that is thinkable: each doubling beyond that is one more.
+    Positive parameters with a positive prior are compared by their logarithms: a tenth is as far as
+    ten times. If the prior of a non-negative parameter is zero, its deviation is a conceivable
+    size, and each doubling beyond counts as one.
     """
     if item.fixed or item.sd == 0.0:
         return 0.0

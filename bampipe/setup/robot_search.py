@@ -1,4 +1,4 @@
-"""The mistakes that a robot's bodies as drawn show: `init`'s search, from what a session states."""
+"""Search for set-up mistakes of a robot by its drawn bodies, starting from the stated session."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,23 +31,23 @@ from bampipe.setup.search import (
     Corrections,
     Family,
     Search,
-    gears,
-    scaled_by_power,
+    gear_families,
+    scale_by_power_of_ten,
 )
 from bampipe.trials.residuals import standstill_of
 from bampipe.trials.signals import Change
 
 DRAWN_SAMPLES = 4_000
-"""Of all trials together, that the bodies as drawn are held against."""
+"""Samples of all trials together that are compared with the drawn bodies."""
 _STATED: Bounds = (1.0 / 3.0, 3.0)
-"""How many times lighter or heavier than drawn what hangs on a joint may be."""
+"""Plausible ratios of the actual to the drawn weight on a joint."""
 _SUSPICIOUS = 0.15
-"""Error with bodies as drawn from which other set-ups are tried: two joints exchanged leave 0.26 at
-least."""
+"""Error with drawn bodies above which other set-ups are tried: two exchanged joints leave at least
+0.26."""
 _ALIKE_SHARES, _FAR_SHARE = np.log(1.5), np.log(1.5)
-"""Within what logarithm drives are off alike, as of one unit, and from what on that is too much."""
+"""Logarithms: largest spread of drives that are wrong by a common unit, and smallest such error."""
 _UNSURE = 0.3
-"""Relative uncertainty of what a drawing asks of a drive, at least."""
+"""Smallest relative uncertainty of the drive that a drawing requires."""
 
 
 def is_drawn(system: System) -> bool:
@@ -67,10 +67,10 @@ def drawn_robot(system: System) -> Robot:
 
 @dataclass
 class DrawnSearch(Search):
-    """Tries set-ups with bodies as drawn.
+    """Tests set-ups against drawn bodies.
 
-    Bodies that are free take on much of a mistake. Each drive has besides an inertia and friction
-    of its own, and one factor for its bodies.
+    Fitted bodies would absorb much of a mistake. Besides, each drive has an inertia and friction of
+    its own, and one factor for its bodies.
     """
 
     is_drawn: ClassVar[bool] = True
@@ -78,7 +78,7 @@ class DrawnSearch(Search):
 
     @cached_property
     def stated(self) -> Comparison:
-        """The drives beside what the drawn bodies require, all as stated but for a heavy body."""
+        """Drives and the drawn bodies' forces, as stated except for a body that is too heavy."""
         drawn = self._as_drawn
         if self.system.model.device.force_unit != "A":
             self.heavier = find_heavy(drawn, drawn.drawn)
@@ -88,7 +88,7 @@ class DrawnSearch(Search):
 
     @cached_property
     def roughly(self) -> Comparison:
-        """The same at the samples that are compared: joints move more slowly than the band ends."""
+        """`stated` at thinned samples only: joints move more slowly than the band's cut-off."""
         kept = [self.band.thinned_rows(len(motion.t)) for motion in self.motions]
         motions = [
             JointMotion(m.position[rows], m.rate[rows], m.change[rows])
@@ -108,7 +108,7 @@ class DrawnSearch(Search):
             for motion in self.motions:
                 at, u = motion.kinematics, motion.inputs(self.system.inputs)
                 z = self.system.memory(*at, u, p, motion.t)
-                # What acts beside the bodies, such as a spring, is as stated whatever else is not.
+                # Other forces than the bodies', such as a spring's, are as stated in any case.
                 beside = self.system.required(*at, z, u, p)
                 beside = beside - robot.drawn_forces(*at, np.array(robot.gravity))
                 drives.append(self.band.thin(self.system.applied(*at, z, u, p) - beside))
@@ -132,13 +132,13 @@ class DrawnSearch(Search):
         )
 
     def drives_against_bodies(self) -> list[str]:
-        """Drives of one joint each that as stated have the other sign than what they move."""
+        """Drives of a single joint whose stated sign is opposite to that of their bodies."""
         drives = self._as_drawn.hold(self._as_drawn.drawn)
         return [name for name, k in self._alone.items() if drives[k].is_turned]
 
     @cached_property
     def _alone(self) -> dict[str, int]:
-        """Joints by the force that alone acts on them, and on nothing else."""
+        """Joints by the force that alone acts on them and on no other joint."""
         return {
             self.signals.forces[f]: k
             for k, row in enumerate(self._by_force)
@@ -148,7 +148,7 @@ class DrawnSearch(Search):
 
     @cached_property
     def _by_force(self) -> Array:
-        """Joint forces by one of each force of the device, (n, forces)."""
+        """Joint forces per unit of each force of the device, (n, forces)."""
         n, inputs = len(self.system.coordinates), len(self.system.inputs)
         at, p = (np.zeros((inputs + 1, n)),) * 3, self.system.prior
         u = np.vstack([np.zeros(inputs), np.eye(inputs)])
@@ -158,7 +158,7 @@ class DrawnSearch(Search):
         return np.asarray((found[1:] - found[0])[places].T)
 
     def screen(self, chosen: Corrections, correction: Correction) -> float:
-        # Signs and sizes of drives of one joint are free here: the shares tell them.
+        # Signs and sizes of drives of a single joint are free here: `together` reads their shares.
         held = self._hold((*chosen, correction), self.roughly)
         return np.inf if held is None else held[0].misfit(held[1]) + 2.0 * correction.cost / WEIGHT
 
@@ -172,7 +172,7 @@ class DrawnSearch(Search):
         return [
             *hypotheses.sign_corrections(self.signals),
             *hypotheses.quarter_turns(self.signals),
-            hypotheses.under_gravity(self.signals, down, 1.0),
+            hypotheses.gravity_correction(self.signals, down, 1.0),
         ]
 
     def discrete(self) -> Iterator[Correction]:
@@ -186,7 +186,7 @@ class DrawnSearch(Search):
             *hypotheses.unit_corrections(self.signals),
             *hypotheses.clock_corrections(self.signals),
         ):
-            # Of a drive in another unit, the share tells, unless it turns several joints.
+            # The share shows the unit of a drive, unless the drive turns several joints.
             of_drive = correction.kind == "scale" and not (axes | coupled) & set(correction.signals)
             cycle = correction.kind == "exchange" and len(correction.signals) > 2
             if not (of_drive or (cycle and len(axes) > MOST_AXES)):
@@ -196,13 +196,13 @@ class DrawnSearch(Search):
         position = np.concatenate([motion.position for motion in self.stated.motions])
         for axis, turns, q in zip(self.signals.axes, self.stated.turning, position.T, strict=True):
             if turns:
-                yield from gears(self.signals, axis, float(np.ptp(q)))
+                yield from gear_families(self.signals, axis, float(np.ptp(q)))
         for force in self.signals.forces:
             if force not in self._alone:
-                yield partial(scaled_by_power, self.signals, (force,)), DECADES
+                yield partial(scale_by_power_of_ten, self.signals, (force,)), DECADES
 
     def together(self, chosen: Corrections) -> Corrections:
-        # What the best mounting and the drives' shares say is mistaken besides.
+        # Add the mistakes that the best mounting and the drives' shares show.
         found: list[Correction] = []
         change = hypotheses.combine(self.signals, chosen)
         compared, rough = (self._compare(change, one) for one in (self.stated, self.roughly))
@@ -214,13 +214,13 @@ class DrawnSearch(Search):
         for k, (axis, (direction, zero)) in enumerate(
             zip(self.signals.axes, mounting.by_joint, strict=True)
         ):
-            found += [hypotheses.turned(self.signals, [axis])] if direction < 0.0 else []
+            found += [hypotheses.sign_correction(self.signals, [axis])] if direction < 0.0 else []
             if zero:
                 off = float(np.remainder(zero + np.pi, 2.0 * np.pi) - np.pi) or np.pi
                 off = off if compared.turning[k] else zero
-                found.append(hypotheses.shifted(self.signals, axis, off, 1.0))
+                found.append(hypotheses.zero_correction(self.signals, axis, off, 1.0))
         if mounting.hangs:
-            found.append(hypotheses.under_gravity(self.signals, mounting.gravity, 1.0))
+            found.append(hypotheses.gravity_correction(self.signals, mounting.gravity, 1.0))
         drives = compared.hold(mounting)
         return (*found, *self._by_share(drives))
 
@@ -228,12 +228,12 @@ class DrawnSearch(Search):
         return False
 
     def _by_share(self, drives: Sequence[Drive]) -> Iterator[Correction]:
-        """Drives whose sign or size is not that of the bodies, each by itself or all alike."""
+        """Yield drives whose sign or size differs from the bodies', one by one or all together."""
         signs = [name for name, k in self._alone.items() if drives[k].is_turned]
         if len(signs) == len(self.signals.forces) > 1:
-            yield hypotheses.turned(self.signals, signs, 1.0)
+            yield hypotheses.sign_correction(self.signals, signs, 1.0)
         else:
-            yield from (hypotheses.turned(self.signals, [name]) for name in signs)
+            yield from (hypotheses.sign_correction(self.signals, [name]) for name in signs)
         sizes = {
             name: float(np.log(abs(drives[k].share)))
             for name, k in self._alone.items()
@@ -243,21 +243,21 @@ class DrawnSearch(Search):
         middle = float(np.median(logs)) if len(logs) else 0.0
         alike = len(logs) > 2 and np.abs(logs - middle).max() < _ALIKE_SHARES
         if alike and abs(middle) > _FAR_SHARE:
-            yield hypotheses.resized(self.signals, self.signals.forces, np.exp(-middle))
+            forces, factor = self.signals.forces, np.exp(-middle)
+            yield hypotheses.nearest_scale_correction(self.signals, forces, factor)
             return
         for name, size in sizes.items():
             if abs(size) > np.log(_STATED[1]):
-                yield hypotheses.resized(self.signals, [name], np.exp(-size))
+                yield hypotheses.nearest_scale_correction(self.signals, [name], np.exp(-size))
 
     def _compare(self, change: Change, stated: Comparison) -> Comparison | None:
-        """The comparison ``stated`` with other readings and drives, zeros apart.
+        """The comparison ``stated`` with other readings and drives, but the same zeros.
 
-        None where a force is to stand for a position.
+        None if the change makes a position of a force.
         """
         n, forces = len(self.signals.axes), len(self.signals.forces)
         readings, drives = change.gain[:n, :n], change.gain[n : n + forces, n : n + forces]
-        beside = change.gain[:n, n:].any() or change.gain[n:, :n].any()
-        if beside:
+        if change.gain[:n, n:].any() or change.gain[n:, :n].any():
             return None
         key = readings.tobytes() + np.array([change.time, id(stated)]).tobytes()
         if key not in self._reread:
@@ -265,7 +265,7 @@ class DrawnSearch(Search):
         found = self._reread[key]
         if np.array_equal(drives, np.eye(forces)):
             return found
-        # Drives at the joints are linear in the forces: what these become is found by those.
+        # Joint drives are linear in the forces, so the forces give their changes.
         into = self._by_force @ drives @ np.linalg.pinv(self._by_force)
         return found.driven(into)
 

@@ -1,4 +1,4 @@
-"""The search for set-up mistakes: one after the other, each by what setting it right changes."""
+"""Search for set-up mistakes, one after the other, by the improvement that a correction brings."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,41 +20,40 @@ from bampipe.trials.motion import Motion
 from bampipe.trials.signals import Signals
 
 SUSPICIOUS_ERROR = 0.4
-"""Error, as a share of the applied force, from which other set-ups are tried. Right ones
-stand below 0.15 with any one effect hidden, a gravity compensator that lags behind at 0.36."""
+"""Error relative to the applied force above which other set-ups are tried. Right set-ups stay below
+0.15 with any one effect hidden; a gravity compensator that lags behind leaves 0.36."""
 LEAST_GAIN = 7.0
-"""Score that setting a mistake right must gain: the error of one axis falls to 42 %, say. Of sound
-sessions no other set-up gains more than 5.0, of mistaken ones the right one at least 7.9."""
+"""Smallest gain of score by a correction: the error of one axis falls to 42 %, for example. In
+sound sessions no other set-up gains more than 5.0, in mistaken ones the right one at least 7.9."""
 LEAST_GAIN_PLACEHOLDER = 4.0
-"""The same for a scale that stands at exactly 1, as nobody has filled it in."""
+"""The same for a scale of exactly 1, which nobody has filled in."""
 EXPLAINED = 0.6
-"""Error that may be left of an axis that is set right or sound, as a share of the applied force and
-of its deviation from its mean: a constant explains an even one, whatever the signals mean."""
+"""Largest error of an axis that counts as corrected or sound, relative to the applied force and to
+its standard deviation: a constant explains a constant force, whatever the signals mean."""
 JUDGED_ERROR, RANKED_ERROR = 0.1, 0.01
-"""Errors below these are alike: when a mistake is named, and when mistakes are ranked."""
+"""Errors below these count as equal: when a mistake is confirmed, and when mistakes are ranked."""
 SPOILS = 2.0
-"""Times its error, or `JUDGED_ERROR` where that is larger, that a correction may leave of an axis
-that was sound before. All drives of a robot taken twice help an axis whose counterbalance the
-device lacks, and take another from 8 to 34 % of its force: no mistake of set-up."""
+"""Largest factor by which a correction may raise the error, or `JUDGED_ERROR` if larger, of an axis
+that was sound before. Doubling all drives of a robot helps an axis whose counterbalance the device
+lacks, and raises another from 8 to 34 % of its force, although the set-up has no mistake."""
 ALIKE = 1.5
-"""Difference of scores within which two mistakes cannot be distinguished."""
+"""Largest difference of scores at which two mistakes cannot be distinguished."""
 MOST_MISTAKES = 4
 
 Judge = Callable[[tuple[Correction, ...]], Plausibility | None]
 SUSPICIOUS_PRIORS = 5.0
-"""Sum of objections from which other set-ups are tried: two parameters beyond
-two deviations."""
+"""Sum of objections above which other set-ups are tried: two parameters beyond two deviations."""
 LEAST_FACTOR, LEAST_TURN, LEAST_SHIFT = 1.5, 0.25, 0.3
-"""A factor, an angle (rad) and a share of an axis' travel below which what is off is no mistake of
-set-up but an effect to be diagnosed."""
+"""Smallest mistakes: a factor, an angle (rad) and a fraction of an axis' travel. Anything smaller
+is an effect to be diagnosed."""
 _VARIED = 0.2
-"""Standard deviation of a drive over its root mean square, the least."""
+"""Smallest relative standard deviation of a drive that varies."""
 MOST_AXES = 3
-"""With more, only signs, the clock and units of all axes or inputs at once are tried: what may be
-exchanged, shifted or scaled grows faster than what a fit of a robot's bodies leaves time for."""
+"""With more axes, only signs, the clock, and units of all axes or inputs together are tried: the
+number of exchanges, shifts and scales grows too fast for fits of a robot's bodies."""
 HIGHEST_HZ = 10.0
-"""Set-ups are compared below this: gross as they are, they show there, and an input that is taken
-for a position has derivatives up to no more than some 25 Hz."""
+"""Frequency below which set-ups are compared: mistakes are so gross that they show there, and an
+input that is taken for a position has derivatives only up to some 25 Hz."""
 _SAMPLES, _SCREENED_SAMPLES = 12_000, 3_000
 _SCREENING_STEPS = 3
 _SHORTLIST = 6
@@ -62,7 +61,7 @@ DECADES = np.arange(-10, 11) / 2.0
 _STEPS = 16
 MOST_TRIALS = 6
 _SAME_FACTOR = 0.05
-"""Logarithm within which the factor that explains most is a usual one."""
+"""Largest difference of logarithms at which the best factor is taken for a usual one."""
 _HALVINGS = 11
 
 Family = Callable[[float], Correction]
@@ -71,12 +70,12 @@ Corrections = tuple[Correction, ...]
 
 @dataclass(frozen=True)
 class Finding:
-    """One mistake with the two set-ups it lies between.
+    """A mistake with the two set-ups that it distinguishes.
 
     Attributes:
-        rivals: other corrections that set it right as well; gain: of the score.
-        before, after: what the set-ups explain, with all other mistakes set right.
-        drawn: whether both are with bodies as drawn.
+        rivals: other corrections that work as well; gain: of the score.
+        before, after: plausibility of the set-ups, with all other mistakes corrected.
+        drawn: whether both were compared with drawn bodies.
     """
 
     correction: Correction
@@ -87,21 +86,21 @@ class Finding:
     drawn: bool = False
 
 
-def conclude(
+def confirm_mistakes(
     judge: Judge,
     chosen: tuple[Correction, ...],
     others: Sequence[Correction],
     placeholders: Sequence[str] = (),
     drawn: bool = False,
 ) -> tuple[Finding, ...]:
-    """The mistakes among corrections that were ``chosen`` together, the one that gains most first.
+    """Return the mistakes among corrections ``chosen`` together, the largest gain first.
 
-    Those without which hardly more is left are no mistakes. None is one if some axis is not
-    explained in the end, or is worse than as stated.
+    Corrections without which the error hardly rises are dropped. There are no mistakes if some axis
+    remains unexplained, or is worse than as stated.
 
     Args:
-        others: corrections that may do in the place of one that was.
-        placeholders: signals whose scale stands at exactly 1; drawn: with bodies as drawn.
+        others: corrections that may replace a chosen one.
+        placeholders: signals whose scale is exactly 1; drawn: whether bodies are as drawn.
     """
     found: list[Finding] = []
     while chosen:
@@ -110,19 +109,19 @@ def conclude(
             return ()
         found = []
         for one in chosen:
-            before = judge(without(chosen, one)) or after.with_nothing_explained()
+            before = judge(drop_correction(chosen, one)) or after.with_nothing_explained()
             found.append(Finding(one, (), before, after, gain_of(before, after, one.cost), drawn))
         idle = min(found, key=lambda f: f.gain - least_gain(f.correction, placeholders))
         if idle.gain >= least_gain(idle.correction, placeholders):
             break
-        chosen = without(chosen, idle.correction)
+        chosen = drop_correction(chosen, idle.correction)
     stated = judge(())
     spoilt = stated is not None and chosen and spoils_sound_axes(stated, found[0].after)
     if spoilt or not 0 < len(chosen) <= MOST_MISTAKES:
         return ()
     most = score_of(judge, chosen) + ALIKE
     for place, finding in enumerate(found):
-        rest = without(chosen, finding.correction)
+        rest = drop_correction(chosen, finding.correction)
         known = {(one.kind, one.signals) for one in chosen}
         rivals: dict[tuple[str, tuple[str, ...]], Correction] = {}
         for other in others:
@@ -135,53 +134,53 @@ def conclude(
     return tuple(found) if explained else ()
 
 
-def without(corrections: tuple[Correction, ...], one: Correction) -> tuple[Correction, ...]:
-    """All corrections but ``one``."""
+def drop_correction(corrections: tuple[Correction, ...], one: Correction) -> tuple[Correction, ...]:
+    """Return all corrections but ``one``."""
     return tuple(other for other in corrections if other is not one)
 
 
 def score_of(judge: Judge, corrections: tuple[Correction, ...]) -> float:
-    """Of a set-up, the lower the better; infinite where it cannot be computed with."""
+    """Score of a set-up, lower being better; infinite if it cannot be computed."""
     found = judge(corrections)
     cost = sum(one.cost for one in corrections)
     return math.inf if found is None else found.score(RANKED_ERROR) + cost
 
 
 def least_gain(correction: Correction, placeholders: Sequence[str] = ()) -> float:
-    """Score that a correction must gain."""
+    """Smallest gain of score at which a correction counts."""
     hinted = correction.kind == "scale" and set(correction.signals) <= set(placeholders)
     return LEAST_GAIN_PLACEHOLDER if hinted else LEAST_GAIN
 
 
 def spoilt_axes(finding: Finding) -> list[int]:
-    """Axes whose error falls by more than a third once the mistake is set right; all, if none."""
+    """Axes whose error falls by more than a third by the correction; all axes if there are none."""
     before, after = finding.before.error, finding.after.error
     fallen = [i for i in range(len(before)) if after[i] < before[i] / 1.5]
     return fallen or list(range(len(before)))
 
 
 def gain_of(before: Plausibility, after: Plausibility, cost: float) -> float:
-    """Of the score, by a correction of that cost."""
+    """Gain of score by a correction of that cost."""
     return before.score(JUDGED_ERROR) - after.score(JUDGED_ERROR) - cost
 
 
 def spoils_sound_axes(before: Plausibility, after: Plausibility) -> bool:
-    """Whether a correction makes an axis much worse that was right without it."""
+    """Whether a correction makes an axis much worse that was sound without it."""
     sound = before.error < SUSPICIOUS_ERROR
     return bool(np.any(after.error[sound] > SPOILS * np.maximum(before.error[sound], JUDGED_ERROR)))
 
 
 @dataclass
 class Search:
-    """One search over hypotheses about signals: what each makes better is what speaks for it.
+    """A search over hypotheses about signals, judged by how well the bare device explains trials.
 
-    Parameters are free; all are tried on a small part of the trials, the best on more.
+    Parameters are free. All hypotheses are tried on a small part of the trials, the best on more.
 
     Attributes:
-        motions: the trials as they are stated, short enough; tested: number of set-ups tried.
-        heavier: the drawn body that alone is far heavier; None where none is.
-        over_position: what the stated set-up explains with a torque over position that the device
-            lacks, where that rather than a mistake is what spoils it; None else.
+        motions: the trials as stated, shortened; tested: number of set-ups tried.
+        heavier: the only body that is far heavier than drawn; None if there is none.
+        over_position: plausibility of the stated set-up with a torque over position that the
+            device lacks, if this rather than a mistake explains the error; otherwise None.
     """
 
     system: System
@@ -198,17 +197,17 @@ class Search:
     is_drawn: ClassVar[bool] = False
 
     def together(self, chosen: Corrections) -> Corrections:
-        """Several corrections that only together explain more; none where there are none."""
+        """Return corrections that explain more only together; none by default."""
         return ()
 
     def rivals(self, tried: list[Correction]) -> list[Correction]:
-        """Corrections that may do as well as the one that was found, of those ``tried``."""
+        """Return corrections, of those ``tried``, that may do as well as the chosen ones."""
         return tried
 
     def find_mistakes(self, placeholders: Sequence[str] = ()) -> tuple[Finding, ...]:
-        """The mistakes of the set-up, the one that gains most first.
+        """Return the mistakes of the set-up, the largest gain first.
 
-        ``placeholders`` are signals whose scale stands at exactly 1.
+        ``placeholders`` are signals whose scale is exactly 1.
         """
         chosen: Corrections = ()
         tried: list[Correction] = []
@@ -225,12 +224,12 @@ class Search:
                 break
             tried += singles
             chosen = (*chosen, *self._with_refined_factor(chosen, best))
-        return conclude(self.judge, chosen, self.rivals(tried), placeholders, self.is_drawn)
+        return confirm_mistakes(self.judge, chosen, self.rivals(tried), placeholders, self.is_drawn)
 
     def _best(
         self, chosen: Corrections, options: Sequence[Corrections], placeholders: Sequence[str]
     ) -> Corrections:
-        """What sets most right, of those that gain enough and spoil no axis."""
+        """Return the best of the options that gain enough and spoil no axis."""
         before = self.judge(chosen)
         ranked = sorted(options, key=lambda option: score_of(self.judge, (*chosen, *option)))
         for option in filter(None, ranked):
@@ -245,11 +244,11 @@ class Search:
         return ()
 
     def _with_refined_factor(self, chosen: Corrections, best: Corrections) -> Corrections:
-        """``best`` with the factor that explains most, where that is none of a unit or a gain."""
+        """Return ``best`` with the optimal factor, if that differs from a unit's or a gain's."""
         first, *rest = best
         if first.kind != "scale":
             return best
-        family = partial(scaled_by_power, self.signals, first.signals)
+        family = partial(scale_by_power_of_ten, self.signals, first.signals)
         start = math.log10(first.factor)
         refined = self._refine(chosen, family, start, math.inf, float(DECADES[1] - DECADES[0]))
         found = (refined, *rest)
@@ -258,7 +257,7 @@ class Search:
         return found if far and gain > ALIKE else best
 
     def _continuous(self, chosen: Corrections) -> list[Correction]:
-        """Scales and zeros of any size: the best families on a grid, then refined."""
+        """Return scales and zeros of any size: the best families on a grid, refined."""
         coarse = []
         for family, grid in self.families(chosen):
             scores = [self.screen(chosen, family(x)) for x in grid]
@@ -273,7 +272,7 @@ class Search:
     def _refine(
         self, chosen: Corrections, family: Family, best: float, least: float, step: float
     ) -> Correction:
-        """The best correction of a family near ``best``, where it scores ``least``."""
+        """Return the best correction of a family near ``best``, whose score is ``least``."""
         for _ in range(_HALVINGS):
             step *= 0.5
             for x in (best - step, best + step):
@@ -283,19 +282,19 @@ class Search:
         return family(best)
 
     def _shortlist(self, chosen: Corrections, tried: Iterable[Correction]) -> list[Correction]:
-        """The corrections that do best on the small part of the trials."""
+        """Return the best corrections on the small part of the trials."""
         screened = [(self.screen(chosen, correction), correction) for correction in tried]
         screened.sort(key=lambda one: one[0])
         return [one for score, one in screened[:_SHORTLIST] if math.isfinite(score)]
 
     @property
     def has_few_axes(self) -> bool:
-        """Whether every kind of mistake can be tried in a few seconds."""
+        """Whether there are so few axes that every kind of mistake can be tried in seconds."""
         return len(self.signals.axes) <= MOST_AXES
 
     @cached_property
     def screened(self) -> tuple[Sequence[Motion], Folds]:
-        """The part of the trials that every set-up is tried on: two that are fitted, one braked."""
+        """The part of the trials for all set-ups: two fitted trials and a braked one."""
         folds = self.folds
         fitted = [k for k, fits in enumerate(folds.fitted) if fits]
         others = [k for k, fits in enumerate(folds.fitted) if not fits]
@@ -305,7 +304,7 @@ class Search:
         return shorten([self.motions[k] for k in chosen], most), part
 
     def judge(self, corrections: Corrections) -> Plausibility | None:
-        """What a set-up explains of the trials; None where it cannot be computed with."""
+        """Return the plausibility of a set-up on the trials; None if it cannot be computed."""
         key = tuple(id(one) for one in corrections)
         if key not in self._judged:
             found = self._judge(corrections, self.motions, self.folds, 12)
@@ -326,7 +325,7 @@ class Search:
         return judge_setup(self.system, changed, change.of_band(self.band), folds, steps, posed)
 
     def screen(self, chosen: Corrections, correction: Correction) -> float:
-        """Score and cost of one correction more; infinite where it makes no sense."""
+        """Return score and cost with one more correction; infinite if it makes no sense."""
         if not _is_gross(correction, self.motions, self.signals):
             return math.inf
         self.tested += 1
@@ -334,9 +333,9 @@ class Search:
         return math.inf if found is None else found.score(RANKED_ERROR) + correction.cost
 
     def lacks_pose(self, best: Corrections) -> bool:
-        """Whether a torque over position explains as much of the stated set-up as ``best`` does.
+        """Whether a torque over position explains the stated set-up as well as ``best`` does.
 
-        That of gravity on a link or of a spring, where the device has none: no column is mistaken.
+        If the device lacks gravity on a link or a spring, no column is mistaken.
         """
         axes = axes_without_pose(self.system, self.motions) if self.has_few_axes else []
         stated = self.judge(())
@@ -352,14 +351,14 @@ class Search:
         return True
 
     def is_suspicious(self, now: Plausibility | None, placeholders: Sequence[str] = ()) -> bool:
-        """Whether so much is left that other set-ups are tried."""
+        """Whether the error or the parameters are implausible enough to try other set-ups."""
         if now is None or now.error.max() > SUSPICIOUS_ERROR:
             return True
         most = LEAST_GAIN_PLACEHOLDER if placeholders else SUSPICIOUS_PRIORS
         return bool(now.objections.sum() > most)
 
     def discrete(self) -> Iterator[Correction]:
-        """Mistakes that are usual."""
+        """Yield usual mistakes."""
         yield from hypotheses.sign_corrections(self.signals)
         yield from hypotheses.clock_corrections(self.signals)
         for correction in hypotheses.unit_corrections(self.signals):
@@ -370,50 +369,53 @@ class Search:
             yield from hypotheses.quarter_turns(self.signals)
 
     def families(self, chosen: Corrections) -> Iterator[tuple[Family, Array]]:
-        """Scales and zeros of any size, each with the sizes to begin with."""
+        """Yield scales and zeros of any size, each with its initial grid."""
         if not self.has_few_axes:
             return
-        for names in hypotheses.groups_of_like(self.signals):
-            yield partial(scaled_by_power, self.signals, names), DECADES
+        for names in hypotheses.group_signals(self.signals):
+            yield partial(scale_by_power_of_ten, self.signals, names), DECADES
         change = hypotheses.combine(self.signals, chosen)
         changed = [change.of_motion(motion, self.signals) for motion in self.screened[0]]
         for place, axis in enumerate(self.signals.axes):
             q = np.concatenate([motion.q[:, place] for motion in changed])
             turns = self.signals.units[place] == "rad"
             if turns:
-                yield from gears(self.signals, axis, float(np.ptp(q)))
+                yield from gear_families(self.signals, axis, float(np.ptp(q)))
             reach = 2.0 * max(float(np.ptp(q)), float(np.abs(np.median(q))))
             grid = (math.pi if turns else reach) * np.linspace(-1.0, 1.0, _STEPS)
-            yield partial(hypotheses.shifted, self.signals, axis, cost=3.0), grid
+            yield partial(hypotheses.zero_correction, self.signals, axis, cost=3.0), grid
 
 
 def shorten(motions: Sequence[Motion], most: int = _SAMPLES) -> list[Motion]:
-    """The middle of each trial, so that all have ``most`` samples together at most."""
+    """Return the middle of each trial, so that all together have at most ``most`` samples."""
     each = most // max(len(motions), 1)
     starts = [max((motion.t.size - each) // 2, 0) for motion in motions]
     return [m.rows(slice(at, at + each)) for m, at in zip(motions, starts, strict=True)]
 
 
-def spread(count: int) -> list[int]:
-    """Numbers of some trials of ``count``, spread over the session."""
+def spread_trials(count: int) -> list[int]:
+    """Return numbers of at most `MOST_TRIALS` of ``count`` trials, evenly spread."""
     chosen = np.linspace(0, max(count - 1, 0), min(count, MOST_TRIALS))
     return [int(number) for number in np.unique(chosen.round())]
 
 
-def scaled_by_power(signals: Signals, names: tuple[str, ...], power: float) -> Correction:
-    return hypotheses.scaled(signals, names, 10.0**power, 3.0)
+def scale_by_power_of_ten(signals: Signals, names: tuple[str, ...], power: float) -> Correction:
+    return hypotheses.scale_correction(signals, names, 10.0**power, 3.0)
 
 
-def gears(signals: Signals, axis: str, travel: float) -> Iterator[tuple[Family, Array]]:
-    """What a motor turns for one of its joint, where a position travels that far, rad."""
+def gear_families(signals: Signals, axis: str, travel: float) -> Iterator[tuple[Family, Array]]:
+    """Yield gear ratios of an axis whose position, with that travel, rad, must be a motor's."""
     if travel > hypotheses.MOST_TRAVEL:
-        yield partial(scaled_by_power, signals, (axis,)), np.log10(hypotheses.JOINT_SPANS / travel)
+        yield (
+            partial(scale_by_power_of_ten, signals, (axis,)),
+            np.log10(hypotheses.JOINT_SPANS / travel),
+        )
 
 
 def _is_gross(correction: Correction, motions: Sequence[Motion], signals: Signals) -> bool:
-    """Whether a scale or zero is off by more than what an effect would explain.
+    """Whether a scale or zero is wrong by more than an effect would explain.
 
-    And whether an exchange leaves a drive that varies: an offset explains any that does not.
+    An exchange must leave drives that vary, since an offset explains any constant one.
     """
     others = [name for name in correction.signals if name not in signals.axes]
     if correction.kind == "exchange" and 0 < len(others) < len(correction.signals):

@@ -1,4 +1,4 @@
-"""Trials in which a sensor counts the other way than in the others: no set-up suits all of them."""
+"""Trials in which a signal has the opposite sign to the other trials, so no set-up suits all."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ import numpy as np
 
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
-from bampipe.setup.hypotheses import Correction, turned
+from bampipe.setup.hypotheses import Correction, sign_correction
 from bampipe.setup.plausibility import Plausibility, judge_setup
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch, is_drawn
 from bampipe.setup.search import ALIKE, LEAST_GAIN, MOST_AXES, SUSPICIOUS_ERROR, gain_of, shorten
@@ -21,11 +21,11 @@ _STEPS, _SAMPLES = 4, 4000
 
 @dataclass(frozen=True)
 class TurnedTrial:
-    """A trial in which the readings of a signal have another sign than in those around it.
+    """A trial in which the readings of a signal have the opposite sign to the other trials.
 
     Attributes:
-        place: of the trial; corrections: any sets it right; of one signal, or a robot's drives.
-        before, after: what it shows alone, as the others are stated and set right.
+        place: number of the trial; corrections: alternatives, each of a signal or a robot's drives.
+        before, after: plausibility of the trial alone, as stated and corrected.
     """
 
     place: int
@@ -37,10 +37,10 @@ class TurnedTrial:
 def find_turned_trials(
     system: System, motions: Sequence[Motion], band: Band, folds: Folds, signals: Signals
 ) -> list[TurnedTrial]:
-    """Find the minority of trials whose signs contradict the others: inertia and friction resist.
+    """Find the minority of trials whose signs contradict the others, by inertia and friction.
 
-    Each trial is fitted alone, so that trials may differ in parameters, as with different dampers.
-    With many joints, the drawn bodies give the signs.
+    Each trial is fitted alone, so that parameters may differ between trials, as with different
+    dampers. With many joints, the drawn bodies determine the signs.
     """
     fitted = folds.fitted_trials
     if len(fitted) < 2:
@@ -63,7 +63,7 @@ def find_turned_trials(
     if all(own.error.max() < SUSPICIOUS_ERROR for own in stated.values()):
         return []
     drives = [name for name in signals.inputs if name not in signals.brakes]
-    options = [turned(signals, [name]) for name in (*signals.axes, *drives)]
+    options = [sign_correction(signals, [name]) for name in (*signals.axes, *drives)]
     fits = {
         k: [fit(k, one) or own.with_nothing_explained() for one in options]
         for k, own in stated.items()
@@ -71,7 +71,7 @@ def find_turned_trials(
     gains = {k: np.array([gain(stated[k], one) for one in of]) for k, of in fits.items()}
     found: dict[int, list[tuple[float, int]]] = {}
     for place in range(len(options)):
-        # Of signs that explain a trial, the one that does so best, or those that do alike.
+        # Of the signs that explain a trial, the best one, and those that are as good.
         against = [k for k, of in gains.items() if of[place] > max(LEAST_GAIN, of.max() - ALIKE)]
         along = [k for k, of in gains.items() if of[place] < -LEAST_GAIN]
         for k in min(against, along, key=len) if against and along else ():
@@ -81,7 +81,7 @@ def find_turned_trials(
     for k, ways in sorted(found.items()):
         most, place = max(ways, key=lambda way: way[0])
         before, after = stated[k], fits[k][place]
-        if gains[k][place] < 0.0:  # The others are turned, and it is not.
+        if gains[k][place] < 0.0:  # the other trials are reversed, not this one
             before, after = after, before
         alike = [options[at] for strength, at in ways if strength > most - ALIKE and at != place]
         result.append(TurnedTrial(k, (options[place], *alike), before, after))
@@ -96,7 +96,7 @@ def _by_drawn_bodies(
     folds: Folds,
     signals: Signals,
 ) -> list[TurnedTrial]:
-    """Those in which a drive goes against its drawn bodies and friction, which it does in few."""
+    """Find the few trials in which a drive opposes its drawn bodies and friction."""
     alone = {
         k: DrawnSearch(
             system, shorten([motions[k]], DRAWN_SAMPLES), band, folds.subset([k]), signals
@@ -108,7 +108,7 @@ def _by_drawn_bodies(
     found = []
     for k, search in alone.items():
         if names := [name for name in against[k] if 2 * often[name] < len(fitted)]:
-            one = turned(signals, names)
+            one = sign_correction(signals, names)
             before, after = search.judge(()), search.judge((one,))
             if before and after and gain_of(before, after, 0.0) > LEAST_GAIN:
                 found.append(TurnedTrial(k, (one,), before, after))

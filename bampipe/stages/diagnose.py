@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import write_parquet
-from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_recipe
 from bampipe.diagnosis.candidates import list_candidates
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.description import describe
@@ -97,7 +97,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     recipe = read_recipe(run, config.model, model)
     for setting in ("without", "also"):
         _require_known(getattr(config, setting), recipe, setting)
-    start = identified(run, config.model, system)
+    start = read_estimate(run, config.model, system)
     jobs = config.jobs or min(8, os.cpu_count() or 1)
     session = Session(trials, config, jobs, config.seed, config.also)
     try:

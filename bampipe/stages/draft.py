@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic.dataclasses import dataclass as checked_dataclass
 
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
-from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_recipe
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.drafts import symbolic
 from bampipe.diagnosis.drafts.effect_file import declare
@@ -90,7 +90,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     source = f"drafted by bampipe from {ingested.session_id}{on}"
     axes = [system.coordinates.index(axis) for axis in diagnosis.unnamed_axes]
     found = draft_formulas(
-        session, read_recipe(run, config.model, model), identified(run, config.model, system),
+        session, read_recipe(run, config.model, model), read_estimate(run, config.model, system),
         axes, source, config.curve, progress,
     )  # fmt: skip
     effects: dict[str, DraftedEffect] = {}

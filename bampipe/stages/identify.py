@@ -292,7 +292,7 @@ def _find_timing(task: _Task, squares: SquaresFit, held: InputTiming | None) -> 
 def _describe_squares(task: _Task, squares: SquaresFit) -> list[str]:
     """Return notes on least squares: no replicates, or an axis that nothing drives."""
     notes, system = [], task.system
-    if task.config.remove_bias and not squares.replayed:
+    if task.config.remove_bias and not squares.has_replicates:
         notes.append(
             "The model cannot be simulated on these trials, so all samples have equal weight and"
             " the bias of filters was not removed."

@@ -131,7 +131,7 @@ def _ingest_trials(
             continue
         noise = entry.kind in MOVING and measured <= number * _MOST_MEASURED / total
         measured += noise
-        channels.note(trial)
+        channels.note_trial(trial)
         trial = thin(trial, every, encoders)
         if noise:
             channels.measure_noise(trial)

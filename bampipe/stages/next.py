@@ -15,7 +15,7 @@ from bampipe.arrays import Array
 from bampipe.data.chain import read_tree
 from bampipe.data.robot_tree import identifier
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
-from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_recipe
 from bampipe.declarations.recording import DRAWING
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session, system_of, without_members
@@ -175,7 +175,7 @@ def _read_case(
             " can be designed",
             where=f"device {model.device.name!r}",
         )
-    p, found = identified(run, config.model, system), run.read(IdentifyResult, config.model)
+    p, found = read_estimate(run, config.model, system), run.read(IdentifyResult, config.model)
     purpose, parameter = _split(config.purpose, list(found.parameters))
     diagnosed = run.find(DiagnoseResult, config.model)
     if diagnosed is None and purpose == "decision":
@@ -275,7 +275,7 @@ def _rank(
     precision = forecast.precision
 
     def utility(motion: Motion) -> float:
-        return precision.worth(precision.of_motion(motion), float(motion.t[-1]), parameter)
+        return precision.utility(precision.of_motion(motion), float(motion.t[-1]), parameter)
 
     return rank_designs(space, utility, partial(report, 0.5))
 
@@ -330,7 +330,7 @@ def _plan(
     # Parameters that the best design for all leaves too uncertain get designs of their own.
     asked = dict(zip(precision.names, goal.sd, strict=True))
     utilities = [
-        partial(precision.worth, seconds=config.seconds, parameter=name)
+        partial(precision.utility, seconds=config.seconds, parameter=name)
         for name, sd in best.sd.items()
         if sd.after > asked[name]
     ]

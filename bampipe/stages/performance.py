@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import read_parquet
-from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate
 from bampipe.errors import InputError
 from bampipe.physics import System, compile_model
 from bampipe.progress import Progress
@@ -49,7 +49,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     """Map joint stiffness, friction and inertia to the handle over the poses of the session."""
     system = compile_model(load_model(run, config.model))
     device = system.model.device
-    p = identified(run, config.model, system)
+    p = read_estimate(run, config.model, system)
     # The range of each axis that the moving trials covered, (n_q, 2).
     columns = [f"q_{axis}" for axis in system.coordinates]
     q = read_parquet(run.require("filter/kinematics.parquet", "filter"), columns=columns)

@@ -16,7 +16,7 @@ from bampipe.declarations.model_file import load_device
 from bampipe.errors import InputError
 from bampipe.estimate.differentiation import uniform_grid
 from bampipe.estimate.gear_windup import Windup, find_windup
-from bampipe.estimate.hysteresis import Hysteresis, hysteresis
+from bampipe.estimate.hysteresis import Hysteresis, measure_hysteresis
 from bampipe.physics import Model, System, compile_model
 from bampipe.progress import Progress
 from bampipe.results.ingest import IngestResult
@@ -227,7 +227,7 @@ def _loops_of(
     torque = np.ascontiguousarray(_applied(system, q, u, grid.t)[:, number])
     deflection = np.ascontiguousarray(q[:, number])
     try:
-        found = hysteresis(torque, deflection, rate)
+        found = measure_hysteresis(torque, deflection, rate)
     except ValueError as error:
         return str(error)
     pose = np.median(q, axis=0)

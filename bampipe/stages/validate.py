@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from bampipe.arrays import Array
 from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.data.store import ParquetAppender
-from bampipe.declarations.model_file import IDENTIFIED_MODEL, identified, load_model, read_recipe
+from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_recipe
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session
 from bampipe.errors import InputError
@@ -31,7 +31,7 @@ from bampipe.trials.comparison import ComparedTrial, axis_errors, compare_trial
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials, trial_of_block
 from bampipe.trials.motion import Motion, trial_names, trial_sizes
-from bampipe.trials.noise_floor import NoiseFloor, draw_trials, floor_replays
+from bampipe.trials.noise_floor import NoiseFloor, count_floor_replicates, draw_trials
 from bampipe.trials.reading import held_out_trials, read_motions, require_sound_motions
 from bampipe.trials.residuals import rms
 
@@ -70,7 +70,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
     """Compare one identified model with all free trials, and those in a viscous field."""
     model = load_model(run, config.model)
     system = compile_model(model)
-    p = identified(run, config.model, system)
+    p = read_estimate(run, config.model, system)
     estimates = run.read(IdentifyResult, config.model)
     trials = read_measured_trials(run, system, timing=estimates.input_timing)
     require_sound_motions(system, trials.motions)
@@ -129,7 +129,7 @@ def _noise_floor(
 ) -> tuple[NoiseFloor | None, list[str]]:
     """Return the floor, None if the fitted model cannot be simulated, and notes on it."""
     progress(0.4, "noise floor")
-    count = config.repeats or floor_replays(trials.motions)
+    count = config.repeats or count_floor_replicates(trials.motions)
     if count == 1:
         raise InputError("one replicate has no scatter", where="validate.repeats", remedy="set 2")
     # Held-out trials are few, and all are needed for the judgement.
@@ -242,7 +242,7 @@ def _result(
         forces=forces,
         free_run=free_run,
         cutoff_hz=dict(zip(system.coordinates, trials.band.cutoff_hz, strict=True)),
-        floor_replays=0 if floor is None else floor.replays,
+        floor_replays=0 if floor is None else floor.replicates,
         failed_checks=failed,
         notes=tuple(notes),
         headline=f"fit on {on}: {best}{checks}",

@@ -1,1 +1,1 @@
-"""Trials on their way from samples to residual, for every stage alike."""
+"""The only path from the samples of a trial to its residual, for all stages."""

@@ -1,4 +1,4 @@
-"""The band in which a session's residuals are compared, found from its motion and force."""
+"""The frequency band in which residuals are compared, chosen from the motion and the force."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.sensors import Sensors
 
 LEAST_HZ = 8.0
-"""No band is narrower: a change of direction, from which friction is read, is that wide."""
+"""Lower limit of the band: a reversal, which shows the friction, is as wide as this."""
 _COVERED = 0.95
 """Share of the power of the applied force, above its noise, that the band covers."""
 _SEGMENT_S = 4.0
@@ -27,13 +27,14 @@ def find_band(
     kinematics: Kinematics,
     chosen_hz: float = 0.0,
 ) -> dict[str, ResidualBand]:
-    """Find where motion and force carry signal above noise, axis by axis.
+    """Find the band of each axis in which motion and force carry signal above noise.
 
-    The band ends where 95 % of the power of the applied force above its noise is covered, but not
-    above the bandwidth of the filtered motion, and not below `LEAST_HZ`.
+    The band covers 95 % of the power of the applied force above its noise. It exceeds neither the
+    bandwidth of the filtered motion nor a fifth of the sampling rate, and is at least `LEAST_HZ`.
 
-    The priors of the bare device map channels to axes. ``chosen_hz`` is that of the user for all
-    axes, Hz; 0 takes it from the data.
+    Args:
+        system: the bare device; its prior maps force channels to axes.
+        chosen_hz: the user's cut-off for all axes, Hz; 0 to choose it from the data.
     """
     rate = sensors.rate_hz
     covered = np.median([_covered_hz(system, motion, sensors) for motion in motions], axis=0)
@@ -54,7 +55,7 @@ def find_band(
             cutoff, reason = force_hz, "95 % of the power of the applied force above its noise"
         else:
             cutoff = max(most, least)
-            reason = f"the force goes on to {force_hz:.3g} Hz, the motion is known up to here"
+            reason = f"the force extends to {force_hz:.3g} Hz, but the motion is known up to here"
         found[axis] = ResidualBand(
             cutoff_hz=cutoff, reason=reason, force_hz=force_hz, motion_hz=motion_hz
         )
@@ -62,7 +63,7 @@ def find_band(
 
 
 def _covered_hz(system: System, motion: Motion, sensors: Sensors) -> Array:
-    """Frequency below which the applied force of each axis has its power, (n_q,)."""
+    """Frequency below which 95 % of the power of each axis' applied force lies, Hz, (n_q,)."""
     rate, p = sensors.rate_hz, system.prior
     device = ModelOnTrial(system, p, [motion])
     applied, gain = device.applied, system.input_map(motion.q, device.inputs, p)
@@ -70,7 +71,7 @@ def _covered_hz(system: System, motion: Motion, sensors: Sensors) -> Array:
     size = min(len(applied), max(32, int(_SEGMENT_S * rate)))
     frequency, density = welch(applied, fs=rate, nperseg=size, axis=0, detrend="constant")
     signal = np.maximum(density - 2.0 * np.square(noise) / rate, 0.0)
-    # What scatters about the noise is no signal: it counts from twice the noise on.
+    # The estimate of the spectrum scatters: only power above twice the noise counts as signal.
     signal[density < 4.0 * np.square(noise) / rate] = 0.0
     signal[0] = 0.0
     power = np.cumsum(signal, axis=0)

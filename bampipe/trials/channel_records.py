@@ -1,4 +1,4 @@
-"""What the samples of a session say of its channels, noted one trial at a time."""
+"""Noise, mains hum and readings in raw counts of each channel, collected trial by trial."""
 
 from collections import defaultdict
 
@@ -13,19 +13,19 @@ from bampipe.results.ingest import MainsHum
 from bampipe.trials.sensors import ChannelNoise, RecordNoise, settle_encoder, settle_force
 
 _COUNTS_SPAN = 16.0
-"""Counts that a converter's readings span at least: fewer tell nothing from a reading in tens."""
+"""Smallest range of counts: readings rounded to tens span fewer distinct values than that."""
 _MIDDLES = (2.0**9, 2.0**11, 2.0**13, 2.0**15)
-"""Counts at which converters of 10 to 16 bits stand where a bipolar sensor carries nothing."""
+"""Readings of converters of 10 to 16 bits at mid-scale, where an unloaded bipolar sensor stands."""
 _NEAR_MIDDLE = 0.05
-"""Share of that by which an unloaded sensor is off it, as offsets and preload go."""
+"""Largest relative deviation of an unloaded sensor from mid-scale, by offset and preload."""
 
 
 class ChannelRecords:
-    """What a session's trials say of its channels: noise, mains hum, readings in counts."""
+    """Noise, mains hum and integer readings of each channel, collected over a session's trials."""
 
     def __init__(self, session: Session, device: Device) -> None:
         self._session, self._device = session, device
-        # One raw unit, in SI, of the forces that are logged in a unit in which none counts whole.
+        # One raw unit in SI, for forces whose unit is so large that they are no whole numbers.
         units: dict[str, float] = {}
         if session.force and not session.force.volts:
             gains = np.diag(np.array(session.force.calibration))
@@ -37,8 +37,8 @@ class ChannelRecords:
         self._hum: dict[str, list[dict[float, float]]] = defaultdict(list)
         self._counts: dict[str, list[tuple[float, float] | None]] = defaultdict(list)
 
-    def note(self, trial: CleanTrial) -> None:
-        """Note one trial and take mains hum off its inputs; encoders have none."""
+    def note_trial(self, trial: CleanTrial) -> None:
+        """Record a trial's integer readings, and remove mains hum from its inputs in place."""
         for name, unit in self._units.items():
             self._counts[name].append(_counts(trial.columns[name] / unit))
         moving = [column for name, column in trial.columns.items() if name.startswith("q_")]
@@ -48,7 +48,7 @@ class ChannelRecords:
                 self._hum[name].append(found)
 
     def measure_noise(self, trial: CleanTrial) -> None:
-        """Note what a trial says of the noise of its encoders (``q_<axis>``) and inputs."""
+        """Measure the noise of a trial's encoders (``q_<axis>``) and inputs."""
         columns = {
             name: np.asarray(values, dtype=float)
             for name, values in trial.columns.items()
@@ -77,7 +77,7 @@ class ChannelRecords:
         }
 
     def mains_hum(self) -> tuple[MainsHum, ...]:
-        """The hum taken off each channel, typical of the trials that had it."""
+        """The hum removed from each channel: the median amplitude of the trials that had it."""
         return tuple(
             MainsHum(
                 channel=name,
@@ -91,7 +91,7 @@ class ChannelRecords:
         )
 
     def count_warnings(self) -> dict[str, str]:
-        """A sentence for each channel that looks like counts in most of its trials."""
+        """A warning for each channel that seems to hold converter counts in most of its trials."""
         said, force, device = {}, self._session.force, self._device
         for name, ranges in self._counts.items():
             found = [each for each in ranges if each is not None]
@@ -113,10 +113,10 @@ class ChannelRecords:
 
 
 def _counts(readings: Array) -> tuple[float, float] | None:
-    """The range of readings of a force (T,) if they are rather counts of a converter, else None.
+    """Return the range of force readings (T,) if they look like converter counts, else None.
 
-    Whole numbers, none negative, that stay farther from zero than they span or about the middle of
-    a converter's range: a force that a machine is moved by comes near zero, and is no whole number.
+    Counts are non-negative whole numbers that either stay farther from zero than they span, or
+    stand about a converter's mid-scale. A force in SI units passes through zero in fractions.
     """
     known = readings[np.isfinite(readings)]
     if not known.size or np.mean(np.abs(known - np.rint(known)) < 1e-6) < 0.95:

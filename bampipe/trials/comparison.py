@@ -1,4 +1,4 @@
-"""What a model requires against what was measured, by trial: residuals, and errors by axis."""
+"""Measured forces and residuals of each trial, and from them the errors of each axis."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -39,9 +39,8 @@ def compare_trial(
 ) -> ComparedTrial:
     """Compare one trial with the model as published, held out, and without friction.
 
-    Args:
-        published: (n_p + 1,) parameters, and the timing of the inputs as far as it is not taken off
-            the trials, s; unseen: the same without the trial.
+    ``published`` (n_p + 1,) are parameters, followed by the change of the input delay from that
+    compensated in the trials, s; ``unseen`` is the same from the other trials.
     """
     motion, band, folds = trials.motions[number], trials.band, trials.folds
     dry = (effect for effect in system.model.effects if effect.effect.is_dry_friction)
@@ -85,7 +84,7 @@ def axis_errors(system: System, compared: Sequence[ComparedTrial]) -> dict[str, 
     unseen = [k for k, c in enumerate(compared) if c.judged] or every
 
     def rms_of(which: Sequence[int], part: Callable[[ComparedTrial], Array]) -> Array:
-        # One trial in memory at a time: of a long session, the others are on disk.
+        # The compared trials of a long session are on disk: read one at a time.
         return rms((part(compared[k]) for k in which), (compared[k].used for k in which))
 
     rmse = rms_of(every, lambda c: c.residual)
@@ -97,7 +96,7 @@ def axis_errors(system: System, compared: Sequence[ComparedTrial]) -> dict[str, 
     mean = sum(measured) / count
     spread = rms_of(unseen, lambda c: c.measured - mean)
     unseen_size = rms_of(unseen, lambda c: c.measured)
-    # Of an axis that nothing drives, such as a pole on a cart, no force is there to explain.
+    # An axis that nothing drives, such as a pole on a cart, has no applied force to explain.
     return {
         axis: AxisError(
             rmse=rmse[i],

@@ -1,8 +1,8 @@
-"""Stretches of trials that no model of the machine could explain: a hit, a dead sensor, a start.
+"""Stretches of trials that no model of the machine explains: hits, dead sensors, warm-ups.
 
-Errors of a model come back wherever the machine does what they depend on. A stretch whose error is
-many times that of the rest, while the same motion leaves an ordinary error at other times, tells of
-an event; left in, it moves estimates and floors, and passes for a physical effect.
+Model errors recur whenever the motion that causes them recurs. If a stretch has an error many times
+larger than the rest, and the same motion elsewhere does not, an event caused it. Such a stretch
+would bias estimates and noise floors, and could appear as a physical effect.
 """
 
 from collections.abc import Sequence
@@ -23,35 +23,35 @@ from bampipe.trials.motion import Motion, trial_sizes
 from bampipe.trials.residuals import applied_rms, fit_device
 
 _BLOCK_S = 0.2
-"""Length of the blocks of which the errors are compared, s."""
+"""Length of the blocks whose errors are compared, s."""
 _TIMES = 20.0
-"""Error of the worst block of such a stretch over that of the rest. `benchmarks/disturbances.py` is
-the study behind it; benchmarks/notebook/setup.md has what came of it."""
+"""Smallest ratio of a stretch's worst block error to the error of the rest. Study:
+`benchmarks/disturbances.py`; its results: benchmarks/notebook/setup.md."""
 _ALONE = 25.0
-"""The same, over the whole stretch, of a motion that does not come back: a stop that is reached
-once has 15."""
+"""The same for a whole stretch whose motion does not recur; an end stop reached once has 15."""
 _EDGE = 3.0
-"""The same at its ends: what is left of an event there would still weigh."""
+"""The same for the blocks at the ends of a stretch, where the tails of the event still weigh."""
 _MOST = 0.1
-"""Share of the samples beyond which the rest is no longer the rule."""
+"""Largest fraction of the samples that disturbances may cover: beyond it, there is no normal."""
 _ORDINARY = 0.05
-"""Share of a stretch's squared error that the same motion may have at other times."""
+"""Largest fraction of a stretch's squared error that the same motion may cause at other times."""
 _APART_S, _BEFORE_S = 1.0, 0.3
 _NEIGHBOURS, _FEWEST, _RADIUS = 12, 4, 0.35
-"""Samples held against one of a stretch, and how near they are: in spreads of all that the error
-may depend on, and at least `_APART_S` away or in another trial."""
+"""Neighbours in state space that each sample of a stretch is compared with: how many, how many are
+needed, and within what distance, in standard deviations of each quantity. They lie at least
+`_APART_S` away in time or in another trial."""
 _SLOWLY = 50.0
-"""How much finer the resolution in velocity is near standstill than elsewhere: friction changes
-within little there, and turns are held against turns."""
+"""How much finer velocity is resolved near standstill, where friction changes quickly, so that
+reversals are compared with reversals."""
 _UNKNOWN = 3
-"""Most blocks at rest that a stretch goes on through."""
+"""Largest number of adjacent blocks at rest that a stretch extends through."""
 _SLOW, _FRICTION = 0.1, 2.0
-"""Below this share of its root mean square velocity an axis may turn unseen; a wrong sign of the
-velocity may be worth so many root mean squares of the applied force."""
+"""Below this fraction of its root mean square velocity, an axis may reverse unnoticed; a wrong sign
+of the velocity may cause an error of this multiple of the root mean square applied force."""
 _ROUNDS = 8
-"""Of weighing wild blocks down, after which the weights stand."""
+"""Iterations of the robust reweighting."""
 _SHORTEST_S = 1.0
-"""Of a part between two disturbances, s, that a filter can start in."""
+"""Shortest part between two disturbances in which a filter can converge, s."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class _Blocks:
     ends: Array
 
     def mean_square(self, values: Array, used: Flags) -> Array:
-        """Of values (N, n_q) over the samples used, (B, n_q), NaN where most are at rest."""
+        """Mean of squares (N, n_q) over the used samples of each block, (B, n_q); NaN at rest."""
         found = np.full((self.trial.size, values.shape[1]), np.nan)
         whole = np.bincount(self.block, minlength=self.trial.size)
         for i in range(values.shape[1]):
@@ -87,11 +87,11 @@ class _Samples:
     Attributes:
         system: the device; blocks: of the samples.
         t: (N,) s since the start of the trial; motion: (N, n_q, 3) position, rate, acceleration.
-        inputs: (N, k) further inputs than forces, such as a damper's current, and how far each is
-            from what it was `_BEFORE_S` before.
-        error: (N, n_q) of the device, N.m or N; excess: (N, n_q) the same, of a turn only what no
-            friction could do, for the sign of the velocity may be wrong there.
-        used: (N, n_q) which of them count.
+        inputs: (N, k) inputs other than forces, such as a damper's current, and the change of each
+            over `_BEFORE_S`.
+        error: (N, n_q) of the device, N.m or N; excess: (N, n_q) the same, but near reversals only
+            the part that friction of the wrong sign could not cause.
+        used: (N, n_q) whether each sample counts.
     """
 
     system: System
@@ -103,12 +103,13 @@ class _Samples:
     excess: Array
     used: Flags
 
-    def judge(self, axis: int, first: int, last: int, undisturbed: Flags) -> Disturbance | None:
-        """Blocks ``first`` to ``last`` as a stretch to leave out; None if its error comes back.
+    def judge_stretch(
+        self, axis: int, first: int, last: int, undisturbed: Flags
+    ) -> Disturbance | None:
+        """Judge blocks ``first`` to ``last``; None if their error recurs with the motion.
 
-        The reason is in words that go on from "the error".
-
-        ``undisturbed`` (B,) are the blocks outside all such stretches of the axis.
+        ``undisturbed`` (B,) marks the blocks outside all candidate stretches of the axis. The
+        reason of the disturbance is the rest of a sentence that begins with "the error".
         """
         blocks, excess = self.blocks, self.excess[:, axis]
         start, end = float(blocks.starts[first]), float(blocks.ends[last])
@@ -135,9 +136,9 @@ class _Samples:
 def find_disturbances(
     system: System, motions: Sequence[Motion], band: Band, fitted: Sequence[int]
 ) -> dict[str, tuple[Disturbance, ...]]:
-    """Find stretches with an error that nothing repeats, by trial.
+    """Find stretches whose error does not recur with the motion, by trial, in order of time.
 
-    The bare device is fitted to the trials numbered ``fitted``. Stretches are in the order of time.
+    The bare device is fitted to the trials numbered ``fitted``.
     """
     samples, stretches = _gather(system, motions, band, fitted), dict[str, list[Disturbance]]()
     if samples is None:
@@ -150,17 +151,17 @@ def find_disturbances(
         for first, last in candidates:
             undisturbed[first : last + 1] = False
         for first, last in candidates:
-            found = samples.judge(axis, first, last, undisturbed)
+            found = samples.judge_stretch(axis, first, last, undisturbed)
             if found is not None:
                 name = motions[int(samples.blocks.trial[first])].trial_id
                 stretches.setdefault(name, []).append(found)
-    return {name: _join(found) for name, found in stretches.items()}
+    return {name: _merge_touching(found) for name, found in stretches.items()}
 
 
 def _gather(
     system: System, motions: Sequence[Motion], band: Band, fitted: Sequence[int]
 ) -> _Samples | None:
-    """The errors of the device on all trials; None where it cannot be fitted: others say why."""
+    """The errors of the bare device on all trials; None if it cannot be fitted."""
     found = fit_device(system, motions, band, fitted)
     if found is None:
         return None
@@ -171,10 +172,10 @@ def _gather(
         np.concatenate([trial.slope for trial in measured]),
         np.concatenate([trial.used for trial in measured]),
     )
-    # One pass: of many trials, few are held.
+    # A single pass: only few of many trials are in memory.
     kept = [_thin(system, motion, band) for motion in motions]
     times, states, others, turns, ends = zip(*kept, strict=True)
-    blocks = _cut(times, ends, band)
+    blocks = _lay_out_blocks(times, ends, band)
     t, state, inputs, turning = map(np.concatenate, (times, states, others, turns))
     error = _robust_residual(stacked, blocks)
     force = applied_rms(system, motions, band, p[:-1], [one.used for one in by_trial])
@@ -184,7 +185,7 @@ def _gather(
 
 
 def _turning(motion: Motion, band: Band) -> Flags:
-    """Which samples lie within half a period of the band of a turn or a halt, (T, n_q)."""
+    """Samples within half a period of the band's cut-off from a reversal or halt, (T, n_q)."""
     turns = np.abs(motion.qd) < _SLOW * np.sqrt(np.mean(motion.qd**2, axis=0))
     turns[1:] |= np.signbit(motion.qd[1:]) != np.signbit(motion.qd[:-1])
     near: Flags = np.empty_like(turns)
@@ -195,11 +196,11 @@ def _turning(motion: Motion, band: Band) -> Flags:
 
 
 def _thin(system: System, motion: Motion, band: Band) -> tuple[Array, Array, Array, Flags, float]:
-    """Samples of one trial that the residual keeps.
+    """Thin one trial as its residual is thinned.
 
     Returns:
-        Time, motion and inputs as in `_Samples`; which are near a turn or a halt, (K, n_q); and the
-        end of the trial, s.
+        Time, motion and inputs as in `_Samples`; which samples are near a reversal or halt,
+        (K, n_q); and the end of the trial, s.
     """
     rows = band.thinned_rows(len(motion.t))
     forces = system.model.device.forces
@@ -214,8 +215,8 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _join(stretches: list[Disturbance]) -> tuple[Disturbance, ...]:
-    """The stretches of one trial in the order of time, those that touch as one."""
+def _merge_touching(stretches: list[Disturbance]) -> tuple[Disturbance, ...]:
+    """Sort the stretches of one trial by time and merge those that touch."""
     groups: list[list[Disturbance]] = []
     for one in sorted(stretches, key=lambda one: one.start_s):
         if groups and one.start_s <= max(other.end_s for other in groups[-1]):
@@ -234,11 +235,11 @@ def _join(stretches: list[Disturbance]) -> tuple[Disturbance, ...]:
 
 
 def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Motion], list[int]]:
-    """Part trials at their disturbances, for what follows a motion from sample to sample.
+    """Split trials at their disturbances, for filters that follow a motion from sample to sample.
 
     Returns:
-        The parts that are long enough, or the trials where nothing disturbs them, and the number
-        of the trial that each is of.
+        The parts that are long enough, or the trials themselves if nothing disturbs them; and the
+        number of the trial that each part belongs to.
     """
     rows: list[slice] = []
     of_trial: list[int] = []
@@ -256,10 +257,10 @@ def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Mot
     return KeptItems(parts, MOST_OF_TRIALS), of_trial
 
 
-def _cut(times: Sequence[Array], ends_s: Sequence[float], band: Band) -> _Blocks:
-    """Thinned samples at ``times``, by trial, each (K,), s, in blocks of `_BLOCK_S`.
+def _lay_out_blocks(times: Sequence[Array], ends_s: Sequence[float], band: Band) -> _Blocks:
+    """Divide the thinned samples, at ``times`` (K,) by trial, s, into blocks of `_BLOCK_S`.
 
-    The margins of the low-pass belong to the blocks beside them.
+    The first and last block of a trial include the margins of the low-pass.
     """
     rows = max(1, round(_BLOCK_S * band.rate_hz / band.step))
     block, trial, starts, ends = [], [], [], []
@@ -277,9 +278,9 @@ def _cut(times: Sequence[Array], ends_s: Sequence[float], band: Band) -> _Blocks
 
 
 def _robust_residual(stacked: Stacked, blocks: _Blocks) -> Array:
-    """The residual (N, n_q) with parameters that a few wild blocks do not move.
+    """The residual (N, n_q) of a robust fit, which a few outlying blocks do not move.
 
-    Blocks are weighted down as Cauchy's distribution has it, in units of the median block.
+    Blocks have Cauchy weights, in units of the median block.
     """
     error = stacked.residual
     count = stacked.slope.shape[2]
@@ -300,17 +301,17 @@ def _robust_residual(stacked: Stacked, blocks: _Blocks) -> Array:
 
 
 def _candidates(mean_square: Array, whole: Array, blocks: _Blocks) -> list[tuple[int, int]]:
-    """First and last block of every stretch whose error (B,) stands far above the rest's.
+    """First and last block of every stretch whose error (B,) is far above that of the rest.
 
-    The rest is what is left without such stretches and all that are larger. A stretch goes on
-    through turns as long as the whole error, theirs included, does.
+    The rest excludes the stretch itself and all larger ones. A stretch extends through reversals
+    while ``whole``, the error that includes reversals, stays high.
     """
     size = np.nan_to_num(mean_square)
     known = np.isfinite(mean_square)
     if not known.any():
         return []
     loud = _loud(mean_square) | _loud(whole)
-    # Blocks that are mostly at rest are unknown: what lies beside a stretch belongs to it.
+    # Blocks mostly at rest have no known error: beside a stretch, they count as part of it.
     for _ in range(_UNKNOWN):
         beside = np.zeros_like(loud)
         beside[1:] |= loud[:-1] & (blocks.trial[1:] == blocks.trial[:-1])
@@ -336,18 +337,18 @@ def _candidates(mean_square: Array, whole: Array, blocks: _Blocks) -> list[tuple
 
 
 def _loud(mean_square: Array) -> Flags:
-    """Which blocks (B,) stand above the lowest of them."""
+    """Blocks (B,) well above the mean of the lowest 1 - `_MOST` of them."""
     known = np.sort(mean_square[np.isfinite(mean_square)])
     lowest = known[: int(np.ceil((1.0 - _MOST) * known.size))].mean()
     return np.asarray(np.nan_to_num(mean_square) > _EDGE**2 * lowest)
 
 
 def _repeated_share(state: Array, error: Array, inside: Flags, others: Flags) -> tuple[bool, float]:
-    """Whether the motion of a stretch comes back, and the share of its squared error that does.
+    """Whether the motion of a stretch recurs, and the fraction of its squared error that recurs.
 
     Args:
-        state: (N, k) position, rate, and what else the error may depend on; error: (N,).
-        inside: the stretch; others: what it is held against.
+        state: (N, k) position, rate and other quantities on which the error may depend.
+        error: (N,); inside: the samples of the stretch; others: those to compare them with.
     """
     places = state / np.maximum(state[others].std(axis=0), np.finfo(float).tiny)
     places[:, 1] = np.arcsinh(_SLOWLY * places[:, 1]) / np.arcsinh(_SLOWLY)

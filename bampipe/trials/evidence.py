@@ -26,8 +26,8 @@ from bampipe.trials.residuals import ModelOnTrial, problem_of, rms
 from bampipe.trials.scale import log_scale, slopes_by_force
 
 _CONVERGED = 1e-8
-"""Change of the negative log likelihood a sample at which a fit ends: a hundredth of a
-standard deviation of a parameter over ten thousand samples, and no digit of an error."""
+"""Change of the negative log likelihood per sample at which a fit ends: a hundredth of a
+parameter's standard deviation over ten thousand samples."""
 
 
 @dataclass(frozen=True)
@@ -36,21 +36,20 @@ class Evidence:
 
     Attributes:
         p: parameters at which it is linearised, (n_p,).
-        joined: the trials as one where they are short, see `join_short`; each else.
+        joined: the trials, joined into one if they are short; see `join_short`.
         folds: which trials were fitted, and which are left out together.
         residual: low-passed and thinned, by trial, each (K, n_q), N.m or N.
-        jacobian: derivative of ``residual`` by the free parameters, by trial, (K, n_q, n_free);
-            of what is measured where parameters multiply it, see `as_measured`.
-        used: which samples count, by trial, (K, n_q), see `standstill`; the others are zero in
-            ``residual`` and ``jacobian``.
-        free: indices of the parameters that are estimated.
+        jacobian: derivative of ``residual`` by the free parameters, by trial, (K, n_q, n_free); of
+            the measured quantity if parameters multiply it, see `as_measured`.
+        used: which samples count, by trial, (K, n_q), see `standstill`; ``residual`` and
+            ``jacobian`` are zero elsewhere.
+        free: indices of the estimated parameters.
         lower, upper: bounds of their change, (n_free,).
-        precision, known: what is known of their change beforehand, (n_free,); see
+        precision, known: precision and mean of the prior of their change, (n_free,); see
             `NormalEquations`.
-        timing: least and largest change of the time by which inputs were sampled after positions,
-            s; both zero where that is not open.
-        factors: by which parameters multiply the measured force of each axis, (n_q,), as a torque
-            constant does a current; nothing where none does.
+        timing: smallest and largest change of the input delay, s; both zero if it is not fitted.
+        factors: absolute parameters that multiply the measured force of each axis, (n_q,), as a
+            torque constant multiplies a current; empty if there are none.
     """
 
     system: System
@@ -72,9 +71,9 @@ class Evidence:
 
     @property
     def slopes(self) -> Iterable[Array]:
-        """By trial, `jacobian` and, where the timing is open, `by_timing` behind it, (K, n_q, n).
+        """By trial, `jacobian`, followed by the column `by_timing` if the delay is fitted.
 
-        Joined anew each time: kept, it would double the memory that an evidence takes.
+        They are joined on each access: stored, they would double the memory of an `Evidence`.
         """
         if not self.by_timing:
             return self.jacobian
@@ -83,24 +82,24 @@ class Evidence:
 
     @cached_property
     def fitted(self) -> tuple[ModelOnTrial, ...]:
-        """The model on each of the trials."""
+        """The model on each trial."""
         return _on_each(self.system, self.p, self.motions)
 
     @cached_property
     def along(self) -> tuple[ModelOnTrial, ...]:
-        """The model along `joined`."""
+        """The model on `joined`."""
         return _on_each(self.system, self.p, self.joined)
 
     def thin(self, of: Callable[[ModelOnTrial], Array]) -> list[Array]:
-        """What a function (T, n_q) of `along` gives, low-passed and thinned, by trial."""
+        """Apply a function (T, n_q) to the model on `joined`; low-pass and thin it, by trial."""
         rows = (x[part] for at in self.along for x in [of(at)] for part in at.motion.parts)
         return self.band.thin_trials(rows, range(len(self.system.coordinates)))
 
     @cached_property
     def by_timing(self) -> tuple[Array, ...]:
-        """Derivative of `residual` by the time by which inputs were sampled late, N.m/s or N/s.
+        """Derivative of `residual` by the input delay, N.m/s or N/s, by trial, each (K, n_q).
 
-        By trial, each (K, n_q); nothing where that is not open, or a delay has its place.
+        Empty if the delay is not fitted, or if the model has a delay of its own.
         """
         step = 0.25 * (self.timing[1] - self.timing[0])
         if step == 0.0 or self.system.takes_timing:
@@ -118,15 +117,15 @@ class Evidence:
 
     @cached_property
     def slopes_by_force(self) -> tuple[Array, ...]:
-        """What `scale.slopes_by_force` returns of `joined`, each (K, n_q, n_forces)."""
+        """`scale.slopes_by_force` on `joined` at the fit, each (K, n_q, n_forces)."""
         each = slopes_by_force(self.system, self.joined, self.band, [self.p])
         return tuple(slope[..., 0] for slope in each)
 
     @cached_property
     def log_scale(self) -> tuple[Array, Array]:
-        """Mean log of what the effects leave of the measured quantity, and its slopes.
+        """Mean log of the fraction of the measured quantity that the effects leave, and its slopes.
 
-        See `scale.log_scale`, (n_q,) and (n_q, n), by the same parameters as `slopes`.
+        See `scale.log_scale`: (n_q,), and (n_q, n) by the same parameters as `slopes`.
         """
         value, slopes = log_scale(
             self.system, self.joined, self.band, self.used, self.p, self.free,
@@ -136,7 +135,7 @@ class Evidence:
 
     @property
     def sizes(self) -> list[int]:
-        """Samples of each trial that its residual stands for."""
+        """Samples before thinning that the residual of each trial represents."""
         return [len(residual) * self.band.step for residual in self.residual]
 
     @cached_property
@@ -148,7 +147,7 @@ class Evidence:
 
     @cached_property
     def weight(self) -> Array:
-        """Weight of the squares of each axis: one over the mean square where it was fitted."""
+        """Weight of the squares of each axis: one over the mean square on the fitted trials."""
         fitted = self.sums.subset(self.folds.fitted_trials)
         mean = fitted.yy.sum(axis=0) / np.maximum(fitted.count.sum(axis=0), 1.0)
         return np.asarray(1.0 / np.maximum(mean, 1e-24))
@@ -169,21 +168,18 @@ def gather_evidence(
     like: Evidence | None = None,
     timing: tuple[float, float] = (0.0, 0.0),
 ) -> Evidence:
-    """Fit a model to the fitted trials by least squares and linearise it there on all.
+    """Fit a model to the fitted trials, from parameters (n_p,), and linearise it on all trials.
 
-    Args:
-        start: parameters to start from, (n_p,).
-        like: a model with some more effects or some less, where that has been fitted: slopes that
-            are the same for both are taken from it.
-        timing: least and largest change of the inputs' timing, s, that may be weighed beside it.
+    ``like`` is a fitted model with more or fewer effects, whose slopes are reused where both agree;
+    ``timing`` limits the change of the input delay, s.
 
     Raises:
-        ValueError: fewer samples than parameters, where steps are to be taken.
+        ValueError: fewer samples than parameters, if a fit is requested.
     """
     if like is not None and (like.motions is not motions or like.band != band):
         like = None
     joined = like.joined if like is not None else join_short(motions)
-    # To be linearised, all trials can be taken at once.
+    # Without a fit, all trials can be linearised at once.
     taken, fitted = (motions, folds.fitted_trials) if most_iterations else (joined, [0])
     problem = problem_of(system, taken, band)
     known = None if like is None else _common_slopes(like, system, problem)
@@ -214,7 +210,7 @@ def gather_evidence(
 
 
 def _factors(problem: Problem, p: Array, axes: int) -> tuple[float, ...]:
-    """`Evidence.factors`."""
+    """Absolute values of the parameters that multiply the forces, see `Evidence.factors`."""
     if problem.multiplied is None:
         return ()
     found = np.ones(axes)
@@ -229,10 +225,10 @@ def _on_each(system: System, p: Array, motions: Sequence[Motion]) -> tuple[Model
 
 
 def _common_slopes(like: Evidence, system: System, problem: Problem) -> KnownSlopes | None:
-    """The slopes by parameters that two models share and that are the same for both.
+    """The slopes by shared parameters that are the same in both models.
 
-    A slope that no parameter changes is that of the model without any effect. None are where other
-    samples stand still for the one than for the other, as where a brake counts.
+    A slope that depends on no parameter is the same with and without any effect. None are shared if
+    standstill differs between the models, as it does if only one of them reads a brake.
     """
     brakes = {*system.model.device.brakes.values()}
     if brakes & {*system.inputs} != brakes & {*like.system.inputs}:

@@ -1,4 +1,4 @@
-"""Which trials a fit may see, which are left out together, and which count in the verdict."""
+"""Division of trials into those to fit, groups to leave out together, and those to judge."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 HELD_OUT = -1
-"""Group of the trials that the session holds out."""
+"""Group number of trials that the session holds out."""
 MOST_GROUPS = 10
-"""With more trials than this, they are left out in so many groups: the cost of leaving each out
-alone grows with the square of their number."""
+"""Largest number of groups left out in turn: the cost grows with its square."""
 
 
 @dataclass(frozen=True)
 class Folds:
-    """How the trials of a session are held out.
+    """Division of a session's trials for fits and held-out errors.
 
     Attributes:
-        groups: number of the group of each trial; those of a group are left out together, those
-            in `HELD_OUT` are never fitted.
+        groups: group number of each trial. The trials of a group are left out together; those in
+            `HELD_OUT` are never fitted.
         fitted: whether a fit may see each trial.
         judged: whether each trial counts in the held-out error.
     """
@@ -28,24 +27,20 @@ class Folds:
     judged: tuple[bool, ...]
 
     @classmethod
-    def of_groups(cls, groups: Sequence[int], fitted: Sequence[bool]) -> Folds:
-        """Judge by the trials that the session holds out, else by all in turn."""
-        held = [group == HELD_OUT for group in groups]
-        return cls(tuple(groups), tuple(fitted), tuple(held) if any(held) else (True,) * len(held))
-
-    @classmethod
     def of_trials(
         cls, names: Sequence[str], held_out: Collection[str], fitted: Collection[str]
     ) -> Folds:
-        """Leave each trial out alone, or in `MOST_GROUPS` groups where there are more."""
-        groups = [
-            HELD_OUT if name in held_out else number % MOST_GROUPS
-            for number, name in enumerate(names)
-        ]
-        return cls.of_groups(groups, [name in fitted for name in names])
+        """Give each trial a group of its own, or divide them into `MOST_GROUPS` groups.
+
+        The trials that the session holds out judge the model; if there are none, all do.
+        """
+        held = [name in held_out for name in names]
+        groups = (HELD_OUT if out else number % MOST_GROUPS for number, out in enumerate(held))
+        judged = held if any(held) else [True] * len(held)
+        return cls(tuple(groups), tuple(name in fitted for name in names), tuple(judged))
 
     def subset(self, trials: Sequence[int]) -> Folds:
-        """The same of some trials, given by number."""
+        """The division of some of the trials, given by number."""
         return Folds(
             tuple(self.groups[k] for k in trials),
             tuple(self.fitted[k] for k in trials),
@@ -54,10 +49,10 @@ class Folds:
 
     @property
     def fitted_trials(self) -> list[int]:
-        """Numbers of the trials that a fit sees."""
+        """Numbers of the trials that a fit may see."""
         return [k for k, fits in enumerate(self.fitted) if fits]
 
     @property
     def nothing_held_out(self) -> bool:
-        """Whether there is one group only, so that the error is that of the fit."""
+        """Whether all trials are in one group, so that the held-out error is that of the fit."""
         return len(set(self.groups)) == 1

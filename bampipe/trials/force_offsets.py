@@ -1,7 +1,8 @@
-"""Forces zeroed anew in each trial: how far each trial's zero is from that of the others.
+"""Force zeros that differ between trials, because the sensor was zeroed anew before each.
 
-A sensor that is zeroed wherever the machine happens to stand takes the load of that pose off the
-whole trial. One offset for all trials leaves most of that, and it passes for weight or friction.
+Zeroing a sensor under load, in whatever pose the machine stands, removes the load of that pose from
+the whole trial. A single offset for all trials leaves most of this error, which then appears as
+weight or friction.
 """
 
 from __future__ import annotations
@@ -19,28 +20,28 @@ from bampipe.trials.motion import Motion, trial_names
 from bampipe.trials.residuals import fit_device, rms
 
 _PARTS = 6
-"""Of a trial, from which its offset is found once more each: they tell its standard error."""
+"""Parts of a trial: the scatter of the offsets found from each gives the standard error."""
 _PLAIN = 5.0
-"""Median size of the offsets over their standard errors, the least."""
+"""Smallest median ratio of the offsets to their standard errors at which they are applied."""
 _LEAVES = 0.7
-"""Share of the mean squared error that offsets by trial leave, the most."""
+"""Largest fraction of the mean squared error that may remain with an offset for each trial."""
 _TOLD, _STILL_TOLD = 1e-3, 0.1
-"""Share of its slope beside one offset for all by which a parameter is told at all, and of that,
-what is left beside offsets by trial, the least: trials that each go one way, or each in a pose of
-their own, tell no offset."""
+"""Identifiability of the other parameters. `_TOLD`: fraction of a parameter's information that must
+remain beside a common offset for it to count as identifiable. `_STILL_TOLD`: fraction of that which
+must remain beside offsets by trial. Trials in a single direction or pose cannot determine them."""
 
 
 def find_force_offsets(
     system: System, motions: Sequence[Motion], band: Band, fitted: Sequence[int]
 ) -> dict[str, dict[str, float]]:
-    """Find what the forces of each trial read too much, against the mean of the trials fitted.
+    """Find the force offset of each trial relative to the mean over the fitted trials.
 
-    Offsets are found beside the parameters of the bare device, so that these do not take them up.
-
-    A fit sees the trials numbered ``fitted``; others get their own by what these found.
+    Offsets and parameters of the bare device are fitted together, so that neither absorbs the
+    other. Only the trials numbered ``fitted`` determine the parameters; the other trials get their
+    offsets with these parameters.
 
     Returns:
-        N or N.m by force, by trial; empty where offsets by trial are not plain.
+        Offsets to subtract, N or N.m, by trial and force; empty if they are not significant.
     """
     forces = system.model.device.forces
     if len(fitted) < 2 or not forces or not (found := fit_device(system, motions, band, fitted)):
@@ -77,13 +78,14 @@ def find_force_offsets(
 
 @dataclass(frozen=True)
 class _Trial:
-    """What one trial says of its offsets, linear in a step of the free parameters and 1.
+    """Least-squares offsets of one trial, as linear functions of the parameter step and 1.
 
     Attributes:
-        offset: (n_force, n_free + 1) that offsets are; parts: of each of its parts, the same.
-        whole: (n_free + 1, n_free + 1) sums of squares and products of slopes and residual, in
-            units of the error of each axis; own: the same beside its offsets.
-        common: (n_force, n_free + 1) and (n_force, n_force) what one offset for all needs of it.
+        offset: (n_force, n_free + 1) coefficients of the offsets; parts: the same for each part.
+        whole: (n_free + 1, n_free + 1) products of slopes and residual, in units of the error of
+            each axis; own: the same after the trial's offsets have been projected out.
+        common: (n_force, n_free + 1) and (n_force, n_force), the products from which a common
+            offset of several trials is projected out.
     """
 
     offset: Array
@@ -96,7 +98,7 @@ class _Trial:
     def of(
         cls, system: System, motion: Motion, band: Band, one: Stacked, p: Array, size: Array
     ) -> _Trial:
-        """From what `stacked_residual` gave."""
+        """Compute the coefficients of a trial from the residual and slopes of its fit."""
         rows = band.thinned_rows(motion.t.size)
         gains = system.input_map(motion.q[rows], motion.inputs(system.inputs)[rows], p)
         weight = (one.used / size)[:, :, None]
@@ -118,13 +120,13 @@ class _Trial:
         )
 
     def error(self, step: Array) -> Array:
-        """Standard errors of the offsets, (n_force,), by its parts."""
+        """Standard errors of the offsets from their scatter over the parts, (n_force,)."""
         sd = np.std(self.parts @ step, axis=0, ddof=1) / np.sqrt(_PARTS)
         return np.asarray(np.maximum(sd, np.finfo(float).tiny))
 
 
 def _still_told(trials: Sequence[_Trial], own: Array, whole: Array) -> bool:
-    """Whether offsets by trial leave what one offset for all leaves to tell the parameters."""
+    """Whether parameters identifiable beside a common offset remain so beside one by trial."""
     across = np.sum([one.common[0] for one in trials], axis=0)
     squared = np.sum([one.common[1] for one in trials], axis=0)
     common = np.diag(whole - across.T @ np.linalg.lstsq(squared, across, rcond=1e-9)[0])[:-1]

@@ -1,4 +1,4 @@
-"""Items of a session, such as its trials: in memory if they are few, else in a temporary file."""
+"""Sequences of large items, such as trials: in memory if small, otherwise in a temporary file."""
 
 import os
 import pickle
@@ -15,23 +15,17 @@ Item = TypeVar("Item")
 Value = TypeVar("Value")
 
 MOST_OF_TRIALS = 100_000_000
-"""Bytes of trials in memory at most, half a million samples: all of a usual session."""
+"""Limit for trials in memory, bytes: half a million samples, which few sessions exceed."""
 _MOST = 10_000_000
-"""Bytes at most of what is computed from them, of which there are many."""
+"""Limit for each quantity computed from the trials, bytes: there are many of these."""
 
 
 class KeptItems(Sequence[Item], Generic[Item]):
-    """A sequence that lies on disk, all but the item asked for last, where it takes much memory.
+    """A sequence that moves to disk when it exceeds ``most`` bytes; the last item read stays.
 
-    What comes back is bit by bit the same. The file has no name: it goes with the last process that
-    holds it, however that ends.
-
-    Args:
-        items: can be pickled.
-        most: bytes in memory at most.
-
-    Raises:
-        InputError: there is no room for temporary files.
+    Items are picklable, and bitwise identical when read back. The file has no name: it disappears
+    with the last process that holds it, however that process ends. If there is no room for it,
+    `InputError` is raised.
     """
 
     def __init__(self, items: Iterable[Item], most: int = _MOST) -> None:
@@ -81,28 +75,28 @@ class KeptItems(Sequence[Item], Generic[Item]):
         return item
 
     def __iter__(self) -> Iterator[Item]:
-        # Whoever goes through all holds one at a time: none stays behind.
+        # Iteration holds one item at a time and leaves none in memory.
         return map(self._read, range(len(self))) if self._places else iter(self._items)
 
     def _read(self, place: int) -> Any:
         at, sizes = self._places[place]
         parts = [np.empty(size, dtype=np.uint8).data for size in sizes]
         for part in parts:
-            # By place, not from where the file is: worker processes share that.
+            # Read at an explicit position: worker processes share the file offset.
             while part:
                 count = os.preadv(self._file, [part], at)
                 part, at = part[count:], at + count
         return pickle.loads(parts[0], buffers=parts[1:])
 
     def each(self, of: Callable[[Item], Value]) -> list[Value]:
-        """What a function gives of each item; called once only."""
+        """Apply a function to each item; the values are cached by function."""
         if of not in self._known:
             self._known[of] = [of(item) for item in self]
         return self._known[of]
 
 
 def _serialise(item: object) -> list[memoryview]:
-    """An item as bytes: how it is put together, then its arrays, which are not copied."""
+    """Pickle an item: the object structure first, then its arrays, which are not copied."""
     buffers: list[pickle.PickleBuffer] = []
     head = pickle.dumps(item, pickle.HIGHEST_PROTOCOL, buffer_callback=buffers.append)
     return [memoryview(head), *(buffer.raw() for buffer in buffers)]

@@ -1,7 +1,7 @@
-"""The filters that every trial goes through, measured or replayed: one way from readings to motion.
+"""The filters that turn readings into motion, the same for measured trials and replicates.
 
-Positions are differentiated axis by axis as ``filter/filter.json`` says; the inputs themselves are
-not filtered, their time derivatives are band-limited.
+Positions are differentiated by axis as ``filter/filter.json`` states. The inputs themselves are not
+filtered; their time derivatives are band-limited.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from bampipe.trials.motion import TIMING_ORDERS, Motion, Recording, input_deriva
 
 @dataclass(frozen=True)
 class AxisFilter:
-    """How the positions of one axis are differentiated.
+    """The filter that differentiates the positions of one axis.
 
     Attributes:
         bandwidth_hz: half-power frequency, Hz.
@@ -71,7 +71,7 @@ class Kinematics:
         return butterworth.smooth(position, self.rate_hz, chosen.bandwidth_hz, chosen.noise_sd)
 
     def derivatives_of(self, axis: int, signal: Array) -> tuple[Array, Array, Array]:
-        """What `differentiate` adds for a signal (T,) that is added to the readings."""
+        """Motion that a signal (T,) adds if it is added to the readings; see `differentiate`."""
         name = list(self.axes)[axis]
         if self.method == "kalman":
             return kalman_smoother.smooth_mean(signal, self._motion_model(name))
@@ -92,12 +92,12 @@ class Kinematics:
         smooth_inputs: Sequence[str],
         wanted: Collection[str] | None = None,
     ) -> Motion:
-        """Filter a recording the way every recording, measured or replayed, is filtered.
+        """Filter a recording, measured or simulated.
 
         Args:
-            smooth_inputs: the channels that have time derivatives.
-            wanted: inputs of the only model that sees the motion: of the derivatives, those that it
-                takes and some more, by which they are moved in time; all by default.
+            smooth_inputs: channels that have time derivatives.
+            wanted: inputs of the only model that will see the motion. Only their derivatives are
+                computed, and those needed to shift them in time; by default all are.
         """
         moved = [self.differentiate(axis, recording.q[:, i]) for i, axis in enumerate(self.axes)]
         channels = dict(recording.channels)
@@ -108,13 +108,7 @@ class Kinematics:
                 names = names[: max(taken, default=0) + TIMING_ORDERS]
             rates = self.input_rates(recording.channels[name], len(names))
             channels |= dict(zip(names, rates, strict=True))
-        return Motion(
-            recording.trial_id,
-            np.arange(len(recording.q)) / self.rate_hz,
-            np.column_stack([m.position for m in moved]),
-            np.column_stack([m.velocity for m in moved]),
-            np.column_stack([m.acceleration for m in moved]),
-            np.column_stack([m.velocity_sd for m in moved]),
-            channels,
-            filters=self,
-        )
+        parts = ("position", "velocity", "acceleration", "velocity_sd")
+        q, qd, qdd, qd_sd = (np.column_stack([getattr(m, x) for m in moved]) for x in parts)
+        t = np.arange(len(recording.q)) / self.rate_hz
+        return Motion(recording.trial_id, t, q, qd, qdd, qd_sd, channels, filters=self)

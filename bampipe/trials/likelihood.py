@@ -1,18 +1,17 @@
-"""The likelihood of what was measured, given a model: the one by which everything is judged.
+"""The likelihood of the measured quantity under a model, by which all models are judged.
 
-Of the samples of an axis that count, in the words of docs/method_residual:
+For each sample of an axis that counts, with the symbols of docs/method_residual.md:
 
     y = f(motion; theta) + beta b + gamma c + e
     var e ~ s^2 (v(z) + tau^2 (b^2 + g^2 c^2) + h^2 + (delta F)^2), with the tails of Student's t
 
-It is that of the measured quantity: with the log of what the model's effects leave of it, see
-`scale`. y is what the fitted model leaves, low-passed; b the mean of replays of the model (what
-filters do to its residual where friction turns, which the measurement shares); c the residual of a
-replay whose friction truly stops the machine where it turns, and g a first guess of its factor; v
-what single replays leave around b, by speed; h what friction is off because no log says when
-between two samples a machine turns; F the applied force; s a scale of each axis, which is found
-with the rest. Parameters have their priors and bounds; so have the nuisance parameters: the factors
-beta and gamma of each axis, and the time by which inputs were sampled late.
+y is the low-passed residual of the fitted model; b the common bias, the mean of replicates; c the
+stopping bias, the residual of a replicate whose friction truly stops the axis, and g a first guess
+of its factor gamma; v the variance of replicates around b in classes z of speed; h the uncertainty
+of dry friction because the instant of a reversal between two samples is unknown; F the applied
+force; s the scale of the axis, which is fitted. Parameters have priors and bounds, and so have the
+nuisance parameters: beta and gamma of each axis, and the input delay. The density is that of the
+measured force: `scale` gives the change of variables from the residual.
 """
 
 from __future__ import annotations
@@ -31,28 +30,28 @@ from bampipe.trials.kept import KeptItems
 from bampipe.trials.scale import bare_slopes
 
 _SPEEDS = 12
-"""Classes of speed in which the variance of replays is averaged, finer where an axis is slow."""
+"""Classes of speed in which the variance of replicates is averaged, finer at low speeds."""
 _LEAST = 1e-3
-"""Of the mean variance: no sample weighs more than a thousand average ones."""
+"""Smallest variance relative to the mean: no sample weighs more than a thousand average ones."""
 NOTHING = 1e-4
-"""Standard deviations by which a parameter moves what is measured over all of its range: none."""
+"""A parameter whose whole range moves the data by fewer standard deviations has no effect."""
 _DETERMINED = 1e-9
-"""Of the largest eigenvalue of the scaled normal equations, below which a direction of the model's
-own parameters is not determined by the trials, and stays."""
+"""A direction of the model's parameters is undetermined, and keeps its value, if its eigenvalue of
+the scaled normal equations is below this fraction of the largest."""
 _LOOSE = 1e-6
-"""Of a parameter in units of its uncertainty, from which on a direction without effect moves it."""
+"""Smallest part of a parameter, in its standard deviations, in a direction without effect."""
 _SLOW = 3.0
-"""Sign widths: slow motion, in which dry friction is as large as it gets."""
+"""Speed in sign widths that counts as slow, where dry friction is fully developed."""
 _MOST_STOPPING = 1.5
-"""Largest factor of the residual of a replay that truly stops."""
+"""Upper bound of gamma, the factor of the stopping bias."""
 _TOGETHER = 100_000
-"""Rows of columns that are weighted at once."""
+"""Rows of columns that are weighted in one pass."""
 _FREQUENCIES = 256
-"""At which the share of white noise that a low-pass leaves is summed."""
+"""Frequencies over which the power of white noise behind a low-pass is averaged."""
 _RIDGE = 1e-10
 _PASSES, _REWEIGHTS = 8, 5
 _STEADY = 0.02
-"""Relative change of the weights up to which they are done: the cost changes by its square."""
+"""Relative change of the weights at convergence; the cost changes by its square."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,9 @@ class Samples:
     """The samples of one axis that count, of all trials in order.
 
     Attributes:
-        rows: their places among the thinned samples of all trials, (n,).
-        trial: number of the trial of each; block: of the stretch of time, both (n,).
-        independent: how many independent ones they are.
+        rows: indices among the thinned samples of all trials, (n,).
+        trial: number of each sample's trial; block: number of its block of time; both (n,).
+        independent: the equivalent number of independent samples.
     """
 
     rows: Indices
@@ -71,7 +70,7 @@ class Samples:
     independent: float
 
     def take(self, values: Iterable[Array], axis: int) -> Iterator[Array]:
-        """By trial, the rows of one axis, (k,) or (k, m), of values, each (K, n_q[, m])."""
+        """Yield the rows of one axis, (k,) or (k, m), of each trial's values (K, n_q[, m])."""
         end = 0
         for each in values:
             first, end = end, end + len(each)
@@ -80,7 +79,7 @@ class Samples:
 
 
 def lay_out_samples(evidence: Evidence, block_s: float) -> tuple[Samples, ...]:
-    """Return the samples of each axis that count; blocks of ``block_s`` seconds are numbered."""
+    """Return the samples of each axis that count, divided into blocks of ``block_s`` seconds."""
     band, sizes = evidence.band, [len(r) for r in evidence.residual]
     trial = np.repeat(np.arange(len(sizes), dtype=np.int32), sizes)
     seconds = np.concatenate([np.arange(n) * band.step / band.rate_hz for n in sizes])
@@ -95,12 +94,12 @@ def lay_out_samples(evidence: Evidence, block_s: float) -> tuple[Samples, ...]:
 
 
 def take_samples(values: Iterable[Array], samples: Samples, axis: int) -> Array:
-    """Return the rows of one axis, (n,) or (n, m), of values by trial, each (K, n_q[, m])."""
+    """Return the rows of one axis, (n,) or (n, m), of the trials' values, each (K, n_q[, m])."""
     return np.concatenate([*samples.take(values, axis)])
 
 
-def _join(parts: Iterable[Array]) -> Iterator[tuple[slice, Array]]:
-    """Arrays one below the other, `_TOGETHER` rows or a few more at a time, and which rows."""
+def _stack_chunks(parts: Iterable[Array]) -> Iterator[tuple[slice, Array]]:
+    """Yield the stacked arrays in chunks of `_TOGETHER` rows or a few more, with their rows."""
     few, end, size = list[Array](), 0, 0
     for part in parts:
         few, size = [*few, part], size + len(part)
@@ -113,13 +112,13 @@ def _join(parts: Iterable[Array]) -> Iterator[tuple[slice, Array]]:
 
 @dataclass(frozen=True)
 class Noise:
-    """What replays of a fitted model leave, which lacks nothing.
+    """Statistics of the residuals of replicates, which lack nothing.
 
     Attributes:
-        bias: their mean at each sample, by axis, each (n,), N.m or N.
-        variance: of what single replays leave around it, smoothed by speed, each (n,).
-        stopping: of a replay without noise whose friction truly stops it, each (n,).
-        residuals: of each replay, by axis, each (replays, n).
+        bias: mean of the replicates at each sample, by axis, each (n,), N.m or N.
+        variance: variance of the replicates around it, averaged by speed, each (n,).
+        stopping: stopping bias, of a noise-free replicate whose friction truly stops, each (n,).
+        residuals: by axis, each (replicates, n).
         speed: class of speed of each sample, by axis, each (n,).
     """
 
@@ -130,10 +129,10 @@ class Noise:
     speed: Sequence[Indices]
 
     def variance_of_bias(self, axis: int, y: Array) -> Array:
-        """How far the bias of a residual ``y``, (n,), may be off, for a relative error of one.
+        """Variance of the biases in a residual ``y`` (n,) for a relative error of one, (n,).
 
-        Half of it where the replays have it, half wherever the axis is as slow: where exactly a
-        machine turns, no replay knows.
+        Half of it applies at the sample itself, and half is spread over samples of the same speed,
+        because no replicate reverses at exactly the right instant.
         """
         b, c, at = self.bias[axis], self.stopping[axis], self.speed[axis]
         both = np.column_stack([b, c]) / np.sqrt(self.variance[axis] + 1e-300)[:, None]
@@ -143,13 +142,6 @@ class Noise:
         count = np.maximum(np.bincount(at, minlength=_SPEEDS), 1)
         return np.asarray(0.5 * (square + (np.bincount(at, square, minlength=_SPEEDS) / count)[at]))
 
-    def without(self, replay: int) -> tuple[Array, ...]:
-        """The bias by all replays but one."""
-        n = len(self.residuals[0])
-        return tuple(
-            (n * b - r[replay]) / (n - 1) for b, r in zip(self.bias, self.residuals, strict=True)
-        )
-
 
 def describe_noise(
     residuals: Sequence[Array],
@@ -157,12 +149,12 @@ def describe_noise(
     evidence: Evidence,
     samples: Sequence[Samples],
 ) -> Noise:
-    """Return the noise that replays show.
+    """Compute the statistics of replicates.
 
     Args:
-        residuals: of replays, by trial, each (K, n_q, replays).
-        stopping: of one whose friction truly stops it, by trial, each (K, n_q).
-        evidence: the model on the measured trials; samples: of it that count.
+        residuals: of the replicates, by trial, each (K, n_q, replicates).
+        stopping: of one whose friction truly stops the axes, by trial, each (K, n_q).
+        evidence: the model on the measured trials; samples: those of it that count.
     """
     thinned = evidence.band.thinned_rows
     speeds = [np.abs(m.qd[thinned(len(m.t))]) for m in evidence.motions]
@@ -186,17 +178,17 @@ def describe_noise(
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Weights of the samples of a session and the nuisance columns of its model.
+    """Weights of a session's samples, and the statistics of the replicates behind them.
 
     Attributes:
-        samples: of each axis that count; noise: of replays.
+        samples: of each axis, those that count; noise: statistics of the replicates.
         root: one over the standard deviation of each sample, by axis, each (n,).
-        bias_variance: how far the bias may be off where the machine turns, by axis, each (n,).
+        bias_variance: variance due to errors of the biases and of the instants of reversals, by
+            axis, each (n,).
         applied: the applied force, by axis, each (n,), N.m or N.
-        model: that was weighted, without its residual and slopes.
+        model: the weighted model, without its residual and slopes.
         force_sd: noise of each measured force, (n_forces,), in its unit.
-        discrepancy: of any model, relative.
-        factors: of what is measured where the weights are those of the residual; see `Evidence`.
+        discrepancy: relative error that any model may have.
     """
 
     samples: tuple[Samples, ...]
@@ -207,7 +199,6 @@ class Likelihood:
     model: Evidence
     force_sd: Array
     discrepancy: float
-    factors: tuple[float, ...] = ()
 
     @classmethod
     def of(
@@ -219,7 +210,7 @@ class Likelihood:
         discrepancy: float,
         force_sd: Array,
     ) -> Likelihood:
-        """Weight samples by the noise of replays, the error of their bias and any model's.
+        """Weight samples by the noise of replicates, the error of the biases and the discrepancy.
 
         Args:
             force_sd: noise of each measured force, (n_forces,), in its unit.
@@ -237,14 +228,14 @@ class Likelihood:
             of_bias = of_bias + take_samples(turning, here, axis) ** 2
             variance = noise.variance[axis] + of_bias + (discrepancy * f) ** 2
             least = _LEAST * float(variance.mean()) if variance.size else 0.0
-            # Where nothing scatters, all samples weigh alike.
+            # Without any scatter, all samples have equal weight.
             root.append(1.0 / np.sqrt(np.maximum(variance, least)) if least else np.ones(len(f)))
             force.append(f)
             bias_variance.append(of_bias)
         model = replace(e, residual=(), jacobian=(), used=())  # their memory
         return cls(
             samples, noise, KeptItems(root), KeptItems(bias_variance), KeptItems(force), model,
-            force_sd, discrepancy, e.factors,
+            force_sd, discrepancy,
         )  # fmt: skip
 
     @cached_property
@@ -257,7 +248,7 @@ class Likelihood:
 
     @cached_property
     def force_share(self) -> tuple[Array, ...]:
-        """Share of the noise of each sample that is that of the measured forces, by axis, (n,)."""
+        """Fraction of each sample's variance that is due to force noise, by axis, (n,)."""
         band, found = self.model.band, list[Array]()
         white = band.passed_power(_FREQUENCIES).mean(axis=0) / band.step
         parts = zip(
@@ -270,13 +261,10 @@ class Likelihood:
         return tuple(found)
 
     def with_equal_weights(self, problem: Problem, lacking: float) -> Likelihood:
-        """The same where all samples of an axis weigh alike on which the model lacks much.
+        """Give all samples equal weight on axes whose scale at a fit exceeds ``lacking``.
 
-        Noise of replays says nothing of an error that is many times as large. Nor is that noise: it
-        repeats with the path, and each sample counts against what is known beforehand.
-
-        Args:
-            problem: the fit, its solution at zero; lacking: scale from which on an axis does.
+        The noise of replicates says nothing about so large an error. The error is not noise either:
+        it recurs with the motion, so each sample counts as independent beside the priors.
         """
         scale = np.sqrt(problem.solve().left / problem.count)
         root, samples = list(self.root), list(self.samples)
@@ -287,13 +275,13 @@ class Likelihood:
         return replace(self, root=KeptItems(root), samples=tuple(samples))
 
     def with_heavy_tails(self, problem: Problem, tails: float) -> Likelihood:
-        """Weights of samples as under Student's t distribution, at a fit of the model.
+        """Reweight samples by Student's t distribution at a fit of the model.
 
-        A few fast reversals that no replay has would otherwise decide (Lange, Little and Taylor
-        1989, Journal of the American Statistical Association 84, 881).
+        Otherwise a few fast reversals that no replicate shows would decide (Lange, Little and
+        Taylor 1989, Journal of the American Statistical Association 84, 881).
 
         Args:
-            problem: the fit, its solution at zero; tails: degrees of freedom.
+            problem: the fit, with its solution at zero; tails: degrees of freedom.
         """
         solved, root = problem.solve(), []
         for axis, (y, base) in enumerate(zip(problem.y, problem.base, strict=True)):
@@ -303,15 +291,15 @@ class Likelihood:
         return replace(self, root=KeptItems(root))
 
     def count_independent(self, problem: Problem, lags: int) -> tuple[Samples, ...]:
-        """Count the samples of each axis that are independent in what a fit of the model leaves.
+        """Count the independent samples of each axis in the residual that a fit leaves.
 
-        What a model lacks comes back with the motion, sample after sample; noise does not, coloured
-        or white. For what goes with the motion, as the applied force does, there are fewer samples
-        by the sum of the products of both autocorrelations (Bartlett 1935, Journal of the Royal
-        Statistical Society 98, 536), over the largest that a replay has.
+        The error of a model recurs with the motion, whereas noise does not. For a quantity that
+        varies like the applied force, the number is divided by the sum over lags of the product of
+        both autocorrelations (Bartlett 1935, Journal of the Royal Statistical Society 98, 536),
+        relative to the largest such sum of a replicate.
 
         Args:
-            problem: the fit, its solution at zero; lags: the most that are summed.
+            problem: the fit, with its solution at zero; lags: how many are summed.
         """
         solved, counted = problem.solve(), []
         for axis, here in enumerate(self.samples):
@@ -323,23 +311,23 @@ class Likelihood:
 
             ours = inflation(problem.y[axis] + problem.base[axis] @ solved.base)
             noise = (self.noise.residuals[axis] - self.noise.bias[axis]) * root
-            replays = max((inflation(values) for values in noise), default=1.0)
-            counted.append(replace(here, independent=here.independent * min(replays / ours, 1.0)))
+            most = max((inflation(values) for values in noise), default=1.0)
+            counted.append(replace(here, independent=here.independent * min(most / ours, 1.0)))
         return tuple(counted)
 
-    def pose(self, evidence: Evidence) -> Problem:
-        """Weight the residual of a linearised model; join what is known of its parameters."""
+    def pose_problem(self, evidence: Evidence) -> Problem:
+        """Weight the residual and slopes of a linearised model, and add its priors."""
         samples, noise, n_q, weights = self.samples, self.noise, len(self.samples), self.root
-        if evidence.factors:  # in units of what is measured: small factors explain nothing
-            ratio = np.array(self.factors) / np.array(evidence.factors)
+        if evidence.factors:  # the unit is that of the measured force: small factors gain nothing
+            ratio = np.array(self.model.factors) / np.array(evidence.factors)
             weights = [root * by for root, by in zip(weights, ratio, strict=True)]
         timing = evidence.timing if evidence.by_timing else ()
         n = len(evidence.free) + len(timing[:1])
 
         def weighted_columns(axis: int) -> Iterator[tuple[slice, Array]]:
-            """By all unknowns, (k, n_all), a part of the rows after the other: all are large."""
+            """Yield the columns of all unknowns, (k, n_all), in chunks, since they are large."""
             bias, stopping, weight = noise.bias[axis], noise.stopping[axis], weights[axis]
-            for part, slopes in _join(samples[axis].take(evidence.slopes, axis)):
+            for part, slopes in _stack_chunks(samples[axis].take(evidence.slopes, axis)):
                 columns = np.zeros((len(slopes), n + 2 * n_q))
                 columns[:, :n] = slopes
                 columns[:, n + axis] = -bias[part]
@@ -353,7 +341,7 @@ class Likelihood:
                 out[part] = x @ to
             return out
 
-        # What lies evenly between two bounds has a standard deviation of 0.29 of their distance.
+        # The standard deviation of a uniform distribution is 0.29 of its width.
         of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
         n_timing, none = len(of_timing), np.zeros(n_q)
         precision = np.concatenate([evidence.precision, of_timing, none + 1.0, none + 1.0])
@@ -383,7 +371,7 @@ class Likelihood:
             moment[at] -= expected @ p[at]
             cost_of_known += 0.5 * float(p[at] @ expected @ p[at])
         normal = sum(products) + known_precision
-        # What changes nothing over its range stays, as a shape does whose strength is zero.
+        # Unknowns without effect over their range stay, like the shape of an effect of no strength.
         size, parameters = np.sqrt(np.diag(normal)), evidence.system.parameters
         reach = np.ones(size.size)
         reach[: len(evidence.free)] = [parameters[i].sd or 1.0 for i in evidence.free]
@@ -410,21 +398,21 @@ class Likelihood:
 
 @dataclass(frozen=True)
 class Problem:
-    """The samples of all axes in units of their noise: what is left, and the model's own columns.
+    """A weighted linear problem: the residual of all axes in units of noise, and its columns.
 
     Attributes:
         likelihood: weights and samples.
-        y: by axis, (n,); base: by axis, (n, P), by the determined combinations of parameters.
-        known_precision, known_moment: of what is known of these beforehand, (P, P) and (P,).
-        log_scale: mean log of what the model's effects leave of the measured quantity, by axis,
-            (n_q,); log_scale_slopes: by the same combinations, (n_q, P).
-        to_parameters: (n_all, P) from these to the free parameters, nuisance parameters last.
-        lower, upper: bounds of the change of those, (n_all,).
-        absence: of each effect of the model, by the place of each of its parameters among the free
-            ones, the change that takes it away.
-        spread: of each, the standard deviations of these strengths before any data; shapes: the
-            places of the parameters that it has beside them.
-        cost_of_known: negative log density of what is known beforehand, where nothing changes.
+        y: residual by axis, (n,); base: by axis, (n, P), columns of the determined combinations of
+            the model's parameters.
+        known_precision, known_moment: (P, P) and (P,), the priors of these.
+        log_scale: mean log of the fraction of the measured quantity that the effects leave, by
+            axis, (n_q,); log_scale_slopes: its slopes by the same combinations, (n_q, P).
+        to_parameters: (n_all, P), from these to the free parameters, nuisance parameters last.
+        lower, upper: bounds of the change of the parameters, (n_all,).
+        absence: by effect, the change of each of its free parameters (by index) that removes it.
+        spread: by effect, prior standard deviations of its free strengths; shapes: by effect, the
+            indices of its free shape parameters.
+        cost_of_known: negative log density of the priors if nothing changes.
         loose: (n_all, m) directions of the parameters in which nothing measured changes.
     """
 
@@ -451,27 +439,27 @@ class Problem:
 
     @property
     def count(self) -> Array:
-        """Samples of each axis, (n_q,), one at least."""
+        """Number of samples of each axis, at least one, (n_q,)."""
         return np.array([max(float(len(y)), 1.0) for y in self.y])
 
     @property
     def moment(self) -> Array:
-        """Slope of the log density of all but the residual where nothing changes, (P,)."""
+        """Gradient of the log density, without the residual, if nothing changes, (P,)."""
         return np.asarray(self.known_moment + self.independent @ self.log_scale_slopes)
 
     @cached_property
     def precision(self) -> Array:
-        """Its curvature, (P, P): a share of the scale is linear in the strength of an effect."""
+        """Its curvature, (P, P): a fraction of the scale is linear in the strength of an effect."""
         slopes = self.log_scale_slopes
         return np.asarray(self.known_precision + (self.independent * slopes.T) @ slopes)
 
     @property
     def fixed_cost(self) -> float:
-        """Negative log density of all but the residual where nothing changes, nats."""
+        """Negative log density, without the residual, if nothing changes, nats."""
         return self.cost_of_known - float(self.independent @ self.log_scale)
 
     def sums(self) -> tuple[Array, Array, Array]:
-        """Products of the base with itself, with y, and of y with itself, by axis."""
+        """Products of the base with itself, of the base with y, and of y with itself, by axis."""
         return (
             np.array([b.T @ b for b in self.base]),
             np.array([b.T @ y for b, y in zip(self.base, self.y, strict=True)]),
@@ -479,7 +467,7 @@ class Problem:
         )
 
     def sums_of(self, parts: Sequence[Indices], count: int) -> tuple[Array, Array, Array]:
-        """`sums` of each of ``count`` parts; ``parts``: of each sample, by axis, each (n,)."""
+        """`sums` of ``count`` parts separately; ``parts`` numbers each axis' samples, (n,)."""
         n_q, n = len(self.y), self.to_parameters.shape[1]
         xx, xy, yy = (np.zeros((count, n_q, *shape)) for shape in ((n, n), (n,), ()))
         for axis, (y, base, part) in enumerate(zip(self.y, self.base, parts, strict=True)):
@@ -491,19 +479,19 @@ class Problem:
         return xx, xy, yy
 
     def hold(self, values: Mapping[int, float], n: int | None = None) -> tuple[Array, Array]:
-        """Unknowns (n,) at which parameters have given values, and (n, m) directions still free.
+        """Fix some parameters: unknowns (n,) with the given values, and (n, m) free directions.
 
-        A value that a direction reaches in which nothing measured changes holds nothing else.
+        A value that can be reached along a direction without effect constrains nothing else.
 
         Args:
-            values: by number of the parameter.
-            n: of unknowns, the model's own first; these alone by default.
+            values: values by index of the parameter.
+            n: number of unknowns, the model's own first; by default these alone.
         """
         nb, places = self.to_parameters.shape[1], list(values)
         n = nb if n is None else n
         fixed, free = np.zeros(n), np.eye(n)
         rows, wanted = self.to_parameters[places], np.array(list(values.values()))
-        # Each row in its own unit; what does not move is held already.
+        # Scale each row to its own unit; a row of zeros needs no constraint.
         norm = np.linalg.norm(rows, axis=1)
         moves = norm > 0.0
         rows, wanted = rows[moves] / norm[moves, None], wanted[moves] / norm[moves]
@@ -522,36 +510,34 @@ class Problem:
         return fixed, free
 
     def solve(self) -> Solved:
-        """The change of the model's own parameters that is most likely."""
+        """The most likely change of the model's own parameters."""
         return solve_bounded(self, *self.sums())
 
     def log_likelihood(self) -> float:
-        """Of the samples at the solution, nats, up to a constant that no weights change."""
+        """Log likelihood of the samples at the solution, nats, up to a constant free of weights."""
         roots = [float(np.mean(np.log(r))) if r.size else 0.0 for r in self.likelihood.root]
         return float(self.independent @ roots) - self.solve().cost
 
     def solve_nuisance(self, count: int) -> Solved:
-        """The nuisance parameters that are most likely where the first ``count``, the model's own,
-        stay as they are.
-        """
+        """The most likely nuisance parameters while the model's ``count`` parameters stay."""
         return solve_bounded(self, *self.sums(), absent=dict.fromkeys(range(count), 0.0))
 
 
 def expect_strengths(squares: Sequence[Array], applied: Sequence[Array]) -> Array:
-    """What is known beforehand of the strengths of an effect: their precision about zero, (m, m).
+    """Return the prior precision of the strengths of an effect about zero, (m, m).
 
-    What it adds has the root mean square of the applied force as its standard deviation, so that
-    no two effects cancel each other with forces that the machine does not have.
+    The contribution of the effect has the root mean square of the applied force as its standard
+    deviation, so that similar effects cannot cancel each other with excessive forces.
 
     Args:
-        squares: by axis, products of what unit strengths add, (m, m); applied: by axis, (n,).
+        squares: by axis, products of the columns of unit strength, (m, m); applied: by axis, (n,).
     """
     pairs = zip(squares, applied, strict=True)
     return np.asarray(sum(square / max(float(f @ f), 1e-300) for square, f in pairs))
 
 
 def _correlate(values: Array, samples: Samples, lags: int) -> Array:
-    """Autocorrelation of values (n,) within trials, (lags + 1,); one and zeros of nothing."""
+    """Autocorrelation of values (n,) within trials, (lags + 1,); (1, 0, ...) if all are zero."""
     total = np.zeros(lags + 1)
     for trial in np.unique(samples.trial):
         here = samples.trial == trial
@@ -566,10 +552,10 @@ def _correlate(values: Array, samples: Samples, lags: int) -> Array:
 
 
 def _error_of_turning(evidence: Evidence) -> Iterator[Array]:
-    """What is not known of friction as a log does not say when between two samples a machine turns.
+    """Standard deviation of dry friction because the instants of reversals are unknown.
 
-    By trial, each (T, n_q), N.m or N: the change of friction from sample to sample, times the
-    standard deviation of a moment that lies evenly between two of them.
+    By trial, each (T, n_q), N.m or N: the change of friction between two samples, times the
+    standard deviation of an instant that is uniformly distributed between them.
     """
     width = evidence.system.sign_widths
     for dry, motion in zip(dry_friction(evidence), evidence.motions, strict=True):
@@ -577,9 +563,9 @@ def _error_of_turning(evidence: Evidence) -> Iterator[Array]:
 
 
 def dry_friction(evidence: Evidence) -> Iterator[Array]:
-    """What turns with the motion in a model, by trial, each (T, n_q), N.m or N.
+    """Dry friction of a model, by trial, each (T, n_q), N.m or N.
 
-    Half the difference between moving slowly one way and the other, brakes included.
+    It is half the difference between slow motion in either direction, brakes included.
     """
     slow = _SLOW * evidence.system.sign_widths
     for at in evidence.along:
@@ -592,7 +578,7 @@ def dry_friction(evidence: Evidence) -> Iterator[Array]:
 
 
 def _places(evidence: Evidence, item: BoundEffect, *, strengths: bool) -> list[int]:
-    """Places among the free parameters of the strengths of an effect, or of its shapes."""
+    """Indices, among the free parameters, of the strengths or of the shapes of an effect."""
     names = {q.name for q in item.parameters if (q.strength if strengths else q.shape)}
     parameters = evidence.system.parameters
     return [k for k, number in enumerate(evidence.free) if parameters[number].name in names]
@@ -603,7 +589,7 @@ def _absence(evidence: Evidence, item: BoundEffect) -> dict[int, float]:
         place: -float(evidence.p[evidence.free[place]])
         for place in _places(evidence, item, strengths=True)
     }
-    # Without its strength a shape says nothing: it does not move to where it was expected.
+    # Without a strength the data say nothing of the shape: it stays, not moving to its prior.
     return away | dict.fromkeys(_places(evidence, item, strengths=False), 0.0)
 
 
@@ -612,10 +598,10 @@ class Solved:
     """The most likely unknowns of a linear problem.
 
     Attributes:
-        unknowns: (n,), the first of them of the model's own combinations of parameters.
-        held: which of the others stay at zero, being out of their bounds else, (n - P,).
-        left: sum of squares by axis, (n_q,); weight: of the squares there.
-        cost: half the independent samples times the log of the mean square, over all axes.
+        unknowns: (n,), of which the first P are the model's own combinations of parameters.
+        held: which of the other unknowns are held at zero by a bound, (n - P,).
+        left: sum of squares by axis, (n_q,); weight: that of the squares at the solution.
+        cost: negative log density, nats.
     """
 
     unknowns: Array
@@ -626,7 +612,7 @@ class Solved:
 
     @property
     def base(self) -> Array:
-        """Those of the model's own parameters."""
+        """The first P unknowns, those of the model."""
         return self.unknowns[: len(self.unknowns) - len(self.held)]
 
 
@@ -641,17 +627,17 @@ def solve_bounded(
     weight: Array | None = None,
     expected: Array | None = None,
 ) -> Solved:
-    """Minimise the negative log likelihood: weights of the axes and bounds found in turn.
+    """Minimise the negative log likelihood, alternating between axis weights and bounds.
 
-    An unknown that leaves its bounds is held at the one it left by.
+    An unknown that leaves its bounds is held at the bound it crossed.
 
     Args:
-        problem: the model's own columns, which are the first of all.
+        problem: the model's own columns, which come first.
         xx, xy, yy: sums of products by axis, (n_q, n, n), (n_q, n), (n_q,).
-        low, high: bounds of the unknowns beyond the model's own, (n - P,).
-        absent: given changes of the model's parameters, by number.
-        weight: of the squares of each axis to start from, (n_q,).
-        expected: precision of the unknowns beyond the model's own about zero, (n - P, n - P).
+        low, high: bounds of the other unknowns, (n - P,).
+        absent: prescribed changes of the model's parameters, by index.
+        weight: initial weight of the squares of each axis, (n_q,).
+        expected: prior precision of the other unknowns about zero, (n - P, n - P).
     """
     p, n = problem, xx.shape[1]
     nb, independent = p.to_parameters.shape[1], p.independent
@@ -693,7 +679,7 @@ def solve_bounded(
 
 
 def solve_scaled(normal: Array, right: Array) -> Array:
-    """Solve a symmetric system whose unknowns have different units; right (n,) or (n, k)."""
+    """Solve a symmetric system whose unknowns have different units; ``right``: (n,) or (n, k)."""
     size = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
     scaled = normal * size * size[:, None]
     scaled.flat[:: len(scaled) + 1] += _RIDGE

@@ -1,4 +1,4 @@
-"""The trials of a session with everything that lies between samples and residual."""
+"""The trials of a session, with the sensors, filters, band and folds behind their residuals."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ from bampipe.trials.reading import (
 from bampipe.trials.sensors import Sensors
 
 SHORTEST_BLOCK_S = 0.8
-"""Of a record that is left out in blocks, as it is the only one, s."""
+"""Shortest block of a record that is the only one and is left out in blocks, s."""
 BLOCK_PERIODS = 10.0
-"""Or so many periods of the lowest cut-off, where that is longer: blocks must be independent."""
+"""Shortest block in periods of the lowest cut-off, if longer: blocks must be independent."""
 FEWEST_BLOCKS, MOST_BLOCKS = 4, 40
 
 
 @dataclass(frozen=True)
 class MeasuredTrials:
-    """What identify, validate and diagnose share: the trials, and how they came to be.
+    """The trials that identify, validate and diagnose share, with their sensors and filters.
 
     Attributes:
         motions: the free trials, then those in a viscous field.
-        sensors: that read them; kinematics: the filters they went through.
-        folds: which a fit may see, and which are left out together.
-        blocks: how many of the motions are blocks of the only trial that is not held out.
-        late_s: time by which inputs were sampled after positions, taken off already; limit_s: the
-            most that it may be, zero where it is not estimated.
-        timed: whether that time is open, so that each model has one of its own.
+        sensors: the sensors that read them; kinematics: the filters that they passed.
+        folds: which trials a fit may see, and which are left out together.
+        blocks: number of motions that are blocks of the only trial that is not held out.
+        late_s: input delay that has been compensated; limit_s: its largest size, zero if it is
+            not estimated.
+        timed: whether each model fits a delay of its own.
     """
 
     motions: Sequence[Motion]
@@ -60,20 +60,20 @@ class MeasuredTrials:
 
     @property
     def timing(self) -> tuple[float, float]:
-        """Least and largest change of the inputs' timing from what is taken off already, s."""
+        """Smallest and largest change of the input delay from the compensated one, s."""
         if not self.timed:
             return (0.0, 0.0)
         return (-self.limit_s - self.late_s, self.limit_s - self.late_s)
 
     def with_input_timing(self, late_s: float) -> MeasuredTrials:
-        """The same with ``late_s`` taken off, instead of `late_s`."""
+        """The same trials, compensated by ``late_s`` instead of `late_s`."""
         if late_s == self.late_s:
             return self
         moved = (m.with_input_timing(late_s - self.late_s) for m in self.motions)
         return replace(self, motions=KeptItems(moved, MOST_OF_TRIALS), late_s=late_s)
 
     def subset(self, chosen: Sequence[int]) -> MeasuredTrials:
-        """The same with some of the trials, given by number."""
+        """Some of the trials, given by number."""
         if len(chosen) == len(self.motions):
             return self
         motions = KeptItems((self.motions[k] for k in chosen), MOST_OF_TRIALS)
@@ -81,24 +81,24 @@ class MeasuredTrials:
 
     @property
     def weighed(self) -> list[Motion]:
-        """All by which effects are weighed: those with brakes on, too, but none held out."""
+        """All trials by which effects are weighed: braked ones too, but none held out."""
         groups = self.folds.groups
         return [m for m, group in zip(self.motions, groups, strict=True) if group != HELD_OUT]
 
 
 def trial_of_block(name: str) -> str:
-    """The trial that the block called ``name`` was cut from; ``name`` itself where it is none."""
+    """Name of the trial from which a block was cut; ``name`` itself if it is not a block."""
     return re.sub(r"@\d+\.\ds$", "", name)
 
 
 def cut_blocks(motion: Motion, band: Band) -> list[Motion]:
     """Cut a motion into blocks with gaps of one period of the lowest cut-off between them.
 
-    Each carries the margins that its low-pass needs, so that what is kept of the blocks tiles the
-    record; the gaps keep what is fitted from reaching into what is judged.
+    Each block has the margins of its low-pass, so that the kept samples tile the record; the gaps
+    separate fitted samples from judged ones.
 
     Returns:
-        The blocks; the motion alone where it is too short for `FEWEST_BLOCKS`.
+        The blocks; the motion alone if it is too short for `FEWEST_BLOCKS`.
     """
     slowest = min(band.cutoff_hz)
     kept = band.thinned_rows(len(motion.t))
@@ -120,12 +120,9 @@ def read_measured_trials(
 ) -> MeasuredTrials:
     """Read the trials of a run folder for a model.
 
-    What brakes do is no part of a model without an effect of theirs: it is not fitted to trials
-    in a viscous field, but judged by them.
-
-    Args:
-        every_input: as in `read_motion`; timing: as identified, taken off as far as it leaves the
-            least residual.
+    A model without effects of the brakes is not fitted to trials in a viscous field, but judged by
+    them. ``every_input`` is as in `read_motion`. Of the input delay ``timing``, the part that
+    minimises the residual is compensated.
 
     Raises:
         InputError: there is no free trial, or a file or column is missing.

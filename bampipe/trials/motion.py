@@ -1,4 +1,4 @@
-"""A trial as its sensors gave it, and the motion that the session's filters make of it."""
+"""A trial as recorded by its sensors, and its motion behind the session's filters."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from bampipe.physics.device import INPUT_ORDERS, derivative
 from bampipe.trials.kept import KeptItems
 
 TIMING_ORDERS = 3
-"""Time derivatives by which inputs are moved in time: half a sample, at the highest frequency of a
-residual, to 0.7 %. By the first alone it is 20 %, which looks like a lag."""
+"""Orders of the Taylor series that shifts inputs in time: half a sample to within 0.7 % at the
+highest frequency of a residual. The first order alone errs by 20 %, which looks like a lag."""
 _MOST_JOINED = 100_000
-"""Samples, of all axes, up to which the trials of a session are gone through at once."""
+"""Largest number of samples, over all axes, up to which a session's trials are joined."""
 SAMPLED = ("t", "q", "qd", "qdd", "qd_sd")
 """Fields of a motion with one row a sample."""
 
@@ -44,22 +44,22 @@ class EncoderFilters(Protocol):
     """The filters between encoders and motion."""
 
     def derivatives_of(self, axis: int, signal: Array) -> tuple[Array, Array, Array]:
-        """Position, rate and acceleration that they make of a signal (T,) in the readings."""
+        """Position, rate and acceleration that a signal (T,) in the readings adds to the motion."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """One trial with its derivatives, on a uniform grid; one row a sample.
+    """One trial with its derivatives, on a uniform grid.
 
     Attributes:
         t: time since the start of the trial, (T,), s.
         q, qd, qdd: (T, n_q), rad or m and derivatives.
         qd_sd: standard deviation of the velocities, (T, n_q).
         channels: inputs of the device and their time derivatives by name, each (T,).
-        left_out: (T, n_q) samples that count no more than those at rest: of a replay, what its
-            trial leaves out; of a trial, its disturbances. None where there are none.
-        filters: that q, qd and qdd went through; None where they are no readings of encoders.
-        parts: rows of each trial, where several have been joined.
+        left_out: (T, n_q) samples that do not count: a trial's disturbances, or in a replicate all
+            samples that its trial leaves out. None if there are none.
+        filters: filters that produced q, qd and qdd; None if they do not stem from encoders.
+        parts: rows of each trial, if several have been joined.
     """
 
     trial_id: str
@@ -106,11 +106,11 @@ class Motion:
         return system.memory(*self.kinematics, u, p, self.t, self.parts, self._states)
 
     def of_mechanism(self, system: System, u: Array, p: Array) -> Motion:
-        """The motion of the mechanism, which is `System.offset` from what its encoders read.
+        """The motion of the mechanism, which differs from the encoder readings by `System.offset`.
 
-        The offset goes through the filters of the encoders. Where play is crossed it jumps as the
-        readings do, and only what was filtered alike leaves nothing of the two. The last one is
-        kept, with the internal states along it.
+        The offset passes the filters of the encoders: it jumps like the readings where play is
+        crossed, and the jumps cancel only if both are filtered alike. The last result is cached
+        with the internal states along it.
         """
         if not system.moves_sensors:
             return self
@@ -134,7 +134,7 @@ class Motion:
         return mechanism
 
     def rows(self, which: slice) -> Motion:
-        """Some of its samples, at the same times."""
+        """The rows ``which`` of the motion, with their times."""
         return replace(
             self,
             **{name: getattr(self, name)[which] for name in SAMPLED},
@@ -144,21 +144,21 @@ class Motion:
         )
 
     def split(self) -> list[Motion]:
-        """Each of the trials that have been joined."""
+        """The trials of which a joined motion consists."""
         return [self.rows(part) for part in self.parts] if len(self.parts) > 1 else [self]
 
     def with_channels(self, changed: Mapping[str, Array]) -> Motion:
         """The same motion with some channels replaced."""
-        return self._tell(replace(self, channels={**self.channels, **changed}), changed)
+        return self._share_states(replace(self, channels={**self.channels, **changed}), changed)
 
-    def _tell(self, other: Motion, changed: Collection[str]) -> Motion:
-        """Tell a motion of which some channels have changed the states that take none of them."""
+    def _share_states(self, other: Motion, changed: Collection[str]) -> Motion:
+        """Pass on the cached internal states that depend on none of the ``changed`` channels."""
         alike = {key: z for key, z in self._states.items() if not {*changed} & {*key[1]}}
         other._states.update(alike)
         return other
 
-    def with_more(self, force: str) -> tuple[Motion, Array]:
-        """The same motion with a little more of a force all the time, and how much, (T,)."""
+    def with_more_force(self, force: str) -> tuple[Motion, Array]:
+        """The same motion with a force increased by a small constant, and that constant, (T,)."""
         if force not in self._kept:
             values = self.channels[force]
             step = np.empty_like(values)
@@ -166,13 +166,13 @@ class Motion:
                 step[part] = 1e-6 * max(float(np.abs(values[part]).max()), 1e-6)
             self._kept[force] = self.with_channels({force: values + step}), step
         more, step = self._kept[force]
-        return self._tell(more, (force,)), step
+        return self._share_states(more, (force,)), step
 
     def with_input_timing(self, late_s: float) -> Motion:
-        """The same motion with inputs that were sampled ``late_s`` after the positions moved back.
+        """The same motion with inputs shifted to compensate a delay of ``late_s`` in sampling.
 
-        A channel and its time derivatives move along the derivatives there are (Taylor's series); a
-        channel without any, such as a brake command, stays.
+        A channel and its time derivatives are shifted by their Taylor series; a channel without
+        derivatives, such as a brake command, stays.
         """
         if late_s == 0.0:
             return self
@@ -189,7 +189,7 @@ class Motion:
 
 
 def join_short(motions: Sequence[Motion]) -> Sequence[Motion]:
-    """All trials as one where they are short: a call costs as much as thousands of samples."""
+    """Join short trials into one motion: a call costs as much as thousands of samples."""
     sizes = trial_sizes(motions)
     if len(motions) == 1 or sum(sizes) * motions[0].q.shape[1] > _MOST_JOINED:
         return motions
@@ -208,7 +208,7 @@ def input_derivatives(name: str) -> tuple[str, ...]:
 
 
 def force_columns(system: System) -> list[int]:
-    """Columns of the inputs of a model that are measured forces."""
+    """Columns of a model's inputs that hold measured forces."""
     return [system.inputs.index(name) for name in system.model.device.forces]
 
 

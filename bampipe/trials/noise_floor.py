@@ -1,4 +1,4 @@
-"""The noise floor: the error of a model that is the whole truth, by replays of enough trials."""
+"""The noise floor: the error that a model without any deficiency would have, from replicates."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ from bampipe.arrays import Array
 from bampipe.trials.motion import Motion, trial_sizes
 
 ENOUGH_SAMPLES = 250_000
-"""Samples up to which all trials are taken: the noise floor of so many is known to about 1 %."""
+"""Sessions up to this size are used whole: they determine the noise floor to about 1 %."""
 LEAST_DRAWN = 50
-"""Fewest trials that stand for all of a long session: the errors of trials differ by a third."""
+"""Smallest random selection of trials from a long session: errors differ by a third by trial."""
 _SEED = 0
 _SD_OF_DEVIATION = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
-FEWEST_REPLAYS, MOST_REPLAYS = 3, 6
-"""Replays are repeated until they hold `ENOUGH_SAMPLES`, within these."""
+"""Standard deviation of a normal distribution divided by its median absolute deviation."""
+FEWEST_REPLICATES, MOST_REPLICATES = 3, 6
+"""Replicates are added until they hold `ENOUGH_SAMPLES`, within these limits."""
 
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """Error of replays.
+    """Error of replicates.
 
     Attributes:
-        level: median over replays, by axis, (n_q,), N.m or N.
-        sd: scatter of one replay, from the median deviation.
-        replays: how many.
+        level: median over replicates, by axis, (n_q,), N.m or N.
+        sd: standard deviation of one replicate, from the median absolute deviation, (n_q,).
+        replicates: their number.
     """
 
     level: Array
     sd: Array
-    replays: int
+    replicates: int
 
     @classmethod
     def of_errors(cls, errors: Sequence[Array]) -> NoiseFloor:
-        """Median and scatter of the errors (n_q,) of replays."""
+        """Median and scatter of the errors (n_q,) of replicates."""
         found = np.array(errors)
         level = np.median(found, axis=0)
         return cls(level, _SD_OF_DEVIATION * np.median(np.abs(found - level), axis=0), len(found))
 
 
-def floor_replays(motions: Sequence[Motion]) -> int:
-    """How many replays of these trials give the floor."""
+def count_floor_replicates(motions: Sequence[Motion]) -> int:
+    """Number of replicates of these trials that determine the noise floor."""
     total = sum(trial_sizes(motions))
-    return int(np.clip(-(-ENOUGH_SAMPLES // max(total, 1)), FEWEST_REPLAYS, MOST_REPLAYS))
+    return int(np.clip(-(-ENOUGH_SAMPLES // max(total, 1)), FEWEST_REPLICATES, MOST_REPLICATES))
 
 
 def draw_trials(sizes: Sequence[int]) -> list[int]:
-    """Numbers of the trials that stand for all of a long session, in order.
+    """Select trials that represent a long session, by number, in order.
 
-    They hold `ENOUGH_SAMPLES`, and are `LEAST_DRAWN` or more; ``sizes`` are in samples.
+    They hold about `ENOUGH_SAMPLES` and are at least `LEAST_DRAWN`; ``sizes`` are in samples.
     """
     total = sum(sizes)
     if total <= ENOUGH_SAMPLES:

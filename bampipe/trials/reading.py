@@ -1,4 +1,4 @@
-"""Trials of a run folder as motions: which there are, and which of them a fit may see."""
+"""Reads the trials of a run folder as motions, and their sensors, filters and band."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,26 +24,26 @@ KINEMATICS = "filter/kinematics.parquet"
 
 
 def read_sensors(run: RunFolder, system: System) -> Sensors:
-    """Return the sensors that ingest settled, in the order of the model."""
+    """Return the sensors that `ingest` determined, axes and forces in the order of the model."""
     return Sensors.from_result(
         run.read(IngestResult), system.coordinates, system.model.device.forces
     )
 
 
 def read_kinematics(run: RunFolder, system: System) -> Kinematics:
-    """Return the filters that the trials went through, in the order of the model."""
+    """Return the filters of the session, axes in the order of the model."""
     return Kinematics.from_result(run.read(FilterResult), system.coordinates)
 
 
 def read_band(run: RunFolder, system: System) -> Band:
-    """Return the band in which residuals are compared, in the order of the model."""
+    """Return the band in which residuals are compared, axes in the order of the model."""
     found = run.read(FilterResult)
     cutoffs = tuple(found.axes[axis].band.cutoff_hz for axis in system.coordinates)
     return Band(found.sample_rate_hz, cutoffs)
 
 
 def held_out_trials(run: RunFolder) -> frozenset[str]:
-    """Return the trials that the session holds out: never fitted, only for judging."""
+    """Return the trials that the session holds out: never fitted, used only for validation."""
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
     if "hold_out" not in trials:
         return frozenset()
@@ -53,13 +53,8 @@ def held_out_trials(run: RunFolder) -> frozenset[str]:
 def free_trials(run: RunFolder, *, fitted: bool = False, braked: bool = False) -> tuple[str, ...]:
     """Return the free trials that were differentiated, in the order of the session.
 
-    Args:
-        fitted: without those that the session holds out.
-        braked: those in a viscous field too, after the others: a lag of the brakes, say, shows
-            in no other.
-
-    Raises:
-        InputError: there is none.
+    With ``fitted``, held-out trials are left out; with ``braked``, those in a viscous field follow,
+    which alone show effects of the brakes. If there is none, `InputError` is raised.
     """
     trials = read_parquet(run.require("ingest/trials.parquet", "ingest"))
     kinds = MOVING if braked else MOVING[:1]
@@ -89,11 +84,9 @@ def read_motion(
 ) -> Motion:
     """Read one trial of a table of kinematics.
 
-    Args:
-        system: the model, whose inputs and their first time derivatives are read.
-        disturbances: of the trial, which are left out; filters: that it went through.
-        every_input: every input of its device too, with all time derivatives: what an effect
-            that is not in the model may need.
+    The model's inputs are read with their first time derivatives; with ``every_input``, all inputs
+    of the device are, with all derivatives, since effects that are not in the model may need them.
+    Disturbances do not count; ``filters`` are those of the session.
 
     Raises:
         InputError: the file or a column that the model needs is missing.
@@ -145,14 +138,10 @@ def read_motions(
     every_input: bool = False,
     late_s: float = 0.0,
 ) -> Sequence[Motion]:
-    """Return the free trials of ``filter/kinematics.parquet``.
+    """Return the free trials of ``filter/kinematics.parquet``, with a delay of inputs compensated.
 
-    Args:
-        fitted, braked: as in :func:`free_trials`; every_input: as in :func:`read_motion`.
-        late_s: time by which inputs were sampled after positions, taken off.
-
-    Raises:
-        InputError: there is none, and as :func:`read_motion`.
+    Arguments and errors are those of :func:`free_trials` and :func:`read_motion`; the inputs were
+    sampled ``late_s`` after the positions, s.
     """
     names = free_trials(run, fitted=fitted, braked=braked)
     path = run.require(KINEMATICS, "filter")
@@ -169,7 +158,7 @@ def require_sound_motions(system: System, motions: Sequence[Motion]) -> None:
     """Refuse trials on which the equations of motion cannot be solved.
 
     Raises:
-        InputError: the mass matrix is singular at a pose of a trial, or a force no number there.
+        InputError: in a pose of a trial, the mass matrix is singular or a force is not finite.
     """
     for motion in motions:
         require_sound(
@@ -196,14 +185,10 @@ def read_samples(run: RunFolder, trial_id: str, system: System) -> dict[str, Arr
 def input_columns(
     columns: Mapping[str, Array], names: Sequence[str], brakes: Mapping[str, str]
 ) -> Array:
-    """Return inputs of a model as columns (T, n_u) of raw samples.
+    """Return inputs of a model by their ``names``, (T, n_u), from raw samples.
 
-    Args:
-        columns: t, force_<c>, brake_<axis>, ...; a brake without a column was off.
-        names: inputs of the model; brakes: input that is the brake command, by axis.
-
-    Raises:
-        InputError: an input has no column.
+    ``columns`` are t, force_<c>, brake_<axis>, ...; a brake without a column was off. ``brakes``
+    has the name of each axis' brake command. An input without a column raises `InputError`.
     """
     column = {name: f"brake_{axis}" for axis, name in brakes.items()}
     t = columns["t"]

@@ -1,8 +1,8 @@
-"""The residual of a model on trials: both sides of the equation filtered alike, by trial.
+"""The residual of a model on trials, low-passed as a whole and thinned.
 
-Velocities from encoders are low-passed, forces are not. Comparing them raw misses effects near
-standstill and invents delays; so the residual as a whole, the sign of the velocity in it included,
-goes through one low-pass before anything is fitted, and is thinned to what that leaves independent.
+Velocities from encoders are low-passed, forces are not: comparing them raw misses effects near
+standstill and invents delays. So the residual as a whole, including the sign of the velocity, goes
+through one low-pass before anything is fitted, and is thinned to nearly independent samples.
 """
 
 from collections.abc import Iterable, Sequence
@@ -33,18 +33,14 @@ def problem_of(
 ) -> Problem:
     """Return the inverse dynamics of ``motions`` as a least-squares problem.
 
-    Its parameters are the model's, then the time by which the inputs were sampled after the
-    positions, s, within half a sample.
-
-    Args:
-        held: parameters that are not estimated, beside those that the model fixes.
-        timing: whether that time is estimated; else it stays as given.
-        turning: whether samples count in which an axis turns round.
+    Its parameters are those of the model, followed by the input delay, s, within half a sample,
+    which is estimated with ``timing``. Parameters in ``held`` are not estimated. Without
+    ``turning``, samples near reversals do not count.
     """
     n = len(system.parameters)
     by_offset, by_body = list(system.moved_by), list(system.of_bodies)
 
-    # Of differences by many parameters few change how the mechanism moves or the bodies' forces.
+    # Few parameters change the motion of the mechanism or the forces of its bodies: cache both.
     @lru_cache(maxsize=2)
     def move(trial: int, late_s: float, offset: tuple[float, ...]) -> Motion:
         motion, p = motions[trial].with_input_timing(late_s), system.prior
@@ -81,7 +77,7 @@ def problem_of(
     free = [i for i, item in enumerate(parameters) if not item.fixed and item.name not in held]
     lower = [parameters[i].lower for i in free]
     upper = [parameters[i].upper for i in free]
-    # When an impact comes is far from linear in what decides it: a secant over a few per cent.
+    # The instant of an impact is strongly nonlinear in its parameters: use a wide secant.
     contact = {q.name for e in system.model.effects if e.effect.ahead for q in e.parameters}
     step = [
         1.0
@@ -92,17 +88,17 @@ def problem_of(
     ]
     known = [parameters[i].prior for i in free]
     precision = [1.0 / parameters[i].sd ** 2 if parameters[i].weighed else 0.0 for i in free]
-    # Moved in time, inputs change the slopes that they are part of.
+    # Slopes that contain an input change when the inputs are shifted in time.
     constant = system.unforced if timing else system.constant
     same = [constant[i] and not system.moves_sensors for i in free]
     multiplied = _multiplied(system, free)
-    if multiplied is not None:  # as measured, their slopes change with the residual
+    if multiplied is not None:  # these slopes depend on the residual, see `as_measured`
         same = [constant and axis < 0 for constant, axis in zip(same, multiplied, strict=True)]
     linear = system.is_linear_in(free)
     if timing:
         half = 0.5 / band.rate_hz
-        # The secant over all of its range serves a model that is linearised once; one that is
-        # linearised again and again needs the tangent, or its descent ends short of the minimum.
+        # A model that is linearised once needs the secant over the whole range; one that is
+        # linearised repeatedly needs the tangent, or its descent stops short of the minimum.
         apart = half if linear else 0.05 * half
         same = [*same, False]
         precision, known = [*precision, 0.0], [*known, 0.0]
@@ -134,8 +130,8 @@ def fit_device(
     """Fit a bare device to the trials numbered ``fitted``.
 
     Returns:
-        Its problem, the parameters (n_p + 1,), and residual and slopes of every trial there; None
-        where it cannot be fitted.
+        The problem, the parameters (n_p + 1,), and residual and slopes of every trial there; None
+        if it cannot be fitted.
     """
     problem = problem_of(system, motions, band)
     try:
@@ -148,9 +144,10 @@ def fit_device(
 
 
 def _multiplied(system: System, free: Sequence[int]) -> Indices | None:
-    """Axes whose inputs free parameters multiply, (n_free,), as torque constants of a robot do.
+    """Axis whose input each free parameter multiplies, (n_free,), like a robot's torque constants.
 
-    A motor that turns several joints is that of one of them. None where there are none.
+    A motor that moves several joints is assigned to one of them. None if there is no such
+    parameter.
     """
     if system.model.device.robot is None:
         return None
@@ -171,11 +168,11 @@ def _multiplied(system: System, free: Sequence[int]) -> Indices | None:
 
 
 def standstill_of(motion: Motion, system: System, rate_hz: float) -> Flags:
-    """Which samples stand still, (T, n_q).
+    """Samples at standstill or left out, (T, n_q).
 
-    Or are left out. A replay leaves out what the trial does as well: where the machine rests for
-    just long enough and the replay for just not, the load that friction balances would pass for an
-    error.
+    A replicate leaves out the same samples as its trial. Otherwise, where the machine rests just
+    long enough to be left out and the replicate does not, the load that friction balances would
+    appear as an error.
     """
     u = motion.inputs(system.inputs)
     brakes = [system.model.device.brakes.get(axis) for axis in system.coordinates]
@@ -189,9 +186,9 @@ def standstill_of(motion: Motion, system: System, rate_hz: float) -> Flags:
 def applied_rms(
     system: System, motions: Sequence[Motion], band: Band, p: Array, used: Sequence[Flags]
 ) -> Array:
-    """Root mean square of the applied force by axis, low-passed as the residual is, (n_q,).
+    """Root mean square of the applied force by axis, low-passed like the residual, (n_q,).
 
-    ``p`` are parameters (n_p,); of each trial the samples ``used`` (K, n_q) count.
+    ``p`` are parameters (n_p,); the samples ``used`` (K, n_q) of each trial count.
     """
     return rms((band.thin(ModelOnTrial(system, p, [m]).applied) for m in motions), used)
 
@@ -206,11 +203,11 @@ def rms(values: Iterable[Array], used: Iterable[Flags]) -> Array:
 
 @dataclass(frozen=True)
 class ModelOnTrial:
-    """A model with given parameters on one trial, computed when it is first asked for.
+    """A model with given parameters on one trial; its properties are computed on first access.
 
     Attributes:
         system: the model; p: its parameters, (n_p,).
-        motions: the trials; trial: the number of the one.
+        motions: the trials; trial: the number of this one.
     """
 
     system: System
@@ -220,7 +217,7 @@ class ModelOnTrial:
 
     @property
     def motion(self) -> Motion:
-        """The trial, fetched anew: of many, not all are in memory."""
+        """The trial, read on each access: a long session is not all in memory."""
         return self.motions[self.trial]
 
     @property
@@ -230,7 +227,7 @@ class ModelOnTrial:
 
     @property
     def mechanism(self) -> Motion:
-        """The trial as the mechanism moved, by the model."""
+        """The motion of the mechanism, which the model may distinguish from the readings."""
         return self._moved if self.system.moves_sensors else self.motion
 
     @cached_property
@@ -256,6 +253,6 @@ class ModelOnTrial:
 
     @cached_property
     def contribution(self) -> Array:
-        """What the model's effects add to the residual; see `System.contribution`, (T, n_q)."""
+        """Contribution of the effects to the residual, see `System.contribution`, (T, n_q)."""
         at = self.mechanism.kinematics
         return self.system.contribution(*at, self.memory, self.inputs, self.p)

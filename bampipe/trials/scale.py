@@ -1,7 +1,7 @@
-"""What a model leaves of the measured quantity: the change of variables of the likelihood.
+"""Change of variables of the likelihood, from the residual to the measured quantity.
 
-The residual is taken on the other side of the equation. Its density is that of what was measured
-where log |d residual / d force| is added to it: nothing is explained by making both sides small.
+The likelihood adds log |d residual / d force| to the density of the residual. A model therefore
+gains nothing by making both sides of the equation small.
 """
 
 from collections.abc import Sequence
@@ -20,12 +20,12 @@ from bampipe.trials.motion import Motion
 Spectra = NDArray[np.complex128]
 
 NO_SLOPE = 1e-3
-"""Slope by a constant force up to which effects pass it as it is."""
+"""Largest slope by a constant force at which effects count as passing the force unchanged."""
 _LEAST_SHARE = 1e-3
 _STEP = 1e-4
-"""Of a parameter's size or uncertainty: the step of a slope."""
+"""Finite-difference step as a fraction of a parameter's value or uncertainty."""
 _SEGMENT = 128
-"""Thinned samples of a segment from which the gain of a filter is found."""
+"""Thinned samples in a segment of a spectrum."""
 
 
 def bare_slopes(
@@ -45,16 +45,16 @@ def bare_slopes(
 def slopes_by_force(
     system: System, motions: Sequence[Motion], band: Band, probes: Sequence[Array]
 ) -> tuple[Array, ...]:
-    """Derivative of what the effects of a model add by each measured force, by trial.
+    """Derivative of the effects' contribution by each measured force, by trial.
 
-    By a force that is more all the time, so that internal states which follow it have come to rest.
-    At parameters ``probes``, m times (n_p,), that give the same internal states; each
+    The force changes by a constant, so that internal states that follow it have settled. The
+    parameters ``probes``, m times (n_p,), must give the same internal states. Each result is
     (K, n_q, n_forces, m), at the thinned samples.
     """
     model = system.model
     passing = [e for e in model.effects if e.effect.ahead is None]
     if len(passing) < len(model.effects):
-        # A contact hands on later what a gap holds back: as a delay, it takes nothing off.
+        # A contact only delays the force that a gap holds back, so it takes nothing away.
         names = [q.name for q in system.parameters]
         known = [e.effect for e in passing]
         system = compile_model(Model(model.device, [e.name for e in passing], known))
@@ -78,16 +78,16 @@ def _slopes(system: System, motion: Motion, kept: Indices, probes: Sequence[Arra
     z = motion.memory(system, p)
     here = added(motion, z)
     for force in system.model.device.forces:
-        more, step = motion.with_more(force)
+        more, step = motion.with_more_force(force)
         changed = added(more, more.memory(system, p) if system.force_fed else z)
         slopes.append((changed - here) / step[kept, None])
     return np.moveaxis(np.array(slopes), (0, 1), (2, 3))
 
 
 def log_of_share(plain: Array, added: Array) -> Array:
-    """The log of what is left of slopes ``plain`` by the forces with ``added`` ones, (n,).
+    """Log of the fraction of the slopes ``plain`` by the forces that remains with ``added``, (n,).
 
-    Both (n, n_forces). Where no force acts nothing is taken.
+    Both are (n, n_forces). Where no force acts, the result is zero.
     """
     before, after = (np.linalg.norm(x, axis=-1) for x in (plain, plain + added))
     share = after / np.where(before > 0.0, before, 1.0)
@@ -103,14 +103,14 @@ def log_scale(
     free: Sequence[int],
     added: Sequence[Array],
 ) -> tuple[Array, Array]:
-    """The mean log of what a model's effects leave of the measured quantity, and its slopes.
+    """Mean log of the fraction of the measured quantity that a model's effects leave, with slopes.
 
-    By axis, (n_q,), and (n_q, n_free). Filters, which pass a constant force, leave all of it.
+    Both by axis, (n_q,) and (n_q, n_free). Filters pass a constant force, so they leave all of it.
 
     Args:
         used: which samples count, by trial, each (K, n_q).
-        p: parameters, (n_p,); free: numbers of those by which slopes are taken.
-        added: slopes by the forces there, each (K, n_q, n_forces).
+        p: parameters, (n_p,); free: indices of those by which slopes are taken.
+        added: slopes of the effects by the forces at ``p``, each (K, n_q, n_forces).
     """
     nothing = np.zeros(len(system.coordinates)), np.zeros((len(system.coordinates), len(free)))
     if not system.parameters_by_force:
@@ -144,7 +144,7 @@ def log_scale(
 def find_spectra(applied: Sequence[Array]) -> Spectra:
     """Spectra of half-overlapping segments of all trials, (segments, n_q, _SEGMENT // 2).
 
-    Of a force by trial, each (K, n_q), low-passed.
+    ``applied`` is a low-passed force by trial, each (K, n_q).
     """
     found = []
     for x in applied:
@@ -155,9 +155,9 @@ def find_spectra(applied: Sequence[Array]) -> Spectra:
 
 
 def gain_of_filter(before: Spectra, after: Spectra, band: Band) -> Array:
-    """Share of the variance of white noise of a force that a filter leaves in the band, (n_q,).
+    """Fraction of white force noise's variance in the band that passes a filter, (n_q,).
 
-    Of the applied force before and after it, as in `find_spectra`.
+    ``before`` and ``after`` are spectra of the applied force as in `find_spectra`.
     """
     cross = np.abs(np.sum(before.conj() * after, axis=0))
     gain = cross / np.maximum(np.sum(np.abs(before) ** 2, axis=0), 1e-300)
@@ -168,7 +168,7 @@ def gain_of_filter(before: Spectra, after: Spectra, band: Band) -> Array:
 
 @cache
 def _to_spectrum(n: int) -> Spectra:
-    """What takes the linear trend off ``n`` samples and transforms them in a window of Hann."""
+    """Matrix that removes the linear trend of ``n`` samples and transforms them (Hann window)."""
     line = np.column_stack([np.ones(n), np.arange(n)])
     windowed = get_window("hann", n)[:, None] * (np.eye(n) - line @ np.linalg.pinv(line))
     return np.asarray(np.fft.rfft(windowed, _SEGMENT, axis=0)[: _SEGMENT // 2])

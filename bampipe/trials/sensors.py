@@ -1,6 +1,6 @@
-"""Noise and resolution of every channel, settled once a session from its own data.
+"""Noise and resolution of every channel, determined once per session from its own data.
 
-What a session file states is a claim; the samples themselves say how noisy they are.
+The values that a session file states are checked against the samples.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from bampipe.estimate.white_noise import (
 from bampipe.results.ingest import IngestResult
 
 _COLOURED = 2.0
-"""Factor from which on the noise of a thinned record is more than that of the whole one."""
+"""Smallest ratio of the noise of a thinned record to that of the whole one if it is coloured."""
 _FOLLOWS = 0.8
-"""Share of its noise that is left of a force without what follows the encoders' readings, below
-which a controller makes the rest. Of the white noise of handles, load cells, motor currents and a
-measured arm 0.98 or more is left, of a command by gains on counts and their differences 0.003;
-where the log keeps every second to tenth sample of the controller, 0.5 to 0.76."""
+"""A force whose noise, without the part that follows the encoder readings, is smaller than this
+fraction is a controller's command. Handles, load cells, motor currents and a measured arm keep 0.98
+or more of their white noise; a command by gains on counts and their differences 0.003, or 0.5 to
+0.76 if the log keeps every second to tenth sample of the controller."""
 DISAGREEMENT = 2.0
-"""Factor between stated and measured noise beyond which a warning is given."""
+"""Ratio of stated to measured noise, or its inverse, beyond which a warning is given."""
 
 
 @dataclass(frozen=True)
 class RecordNoise:
-    """What one trial says of the noise of one channel.
+    """Noise of one channel in one trial.
 
     Attributes:
-        step: of its counts, 0.0 where its values lie on no grid.
-        white_sd: standard deviation of its white noise; slow_sd: of noise that reaches over several
-            samples, or of a signal that is as fast. NaN where the record is too short.
-        pulsed: whether the noise is a controller's, which depends on the motion.
+        step: step of its counts; 0.0 if its values lie on no grid.
+        white_sd: standard deviation of the white noise; slow_sd: of noise correlated over several
+            samples, or of an equally fast signal. NaN if the record is too short.
+        pulsed: whether a controller causes the noise, which then depends on the motion.
     """
 
     step: float
@@ -60,10 +60,11 @@ class RecordNoise:
     def of_inputs(
         cls, records: Mapping[str, Array], readings: Sequence[Array], t: Array
     ) -> dict[str, RecordNoise]:
-        """Measure inputs by name, each (T,), recorded beside ``readings`` of encoders, each (T,).
+        """Measure inputs by name, each (T,), recorded with ``readings`` of encoders, each (T,).
 
-        What a controller makes of the readings acts on the machine, and is no noise. Of a log that
-        keeps some of its samples only, the rest is left: pulses from readings that are not logged.
+        The part that a controller derives from the readings acts on the machine, so it is not
+        noise. If the log keeps only some of the controller's samples, pulses remain, which stem
+        from readings that were not logged.
         """
         found = {name: cls.of(record, t) for name, record in records.items()}
         if not records or not readings:
@@ -80,15 +81,14 @@ class RecordNoise:
 
 @dataclass(frozen=True)
 class ChannelNoise:
-    """What was settled for one channel.
+    """Noise and resolution of one channel for the session.
 
     Attributes:
-        noise_sd: standard deviation of the white noise of a sample, quantisation included.
-        resolution: step of its counts; for a channel without one, the step whose rounding has
-            this noise.
-        stated, measured: the noise, or the step, as the session file states it and as the data
-            have it; None where unknown.
-        warning: a sentence where the two disagree, else "".
+        noise_sd: standard deviation of the white noise of a sample, including quantisation.
+        resolution: step of its counts; for a channel without counts, the step whose rounding
+            causes this noise.
+        stated, measured: noise or step from the session file and from the data; None if unknown.
+        warning: a sentence if the two disagree, else "".
     """
 
     noise_sd: float
@@ -101,7 +101,7 @@ class ChannelNoise:
 def settle_encoder(
     axis: str, unit: str, stated: float | None, records: Sequence[RecordNoise]
 ) -> ChannelNoise:
-    """Settle resolution and noise of an encoder; its step may be ``stated``, rad or m."""
+    """Determine resolution and noise of an encoder; ``stated`` is its step, rad or m, if known."""
     step = _typical_step(records)
     stated = stated or None
     warning = ""
@@ -114,7 +114,7 @@ def settle_encoder(
         step = stated
     rounding = step / np.sqrt(12.0)
     white = _typical_noise(records, rounding) or 0.0
-    # Rounding alone leaves differences of a third to one step; more than that is noise beside it.
+    # Rounding alone causes differences of a third to one step; more than that is additional noise.
     noise = white if white > DISAGREEMENT * rounding else rounding
     if stated and not warning and noise > rounding:
         warning = (
@@ -128,7 +128,7 @@ def settle_encoder(
 def settle_force(
     name: str, unit: str, stated: float | None, records: Sequence[RecordNoise]
 ) -> ChannelNoise:
-    """Settle the noise of a force channel: as measured; as stated where too little is recorded."""
+    """Determine the noise of a force channel: the measured one, or as stated if data are short."""
     stated = stated if stated is not None and stated > 0.0 else None
     measured = _typical_noise(records, stated)
     warning = ""
@@ -151,11 +151,11 @@ def _typical_step(records: Sequence[RecordNoise]) -> float:
 
 
 def _typical_noise(records: Sequence[RecordNoise], stated: float | None) -> float | None:
-    """Noise of a channel, the same in every trial, however much its signal adds in some.
+    """Noise of a channel, which is the same in every trial, whereas the signal may differ.
 
-    Noise over several samples counts where it is clearly more than that of neighbouring ones, and
-    what is stated does not speak for the latter: nothing else distinguishes a fast signal from it.
-    What a controller makes of counts differs from trial to trial, and its mean square counts.
+    Noise correlated over several samples is used if it clearly exceeds that of neighbouring
+    samples, unless the stated noise is closer to the latter: it may be a fast signal.
+    The commands of a controller differ by trial, and their mean square is used.
     """
     pulses = [r.white_sd for r in records if r.pulsed]
     if 2 * len(pulses) > len(records):
@@ -176,12 +176,12 @@ def _lower_quartile(values: Sequence[float]) -> float | None:
 
 @dataclass(frozen=True)
 class Sensors:
-    """What lies between a mechanism and its recording.
+    """The sensors between a mechanism and its recording.
 
     Attributes:
         rate_hz: sampling rate.
         resolution: step of each encoder, (n_q,), rad or m.
-        reading_sd: noise of each encoder reading, its rounding included, (n_q,), rad or m.
+        reading_sd: noise of each encoder reading, including rounding, (n_q,), rad or m.
         force_sd: noise of each force channel, (n_f,), in its unit.
     """
 

@@ -1,4 +1,4 @@
-"""The recorded signals of a session, and what becomes of a motion when one means something else."""
+"""Recorded signals of a session, and motions under another meaning of them (sign, unit, zero)."""
 
 from __future__ import annotations
 
@@ -15,21 +15,20 @@ from bampipe.results.ingest import IngestResult
 from bampipe.trials.motion import Motion
 
 ZERO_OF = "zero of "
-"""What the uncertainty of an encoder's zero is called, before its axis."""
+"""Prefix of the name for the uncertainty of an encoder's zero, before its axis."""
 
 
 @dataclass(frozen=True)
 class Signals:
-    """Axes, forces, other channels and brakes in one order, and how raw columns became them.
+    """Axes, forces, other channels and brakes in one order, and their calibration.
 
     Attributes:
-        names: of the signals, the axes first; axes, forces, channels, brakes: those of each kind.
-        units: SI unit of each; stated: the unit that the session file gives its readings.
+        axes, forces, channels, brakes: names of the signals of each kind.
+        units: SI unit of each; stated: the unit that the session file gives for its readings.
         gain: (n, n), offset: (n,): value = gain @ raw + offset.
-        gain_sd: (n, n) standard uncertainty of the calibration, as a share: value' = (1 + that)
-            @ value.
-        offset_sd: (n,) that of the offset: the zero of an encoder is known to a step, whether it
-            rounds or cuts (rectangular distribution, JCGM 100:2008, 4.3.7).
+        gain_sd: (n, n) relative standard uncertainty of the gain: value' = (1 + that) @ value.
+        offset_sd: (n,) standard uncertainty of the offset. The zero of an encoder is known to one
+            step, whether it rounds or truncates (rectangular distribution, JCGM 100:2008, 4.3.7).
     """
 
     axes: tuple[str, ...]
@@ -45,16 +44,16 @@ class Signals:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all signals."""
+        """Names of all signals, the axes first."""
         return (*self.axes, *self.inputs)
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Signals that are no coordinates."""
+        """Signals other than coordinates."""
         return (*self.forces, *self.channels, *self.brakes)
 
     def places(self, names: Sequence[str]) -> list[int]:
-        """Positions of the signals called ``names``."""
+        """Indices of the signals called ``names``."""
         return [self.names.index(name) for name in names]
 
     @classmethod
@@ -87,7 +86,7 @@ class Signals:
         force = session.force
         matrix = np.array(force.calibration)
         places = [i for i, name in enumerate(inputs, len(axes)) if name in force.columns]
-        # Where several columns make one component, no column can stand for another.
+        # If several columns make up one component, no column can stand for another.
         if matrix.shape == (len(places), len(places)) and places:
             order = [session.force.columns.index((*axes, *inputs)[i]) for i in places]
             matrix = matrix[np.ix_(order, order)]
@@ -114,11 +113,11 @@ def _stated(name: str, session: IngestResult) -> str:
 
 @dataclass(frozen=True)
 class Change:
-    """What another set-up says: value' = gain @ value + offset, t' = time * t, and gravity.
+    """Another reading of the signals: value' = gain @ value + offset, t' = time * t, and gravity.
 
     Attributes:
-        gain: (n, n); offset: (n,), in the order of the signals; time: of the clock.
-        gravity: in the frame of a robot's base, m/s2; None where it is as the device file says.
+        gain: (n, n); offset: (n,), in the order of the signals; time: factor of the clock.
+        gravity: in the frame of a robot's base, m/s2; None for that of the device file.
     """
 
     gain: Array
@@ -128,11 +127,11 @@ class Change:
 
     @classmethod
     def none(cls, count: int) -> Change:
-        """The set-up as it is stated, of ``count`` signals."""
+        """The stated reading of ``count`` signals."""
         return cls(np.eye(count), np.zeros(count))
 
     def after(self, first: Change) -> Change:
-        """Both, ``first`` first."""
+        """Both changes, ``first`` being applied first."""
         return Change(
             self.gain @ first.gain,
             self.gain @ first.offset + self.offset,
@@ -141,7 +140,7 @@ class Change:
         )
 
     def of_motion(self, motion: Motion, signals: Signals) -> Motion:
-        """The motion that another set-up makes of the same readings."""
+        """The motion that the same readings give under this change."""
         n = len(signals.axes)
         none = np.zeros_like(motion.t)
         orders = []
@@ -151,9 +150,7 @@ class Change:
             orders.append((values + self.offset if order == 0 else values) / self.time**order)
         sd = np.zeros((motion.t.size, len(self.gain)))
         sd[:, :n] = motion.qd_sd
-        channels = {}
-        for i, name in enumerate(signals.inputs, n):
-            channels[name] = orders[0][:, i]
+        channels = dict(zip(signals.inputs, orders[0][:, n:].T, strict=True))
         return replace(
             motion,
             t=motion.t * self.time,
@@ -165,7 +162,7 @@ class Change:
         )
 
     def of_band(self, band: Band) -> Band:
-        """The same band, in the time of another clock."""
+        """The same band in the time of the changed clock."""
         return Band(
             band.rate_hz / self.time,
             tuple(f / self.time for f in band.cutoff_hz),
@@ -174,7 +171,7 @@ class Change:
 
 
 def calibration_changes(signals: Signals) -> Iterator[tuple[str, Change]]:
-    """What one standard uncertainty of each calibration makes of the signals, by its name."""
+    """Change of the signals by one standard uncertainty of each calibration, with its name."""
     for row, column in np.argwhere(signals.gain_sd > 0.0):
         change = Change.none(len(signals.names))
         change.gain[row, column] += signals.gain_sd[row, column]

@@ -1,4 +1,4 @@
-"""By how much the inputs of a robot were sampled after its positions, drive by drive."""
+"""Delay of a robot's inputs behind its positions, from all drives together."""
 
 from collections.abc import Sequence
 
@@ -17,25 +17,22 @@ from bampipe.trials.residuals import problem_of
 def find_robot_timing(
     system: System, motions: Sequence[Motion], band: Band, p: Array
 ) -> tuple[float, float]:
-    """Time by which the inputs of a robot were sampled after its positions, and its sd, s.
+    """Delay of the sampling of a robot's inputs behind its positions, and its sd, s.
 
-    One clock reads all drives, so that what most of them agree on is theirs: the median over the
-    joints. One drive that acts late would move a fit to all, and every other joint with it.
-    Samples in which a joint turns round do not count: friction that truly stops it looks late
-    there, by milliseconds, and would outweigh the rest of the path. Where the model has a delay of
-    its own for a drive, its joint tells nothing, and does not count either.
+    One clock reads all drives, so the delay is the median over the joints: in a common fit, one
+    drive that acts late would move the delay, and with it all other joints. Samples near reversals
+    do not count: friction that truly stops a joint appears milliseconds late there, and would
+    outweigh the rest of the path. Nor do joints whose drive has a delay of its own in the model.
 
-    The residual is linearised at the parameters ``p`` (n_p,) of the fit.
-
-    Returns:
-        Zero and infinity where no joint tells it.
+    The residual is linearised at the fitted parameters ``p`` (n_p,). If no joint determines the
+    delay, the result is zero and infinity.
     """
     problem = problem_of(system, motions, band, timing=True, turning=False)
     at = np.append(p, 0.0)
     stacked = [stacked_residual(problem, trial, at) for trial in range(len(motions))]
     slopes = [each.slope for each in as_measured(problem, at, stacked)]
     own, axes = problem.free.size - 1, range(len(system.coordinates))
-    # A column for each joint's own timing, in place of the one for all.
+    # Replace the column of the common delay by one for each joint.
     split = [
         np.concatenate([slope[:, :, :own], slope[:, :, own:] * np.eye(len(axes))], axis=2)
         for slope in slopes

@@ -29,7 +29,7 @@ from scipy.optimize import minimize
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
-from bampipe.declarations.model_file import identified, load_model, read_recipe
+from bampipe.declarations.model_file import load_model, read_estimate, read_recipe
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Dictionary
 from bampipe.diagnosis.ranges import MachineScale
@@ -93,7 +93,7 @@ def search(session: Path, folder: Path) -> list[tuple[str, float]]:
     timing = run.read(IdentifyResult, "base").input_timing
     trials = Session(read_measured_trials(run, system, every_input=True, timing=timing), Criteria())
     recipe = read_recipe(run, "base", model)
-    fit = trials.fit_plainly(recipe, identified(run, "base", system))
+    fit = trials.fit_plainly(recipe, read_estimate(run, "base", system))
     e, samples = fit.evidence, fit.likelihood.samples
     names = trials.candidate_names(recipe)
     candidates = {c.name: c for c in candidates_of(recipe, names)}

@@ -258,7 +258,7 @@ def test_mass_is_with_the_link_that_carries_it_or_beyond_a_joint_as_drawn(cell: 
         "carriage": pytest.approx(value["mass.slide"] - 0.4),
         "lower": pytest.approx(value["mass.bend"] - 0.15),
     }
-    said = "the mass of what is fixed to a link is in that link, not in cover, lamp, bracket and"
+    said = "masses fixed to a link are part of that link, not of cover, lamp, bracket and"
     assert f"{said} tool0; the payload of 0.6 kg is in the last link that moves" in text
     losses = {
         e.get("name"): e.find("dynamics") for e in ElementTree.fromstring(text).iterfind("joint")
@@ -292,7 +292,7 @@ def test_a_drawing_too_heavy_beside_the_chain_is_said(tmp_path: Path) -> None:
         entries[f"inertia_{number}.bend"] = {"estimate": 2.0}
     write_result(found.run.root, IdentifyResult, parameters=entries)
     text = export_model(found.run, "base", "urdf")
-    assert "no body has what is left for lower: what hangs there beside the chain" in text
+    assert "no possible body remains for lower: the bodies beside the chain" in text
 
 
 @pytest.mark.parametrize("form", ["urdf", "mjcf"])

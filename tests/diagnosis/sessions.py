@@ -19,7 +19,7 @@ from bampipe.trials.folds import Folds
 from bampipe.trials.kinematics import AxisFilter, Kinematics
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import StandIn, read_by_sensors
+from bampipe.trials.replicates import SimulatedTrials, read_by_sensors
 from bampipe.trials.sensors import Sensors
 
 RATE = 250.0
@@ -127,8 +127,8 @@ def made(
                 channels[f"{head}_{order}_{component}"] = np.zeros(len(t))
         wanted = Motion(f"t{trial + 1:02d}", t, q, qd, qdd, np.zeros_like(qd), channels)
         rng = np.random.default_rng([11, trial])
-        stand_in = StandIn(system, p, [wanted], SENSORS.rate_hz)
-        recording = read_by_sensors(system, wanted, *stand_in.courses[0], SENSORS, rng)
+        simulated = SimulatedTrials(system, p, [wanted], SENSORS.rate_hz)
+        recording = read_by_sensors(system, wanted, *simulated.courses[0], SENSORS, rng)
         seen = KINEMATICS.observe(recording, system.model.device.forces)
-        motions.append(replace(seen, left_out=stand_in.rests[0]))
+        motions.append(replace(seen, left_out=simulated.rests[0]))
     return MeasuredTrials(tuple(motions), SENSORS, KINEMATICS, BAND, folds(trials))

@@ -61,7 +61,7 @@ def test_a_drive_that_hardly_acts_any_more_explains_nothing(tmp_path: Path) -> N
         fits.append(replace(before, recipe=weak, evidence=evidence))
     same, weaker = fits
     keys = (("drive_sag:joint", (0.5,)),)
-    small = replace(weaker, problem=before.likelihood.pose(weaker.evidence))
+    small = replace(weaker, problem=before.likelihood.pose_problem(weaker.evidence))
     with open_search(session, before, only=("drive_sag:joint",)) as search:
         assert search.volume_where_fitted(keys, same.evidence) == pytest.approx([0.0])
         assert search.volume_where_fitted(keys, weaker.evidence) is None

@@ -33,7 +33,7 @@ def fitted(record):
 def factors(fit, residual):
     """Of the common bias, and of the replay that stops, by axis, each (n_q,)."""
     y = tuple(r * root for r, root in zip(residual, fit.likelihood.root, strict=True))
-    problem = replace(fit.likelihood.pose(fit.evidence), y=y)
+    problem = replace(fit.likelihood.pose_problem(fit.evidence), y=y)
     solved = problem.to_parameters @ problem.solve().base
     n_q = len(residual)
     return solved[-2 * n_q : -n_q], solved[-n_q:]
@@ -57,7 +57,7 @@ def test_a_replay_has_unit_variance_in_units_of_its_noise(fitted):
         assert spread.max() > 1.5 * spread.min()
 
 
-def test_replays_are_the_same_in_other_processes(fitted):
+def test_replicates_are_the_same_in_other_processes(fitted):
     session, fit = fitted
     e = fit.evidence
     alone = session.replay(e, e.p, 3)

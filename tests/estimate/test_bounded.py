@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, lsq_linear
 
-from bampipe.estimate.bounded import descend, invert_scaled, solve_bounded
+from bampipe.estimate.bounded import invert_scaled, solve_bounded
+from bampipe.estimate.least_squares import descend
 from bampipe.estimate.normal_equations import NormalEquations
 
 
@@ -100,7 +101,7 @@ class Decay:
         slope = np.column_stack([fall, -self.value[0] * self.t * fall])
         return slope.T @ slope, -slope.T @ self.residual(self.value)
 
-    def moved(self, value: np.ndarray, share: float) -> Decay:
+    def moved(self, value: np.ndarray) -> Decay:
         return Decay(value)
 
 

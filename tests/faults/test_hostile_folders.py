@@ -17,7 +17,7 @@ from bampipe.errors import InputError
 from bampipe.files import is_inside, is_normal, read_json, read_toml
 from bampipe.results.run import is_result
 from bampipe.run import models
-from bampipe.run.events import unheard
+from bampipe.run.events import ignore_event
 
 
 def digest(text: str) -> str:
@@ -257,7 +257,7 @@ def test_trials_that_are_no_tables_are_one_line(toy: Toy, command: Command, tria
 
 def test_an_effect_whose_name_is_a_path_writes_nothing(toy: Toy, outside: Path) -> None:
     """A diagnosis in a run folder names effects: `extend --auto` takes them from there."""
-    options = loop.LoopOptions(toy.root, toy.request().pipeline, False, False, unheard)
+    options = loop.LoopOptions(toy.root, toy.request().pipeline, False, False, ignore_event)
     before = everything(toy.folder)
     for name in ("../../../outside/x", "a/b:yaw", "x:../../y", "\0", ".."):
         with pytest.raises(InputError):
@@ -271,4 +271,4 @@ def test_an_unfinished_model_is_not_the_one_to_extend(tmp_path: Path) -> None:
     effect = "stribeck:carriage"
     child = models.child_name("base", (effect,))
     models.write(tmp_path, ModelFile(name=child, parent="base", device="slider", effects=(effect,)))
-    assert models.counting_model(tmp_path) == "base"
+    assert models.default_model(tmp_path) == "base"

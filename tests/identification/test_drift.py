@@ -117,8 +117,8 @@ def test_in_closed_loop_only_judged_trials_count(monkeypatch: pytest.MonkeyPatch
             motion.trial_id, both, factor * both, motion_of, factor * motion_of
         )  # fmt: skip
 
-    monkeypatch.setattr(free_run, "_closed", closed)
-    monkeypatch.setattr(free_run, "_lacks", lambda *_: "")
+    monkeypatch.setattr(free_run, "_run_closed_loop", closed)
+    monkeypatch.setattr(free_run, "_why_not_closed", lambda *_: "")
     monkeypatch.setattr(free_run, "why_not_free", lambda *_: "")
     monkeypatch.setattr(free_run, "compile_law", lambda _: SimpleNamespace())
     device = SimpleNamespace(prescribed=False, forces=("force_motor",))

@@ -390,8 +390,8 @@ def test_information_narrows_an_uncertainty_by_its_root_and_blocks_widen_it():
     assert known.gain(known.information) == pytest.approx(0.5 * np.log(2.0))
     # For one parameter, trials are worth the fall of the logarithm of its uncertainty.
     much = 3.0 * known.information
-    assert known.worth(much, 20.0, "mass") == pytest.approx(np.log(2.0), rel=1e-3)
-    assert known.worth(much, 20.0) == known.gain(much)
+    assert known.utility(much, 20.0, "mass") == pytest.approx(np.log(2.0), rel=1e-3)
+    assert known.utility(much, 20.0) == known.gain(much)
     few = made_precision(0.01 * np.sqrt(6 / 4), 0.01, 6)
     nothing = np.zeros((2, 2))
     assert few.expect(nothing, 0.0).median[0] < few.sd[0]

@@ -39,7 +39,7 @@ def search_beside(fit: Fit, residual, known: Search | None = None) -> Search:
     scale = MachineScale.of_trials(fit.evidence)
     dictionary = Dictionary(fit.evidence, fit.likelihood.samples, candidates, scale)
     y = tuple(r * root for r, root in zip(residual, fit.likelihood.root, strict=True))
-    problem = replace(fit.likelihood.pose(fit.evidence), y=y)
+    problem = replace(fit.likelihood.pose_problem(fit.evidence), y=y)
     atoms = known.atoms if known is not None else {}
     return Search(problem, dictionary, dictionary.make_all, CRITERIA, atoms)
 

@@ -128,7 +128,7 @@ def test_a_device_without_a_scale_is_refused(tmp_path: Path) -> None:
         "joint.toml",
     )
     used = set_text(r"torque_per_ampere\*current", "gain*torque_per_ampere*current", "joint.toml")
-    with pytest.raises(bampipe.InputError, match="the scale of its equation is undetermined: with"):
+    with pytest.raises(bampipe.InputError, match="the scale of its equation is undetermined"):
         inspected(tmp_path, free, used)
 
 
@@ -206,7 +206,7 @@ def test_what_hardly_follows_the_force_is_not_called_sound(tmp_path: Path) -> No
     found = inspected(tmp_path, mistakes.hold_even, machine="axis")
     assert found.axes["carriage"].state == "unexplained"
     (line,) = list_setup_faults(found)
-    assert line.startswith("carriage: of how the applied force varies, the bare device explains")
+    assert line.startswith("carriage: the bare device explains")
 
 
 def test_gravity_that_the_device_lacks_is_no_exchanged_column(tmp_path: Path) -> None:
@@ -216,7 +216,7 @@ def test_gravity_that_the_device_lacks_is_no_exchanged_column(tmp_path: Path) ->
     found = inspected(tmp_path, weightless, no_moments)
     assert found.mistakes == ()
     (line,) = list_setup_faults(found)
-    assert line.startswith("a torque that follows the position of joint, as of gravity or a spring")
+    assert line.startswith("a torque that follows the position of joint")
 
 
 def test_a_gear_that_was_left_out_is_found_whatever_its_reduction(tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ from bampipe.data.device_file import complete_device
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import Model, System, compile_model
 from bampipe.physics.registry import device_from
-from bampipe.setup.hypotheses import scaled
+from bampipe.setup.hypotheses import scale_correction
 from bampipe.setup.plausibility import Plausibility
 from bampipe.setup.robot_search import DRAWN_SAMPLES, DrawnSearch
-from bampipe.setup.search import Finding, conclude, shorten
+from bampipe.setup.search import Finding, confirm_mistakes, shorten
 from bampipe.setup.turned_trials import find_turned_trials
 from bampipe.trials.folds import Folds
 from bampipe.trials.motion import Motion
@@ -130,8 +130,8 @@ def test_what_spoils_a_joint_that_was_right_is_no_mistake(third: float, named: b
         Plausibility(np.array(error), np.ones(4), arm().prior, np.full(len(arm().prior), objection))
         for error, objection in (((0.10, 0.55, 0.08, 0.21), 1.0), ((0.12, 0.32, third, 0.21), 0.5))
     )
-    twice = scaled(search.signals, FORCES, 2.0, 0.0)
-    assert bool(conclude(lambda chosen: after if chosen else before, (twice,), ())) == named
+    twice = scale_correction(search.signals, FORCES, 2.0, 0.0)
+    assert bool(confirm_mistakes(lambda chosen: after if chosen else before, (twice,), ())) == named
 
 
 def test_a_drive_that_one_trial_has_turned_is_named_with_it() -> None:

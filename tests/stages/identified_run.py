@@ -15,7 +15,7 @@ from bampipe.progress import silent
 from bampipe.stages import filter as filter_stage
 from bampipe.stages import ingest
 from bampipe.trials.motion import Motion
-from bampipe.trials.replay import follow_motion, read_by_sensors
+from bampipe.trials.replicates import follow_motion, read_by_sensors
 from bampipe.trials.sensors import Sensors
 
 RATE = 500.0

@@ -8,7 +8,7 @@ from made_results import write_result
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model import ModelFile
-from bampipe.declarations.model_file import identified
+from bampipe.declarations.model_file import read_estimate
 from bampipe.errors import InputError
 from bampipe.physics import Model, compile_model, registry
 from bampipe.progress import silent
@@ -42,7 +42,7 @@ def test_the_best_confirmed_model_counts(tmp_path: Path) -> None:
     assert {rung.model: rung.confirmed for rung in found.ladder} == dict.fromkeys(
         models.names(tmp_path), True
     )
-    assert found.best == models.counting_model(tmp_path) == "base+a.yaw+b.yaw"
+    assert found.best == models.default_model(tmp_path) == "base+a.yaw+b.yaw"
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_a_child_that_is_no_better_does_not_count(tmp_path: Path, errors: dict[s
     add(tmp_path, "base+a.yaw+b.yaw", "base+a.yaw", yaw=0.1, pitch=0.1)
     found = compared(tmp_path)
     assert [rung.confirmed for rung in found.ladder] == [True, False, False]
-    assert found.best == models.counting_model(tmp_path) == "base"
+    assert found.best == models.default_model(tmp_path) == "base"
 
 
 def test_a_child_whose_floor_is_lost_does_not_count(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_a_damaged_ladder_is_as_none(tmp_path: Path) -> None:
     add(tmp_path, "base+a.yaw", "base", yaw=0.2)
     compared(tmp_path)
     (tmp_path / CompareResult.FILE).write_text("{")
-    assert models.counting_model(tmp_path) == "base"
+    assert models.default_model(tmp_path) == "base"
 
 
 @pytest.mark.parametrize("error", [0.2, 0.5])
@@ -100,13 +100,13 @@ def test_what_is_fixed_stands_at_its_prior_and_what_is_missing_is_named(tmp_path
     assert len(free) < len(system.parameters)
     found = {name: {"estimate": 1.0 + k, "sd": 0.1} for k, name in enumerate(free)}
     write_result(tmp_path, IdentifyResult, parameters=found)
-    p = identified(RunFolder(tmp_path), "base", system)
+    p = read_estimate(RunFolder(tmp_path), "base", system)
     for item, value in zip(system.parameters, p, strict=True):
         assert value == (item.prior if item.fixed else found[item.name]["estimate"])
     assert np.isfinite(p).all()
     del found["armature"]
     write_result(tmp_path, IdentifyResult, parameters=found)
     with pytest.raises(InputError, match=r"identify\.json: no parameter 'armature'; bampipe iden"):
-        identified(RunFolder(tmp_path), "base", system)
+        read_estimate(RunFolder(tmp_path), "base", system)
     with pytest.raises(InputError, match="bampipe identify"):
-        identified(RunFolder(tmp_path), "other", system)
+        read_estimate(RunFolder(tmp_path), "other", system)

@@ -1,12 +1,11 @@
-"""The fitted model in place of the machine: recordings that contain nothing the model lacks.
+"""Replicates: simulations of the fitted model on the trials, which lack nothing by construction.
 
-Noise floors, chance levels and the bias of least squares come from here. The model is driven along
-nearly the measured motion by the measured force plus an arm. Where something stiff gives the
-motion it keeps that and takes the force it needs: on a test bench; of a machine whose friction
-would stop it within a small part of a sample; of a robot whose position controllers are so fast
-that its drives jump where joints turn round; and of any robot that a spring which the model lacks
-would carry away. What it does is read by the same sensors and goes through
-the same filters.
+They give noise floors, null distributions and the bias of least squares. The measured force, and a
+soft spring towards the measured motion, drive the model. The motion is kept instead, and the force
+that it requires is computed, where something stiff prescribes it: on a test bench; on a machine
+whose friction would stop it within a small part of a sample; on a robot whose position controllers
+are so fast that its drives jump when joints reverse; and on any robot that a spring missing from
+the model would carry away. The same sensors and filters then read the result.
 """
 
 from collections.abc import Sequence
@@ -30,34 +29,34 @@ from bampipe.trials.residuals import ModelOnTrial, standstill_of
 from bampipe.trials.sensors import Sensors
 
 _FARTHEST = 0.1
-"""Of a joint's travel: how far the replay of a robot may be from the measured motion. Sound
-replays of simulated arms stay within 0.2 %, without a drive's delay within 0.7 %; without a spring
-that pulls, a light joint goes 1.3 times its travel."""
+"""Largest deviation of a robot's replicate from the measured motion, as a fraction of the joint's
+travel. Sound replicates of simulated arms stay within 0.2 %, without a drive's delay within 0.7 %;
+if a strong spring is missing, a light joint moves 1.3 times its travel."""
 _JUMPS = 0.8
-"""Share of the jump of friction at a reversal that drives make within one sample, from which on
-controllers give the motion. Simulated arms along a smooth path make 0.93 to 0.99 of it, one whose
+"""Fraction of the jump of friction at a reversal that drives make within one sample, above which
+controllers prescribe the motion. Simulated arms on smooth paths make 0.93 to 0.99 of it, one whose
 controller acts at 250 Hz 0.07 to 0.93, two measured arms 0.01 to 0.14."""
 _LATEST = 8
-"""Samples by which a drive may act after its log says so, or be read after it acts: its jumps then
-stand in the log before or behind those of friction."""
+"""Largest delay of a drive behind its log, or of the log behind the drive, in samples: the jumps of
+the drive are then logged before or after those of friction."""
 _FEW_REVERSALS = 5
 _CORRECTIONS, _CANCELLED = 8, 1e-3
-"""Newton steps to the force that a motion needs, and the part of the residual that may remain."""
+"""Newton steps to the force that a motion requires, and the fraction of the residual left."""
 _SMALL, _LEAST_SLOPE = 1e-3, 0.05
-"""Part of such a step from which slopes are taken, and the least of these that is one."""
+"""Relative size of the step from which slopes are taken, and the smallest slope that is used."""
 _PROBED, _FEW = 300, 50
-"""Samples of a trial at which the steps of integration are counted; to tell ten from one, a few."""
+"""Samples of a trial at which integration steps are counted; few suffice to tell ten from one."""
 LONGEST_STEP_S = 2.5e-4
 _STIFFEST = 10.0
-"""Steps of integration over those of `LONGEST_STEP_S` from which on friction holds a machine so
-fast that its drive gives the motion: simulated and measured machines that move freely take 1 to
-1.5, a damper on a test bench 30 to 70."""
+"""Integration steps relative to those of `LONGEST_STEP_S` above which friction holds a machine so
+firmly that its drive prescribes the motion. Machines that move freely, simulated and measured, take
+1 to 1.5, a damper on a test bench 30 to 70."""
 FOLLOWED_HZ = 10.0
-"""Highest frequency of the motion to follow where encoder and handle move apart."""
+"""Highest frequency of the motion to follow if the encoder and the handle move apart."""
 
 
 class Course(NamedTuple):
-    """What a machine does in one trial, before any sensor reads it.
+    """The simulated motion and force of one trial, before any sensor reads them.
 
     Attributes:
         q: positions at the encoders, (T, n_q), rad or m.
@@ -69,10 +68,10 @@ class Course(NamedTuple):
 
 
 @dataclass(frozen=True)
-class StandIn:
-    """A fitted model in place of the machine, which follows the measured trials of a session.
+class SimulatedTrials:
+    """A fitted model that follows the measured trials of a session: the source of replicates.
 
-    Its effects of kind ``measurement`` act on what the encoders read.
+    Its effects of kind ``measurement`` act on the encoders' readings.
     """
 
     system: System
@@ -82,21 +81,17 @@ class StandIn:
 
     @cached_property
     def courses(self) -> Sequence[Course]:
-        """What it does in each trial: the same in all replays, which differ by noise alone."""
+        """The course of each trial, the same in all replicates: these differ only by noise."""
         return KeptItems(follow_motion(self.system, self.p, m, self.rate_hz) for m in self.motions)
 
     @cached_property
     def rests(self) -> Sequence[Flags]:
-        """Where the axes of each trial stand still, (T, n_q)."""
+        """The samples that do not count in each trial, (T, n_q)."""
         return KeptItems(standstill_of(m, self.system, self.rate_hz) for m in self.motions)
 
 
 def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> Course:
-    """Simulate one trial of a fitted model.
-
-    Raises:
-        Runaway: the simulated motion grows without bounds.
-    """
+    """Simulate one trial of a fitted model; raise `Runaway` if the motion grows without bounds."""
     u = motion.inputs(system.inputs)
     fitted = ModelOnTrial(system, p, [motion])
     if _is_motion_given(fitted):
@@ -106,8 +101,8 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
     at = {name: i for i, name in enumerate(system.inputs)}
     forces = system.model.device.forces
     columns = force_columns(system)
-    # A delay by derivatives holds within the band of a residual; a simulated machine feels what is
-    # beyond it, too, such as the jumps of a drive. So its forces are moved, and it has no delay.
+    # A delay by derivatives holds only within the band of a residual. A simulated machine feels
+    # faster changes too, such as jumps of a drive, so its forces are shifted and its delay is zero.
     late = _lateness(fitted) * rate_hz
     acting, prompt = u.copy(), _without_delays(system, p)
     for force, samples in zip(forces, late, strict=True):
@@ -127,7 +122,7 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
             raise
         return Course(motion.q, _required_force(fitted, rate_hz))
     strayed = np.abs(x[:, : q.shape[1]] - q).max(axis=0) > _FARTHEST * np.ptp(q, axis=0)
-    if _is_controlled(system) and strayed.any():  # no likeness of a held robot
+    if _is_controlled(system) and strayed.any():  # controllers would not let a robot stray so far
         return Course(motion.q, _required_force(fitted, rate_hz))
     seen = system.encoder_readings(x, total, prompt)[:, : len(system.coordinates)]
     arm = total[:, columns] - acting[:, columns]
@@ -142,7 +137,7 @@ def steps_to_follow(
     longest_step_s: float = LONGEST_STEP_S,
     probed: int = _PROBED,
 ) -> float:
-    """Steps of integration that a model takes along a motion, from sample to sample on average."""
+    """Mean number of integration steps that a model takes per sample along a motion."""
     u = motion.inputs(system.inputs)
     true = motion.of_mechanism(system, u, p)
     memory = true.memory(system, p)
@@ -155,7 +150,7 @@ def steps_to_follow(
 
 
 def _lateness(fitted: ModelOnTrial) -> Array:
-    """Time by which each force acts after it was logged, (n_f,), s; negative if it acts before."""
+    """Delay of each force behind its log, (n_f,), s; negative if the force acts earlier."""
     system, p, motion, u = fitted.system, fitted.p, fitted.motion, fitted.inputs
     found = np.zeros(len(system.model.device.forces))
     if not system.delays:
@@ -179,7 +174,7 @@ def _lateness(fitted: ModelOnTrial) -> Array:
 
 
 def _shifted(values: Array, samples: float) -> Array:
-    """What a signal (T,) is some samples later; its last value beyond its ends."""
+    """A signal (T,) advanced by some samples; beyond its ends, its last value."""
     if samples == 0.0 or not values.any():
         return values
     at = np.clip(np.arange(values.size) + samples, 0, values.size - 1)
@@ -187,7 +182,7 @@ def _shifted(values: Array, samples: float) -> Array:
 
 
 def keep_motion(fitted: Sequence[ModelOnTrial]) -> bool:
-    """Whether replays of a model keep the motion of every trial, and its turns, as measured."""
+    """Whether the replicates of a model keep the measured motion of every trial."""
     return all(_is_motion_given(each) for each in fitted)
 
 
@@ -207,16 +202,16 @@ def is_stiff(system: System, p: Array, motion: Motion) -> bool:
 
 
 def _is_controlled(system: System) -> bool:
-    """Whether each joint of a robot has a drive, which follows the path of its controller."""
+    """Whether every joint of a robot has a drive, whose controller follows a path."""
     return system.model.device.robot is not None and not system.undriven
 
 
 def _jumps(fitted: ModelOnTrial) -> bool:
-    """Whether the drives of a robot jump, within a sample, as friction does where a joint turns.
+    """Whether a robot's drives jump within a sample when joints reverse, as friction does.
 
-    Between two samples nothing says when they do: driven by such a log, a model would stick for as
-    long as that, and be rougher than the machine. Of a drive that acts late they stand earlier in
-    the log, of one that is read late they stand later, spread over two samples.
+    The log does not say when between two samples they do. Driven by it, a model would stick for
+    up to a sample and be rougher than the machine. Jumps of a delayed drive are logged earlier, and
+    those of a delayed log later, spread over two samples.
     """
     motion, u = fitted.motion, fitted.inputs
     gains = fitted.system.input_map(motion.q, u, fitted.p)
@@ -235,27 +230,27 @@ def _jumps(fitted: ModelOnTrial) -> bool:
 
 
 def _required_force(fitted: ModelOnTrial, rate_hz: float) -> Array:
-    """The force that the model needs for the motion as measured, (T, n_f): none is left over.
+    """The force that leaves no residual for the measured motion, (T, n_f).
 
-    What acts late is logged as much earlier, sample by sample: a jump of friction then falls
-    between other samples than those of the position, which no delay of the log as a whole gives.
+    The log of a delayed force is advanced, sample by sample: its jumps then fall between other
+    samples than those of the position, which no delay of the whole log reproduces.
     """
     system, motion = fitted.system, fitted.motion
     found, late = fitted.inputs[:, force_columns(system)].copy(), _lateness(fitted) * rate_hz
     for samples in np.unique(late):
         at = fitted
         if late.any():
-            moved = _moved_on(motion, system.model.device.forces, samples)
+            moved = _advance_motion(motion, system.model.device.forces, samples)
             at = ModelOnTrial(system, _without_delays(system, fitted.p), [moved])
         found[:, late == samples] = _cancel_residual(at)[:, late == samples]
     return found
 
 
 def _cancel_residual(fitted: ModelOnTrial) -> Array:
-    """The measured force changed by Newton steps until the model leaves nothing, (T, n_f).
+    """Change the measured force by Newton steps until no residual is left, (T, n_f).
 
-    An effect that takes a part of the force needs more of it. What a force does through a state of
-    its own, such as a lag, has no slope by the force of the moment; that is taken to be one.
+    An effect that takes a part of the force requires more of it. A force that acts through an
+    internal state, such as a lag, has no instantaneous slope; one is assumed.
     """
     system, motion, p = fitted.system, fitted.motion, fitted.p
     columns = force_columns(system)
@@ -283,8 +278,8 @@ def _without_delays(system: System, p: Array) -> Array:
     return prompt
 
 
-def _moved_on(motion: Motion, forces: Sequence[str], samples: float) -> Motion:
-    """A trial some samples later, beside ``forces`` as they are."""
+def _advance_motion(motion: Motion, forces: Sequence[str], samples: float) -> Motion:
+    """Advance a trial by some samples, except for its ``forces``."""
     stay = {name for force in forces for name in (force, *input_derivatives(force))}
     channels = {
         name: values if name in stay else _shifted(values, samples)
@@ -305,7 +300,7 @@ def read_by_sensors(
     sensors: Sensors,
     rng: np.random.Generator,
 ) -> Recording:
-    """What the sensors make of positions (T, n_q) and forces (T, n_f)."""
+    """Add quantisation and noise to positions (T, n_q) and forces (T, n_f)."""
     seen = q + rng.normal(size=q.shape) * sensors.scatter_sd if sensors.scatter_sd.any() else q
     step = np.where(sensors.resolution > 0.0, sensors.resolution, 1.0)
     offset = rng.uniform(0.0, 1.0, q.shape[1]) * step
@@ -316,25 +311,25 @@ def read_by_sensors(
     return Recording(motion.trial_id, read, {**motion.channels, **named})
 
 
-def replay_motion(
-    stand_in: StandIn,
+def make_replicate(
+    simulated: SimulatedTrials,
     trial: int,
     sensors: Sensors,
     kinematics: Kinematics,
     rng: np.random.Generator,
 ) -> Motion:
-    """Replay one trial and filter it as the measured one was.
+    """Make a replicate of one trial, and filter it as the measured one was filtered.
 
-    Time derivatives are made of the forces alone, those that the model needs; other channels are
-    the measured ones. ``rng`` is the source of the noise and of where the encoders' counts fall.
+    Only forces get time derivatives, those that the model needs; other channels are the measured
+    ones. ``rng`` gives the noise and the offsets of the encoder counts.
 
     Raises:
         Runaway: the simulated motion grows without bounds.
     """
-    system, course = stand_in.system, stand_in.courses[trial]
-    recording = read_by_sensors(system, stand_in.motions[trial], *course, sensors, rng)
+    system, course = simulated.system, simulated.courses[trial]
+    recording = read_by_sensors(system, simulated.motions[trial], *course, sensors, rng)
     motion = kinematics.observe(recording, system.model.device.forces, system.inputs)
-    return replace(motion, left_out=stand_in.rests[trial])
+    return replace(motion, left_out=simulated.rests[trial])
 
 
 def _reference(
@@ -342,10 +337,10 @@ def _reference(
 ) -> tuple[Array, Array]:
     """Positions and rates of the handle to follow, each (T, n_q).
 
-    Where play or wind-up lies between encoder and handle, the handle's motion is the encoder's
-    plus what the model puts between them. That jumps where a gap is crossed, a little before or
-    after the logged jump; a handle with inertia does not follow the difference of the two.
-    Where the force moves a part first that an internal state follows, it is that state.
+    With play or wind-up between encoder and handle, the handle's motion is the encoder's plus the
+    offset of the model. The offset jumps where a gap is crossed, slightly before or after the
+    logged jump, and a handle with inertia cannot follow the difference; so the sum is low-passed.
+    If the force first moves a part that an internal state describes, that state is followed.
     """
     if not system.moves_sensors:
         x = np.hstack([motion.q, motion.qd, system.memory(*motion.kinematics, u, p, motion.t)])

@@ -10,11 +10,11 @@ from independent_runs import record_trials
 
 from bampipe.diagnosis.session import system_of
 from bampipe.physics import Model, compile_model
-from bampipe.trials import replay
+from bampipe.trials import replicates
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.measured import MeasuredTrials
-from bampipe.trials.replay import StandIn, replay_motion
+from bampipe.trials.replicates import SimulatedTrials, make_replicate
 from bampipe.trials.residuals import ModelOnTrial, problem_of
 
 
@@ -38,10 +38,10 @@ def test_a_replay_for_one_model_has_the_same_inputs(fitted) -> None:
     system = evidence.system
     logged = {name: trials.motions[0].channels[name] for name in system.inputs}
     motion = replace(trials.motions[0], channels=logged)
-    stand_in = StandIn(system, evidence.p, [motion], trials.sensors.rate_hz)
-    rngs, course = [np.random.default_rng(3) for _ in range(2)], stand_in.courses[0]
-    own = replay_motion(stand_in, 0, trials.sensors, trials.kinematics, rngs[0])
-    recording = replay.read_by_sensors(system, motion, *course, trials.sensors, rngs[1])
+    simulated = SimulatedTrials(system, evidence.p, [motion], trials.sensors.rate_hz)
+    rngs, course = [np.random.default_rng(3) for _ in range(2)], simulated.courses[0]
+    own = make_replicate(simulated, 0, trials.sensors, trials.kinematics, rngs[0])
+    recording = replicates.read_by_sensors(system, motion, *course, trials.sensors, rngs[1])
     every = trials.kinematics.observe(recording, system.model.device.forces)
     np.testing.assert_array_equal(every.inputs(system.inputs), own.inputs(system.inputs))
     np.testing.assert_array_equal(
@@ -50,30 +50,30 @@ def test_a_replay_for_one_model_has_the_same_inputs(fitted) -> None:
     assert len(own.channels) < len(every.channels)
 
 
-def test_replays_differ_by_noise_alone_and_share_what_was_simulated(
+def test_replicates_differ_by_noise_alone_and_share_what_was_simulated(
     fitted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trials, evidence = fitted
     simulated: list[str] = []
 
-    def counted(system: Any, p: Any, motion: Any, rate_hz: float) -> replay.Course:
+    def counted(system: Any, p: Any, motion: Any, rate_hz: float) -> replicates.Course:
         simulated.append(motion.trial_id)
         return follow(system, p, motion, rate_hz)
 
-    follow = replay.follow_motion
-    monkeypatch.setattr(replay, "follow_motion", counted)
+    follow = replicates.follow_motion
+    monkeypatch.setattr(replicates, "follow_motion", counted)
     rate_hz, motions = trials.sensors.rate_hz, trials.motions
 
-    def replayed(stand_in: StandIn, number: int) -> Any:
+    def replayed(simulated: SimulatedTrials, number: int) -> Any:
         rngs = (np.random.default_rng([7, number, k]) for k in range(len(motions)))
         filters = trials.sensors, trials.kinematics
-        return [replay_motion(stand_in, k, *filters, rng) for k, rng in enumerate(rngs)]
+        return [make_replicate(simulated, k, *filters, rng) for k, rng in enumerate(rngs)]
 
-    one = StandIn(evidence.system, evidence.p, motions, rate_hz)
+    one = SimulatedTrials(evidence.system, evidence.p, motions, rate_hz)
     shared = [replayed(one, number) for number in range(2)]
     assert simulated == [motion.trial_id for motion in motions]
     for number in range(2):
-        anew = replayed(StandIn(evidence.system, evidence.p, motions, rate_hz), number)
+        anew = replayed(SimulatedTrials(evidence.system, evidence.p, motions, rate_hz), number)
         for known, again in zip(shared[number], anew, strict=True):
             np.testing.assert_array_equal(known.q, again.q)
             np.testing.assert_array_equal(
@@ -87,11 +87,11 @@ def test_a_replay_leaves_out_the_moments_at_which_the_machine_stands_still(fitte
     motion = trials.motions[0]
     rest = np.zeros(motion.q.shape, dtype=bool)
     rest[200:240] = True
-    stand_in = StandIn(
+    simulated = SimulatedTrials(
         evidence.system, evidence.p, [replace(motion, left_out=rest)], trials.sensors.rate_hz
     )
-    replayed = replay_motion(
-        stand_in, 0, trials.sensors, trials.kinematics, np.random.default_rng(1)
+    replayed = make_replicate(
+        simulated, 0, trials.sensors, trials.kinematics, np.random.default_rng(1)
     )
     still = problem_of(evidence.system, [replayed], trials.band).standstill[0]
     assert still[rest].all() and 0.0 < still.mean() < 0.5
@@ -115,7 +115,7 @@ def test_the_jumps_of_a_drive_that_acts_or_is_read_late_are_seen(late: float) ->
     motion = SimpleNamespace(q=q[:, None], qd=qd[:, None])
 
     def jumps(force) -> bool:
-        return replay._jumps(
+        return replicates._jumps(
             SimpleNamespace(
                 system=system, motion=motion, p=np.zeros(1), inputs=force[:, None],
                 residual=(force - needed)[:, None],
@@ -137,10 +137,10 @@ def test_a_replay_of_a_late_motor_leaves_what_the_measurement_leaves(machine, tm
     start = system.prior.copy()
     start[-1] = 0.005
     p = gather_evidence(system, trials.motions, trials.band, start, trials.folds).p
-    stand_in = StandIn(system, p, trials.motions, trials.sensors.rate_hz)
+    simulated = SimulatedTrials(system, p, trials.motions, trials.sensors.rate_hz)
     for number, measured in enumerate(trials.motions):
         rng = np.random.default_rng(1)
-        replayed = replay_motion(stand_in, number, trials.sensors, trials.kinematics, rng)
+        replayed = make_replicate(simulated, number, trials.sensors, trials.kinematics, rng)
         there, here = (
             np.sqrt(np.mean(trials.band.thin(ModelOnTrial(system, p, [m]).residual) ** 2))
             for m in (measured, replayed)
@@ -168,7 +168,7 @@ def test_the_force_that_a_motion_needs_leaves_no_residual(fitted, effect, values
     )
     motion = trials.motions[0]
     measured = ModelOnTrial(system, p, [motion])
-    force = replay._required_force(measured, trials.sensors.rate_hz)
+    force = replicates._required_force(measured, trials.sensors.rate_hz)
     named = dict(zip(system.model.device.forces, force.T, strict=True))
     needed = ModelOnTrial(system, p, [motion.with_channels(named)])
     before, after = (
@@ -189,5 +189,5 @@ def test_how_late_a_force_acts_is_read_off_the_model(fitted, effect, late) -> No
     motion = trials.motions[0]
     derivatives = {name: np.zeros(motion.t.size) for name in system.inputs}
     motion = motion.with_channels(derivatives | dict(motion.channels))
-    found = replay._lateness(ModelOnTrial(system, p, [motion]))
+    found = replicates._lateness(ModelOnTrial(system, p, [motion]))
     np.testing.assert_allclose(found, [late], atol=1e-9)
