@@ -358,7 +358,7 @@ class SetCosts:
         left = self.dictionary.evidence.log_scale[0] + means
         if (left < np.log(_LEAST_SLOPE)).any():
             return None
-        return self.p.independent * means * self._moves_noise
+        return np.asarray(self.p.independent * means * self._moves_noise)
 
     def _log_slopes(
         self, keys: Sequence[Key], strengths: Sequence[Array], scale: Array

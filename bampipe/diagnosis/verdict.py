@@ -175,7 +175,7 @@ def _alike(selection: Selection, effect: str, mentioned: float) -> tuple[str, ..
     """Effects that take the place of one in a set which is as good as undecided against it."""
     best = {*selection.effects}
     found = []
-    for one in selection.weighed.sets[1:]:
+    for one in selection.weighed.sets:
         swapped = {*one.effects} ^ best
         if len(swapped) == 2 and effect in swapped and one.probability >= mentioned:
             found += [e for e in swapped if e != effect]
