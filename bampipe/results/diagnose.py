@@ -193,7 +193,7 @@ class DiagnoseResult(Result):
         found = {}
         for effect in self.selected:
             rest = {*self.selected} - {effect}
-            others = [s.effects for s in self.sets[1:] if effect not in s.effects]
+            others = [s.effects for s in self.sets if effect not in s.effects]
             swapped = [{*o} - rest for o in others if rest <= {*o} and len({*o} - rest) == 1]
             found[effect] = tuple(dict.fromkeys(name for one in swapped for name in one))
         return found
