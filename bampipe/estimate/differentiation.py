@@ -59,6 +59,14 @@ class UniformGrid:
         last = np.searchsorted(self.source, self.t + 1e-9, side="right") - 1
         return np.asarray(values[np.clip(last, 0, len(values) - 1)], dtype=np.float64)
 
+    @property
+    def stamp_offset(self) -> Array:
+        """Time of the nearest sample less that of each grid point, (T,), s."""
+        after = np.clip(np.searchsorted(self.source, self.t), 1, len(self.source) - 1)
+        sides = self.source[after - 1] - self.t, self.source[after] - self.t
+        nearest = np.where(np.abs(sides[0]) < np.abs(sides[1]), *sides)
+        return np.zeros(len(self.t)) if self.exact else np.asarray(nearest)
+
     def resample(self, values: Array, jumps: bool = False) -> Array:
         """Interpolate ``values`` (N,) to the grid (T,).
 

@@ -460,6 +460,7 @@ def _differentiate(
     """Return the rows of one trial and, per axis, the median error bands (position, ...)."""
     grid, frame = trial.grid, trial.frame
     columns: dict[str, object] = {"trial_id": trial.trial_id, "t": grid.t}
+    columns["stamp_offset"] = grid.stamp_offset
     motions = {
         axis: kinematics.differentiate(
             axis, grid.resample(frame[f"q_{axis}"].to_numpy(dtype=np.float64)), trial.observed

@@ -60,6 +60,7 @@ class Motion:
             samples that its trial leaves out. None if there are none.
         filters: filters that produced q, qd and qdd; None if they do not stem from encoders.
         parts: rows of each trial, if several have been joined.
+        stamp_offset: time of the nearest logged sample less ``t``, (T,), s; None if all are zero.
     """
 
     trial_id: str
@@ -72,6 +73,7 @@ class Motion:
     left_out: Flags | None = None
     filters: EncoderFilters | None = None
     parts: Sequence[slice] = (slice(None),)
+    stamp_offset: Array | None = None
     _states: dict[Any, Array] = field(default_factory=dict, init=False, repr=False, compare=False)
     _kept: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 

@@ -110,7 +110,8 @@ def read_motion(
     for column in required:
         if column not in stored:
             raise _no_column(column, str(path))
-    read = dict.fromkeys(["t", *required, *(c for c in column_of.values() if c in stored)])
+    optional = ("stamp_offset", *column_of.values())
+    read = dict.fromkeys(["t", *required, *(c for c in optional if c in stored)])
     columns = read_arrays(path, list(read), trial_id)
     t = columns["t"]
     channels = {
@@ -126,7 +127,11 @@ def read_motion(
     if disturbances:
         inside = np.any([(t >= one.start_s) & (t <= one.end_s) for one in disturbances], axis=0)
         left_out = np.tile(inside[:, None], (1, len(axes)))
-    return Motion(trial_id, t, **kinematics, channels=channels, left_out=left_out, filters=filters)
+    offset = columns.get("stamp_offset", np.zeros(0))
+    return Motion(
+        trial_id, t, **kinematics, channels=channels, left_out=left_out, filters=filters,
+        stamp_offset=offset if offset.any() else None,
+    )  # fmt: skip
 
 
 def read_motions(

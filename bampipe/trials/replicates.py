@@ -15,7 +15,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import Akima1DInterpolator, CubicSpline
 
 from bampipe.arrays import Array, Flags
 from bampipe.estimate.butterworth import zero_phase
@@ -233,9 +233,18 @@ def _required_force(fitted: ModelOnTrial, rate_hz: float) -> Array:
     """The force that leaves no residual for the measured motion, (T, n_f).
 
     The log of a delayed force is advanced, sample by sample: its jumps then fall between other
-    samples than those of the position, which no delay of the whole log reproduces.
+    samples than those of the position, which no delay of the whole log reproduces. Samples between
+    those of the grid see a jump of friction earlier or later, and are resampled as the log was.
     """
     system, motion = fitted.system, fitted.motion
+    if (late_by := motion.stamp_offset) is not None:
+        by = late_by[:, None]
+        q, qd = motion.q + by * motion.qd + 0.5 * by**2 * motion.qdd, motion.qd + by * motion.qdd
+        logged = replace(motion, q=q, qd=qd, stamp_offset=None)
+        stamps, first = np.unique(motion.t + late_by, return_index=True)
+        force = _required_force(ModelOnTrial(system, fitted.p, [logged]), rate_hz)[first]
+        inside = np.clip(motion.t, stamps[0], stamps[-1])
+        return np.asarray(Akima1DInterpolator(stamps, force, method="makima")(inside))
     found, late = fitted.inputs[:, force_columns(system)].copy(), _lateness(fitted) * rate_hz
     for samples in np.unique(late):
         at = fitted

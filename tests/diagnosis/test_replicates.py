@@ -166,7 +166,7 @@ def test_the_force_that_a_motion_needs_leaves_no_residual(fitted, effect, values
         evidence.p,
         [values[q.name.removeprefix(f"{head}.")] for q in system.parameters[len(evidence.p) :]],
     )
-    motion = trials.motions[0]
+    motion = replace(trials.motions[0], stamp_offset=None)
     measured = ModelOnTrial(system, p, [motion])
     force = replicates._required_force(measured, trials.sensors.rate_hz)
     named = dict(zip(system.model.device.forces, force.T, strict=True))
