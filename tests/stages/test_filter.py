@@ -96,7 +96,7 @@ def test_motion_is_recovered(run: RunFolder, method: str) -> None:
 def test_columns_and_bands_and_a_force_that_is_not_filtered(run: RunFolder) -> None:
     _, kinematics = run_stage(run)
     expected = {f"{kind}_{axis}" for kind in KINEMATIC for axis in AXES}
-    expected |= {"trial_id", "t", "bridged", "brake_yaw"}
+    expected |= {"trial_id", "t", "bridged", "stamp_offset", "brake_yaw"}
     expected |= {f"force_{c}" for c in "xyz"}
     orders = ("rate", "curvature", "third", "fourth", "fifth", "sixth")
     expected |= {f"force_{order}_{c}" for order in orders for c in "xyz"}
