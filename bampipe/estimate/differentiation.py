@@ -61,11 +61,11 @@ class UniformGrid:
 
     @property
     def stamp_offset(self) -> Array:
-        """Time of the nearest sample less that of each grid point, (T,), s."""
+        """Time of the nearest sample less that of each grid point, (T,), s; 0 across gaps."""
         after = np.clip(np.searchsorted(self.source, self.t), 1, len(self.source) - 1)
         sides = self.source[after - 1] - self.t, self.source[after] - self.t
         nearest = np.where(np.abs(sides[0]) < np.abs(sides[1]), *sides)
-        return np.zeros(len(self.t)) if self.exact else np.asarray(nearest)
+        return np.where(self.exact | self.bridged, 0.0, nearest)
 
     def resample(self, values: Array, jumps: bool = False) -> Array:
         """Interpolate ``values`` (N,) to the grid (T,).

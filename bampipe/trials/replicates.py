@@ -241,8 +241,10 @@ def _required_force(fitted: ModelOnTrial, rate_hz: float) -> Array:
         by = late_by[:, None]
         q, qd = motion.q + by * motion.qd + 0.5 * by**2 * motion.qdd, motion.qd + by * motion.qdd
         logged = replace(motion, q=q, qd=qd, stamp_offset=None)
-        stamps, first = np.unique(motion.t + late_by, return_index=True)
-        force = _required_force(ModelOnTrial(system, fitted.p, [logged]), rate_hz)[first]
+        # Of points of the grid that share a sample, the nearest.
+        stamps, order = np.round(motion.t + late_by, 9), np.argsort(np.abs(late_by), kind="stable")
+        stamps, first = np.unique(stamps[order], return_index=True)
+        force = _required_force(ModelOnTrial(system, fitted.p, [logged]), rate_hz)[order[first]]
         inside = np.clip(motion.t, stamps[0], stamps[-1])
         return np.asarray(Akima1DInterpolator(stamps, force, method="makima")(inside))
     found, late = fitted.inputs[:, force_columns(system)].copy(), _lateness(fitted) * rate_hz

@@ -166,8 +166,9 @@ class TestUniformGrid:
         assert grid.t[0] == t[0]
         assert 37 <= grid.bridged.sum() <= 40
         nearest = grid.t + grid.stamp_offset
-        assert np.abs(nearest[:, None] - t).min(axis=1).max() < 1e-12
-        assert np.max(np.abs(grid.stamp_offset[~grid.bridged])) < 1.0 / RATE
+        assert np.abs(nearest[~grid.bridged, None] - t).min(axis=1).max() < 1e-12
+        assert np.all(grid.stamp_offset[grid.bridged] == 0.0)
+        assert np.max(np.abs(grid.stamp_offset)) < 1.0 / RATE
         signal = np.sin(2 * np.pi * 2.0 * t)
         error = np.abs(grid.resample(signal) - np.sin(2 * np.pi * 2.0 * grid.t))
         assert np.max(error[~grid.bridged]) < 5e-4
