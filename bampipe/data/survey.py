@@ -30,7 +30,7 @@ _OTHER_DATA = {
     **dict.fromkeys((".xls", ".ods"), "save the sheet as .xlsx or CSV"),
     **dict.fromkeys((".pkl", ".pickle", ".joblib"), "it may run any program; save with np.savez"),
     **dict.fromkeys((".feather", ".arrow", ".orc", ".rds"), "save it as Parquet or CSV"),
-    **dict.fromkeys((".zip", ".gz", ".7z", ".tar", ".bz2", ".xz", ".rar"), "unpack it"),
+    **dict.fromkeys((".zip", ".7z", ".tar", ".bz2", ".xz", ".rar"), "unpack it"),
     **dict.fromkeys(
         (".c3d", ".mf4", ".mdf", ".blf", ".bin", ".ulg", ".tlog", ".trc", ".r64", ".fig", ".slx"),
         "export its channels as CSV, a sample a row",
@@ -50,7 +50,7 @@ _GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
 _WORDS = {
     "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
     " nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
-    " tid czas cas zaman aika ido",
+    " tid czas cas zaman aika ido ipoc",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
     " wanted con ctrl action ziel consigne consigna referencia riferimento planned requested",
     "brake": "brake bremse",
@@ -63,8 +63,8 @@ _WORDS = {
     "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung tension"
     " voltaje tensao tensione",
     "position": "pos position ang angle theta phi psi q enc encoder disp displacement dist x stroke"
-    " winkel weg lage hub joint deflection yaw pitch extension carriage counts posicion posicao"
-    " posizione angulo angolo hoek vinkel kat uhel aci konum poloha course",
+    " winkel weg lage hub joint deflection yaw pitch extension carriage counts posicion"
+    " posicao posizione angulo angolo hoek vinkel kat uhel aci konum poloha course inkremente",
 }
 _SIGNS = {
     "加速度": "acc", "速度": "velocity", "力矩": "torque", "扭矩": "torque", "转矩": "torque",
@@ -437,6 +437,13 @@ class _Logs:
         first = sorted(ordered, key=lambda c: (c not in times, _role(c, labels[c]) != "position"))
         raw = read_recording(self.folder, trial, first, clock, self.dialect)
         sound = _complete_rows(raw.columns, clock.column)
+        if clock.column in raw.columns:
+            stamps = raw.columns[clock.column][sound]
+            # Of a log that is written backwards, the clock says so.
+            mixed = _RISES > np.mean(np.diff(stamps) > 0) > 1.0 - _RISES
+            if mixed and len(np.unique(stamps)) == len(stamps):
+                sound = sound[np.argsort(stamps)]
+                self.remarks.append(f"rows of {trial.file} are out of order: sorted by their times")
         self.first = trial.file
         if not (trial.parts or trial.recording or is_text(trial.file)):
             self.remarks += raw.remarks
@@ -518,9 +525,10 @@ def _like(path: Path) -> str:
 
 
 def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
-    """Rows (T,) in which no column lacks a number, those columns apart that mostly lack one.
+    """Places (T,) of the rows in which no column lacks a number.
 
-    Of a clock that nearly always increases, only rows in which it does.
+    Columns that mostly lack one apart. Of a clock that nearly always increases, only rows in which
+    it does.
     """
     known = [np.isfinite(values) for values in columns.values()]
     if clock in columns:
@@ -529,7 +537,7 @@ def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
         known += [rises] if rises.mean() > _RISES else []
     kept = [mask for mask in known if 2 * mask.sum() > len(mask)]
     complete = np.logical_and.reduce(kept) if kept else np.ones(len(known[0]), dtype=bool)
-    return complete if 2 * complete.sum() > len(complete) else np.ones_like(complete)
+    return np.flatnonzero(complete if 2 * complete.sum() > len(complete) else complete | True)
 
 
 def _by_looks(
@@ -641,7 +649,9 @@ def _role(name: str, stated: str) -> str:
     if said & _PLAIN_POSITIONS and said & _PRESENT:
         said -= _PRESENT  # the position that is current, and no current
     roles = [role for role, text in _WORDS.items() if said & set(text.split())]
-    if len(roles) > 1 and max(map(len, said)) == 1:
+    if len(roles) > 1 and (longer := {word for word in said if len(word) > 1}):
+        roles = [r for r in roles if longer & set(_WORDS[r].split())] or roles  # T.Angle
+    elif len(roles) > 1:
         # x_F: letters that stand for several quantities
         return next(
             (_role_by_unit(x) for x in re.split(r"[_\W]+", name)[1:] if x in "AV" and x), ""

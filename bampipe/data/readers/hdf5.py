@@ -5,7 +5,6 @@ or a column of a matrix (``log/pose[2]``). What lies outside the file is not fol
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -71,16 +70,16 @@ def _arrays(file: Any, alone: bool = False) -> Iterator[tuple[str, Stored]]:
             if not (alone and names):
                 yield label if field is None else f"{label}.{field}", array
             for place, name in enumerate(names):
-                column = replace(
-                    array, shape=(max(data.shape),), load=partial(_column, data, place)
-                )
+                load, said = partial(_column, data, place), _unit(data, place)
+                column = Stored((max(data.shape),), array.kind, load, said)
                 yield f"{label}/{name}", column
 
 
 def _stored(data: Any, field: str | None) -> Stored:
     kind = (data.dtype if field is None else data.dtype[field]).kind
     kind = "U" if data.attrs.get("MATLAB_class") == b"char" else kind
-    return Stored(data.shape, kind, partial(_read, data, field), _unit(data))
+    place = data.dtype.names.index(field) if field else 0
+    return Stored(data.shape, kind, partial(_read, data, field), _unit(data, place))
 
 
 def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
@@ -136,12 +135,8 @@ def _texts(cells: Iterable[Any]) -> list[str]:
     return [x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in cells]
 
 
-def _unit(data: Any) -> str:
-    """Unit that the file states for a dataset."""
-    for key in ("unit", "units", "Unit", "Units"):
-        value = data.attrs.get(key)
-        if isinstance(value, bytes):
-            value = value.decode("utf-8", "replace")
-        if isinstance(value, str):
-            return value
-    return ""
+def _unit(data: Any, place: int) -> str:
+    """Unit that the file states for a dataset, or in a list for the columns or fields of it."""
+    stated = (data.attrs[key] for key in ("unit", "units", "Unit", "Units") if key in data.attrs)
+    said = _texts(np.atleast_1d(next(stated, "")))
+    return said[0] if len(said) == 1 else said[place] if place < len(said) else ""

@@ -13,6 +13,7 @@ import numpy as np
 from bampipe.data.readers import hdf5
 from bampipe.data.readers.arrays import Stored, columns_of_arrays, read_arrays, stored
 from bampipe.data.readers.trial import RawTrial, Wanted
+from bampipe.data.units import units_beside
 from bampipe.errors import InputError
 
 _HEADER = 128
@@ -92,13 +93,11 @@ def _arrays(path: Path) -> tuple[dict[str, Stored], str]:
 
 def _called(found: dict[str, np.ndarray | str | None]) -> tuple[dict[str, Stored], str]:
     texts = {label: text for label, text in found.items() if isinstance(text, str) and text}
-    names, units = dict[str, str](), dict[str, str]()
+    names, units = dict[str, str](), units_beside(texts)
     for label, text in texts.items():
         owner, _, key = label.rpartition(".")
         if key.lower() in _NAMES and owner.endswith("]"):
             names.setdefault(owner, re.sub(r"[^\w ./+-]|[\[\]]", "", text))
-        elif key.lower() in ("unit", "units"):
-            units[owner] = text
     lists: dict[str, dict[int, str]] = {}
     for label, text in texts.items():
         if item := re.fullmatch(r"(.+)\[(\d+)\]", label):
@@ -120,9 +119,9 @@ def _called(found: dict[str, np.ndarray | str | None]) -> tuple[dict[str, Stored
     for label, value in found.items():
         owner, _, key = label.rpartition(".")
         kept, sampled = owner.rpartition("[")[0], key.lower() in _VALUES
+        unit = units.get(label) or (units.get(owner, "") if sampled else "")
         if owner in names and several[kept, names[owner]] == 1:
             label = f"{kept}.{names[owner]}" + ("" if sampled else f".{key}")
-        unit = units.get(owner, "") if sampled else ""
         array = None if isinstance(value, str) else value
         arrays[label.removeprefix(root)] = stored(array, unit)
     return arrays, root

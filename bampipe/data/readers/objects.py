@@ -6,7 +6,6 @@ as many names stands beside them, they have these.
 """
 
 import json
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import Stored, columns_of_arrays, read_arrays, stored
 from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves, reads_as_number
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns
+from bampipe.data.units import units_beside
 from bampipe.errors import InputError, located
 
 
@@ -28,7 +28,7 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
     Raises:
         InputError: not JSON, no such list, a column missing or not of numbers.
     """
-    samples, constants, notes = _samples(path)
+    samples, constants, notes, units = _samples(path)
     if isinstance(samples, dict):
         fixed = [column for column in wanted.columns if column in constants]
         alone = {c: stored(np.array([as_number(constants[c], f"'{c}'")])) for c in fixed}
@@ -50,18 +50,19 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
             values[column] = moments.seconds(stamps)
         else:
             values[column] = np.fromiter(map(as_number, cells, places), float, len(cells))
-    return RawTrial(aligned(values, "value"), first_row=1, notes=notes)
+    stated = {column: units[column] for column in wanted.columns if column in units}
+    return RawTrial(aligned(values, "value"), first_row=1, notes=notes, units=stated)
 
 
 def columns(path: Path) -> dict[str, str]:
     """Names of the values that are numbers, or moments (unit "datetime"), in the first sample."""
-    samples, constants, _ = _samples(path)
+    samples, constants, _, units = _samples(path)
     if isinstance(samples, dict):
         return columns_of_arrays(samples) | dict.fromkeys(constants, "")
     found = {}
     for column, cell in leaves(samples[0]):
         if reads_as_number(cell):
-            found[column] = ""
+            found[column] = units.get(column, "")
         elif isinstance(cell, str) and moments.is_moment(cell):
             found[column] = "datetime"
     return found | {c: "" for c in constants if c not in found}
@@ -69,10 +70,11 @@ def columns(path: Path) -> dict[str, str]:
 
 def stated_units(path: Path) -> dict[str, str]:
     """Units stated beside the samples, such as ``"force units": "kip"``, by quantity."""
-    content = _parsed(path.read_text(encoding="utf-8-sig"))
-    items = content.items() if isinstance(content, dict) else ()
-    parts = [(re.split(r"[ _]units?$", str(key), flags=re.I), value) for key, value in items]
-    return {key[0]: value for key, value in parts if len(key) > 1 and isinstance(value, str)}
+    return _units_beside(_parsed(path.read_text(encoding="utf-8-sig")))
+
+
+def _units_beside(content: object) -> dict[str, str]:
+    return units_beside(dict(leaves(content))) if isinstance(content, dict) else {}
 
 
 def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
@@ -95,7 +97,7 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
             own = [next((str(x[key]) for key in _CALLED if key in x), "") for x in value]
             places = own if all(own) and len(set(own)) == len(own) else range(len(value))
             for place, item in zip(places, value, strict=True):
-                yield from _arrays(item, f"{path}[{place}]")
+                yield from _arrays(item, f"{path or 'data'}[{place}]")
             return
         if isinstance(value[0], str):
             if moments.is_moment(value[0]) and all(isinstance(x, str | None) for x in value):
@@ -109,6 +111,7 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
             yield path or "data", array
 
 
+_Samples = list[object] | dict[str, Stored]
 _CALLED = ("name", "label", "signal", "channel")
 """Keys of what an object is called."""
 
@@ -122,10 +125,8 @@ def _with_lists(content: object, depth: int = 2) -> object:
     return {key: _with_lists(item, depth - 1) for key, item in content.items()}
 
 
-def _samples(
-    path: Path,
-) -> tuple[list[object] | dict[str, Stored], Mapping[str, object], tuple[str, ...]]:
-    """Samples of a file, or its arrays; the numbers beside them, and what was left out."""
+def _samples(path: Path) -> tuple[_Samples, Mapping[str, object], tuple[str, ...], dict[str, str]]:
+    """Samples of a file, or its arrays; numbers beside them, what was left out, and units."""
     data = path.read_bytes()
     try:
         text = data.decode("utf-8-sig")
@@ -145,16 +146,20 @@ def _samples(
             notes = ("last line is cut off: 1 row dropped",)
     else:
         content = _with_lists(_parsed(text))
+    units = _units_beside(content)
     items = content.items() if isinstance(content, dict) else [("", content)]
     lists = {str(k): v for k, v in items if isinstance(v, list) and v and isinstance(v[0], dict)}
-    # Objects are samples rather than recordings, whose values are long lists.
-    single = all(any(reads_as_number(x) for _, x in leaves(v[0])) for v in lists.values())
+    # Objects are samples rather than recordings, whose values are lists longer than that of them.
+    single = all(
+        any(reads_as_number(x) for _, x in leaves(v[0]))
+        and not any(isinstance(x, list) and len(x) > len(v) for x in v[0].values())
+        for v in lists.values()
+    )
     if not (lists and single) and (arrays := dict(_arrays(content))):
-        units = {label: find(content, f"{label.rpartition('.')[0]}.unit") for label in arrays}
-        stated = {label: unit if isinstance(unit, str) else "" for label, unit in units.items()}
+        stated = {x: units.get(x) or units.get(x.rpartition(".")[0], "") for x in arrays}
         kinds = {label: "M" * (array.dtype.kind == "O") for label, array in arrays.items()}
         held = {label: stored(a, stated[label], kinds[label]) for label, a in arrays.items()}
-        return held, _numbers(content), notes
+        return held, _numbers(content), notes, units
     if not isinstance(content, list) and len(lists) != 1:
         raise InputError(
             f"{len(lists)} lists of samples: {', '.join(lists)}"
@@ -168,7 +173,7 @@ def _samples(
     for count, sample in enumerate(samples, 1):
         if not isinstance(sample, dict):
             raise InputError("not an object with named values", where=f"sample {count}")
-    return samples, _numbers(content), notes
+    return samples, _numbers(content), notes, units
 
 
 def _parsed(text: str, where: str = "") -> object:

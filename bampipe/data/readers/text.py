@@ -5,6 +5,7 @@ Rows are counted as an editor does: the first line of the file is row 1.
 
 import codecs
 import csv
+import gzip
 import io
 import re
 from collections.abc import Iterator
@@ -82,7 +83,7 @@ def columns(path: Path, dialect: Dialect | None = None) -> dict[str, str]:
 def is_table(path: Path) -> bool:
     """Whether a file of an unknown extension is text with rows of numbers."""
     try:
-        with path.open("rb") as stream:
+        with _unpacked(path) as stream:
             return dialects.share_of_rows(_head(stream)) > _MANY_ROWS
     except (OSError, InputError):
         return False
@@ -94,7 +95,7 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
 
     InputError where it is not in the encoding that it claims.
     """
-    with path.open("rb") as file:
+    with _unpacked(path) as file:
         stream = _sheet(file) if path.suffix.lower().startswith(".xls") else file
         head = stream.read(HEAD)
         stream.seek(0)
@@ -118,6 +119,12 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
             if form.names and not dialect.names:
                 dialect = dialect.model_copy(update={"names": form.names})
         yield io.BytesIO(text.encode("utf-8", "replace")), dialect, said
+
+
+def _unpacked(path: Path) -> BinaryIO:
+    """The open file; what gzip has packed as it is in memory."""
+    packed = path.suffix.lower() == ".gz"
+    return io.BytesIO(gzip.decompress(path.read_bytes())) if packed else path.open("rb")
 
 
 def _sheet(file: BinaryIO) -> BinaryIO:
@@ -153,8 +160,8 @@ def _asian(head: bytes) -> str:
     runs = re.findall(rb"[\x80-\xff]+", head)
     if not runs or _sound(head, "utf-8"):
         return ""
-    # Letters of Western Europe stand alone among others.
-    lone = re.search(rb"[A-Za-z][\x80-\xff]{2}(?![\x80-\xff])", head)
+    # Letters of Western Europe stand alone among others; below b0, GBK has dots and other signs.
+    lone = re.search(rb"[A-Za-z][\xb0-\xff][\x80-\xff](?![\x80-\xff])", head)
     if not lone and all(len(run) % 2 == 0 for run in runs) and _sound(head, "gb2312"):
         return "gb18030"
     japanese = re.findall(rb"[\x82\x83\x88-\x9f][\x40-\xfc]", head)

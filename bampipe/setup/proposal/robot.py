@@ -25,7 +25,7 @@ from bampipe.setup.drawn_bodies import (
 from bampipe.setup.mounting import Mounting, find_mounting
 from bampipe.setup.proposal.joints import Group, pair_joints
 from bampipe.setup.proposal.notes import Notes
-from bampipe.setup.proposal.positions import position_in_si, scale_to
+from bampipe.setup.proposal.positions import in_counts, position_in_si, scale_to
 
 BEYOND = 1.5
 """Times its range that a joint must travel for the position to be another's."""
@@ -222,7 +222,7 @@ def find_robot_columns(
             notes.check.append(f"of several {what}, {groups[0]} are taken, not {listed}")
     positions, drives = next(iter(by_position), None), next(iter(by_drive), None)
     turns, logged, joints = _turns(device, robot), Logged(device, robot, t), _joints(device)
-    if positions is None or drives is None:
+    if positions is None or drives is None or any(map(in_counts, positions.columns)):
         columns = dict(zip(joints, positions.columns, strict=True)) if positions else {}
         columns |= dict(zip(device.forces, drives.columns, strict=True)) if drives else {}
         return RobotColumns(joints, {**columns, **some_drives})
