@@ -437,13 +437,6 @@ class _Logs:
         first = sorted(ordered, key=lambda c: (c not in times, _role(c, labels[c]) != "position"))
         raw = read_recording(self.folder, trial, first, clock, self.dialect)
         sound = _complete_rows(raw.columns, clock.column)
-        if clock.column in raw.columns:
-            stamps = raw.columns[clock.column][sound]
-            # Of a log that is written backwards, the clock says so.
-            mixed = _RISES > np.mean(np.diff(stamps) > 0) > 1.0 - _RISES
-            if mixed and len(np.unique(stamps)) == len(stamps):
-                sound = sound[np.argsort(stamps)]
-                self.remarks.append(f"rows of {trial.file} are out of order: sorted by their times")
         self.first = trial.file
         if not (trial.parts or trial.recording or is_text(trial.file)):
             self.remarks += raw.remarks
@@ -525,10 +518,9 @@ def _like(path: Path) -> str:
 
 
 def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
-    """Places (T,) of the rows in which no column lacks a number.
+    """Rows (T,) in which no column lacks a number, those columns apart that mostly lack one.
 
-    Columns that mostly lack one apart. Of a clock that nearly always increases, only rows in which
-    it does.
+    Of a clock that nearly always increases, only rows in which it does.
     """
     known = [np.isfinite(values) for values in columns.values()]
     if clock in columns:
@@ -537,7 +529,7 @@ def _complete_rows(columns: Mapping[str, np.ndarray], clock: str) -> np.ndarray:
         known += [rises] if rises.mean() > _RISES else []
     kept = [mask for mask in known if 2 * mask.sum() > len(mask)]
     complete = np.logical_and.reduce(kept) if kept else np.ones(len(known[0]), dtype=bool)
-    return np.flatnonzero(complete if 2 * complete.sum() > len(complete) else complete | True)
+    return complete if 2 * complete.sum() > len(complete) else np.ones_like(complete)
 
 
 def _by_looks(

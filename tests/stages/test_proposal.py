@@ -282,7 +282,7 @@ def test_what_only_a_person_knows_is_left_open(tmp_path):
     read, proposal = proposed(tmp_path / "arm")
     assert read["device"] == "bam" and read["time"] == {"column": "time_us", "unit": "us"}
     assert [t["kind"] for t in read["trials"]] == ["free"] * 5 + ["locked"] * 3
-    assert len(proposal.fill_in) == 5
+    assert len(proposal.fill_in) == 4  # yaw and pitch in one
     text = (tmp_path / "arm/session.toml").read_text()
     assert text.count("# fill in: ") == 5 and "# guess: " in text
     with pytest.raises(InputError, match="counts_per_unit: found 0, expected the number of counts"):

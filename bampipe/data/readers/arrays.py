@@ -73,7 +73,7 @@ def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
         variable, index = split_index(column, known)
         array = known.get(variable)
         if array is None or array.kind not in _NUMBERS + _STAMPED:
-            raise _fault(variable, known, f"{what} '{column}'")
+            raise _fault(column if array is None else variable, known, f"{what} '{column}'")
         check_size(math.prod(array.shape), wanted)
         with located(f"{what} '{column}'"):
             values[column] = _read_column(array, index, wanted.datetimes.get(column))

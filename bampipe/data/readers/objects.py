@@ -6,8 +6,9 @@ as many names stands beside them, they have these.
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,9 @@ import numpy as np
 from bampipe.data.readers import moments
 from bampipe.data.readers.arrays import Stored, columns_of_arrays, read_arrays, stored
 from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves, reads_as_number
-from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns
+from bampipe.data.readers.trial import RawTrial, Wanted
 from bampipe.data.units import units_beside
-from bampipe.errors import InputError, located
+from bampipe.errors import InputError
 
 
 def read(path: Path, wanted: Wanted) -> RawTrial:
@@ -28,44 +29,13 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
     Raises:
         InputError: not JSON, no such list, a column missing or not of numbers.
     """
-    samples, constants, notes, units = _samples(path)
-    if isinstance(samples, dict):
-        fixed = [column for column in wanted.columns if column in constants]
-        alone = {c: stored(np.array([as_number(constants[c], f"'{c}'")])) for c in fixed}
-        return replace(read_arrays(alone | samples, wanted, "array"), notes=notes)
-    first, values = samples[0], {}
-    beside = [column for column in wanted.columns if find(first, column) is MISSING]
-    unknown = [column for column in beside if column not in constants]
-    check_columns([path for path, _ in leaves(first)] + list(constants), unknown)
-    for column in wanted.columns:
-        parts = [constants] if column in beside else samples
-        cells = [None if (c := find(part, column)) is MISSING else c for part in parts]
-        places = (f"sample {n}, '{column}'" for n, _ in enumerate(cells, 1))
-        if column in wanted.datetimes:
-            for cell, where in zip(cells, places, strict=True):
-                if not isinstance(cell, str | None):
-                    raise InputError(f"found {cell!r:.40}, expected a date and time", where=where)
-            with located(f"'{column}'"):
-                stamps = moments.nanoseconds(cells, wanted.datetimes[column])
-            values[column] = moments.seconds(stamps)
-        else:
-            values[column] = np.fromiter(map(as_number, cells, places), float, len(cells))
-    stated = {column: units[column] for column in wanted.columns if column in units}
-    return RawTrial(aligned(values, "value"), first_row=1, notes=notes, units=stated)
+    arrays, notes = _contents(path, wanted.columns)
+    return replace(read_arrays(arrays, wanted, "value"), notes=notes)
 
 
 def columns(path: Path) -> dict[str, str]:
     """Names of the values that are numbers, or moments (unit "datetime"), in the first sample."""
-    samples, constants, _, units = _samples(path)
-    if isinstance(samples, dict):
-        return columns_of_arrays(samples) | dict.fromkeys(constants, "")
-    found = {}
-    for column, cell in leaves(samples[0]):
-        if reads_as_number(cell):
-            found[column] = units.get(column, "")
-        elif isinstance(cell, str) and moments.is_moment(cell):
-            found[column] = "datetime"
-    return found | {c: "" for c in constants if c not in found}
+    return columns_of_arrays(_contents(path)[0])
 
 
 def stated_units(path: Path) -> dict[str, str]:
@@ -111,7 +81,6 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
             yield path or "data", array
 
 
-_Samples = list[object] | dict[str, Stored]
 _CALLED = ("name", "label", "signal", "channel")
 """Keys of what an object is called."""
 
@@ -125,8 +94,8 @@ def _with_lists(content: object, depth: int = 2) -> object:
     return {key: _with_lists(item, depth - 1) for key, item in content.items()}
 
 
-def _samples(path: Path) -> tuple[_Samples, Mapping[str, object], tuple[str, ...], dict[str, str]]:
-    """Samples of a file, or its arrays; numbers beside them, what was left out, and units."""
+def _contents(path: Path, wanted: Sequence[str] = ()) -> tuple[dict[str, Stored], tuple[str, ...]]:
+    """What a file holds by name, what is ``wanted`` by other names too, and what was left out."""
     data = path.read_bytes()
     try:
         text = data.decode("utf-8-sig")
@@ -146,7 +115,6 @@ def _samples(path: Path) -> tuple[_Samples, Mapping[str, object], tuple[str, ...
             notes = ("last line is cut off: 1 row dropped",)
     else:
         content = _with_lists(_parsed(text))
-    units = _units_beside(content)
     items = content.items() if isinstance(content, dict) else [("", content)]
     lists = {str(k): v for k, v in items if isinstance(v, list) and v and isinstance(v[0], dict)}
     # Objects are samples rather than recordings, whose values are lists longer than that of them.
@@ -155,11 +123,13 @@ def _samples(path: Path) -> tuple[_Samples, Mapping[str, object], tuple[str, ...
         and not any(isinstance(x, list) and len(x) > len(v) for x in v[0].values())
         for v in lists.values()
     )
+    units = _units_beside(content)
+    alone = {key: _column([value], "", units) for key, value in _numbers(content).items()}
     if not (lists and single) and (arrays := dict(_arrays(content))):
         stated = {x: units.get(x) or units.get(x.rpartition(".")[0], "") for x in arrays}
         kinds = {label: "M" * (array.dtype.kind == "O") for label, array in arrays.items()}
         held = {label: stored(a, stated[label], kinds[label]) for label, a in arrays.items()}
-        return held, _numbers(content), notes, units
+        return held | alone, notes
     if not isinstance(content, list) and len(lists) != 1:
         raise InputError(
             f"{len(lists)} lists of samples: {', '.join(lists)}"
@@ -173,7 +143,25 @@ def _samples(path: Path) -> tuple[_Samples, Mapping[str, object], tuple[str, ...
     for count, sample in enumerate(samples, 1):
         if not isinstance(sample, dict):
             raise InputError("not an object with named values", where=f"sample {count}")
-    return samples, _numbers(content), notes, units
+    named = [x for x, cell in leaves(samples[0]) if reads_as_number(cell) or _is_moment(cell)]
+    named += [name for name in wanted if find(samples[0], name) is not MISSING]
+    found = {name: _column(samples, name, units) for name in dict.fromkeys(named)}
+    return {**found, **{x: alone[x] for x in alone if x not in found}}, notes
+
+
+def _column(samples: Sequence[object], name: str, units: Mapping[str, str]) -> Stored:
+    """What stands at ``name`` in the samples, or these themselves; null where nothing does."""
+    found = (find(sample, name) if name else sample for sample in samples)
+    cells = [None if cell is MISSING else cell for cell in found]
+    if any(map(_is_moment, cells)):
+        return stored(np.array(cells, dtype=object), kind="M")
+    places = (f"sample {n}, '{name}'" for n, _ in enumerate(cells, 1))
+    load = partial(np.fromiter, map(as_number, cells, places), float, len(cells))
+    return Stored((len(cells),), "f", load, units.get(name, ""))
+
+
+def _is_moment(cell: object) -> bool:
+    return isinstance(cell, str) and moments.is_moment(cell)
 
 
 def _parsed(text: str, where: str = "") -> object:

@@ -41,6 +41,10 @@ _LEAP_S, _SHORTEST_S, _MOST_CUTS = 1.0, 2.0, 200
 """Length, s, of what lies between two trials and of a trial, the least; cuts, the most."""
 
 
+_GUESSED_GEAR = 0.03
+"""Relative standard uncertainty of a reduction that weight shows beside drawn bodies."""
+
+
 @dataclass(frozen=True)
 class ProposedSession:
     """What to write, and what a person has to look at.
@@ -94,7 +98,7 @@ def propose(
         columns = find_robot_columns(
             folder, chosen.device, chosen.device.robot, found, clock.t, notes
         )
-        chosen = _with_guessed_motors(folder, chosen, columns)
+        chosen = _with_guessed_motors(folder, chosen, columns, match.scale_sd)
         match.robot = columns
         if columns.mounting is not None:
             chosen = _hung(folder, chosen, columns.mounting, notes)
@@ -162,9 +166,18 @@ def _head(folder: Path, device: str, rate: str) -> list[str]:
     ]
 
 
-def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColumns) -> ChosenDevice:
-    """A new device file with the torque constants or reductions that the drawing suggests."""
+def _with_guessed_motors(
+    folder: Path, chosen: ChosenDevice, columns: RobotColumns, scale_sd: dict[str, float]
+) -> ChosenDevice:
+    """A new device file with the torque constants or reductions that the drawing suggests.
+
+    ``scale_sd`` is given what all estimates then rest on.
+    """
     sizes = [abs(drive.share) for drive in columns.drives.values()]
+    robot = chosen.device.robot
+    assert robot is not None
+    if not robot.motors:
+        scale_sd |= dict.fromkeys(columns.gears, _GUESSED_GEAR)
     if not chosen.text or not all(drive.is_sure for drive in columns.drives.values()) or not sizes:
         return chosen
     joints = [c.name for c in chosen.device.coordinates]
@@ -175,14 +188,18 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColum
         guessed = {j: (n, 1.0 / size) for j, n, size in found}
         # Where most is carried, errors of single bodies count least.
         size = {
-            joint: float(np.nanstd(columns.columns[name].values) / abs(drive.share))
-            for joint, (name, drive) in zip(joints, columns.drives.items(), strict=True)
+            name: float(np.nanstd(columns.columns[name].values) / abs(drive.share))
+            for name, drive in columns.drives.items()
         }
-        return with_motors(folder, chosen, guessed, max(size, key=lambda joint: size[joint]))
+        reference = max(size, key=lambda name: size[name])
+        scale_sd[reference] = robot.uncertainty
+        return with_motors(folder, chosen, guessed, reference.removeprefix("current_"))
     if columns.gears and all(LEAST_AT_JOINT < size < 1.0 / LEAST_AT_JOINT for size in of_motor):
+        scale_sd |= dict.fromkeys(columns.drives, _GUESSED_GEAR)
         return with_motors(folder, chosen, {j: (columns.gears.get(j, 1.0), None) for j in joints})
     if not columns.gears and all(size < LEAST_AT_JOINT for size in sizes):
         gears = {j: (1.0 / size, None) for j, size in zip(joints, sizes, strict=True)}
+        scale_sd |= dict.fromkeys(columns.drives, robot.uncertainty)
         return with_motors(folder, chosen, gears)
     return chosen
 

@@ -239,7 +239,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         drive = replace(drive, scaled=role == "force" and not levered)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
     weight, on_gravity = weight_of(position, fit, linear, found)
-    name = position.name.removesuffix(f"[{position.stated}]")
+    name = position.name.removesuffix(f" [{position.stated}]")
     starter = starter_device(name, linear, drive, fit, weight, width)
     match.given = {starter.axis: read}
     if match.turning and role == "force" and driver is not None and "motor" in words(driver.name):

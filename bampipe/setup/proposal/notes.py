@@ -23,13 +23,13 @@ class Notes:
     """What a person has to look at, collected while the tables are put together.
 
     Attributes:
-        fill_in: what only a person can know, a sentence each.
+        fill_in: of what something only a person can know is asked, by question and where to look.
         check: guesses, a sentence each.
         columns: inputs and axes that have no column, by what is missing of them: one question each.
         units: columns that look like the positions of axes, by those: one question for their unit.
     """
 
-    fill_in: list[str] = field(default_factory=list)
+    fill_in: dict[tuple[str, str], list[str]] = field(default_factory=dict)
     check: list[str] = field(default_factory=list)
     columns: dict[tuple[str, str], list[str]] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
@@ -42,7 +42,11 @@ class Notes:
             f"{_column_of(names, *kind)}. To find it: {COLUMNS}"
             for kind, names in self.columns.items()
         )
-        return [*self.fill_in, *unit, *columns]
+        asked = (
+            f"{text.replace('{}', join_names(of))}. To find it: {where}"
+            for (text, where), of in self.fill_in.items()
+        )
+        return [*asked, *unit, *columns]
 
     def guess(self, text: str) -> str:
         """The comment that marks a guess; the same guess is listed once."""
@@ -60,10 +64,13 @@ class Notes:
         self.units[axis] = column
         return f"  # fill in: {_unit_of({axis: column})}"
 
-    def ask(self, text: str, where: str) -> str:
-        """The comment that marks what a person must fill in, and where to look it up."""
-        self.fill_in.append(f"{text}. To find it: {where}")
-        return f"  # fill in: {text}"
+    def ask(self, text: str, where: str, of: str = "") -> str:
+        """The comment that marks what a person must fill in, and where to look it up.
+
+        What is asked ``of`` several, which {} stands for in the text, becomes one question.
+        """
+        self.fill_in.setdefault((text, where), []).append(of)
+        return f"  # fill in: {text.replace('{}', of)}"
 
 
 def _column_of(names: list[str], what: str, unit: str) -> str:

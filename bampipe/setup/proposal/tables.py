@@ -249,7 +249,9 @@ def _encoder(
     if worth is not None and column.si is not None:
         turns, sd = (column.scale * part for part in (worth.size, worth.sd))
         said = spelled(column.unit, _POSITION_UNITS)
+        match.scale_sd[axis.name] = sd / turns
         fields = f", gear_ratio = {turns:.4g}, zero_counts = {worth.zero:.4g}"
+        fields += _scale_sd(axis.name, match)
         return entry(column.name, said, fields) + notes.guess(
             f"{column.name} is the position of the motor of {axis.name}, which turns {turns:.4g} ±"
             f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
@@ -282,9 +284,9 @@ def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -
     ``turns``: of what the encoder sits on, for one of the axis.
     """
     direction, zero = match.robot.counting.get(axis.name, (1.0, 0.0))
-    fields, ways = "", []
+    fields, ways = _scale_sd(axis.name, match), []
     if direction * turns != 1.0:
-        fields = f", gear_ratio = {direction * turns:.10g}"
+        fields += f", gear_ratio = {direction * turns:.10g}"
     if direction < 0.0:
         ways.append("counts the other way than the drawing")
     if zero:
@@ -319,7 +321,8 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: No
     power = 2.0 ** round(np.log2(turn)) if turn > 0.0 else 0.0
     is_power = abs(turn - power) < max(_SURE * sd, _NEAR * power)
     size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}" if turn > 0.0 else "0.0"
-    counting = f"counts_per_unit = {size}, zero_counts = {zero:.0f}"
+    match.scale_sd[axis.name] = sd / turn if turn > 0.0 and not is_power else 0.0
+    counting = f"counts_per_unit = {size}, zero_counts = {zero:.0f}" + _scale_sd(axis.name, match)
     table = f'{{ column = {quoted(column.name)}, {counting}, unit = "{axis.unit}" }}'
     if worth is not None:
         taken = f" ({power:.0f}, a power of two, is taken)" if is_power else ""
@@ -329,11 +332,18 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: No
             " in the encoder's counts a turn, times the gear, by 2 pi"
         )
     return table + notes.ask(
-        f"counts_per_unit of {axis.name}, the counts in one {axis.unit}; zero_counts is a guess",
+        f"counts_per_unit of {{}}, the counts in one {axis.unit}; zero_counts is a guess",
         "counts a turn in the encoder's data sheet, times the gear, by 2 pi"
         if axis.unit == "rad"
         else "the scale's data sheet",
+        axis.name,
     )
+
+
+def _scale_sd(name: str, match: Matcher) -> str:
+    """The field of the uncertainty of a scale that is a guess, by name of axis or input."""
+    sd = match.scale_sd.get(name, 0.0)
+    return f", scale_sd = {_rounded(sd)}" if sd else ""
 
 
 def _rounded(sd: float) -> str:
@@ -496,7 +506,7 @@ def _channel(
     register = match.registers.get(column.name)
     fields = register.fields if register else ""
     turned = name in match.robot.turned or column.name == match.reacting
-    fields += ", scale = -1.0" if turned else ""
+    fields += (", scale = -1.0" if turned else "") + _scale_sd(name, match)
     slides = (column.si, si) == ("N", "N.m")  # the drive of a sliding joint
     if column.si == si or slides:
         table = entry(column.name, bare(column.unit), fields)
