@@ -63,8 +63,9 @@ _WORDS = {
     "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung tension"
     " voltaje tensao tensione",
     "position": "pos position ang angle theta phi psi q enc encoder disp displacement dist x stroke"
-    " winkel weg lage hub joint deflection yaw pitch extension carriage counts posicion"
-    " posicao posizione angulo angolo hoek vinkel kat uhel aci konum poloha course inkremente",
+    " winkel weg lage hub joint deflection yaw pitch extension carriage counts pot poti"
+    " posicion posicao posizione angulo angolo hoek vinkel kat uhel aci konum poloha course"
+    " inkremente",
 }
 _SIGNS = {
     "加速度": "acc", "速度": "velocity", "力矩": "torque", "扭矩": "torque", "转矩": "torque",

@@ -104,10 +104,10 @@ def units_in(names: Iterable[str]) -> dict[str, str]:
     }
 
 
-def units_beside(texts: Mapping[str, object]) -> dict[str, str]:
+def units_beside(texts: Mapping[str, str]) -> dict[str, str]:
     """Units by what they are of, from texts in a file: ``q_unit``, ``q.unit``, ``units.q``."""
-    found = {_BESIDE.sub("", name, count=1): (name, text) for name, text in texts.items()}
-    return {of: text for of, (name, text) in found.items() if of != name and isinstance(text, str)}
+    found = ((_BESIDE.sub("", name, count=1), name) for name in texts)
+    return {of: texts[name] for of, name in found if of != name}
 
 
 def unit(text: str) -> RecordedUnit | None:

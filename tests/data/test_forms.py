@@ -234,7 +234,7 @@ def test_channels_go_by_the_names_beside_them(tmp_path: Path):
     np.testing.assert_array_equal(trial.columns["log/u"], U)
     content = {"log": [{"name": n, "values": [*v, *v]} for n, v in (("q", Q), ("u", U))]}
     (tmp_path / "d.json").write_text(json.dumps(content | {"meta": {"fs": 100}}))
-    assert set(columns_of(tmp_path / "d.json")) == {"log[q].values", "log[u].values", "meta.fs"}
+    assert set(columns_of(tmp_path / "d.json")) == {"log.q", "log.u", "meta.fs"}
     (tmp_path / "d.json").write_text(json.dumps([{"q": f"{q:.4f}"} for q in Q]))
     np.testing.assert_array_equal(read_trial(tmp_path / "d.json", ("q",)).columns["q"], Q)
     heads = np.array(["t", "q", "u"], dtype=object)

@@ -14,7 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import Stored, columns_of_arrays, read_arrays, stored
+from bampipe.data.readers.arrays import (
+    Stored,
+    called_signals,
+    columns_of_arrays,
+    read_arrays,
+    stored,
+)
 from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves, reads_as_number
 from bampipe.data.readers.trial import RawTrial, Wanted
 from bampipe.data.units import units_beside
@@ -40,11 +46,12 @@ def columns(path: Path) -> dict[str, str]:
 
 def stated_units(path: Path) -> dict[str, str]:
     """Units stated beside the samples, such as ``"force units": "kip"``, by quantity."""
-    return _units_beside(_parsed(path.read_text(encoding="utf-8-sig")))
+    return units_beside(_texts(_parsed(path.read_text(encoding="utf-8-sig"))))
 
 
-def _units_beside(content: object) -> dict[str, str]:
-    return units_beside(dict(leaves(content))) if isinstance(content, dict) else {}
+def _texts(content: object) -> dict[str, str]:
+    """The texts in a parsed file, by their paths."""
+    return {path: text for path, text in leaves(content) if isinstance(text, str)}
 
 
 def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
@@ -64,9 +71,7 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
                     yield label, array
     elif isinstance(value, list) and value:
         if isinstance(value[0], dict):
-            own = [next((str(x[key]) for key in _CALLED if key in x), "") for x in value]
-            places = own if all(own) and len(set(own)) == len(own) else range(len(value))
-            for place, item in zip(places, value, strict=True):
+            for place, item in enumerate(value):
                 yield from _arrays(item, f"{path or 'data'}[{place}]")
             return
         if isinstance(value[0], str):
@@ -79,10 +84,6 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
             return
         if array.ndim <= 2 and array.size and len(array) > 1:
             yield path or "data", array
-
-
-_CALLED = ("name", "label", "signal", "channel")
-"""Keys of what an object is called."""
 
 
 def _with_lists(content: object, depth: int = 2) -> object:
@@ -123,12 +124,13 @@ def _contents(path: Path, wanted: Sequence[str] = ()) -> tuple[dict[str, Stored]
         and not any(isinstance(x, list) and len(x) > len(v) for x in v[0].values())
         for v in lists.values()
     )
-    units = _units_beside(content)
+    texts = _texts(content)
+    units = units_beside(texts)
     alone = {key: _column([value], "", units) for key, value in _numbers(content).items()}
     if not (lists and single) and (arrays := dict(_arrays(content))):
-        stated = {x: units.get(x) or units.get(x.rpartition(".")[0], "") for x in arrays}
         kinds = {label: "M" * (array.dtype.kind == "O") for label, array in arrays.items()}
-        held = {label: stored(a, stated[label], kinds[label]) for label, a in arrays.items()}
+        called = called_signals(arrays, texts).items()
+        held = {name: stored(arrays[x], unit, kinds[x]) for x, (name, unit) in called}
         return held | alone, notes
     if not isinstance(content, list) and len(lists) != 1:
         raise InputError(

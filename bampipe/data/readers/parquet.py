@@ -66,7 +66,7 @@ def columns(path: Path) -> dict[str, str]:
     schema = pq.read_schema(path)
     found = dict.fromkeys(lerobot.vector_columns(path, schema), "")
     attributes = json.loads((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}"))
-    beside = units_beside(dict(leaves(attributes)))
+    beside = units_beside({k: u for k, u in leaves(attributes) if isinstance(u, str)})
     for field in schema:
         if field.name in lerobot.NO_READINGS and lerobot.EPISODE in schema.names:
             continue

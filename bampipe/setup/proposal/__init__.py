@@ -6,7 +6,7 @@ a radian, is left at a value that the session reader refuses with a line saying 
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from bampipe.physics.device import Device
 from bampipe.setup.mounting import Mounting
 from bampipe.setup.proposal.device import (
     DEVICE,
+    UNKNOWN_CONSTANT,
     ChosenDevice,
     find_device,
     new_device,
@@ -102,7 +103,7 @@ def propose(
         match.robot = columns
         if columns.mounting is not None:
             chosen = _hung(folder, chosen, columns.mounting, notes)
-        _check_robot(chosen, columns, notes)
+        chosen = _check_robot(chosen, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
     if len(match.rivals) > 1 and len(chosen.device.coordinates) == 1:
@@ -218,8 +219,8 @@ def _hung(folder: Path, chosen: ChosenDevice, mounting: Mounting, notes: Notes) 
     return with_gravity(folder, chosen, said) if chosen.text else chosen
 
 
-def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> None:
-    """What a look at the columns does not show of a robot."""
+def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> ChosenDevice:
+    """The robot without torque constants that nothing tells; what else to look at is noted."""
     robot = chosen.device.robot
     assert robot is not None
     if "tip =" in chosen.text:
@@ -230,11 +231,6 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
             f"positions and torques are those of the joints, {joints}: if they are of motors, give"
             " [robot.motors] and the reductions"
         )
-        if chosen.device.force_unit == "A" and chosen.text:
-            notes.check.append(
-                f"{chosen.name}: torque_constant 1.0 is not yours yet: all forces and inertias"
-                " scale with it"
-            )
     notes.check += [
         f"no body has this, and the nearest that one can have is taken: {line}"
         for line in robot.impossible
@@ -243,6 +239,13 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
         notes.check.append(
             f"no mass is drawn on {join_names(robot.undrawn)}: put it in where there is a body"
         )
+    if UNKNOWN_CONSTANT not in chosen.text:
+        return chosen
+    note = notes.ask(
+        f"torque_constant of each motor in {chosen.name}, N.m/A at the joint",
+        "the drive's data sheet, times the reduction",
+    )
+    return replace(chosen, text=chosen.text.replace(UNKNOWN_CONSTANT, f'"{UNKNOWN}"{note}'))
 
 
 def _trials_tables(

@@ -36,6 +36,8 @@ from bampipe.setup.proposal.starter import Drive, starter_device, weight_of
 
 DEVICE = "device.toml"
 _SCHEMA = "bampipe.device/1"
+UNKNOWN_CONSTANT = "1  # guess: N.m/A, gears included"
+"""Stands for the torque constant of a motor until a drawing or a person tells."""
 _MAY_SLIDE = " (no unit says that it slides: if it does, bampipe init FOLDER --device slider)"
 _MAY_TURN = " (by a force in N alone: if it turns, call its column {0}_rad or {0}_deg)"
 _HEAD_BYTES = 1 << 16
@@ -239,7 +241,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         drive = replace(drive, scaled=role == "force" and not levered)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
     weight, on_gravity = weight_of(position, fit, linear, found)
-    name = position.name.removesuffix(f" [{position.stated}]")
+    name = position.name.removesuffix(f" [{read.stated}]")
     starter = starter_device(name, linear, drive, fit, weight, width)
     match.given = {starter.axis: read}
     if match.turning and role == "force" and driver is not None and "motor" in words(driver.name):

@@ -104,6 +104,8 @@ def _groups(names: Sequence[str], columns: Sequence[SurveyedColumn]) -> list[Gro
         for group in _numbered_alike(columns, split).values()
         if len(group) == len(names)
     ]
+    # What is on the side of the motors stands for their joints only where nothing else does.
+    found.sort(key=lambda group: "motor" in _tokens(group.columns[0].name))
     taken: set[str] = set()
     chosen = []
     for group in found:

@@ -19,7 +19,7 @@ _NAMELESS = (
     " measured meas current state value deg degree degrees rad radian radians vel velocity speed"
     " header feedback column ang motion dist percent rec log data mot motor field run runs"
     " observation ist akt grad rev mesure mesuree medido misurato gemessen trial experiment"
-    " inertia offset moment inkremente increments"
+    " inertia offset moment inkremente increments samples channels signals"
 )
 """Words in the name of a position that name no axis."""
 _FROM_A_MOTOR = REFERENCE_WORDS | {"effort", "eff", "torque", "tau"}

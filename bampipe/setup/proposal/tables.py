@@ -332,7 +332,8 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: No
             " in the encoder's counts a turn, times the gear, by 2 pi"
         )
     return table + notes.ask(
-        f"counts_per_unit of {{}}, the counts in one {axis.unit}; zero_counts is a guess",
+        f"counts_per_unit of {{}}, the counts in one {axis.unit}; zero_counts is a guess"
+        + (" of what is read where the drawing has 0" if match.robot.joints else ""),
         "counts a turn in the encoder's data sheet, times the gear, by 2 pi"
         if axis.unit == "rad"
         else "the scale's data sheet",
@@ -522,6 +523,13 @@ def _channel(
             "the drive's table of registers",
         )
         return entry(column.name, UNKNOWN, fields) + note
+    if column.conversion is not None and column.si != si:
+        note = notes.ask(
+            f"the scale of {{}}, {si} for one {bare(column.unit)}, in which its column is",
+            "of a share, what is rated, in the drive's data sheet",
+            name,
+        )
+        return entry(column.name, si, f"{fields}, scale = 0.0") + note
     likely = si if register else guesses.likely_unit(si, column.values) or si
     if name == "supply" and column.is_integer and float(np.nanmedian(column.values)) > _MOST_VOLTS:
         likely = "0.1V"
