@@ -88,7 +88,7 @@ def read_recording(
             raw = _by_time(raw, other, entry.file, part, kept, (clock.column, time), ticks)
     raw = replace(raw, columns={column: raw.columns[column] for column in columns})
     raw = _one_of(raw, entry, clock)
-    for repair in (_filled, _in_order, _once, _without_codes, _at_one_rate):
+    for repair in (_filled, _once, _without_codes, _at_one_rate):
         raw = repair(raw, clock)
     return raw
 
@@ -156,23 +156,6 @@ def _at_one_rate(raw: RawTrial, clock: Clock) -> RawTrial:
             )
     remarks = [*raw.remarks, *remarks]
     return replace(raw, columns=columns, kept=raw.rows[rows], remarks=tuple(remarks), resumed=())
-
-
-def _in_order(raw: RawTrial, clock: Clock) -> RawTrial:
-    """The rows in the order of their times, where they are shuffled: the readings get smoother."""
-    t = raw.columns.get(clock.column, np.empty(0))
-    if raw.begun or len(t) < _LEAST or not 1.0 - _MOSTLY < np.mean(np.diff(t) > 0.0) < _MOSTLY:
-        return raw
-    order = np.argsort(t, kind="stable")
-    columns = {name: values[order] for name, values in raw.columns.items()}
-    travels = [
-        tuple(np.nansum(np.abs(np.diff(values))) for values in (columns[name], raw.columns[name]))
-        for name in columns.keys() - {clock.column}
-    ]
-    if not travels or np.mean([new / old for new, old in travels if old > 0.0]) >= 1.0:
-        return raw
-    notes = (*raw.notes, "rows are out of order: sorted by their times")
-    return replace(raw, columns=columns, kept=raw.rows[order], notes=notes, resumed=())
 
 
 def _once(raw: RawTrial, clock: Clock) -> RawTrial:

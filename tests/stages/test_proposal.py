@@ -176,10 +176,10 @@ def test_tables_of_any_extension_are_read_and_prose_beside_them_is_no_table(tmp_
 
 def test_the_unit_of_joints_without_names_is_asked_once() -> None:
     notes = Notes()
-    comments = [notes.ask_unit(f"column_{n}", f"joint_{n}") for n in (1, 2)]
-    assert comments[1].endswith("column_2, which looks like the position of joint_2")
-    (question,) = notes.questions
-    assert question.startswith("the unit of column_1 and column_2, which look like the positions")
+    looks = [f"column_{n}, which looks like the position of joint_{n}" for n in (1, 2)]
+    comments = [notes.ask("the unit of {}", "the manual", of) for of in looks]
+    assert comments[1].endswith(looks[1])
+    assert notes.questions == [f"the unit of {looks[0]} and {looks[1]}. To find it: the manual"]
 
 
 def arm_log(turned: float = 0.0) -> dict[str, np.ndarray]:

@@ -42,7 +42,7 @@ _LEAP_S, _SHORTEST_S, _MOST_CUTS = 1.0, 2.0, 200
 """Length, s, of what lies between two trials and of a trial, the least; cuts, the most."""
 
 
-_GUESSED_GEAR = 0.03
+_GUESSED_GEAR = 0.1
 """Relative standard uncertainty of a reduction that weight shows beside drawn bodies."""
 
 

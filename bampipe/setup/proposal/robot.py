@@ -148,9 +148,10 @@ class Logged:
                 left = np.sqrt([max(drive.left, 1e-12) for drive in judged])
                 if not in_torque:
                     return np.asarray(left)
-                # A torque of the motor is that of the joint over the reduction, as drawn.
-                size = np.array([max(abs(drive.share), 1e-9) for drive in judged])
-                return np.concatenate([left, _DRAWN * np.log(size[moved] * tried[moved])])
+                # A torque is that of the joint as drawn, or of the motor: over the reduction.
+                size = np.log([max(abs(drive.share), 1e-9) for drive in judged])[moved]
+                off = np.stack([size, size + np.log(tried[moved])])
+                return np.concatenate([left, _DRAWN * off[np.abs(off).sum(axis=1).argmin()]])
 
             found = least_squares(misfit, np.log(ratio[moved]), diff_step=1e-3, max_nfev=40)
             best = at_joint.copy()

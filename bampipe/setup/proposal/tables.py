@@ -27,8 +27,8 @@ _COUNTERS = frozenset(["tick", "ticks", "cycle", "cycles", "timestep", "timestep
 """Words in the name of a clock that counts at a rate of its own."""
 _SECONDS = {"sec", "secs", "seconds"}
 _NANOSECONDS = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
-_FALLING = 0.9
-"""Share of steps at which the time of a log that is written backwards falls, the least."""
+_MIXED = 0.1
+"""Share of steps at which times fall that are all different, of rows that stand out of order."""
 _SLOW_HZ = 40.0
 """Below, accelerations of a joint that stops within a tenth of a second are not seen."""
 _OF_ROWS = (
@@ -162,11 +162,12 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
         rate = f'sample_rate_hz = "{UNKNOWN}"'
         return ProposedClock(t, (numbers.name,), _table(*lines), rate)
     stamps = next((column for column in found.of("time") if not column.is_constant), None)
-    if stamps is not None and _FALLING < np.mean(np.diff(stamps.values) < 0.0):
+    falls = float(np.mean(np.diff(stamps.values) < 0.0)) if stamps is not None else 0.0
+    if stamps is not None and _MIXED < falls and len(np.unique(stamps.values)) == len(samples):
         raise InputError(
-            f"{stamps.name} falls from row to row: the log is written backwards",
+            f"{stamps.name} falls from row to row: the log is written backwards, or out of order",
             where=found.trials[0].file,
-            remedy="turn the order of its rows round",
+            remedy="sort its rows by their time",
         )
     why = "no column increases like a time" if stamps is None else _describe_stamps(stamps)
     note = notes.guess(f"samples are counted: {why}")
@@ -223,7 +224,7 @@ def encoders_table(
     for axis in device.coordinates:
         column = match.position(axis.name, len(device.coordinates), notes)
         if column is None:
-            note = notes.ask_column(axis.name, axis.unit, "position")
+            note = notes.ask_column(f"the position of {axis.name}", axis.unit)
             lines.append(f"{axis.name} = {entry(UNKNOWN, axis.unit)}{note}")
             continue
         axes[axis.name] = column
@@ -259,9 +260,9 @@ def _encoder(
         )
     right, geared = column.si == axis.unit, axis.name in match.robot.gears
     if (column.by_looks or column.is_foreign) and not right:
-        said = f"the unit of {column.name}, stated as '{column.stated}'"
-        foreign = column.is_foreign
-        note = notes.ask(said, UNITS) if foreign else notes.ask_unit(column.name, axis.name)
+        looks = f"which looks like the position of {axis.name}"
+        said = f"stated as '{column.stated}'" if column.is_foreign else looks
+        note = notes.ask("the unit of {}", UNITS, f"{column.name}, {said}")
         return entry(column.name, UNKNOWN, _velocity_beside(axis, alone, match, notes)) + note
     by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
     said = (spelled(column.unit, _POSITION_UNITS) if right else by_size) or axis.unit
