@@ -87,10 +87,7 @@ def read_recording(
             ticks = SECONDS.get(clock.unit, 1.0), SECONDS.get(unit, 1.0)
             raw = _by_time(raw, other, entry.file, part, kept, (clock.column, time), ticks)
     raw = replace(raw, columns={column: raw.columns[column] for column in columns})
-    raw = _one_of(raw, entry, clock)
-    for repair in (_filled, _once, _without_codes, _at_one_rate):
-        raw = repair(raw, clock)
-    return raw
+    return _at_one_rate(_without_codes(_filled(_one_of(raw, entry, clock), clock), clock), clock)
 
 
 def _without_codes(raw: RawTrial, clock: Clock) -> RawTrial:
@@ -156,19 +153,6 @@ def _at_one_rate(raw: RawTrial, clock: Clock) -> RawTrial:
             )
     remarks = [*raw.remarks, *remarks]
     return replace(raw, columns=columns, kept=raw.rows[rows], remarks=tuple(remarks), resumed=())
-
-
-def _once(raw: RawTrial, clock: Clock) -> RawTrial:
-    """The rows without copies of those before them, where each stamp that repeats is of a copy."""
-    t = raw.columns.get(clock.column, np.empty(0))
-    twice = np.flatnonzero(np.diff(t) == 0.0) + 1
-    pairs = [(values[twice], values[twice - 1]) for values in raw.columns.values()]
-    if not len(twice) or raw.begun or not all(np.array_equal(*p, equal_nan=True) for p in pairs):
-        return raw
-    rows = np.delete(np.arange(len(t)), twice)
-    columns = {name: values[rows] for name, values in raw.columns.items()}
-    notes = (*raw.notes, f"{len(twice)} rows that stand twice are left out")
-    return replace(raw, columns=columns, kept=raw.rows[rows], notes=notes, resumed=())
 
 
 def _is_sparse(known: np.ndarray) -> bool:

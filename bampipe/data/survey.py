@@ -43,7 +43,7 @@ _MOST_SCANNED = 1 << 30
 """Bytes of text in which other recordings are looked for; reading them takes some seconds."""
 _WHOLE = 2
 """Of logs that hold both a motion and what drives it."""
-_RISES = 0.95
+_RISES = 0.8
 """Share of samples at which a clock rises, if what else it does is an accident."""
 _GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
 """Words in the name of a column that say less of it than the name of its file."""
@@ -208,8 +208,6 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     sound = []
     for trial in trials:
         try:
-            if read:
-                logs.compare(trial, common)
             several = logs.recordings(trial)
             read = read or logs.read(several[0], common)
             sound += several
@@ -219,8 +217,15 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
         raise logs.fault()
     columns, guessed = _by_looks(_with_commands(list(read)), folder)
     if guessed and sound[0].file.lower().endswith(".json"):
-        beside = objects.stated_units(folder / sound[0].file)
-        columns = tuple(_with_unit_beside(c, columns, beside) for c in columns)
+        # The first unit of a quantity is that of the first column which looks like it.
+        beside = objects.stated_units(folder / sound[0].file).items()
+        units = {_role(name, u): u for name, u in reversed(beside) if unit(u) is not None}
+        columns = tuple(
+            replace(c, unit=units.pop(c.role), by_looks=False)
+            if c.by_looks and c.role in units
+            else c
+            for c in columns
+        )
     if dataset is not None:
         logs.remarks = [lerobot.REMARK]
     return Survey(tuple(sound), columns, (*logs.remarks, *guessed), tuple(logs.passed))
@@ -239,7 +244,6 @@ class _Logs:
     found: dict[str, dict[str, str]] = field(default_factory=dict)
     passed: list[tuple[str, str]] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
-    first: str = ""
     scanned: int = 0
 
     def paths(self) -> list[Path]:
@@ -438,7 +442,6 @@ class _Logs:
         first = sorted(ordered, key=lambda c: (c not in times, _role(c, labels[c]) != "position"))
         raw = read_recording(self.folder, trial, first, clock, self.dialect)
         sound = _complete_rows(raw.columns, clock.column)
-        self.first = trial.file
         if not (trial.parts or trial.recording or is_text(trial.file)):
             self.remarks += raw.remarks
         # Times of one name, beside the readings that each is of.
@@ -464,17 +467,6 @@ class _Logs:
             unit = _unit(column, said, role)
             found.append(SurveyedColumn(column, said, role, unit, raw.columns[column][sound]))
         return tuple(found)
-
-    def compare(self, trial: TrialEntry, wanted: Sequence[str]) -> None:
-        """Raise InputError where a log states another unit than the first that was read."""
-        for column in wanted:
-            here, there = self.found[trial.file].get(column), self.found[self.first].get(column)
-            known, other = unit(here or ""), unit(there or "")
-            if here and there and known and other and known != other:
-                raise InputError(
-                    f"gives {column} in {here}, {self.first} in {there}",
-                    remedy="export both in one unit, or put it into a session of its own",
-                )
 
     def recordings(self, trial: TrialEntry) -> list[TrialEntry]:
         """The recordings that one text file or list of structs holds; others as they are.
@@ -564,16 +556,6 @@ def _by_looks(
     return tuple(
         replace(c, role=roles[c.name], by_looks=True) if c.name in roles else c for c in columns
     ), [guessed]
-
-
-def _with_unit_beside(
-    column: SurveyedColumn, columns: Sequence[SurveyedColumn], beside: Mapping[str, str]
-) -> SurveyedColumn:
-    """A column that is known by its looks with the first unit ``beside`` of its quantity."""
-    first = next((c for c in columns if c.role == column.role), None)
-    said = next((u for name, u in beside.items() if _role(name, u) == column.role), "")
-    known = column.by_looks and column is first and unit(said) is not None
-    return replace(column, unit=said, by_looks=False) if known else column
 
 
 def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:

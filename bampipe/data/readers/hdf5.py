@@ -70,7 +70,7 @@ def _arrays(file: Any, alone: bool = False) -> Iterator[tuple[str, Stored]]:
             if not (alone and names):
                 yield label if field is None else f"{label}.{field}", array
             for place, name in enumerate(names):
-                load, said = partial(_column, data, place), _unit(data, place)
+                load, said = partial(_read, data, None, place), _unit(data, place)
                 column = Stored((max(data.shape),), array.kind, load, said)
                 yield f"{label}/{name}", column
 
@@ -113,8 +113,8 @@ def _names(data: Any) -> list[str]:
     return texts if data.ndim == 2 and len(texts) == width and len(set(texts)) == width else []
 
 
-def _read(data: Any, field: str | None) -> np.ndarray:
-    """A dataset, or a field of all its rows; texts as objects."""
+def _read(data: Any, field: str | None, place: int | None = None) -> np.ndarray:
+    """A dataset, a field of all its rows, or its column at a place; texts as objects."""
     kind = data.dtype if field is None else data.dtype[field]
     if kind.kind == "S" and kind.itemsize > moments.LONGEST:
         raise InputError(f"a text of {kind.itemsize} bytes, expected a date and time")
@@ -124,11 +124,9 @@ def _read(data: Any, field: str | None) -> np.ndarray:
         starts = range(0, max(data.shape[:1], default=0), _BLOCK_ROWS)
         parts = [data[k : k + _BLOCK_ROWS][field] for k in starts]
         cells = np.concatenate(parts) if parts else np.asarray(data[field])
+    if place is not None:
+        return pick(cells, place)
     return np.array(_texts(cells), dtype=object) if kind.kind in "OS" else cells
-
-
-def _column(data: Any, place: int) -> np.ndarray:
-    return pick(_read(data, None), place)
 
 
 def _texts(cells: Iterable[Any]) -> list[str]:

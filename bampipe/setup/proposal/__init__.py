@@ -42,8 +42,8 @@ _LEAP_S, _SHORTEST_S, _MOST_CUTS = 1.0, 2.0, 200
 """Length, s, of what lies between two trials and of a trial, the least; cuts, the most."""
 
 
-_GUESSED_GEAR = 0.1
-"""Relative standard uncertainty of a reduction that weight shows beside drawn bodies."""
+_GUESSED_GEAR = ", scale_sd = 0.1"
+"""Of a reduction that weight shows beside bodies that are drawn to 15 %."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def propose(
     lines = [
         *_head(folder, chosen.name, clock.rate),
         *(["[csv]", f"names = [{', '.join(map(quoted, names))}]", ""] if names else []),
-        *clock.lines,
+        *("[time]", *clock.lines, ""),
         *encoders,
         *inputs,
         *([f"# not used: {', '.join(left)}", ""] if left else []),
@@ -168,7 +168,7 @@ def _head(folder: Path, device: str, rate: str) -> list[str]:
 
 
 def _with_guessed_motors(
-    folder: Path, chosen: ChosenDevice, columns: RobotColumns, scale_sd: dict[str, float]
+    folder: Path, chosen: ChosenDevice, columns: RobotColumns, scale_sd: dict[str, str]
 ) -> ChosenDevice:
     """A new device file with the torque constants or reductions that the drawing suggests.
 
@@ -193,14 +193,14 @@ def _with_guessed_motors(
             for name, drive in columns.drives.items()
         }
         reference = max(size, key=lambda name: size[name])
-        scale_sd[reference] = robot.uncertainty
+        scale_sd[reference] = f", scale_sd = {robot.uncertainty}"
         return with_motors(folder, chosen, guessed, reference.removeprefix("current_"))
     if columns.gears and all(LEAST_AT_JOINT < size < 1.0 / LEAST_AT_JOINT for size in of_motor):
         scale_sd |= dict.fromkeys(columns.drives, _GUESSED_GEAR)
         return with_motors(folder, chosen, {j: (columns.gears.get(j, 1.0), None) for j in joints})
     if not columns.gears and all(size < LEAST_AT_JOINT for size in sizes):
         gears = {j: (1.0 / size, None) for j, size in zip(joints, sizes, strict=True)}
-        scale_sd |= dict.fromkeys(columns.drives, robot.uncertainty)
+        scale_sd |= dict.fromkeys(columns.drives, f", scale_sd = {robot.uncertainty}")
         return with_motors(folder, chosen, gears)
     return chosen
 
@@ -245,7 +245,7 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> C
         f"torque_constant of each motor in {chosen.name}, N.m/A at the joint",
         "the drive's data sheet, times the reduction",
     )
-    return replace(chosen, text=chosen.text.replace(UNKNOWN_CONSTANT, f'"{UNKNOWN}"{note}'))
+    return replace(chosen, text=chosen.text.replace(UNKNOWN_CONSTANT, f'= "{UNKNOWN}"{note}'))
 
 
 def _trials_tables(

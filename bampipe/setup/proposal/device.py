@@ -36,7 +36,7 @@ from bampipe.setup.proposal.starter import Drive, starter_device, weight_of
 
 DEVICE = "device.toml"
 _SCHEMA = "bampipe.device/1"
-UNKNOWN_CONSTANT = "1  # guess: N.m/A, gears included"
+UNKNOWN_CONSTANT = "= 1  # guess: N.m/A, gears included"
 """Stands for the torque constant of a motor until a drawing or a person tells."""
 _MAY_SLIDE = " (no unit says that it slides: if it does, bampipe init FOLDER --device slider)"
 _MAY_TURN = " (by a force in N alone: if it turns, call its column {0}_rad or {0}_deg)"
@@ -281,7 +281,9 @@ def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bo
     currents = [c for c in found if "motor" not in words(c.name)]
     if driver is None:
         return bool(currents)
-    alike = [c for c in currents if _go_together(c.values, driver.values)]
+    pairs = (np.nan_to_num([c.values, driver.values]) for c in currents)
+    together = [abs(float(np.corrcoef(pair)[0, 1])) > _SAME_DRIVE for pair in pairs]
+    alike = [c for c, same in zip(currents, together, strict=True) if same]
     for current in alike:
         match.used.add(current.name)
         notes.check.append(
@@ -296,11 +298,6 @@ def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bo
         if REFERENCE_WORDS & set(words(name))
     ]
     return bool(coils)
-
-
-def _go_together(one: np.ndarray, other: np.ndarray) -> bool:
-    known = np.isfinite(one) & np.isfinite(other)
-    return abs(float(np.corrcoef(one[known], other[known])[0, 1])) > _SAME_DRIVE
 
 
 def _at_joint(

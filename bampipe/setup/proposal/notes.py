@@ -12,11 +12,6 @@ COLUMNS = "see the headers of the logs, or ask who wrote the logger"
 UNITS = "ask who wrote the logger, or see how far it moves; rad, deg, m and mm are usual"
 """Where the unit of a position is."""
 
-_SPELLED = {
-    "in": "inches", "m": "metres", "mm": "millimetres", "rad": "radians", "deg": "degrees",
-    "rev": "turns", "s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds",
-}  # fmt: skip
-
 
 @dataclass
 class Notes:
@@ -55,11 +50,6 @@ class Notes:
         """
         self.fill_in.setdefault((text, where), []).append(of)
         return f"  # fill in: {text.replace('{}', of)}"
-
-
-def say_unit(name: str) -> str:
-    """The name of a unit in a sentence."""
-    return _SPELLED.get(name, name)
 
 
 def quoted(text: str) -> str:
