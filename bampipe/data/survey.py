@@ -30,7 +30,7 @@ _OTHER_DATA = {
     **dict.fromkeys((".xls", ".ods"), "save the sheet as .xlsx or CSV"),
     **dict.fromkeys((".pkl", ".pickle", ".joblib"), "it may run any program; save with np.savez"),
     **dict.fromkeys((".feather", ".arrow", ".orc", ".rds"), "save it as Parquet or CSV"),
-    **dict.fromkeys((".zip", ".7z", ".tar", ".bz2", ".xz", ".rar"), "unpack it"),
+    **dict.fromkeys((".zip", ".gz", ".7z", ".tar", ".bz2", ".xz", ".rar"), "unpack it"),
     **dict.fromkeys(
         (".c3d", ".mf4", ".mdf", ".blf", ".bin", ".ulg", ".tlog", ".trc", ".r64", ".fig", ".slx"),
         "export its channels as CSV, a sample a row",
@@ -567,19 +567,14 @@ def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:
     """
     measured = [column.role for column in columns if column.role in DRIVERS]
     wanted = ("current",) if measured == ["force"] else () if measured else DRIVERS
-    return tuple(
-        replace(column, role=role)
-        if column.role == "reference" and (role := _role_apart(column)) in wanted
-        else column
-        for column in columns
-    )
-
-
-def _role_apart(column: SurveyedColumn) -> str:
-    """The role that the unit or the rest of the name gives to a reference."""
-    said = set(words(column.name)) - REFERENCE_WORDS
-    named = (role for role in DRIVERS if said & set(_WORDS[role].split()))
-    return _role_by_unit(column.stated) or next(named, "")
+    found = []
+    for column in columns:
+        said = set(words(column.name)) - REFERENCE_WORDS
+        named = (role for role in DRIVERS if said & set(_WORDS[role].split()))
+        role = _role_by_unit(column.stated) or next(named, "")
+        commands = column.role == "reference" and role in wanted
+        found.append(replace(column, role=role) if commands else column)
+    return tuple(found)
 
 
 def words(name: str) -> list[str]:

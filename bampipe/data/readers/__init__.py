@@ -29,7 +29,6 @@ _AGAIN = "copy it again from the logger"
 _FORMATS: tuple[tuple[tuple[str, ...], ModuleType, str, str], ...] = (
     (TEXTS, text, "", ""),
     (SHEETS, text, "workbook of Excel", "save it again, or export the sheet as CSV"),
-    ((".gz",), text, "text packed by gzip", "unpack it"),
     ((".parquet",), parquet, "Parquet file", _AGAIN),
     ((".mat",), mat, "MATLAB file", "save it again from MATLAB"),
     ((".h5", ".hdf5", ".hdf"), hdf5, "HDF5 file", _AGAIN),
@@ -56,7 +55,7 @@ _KINDS = (
     (b"SQLite format 3", (".db3",), "an SQLite file"),
     (b"PK\x03\x04", ("", ".npz", *SHEETS), "a zip archive or spreadsheet"),
     (b"\x93NUMPY", (".npy",), "an array of NumPy"),
-    (b"\x1f\x8b", (".gz",), "a gzip archive"),
+    (b"\x1f\x8b", ("",), "a gzip archive"),
     (hdf5.SIGNATURE, (".h5", ".hdf5", ".hdf", ".mat"), "an HDF5 file"),
 )
 

@@ -5,7 +5,6 @@ Rows are counted as an editor does: the first line of the file is row 1.
 
 import codecs
 import csv
-import gzip
 import io
 import re
 from collections.abc import Iterator
@@ -77,7 +76,7 @@ def columns(path: Path, dialect: Dialect | None = None) -> dict[str, str]:
 def is_table(path: Path) -> bool:
     """Whether a file of an unknown extension is text with rows of numbers."""
     try:
-        with _unpacked(path) as stream:
+        with path.open("rb") as stream:
             return dialects.share_of_rows(_head(stream)) > _MANY_ROWS
     except (OSError, InputError):
         return False
@@ -89,7 +88,7 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
 
     InputError where it is not in the encoding that it claims.
     """
-    with _unpacked(path) as file:
+    with path.open("rb") as file:
         stream = _sheet(file) if path.suffix.lower().startswith(".xls") else file
         head = stream.read(HEAD)
         stream.seek(0)
@@ -114,12 +113,6 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
             if form.names and not dialect.names:
                 dialect = dialect.model_copy(update={"names": form.names})
         yield io.BytesIO(text.encode("utf-8", "replace")), dialect, said
-
-
-def _unpacked(path: Path) -> BinaryIO:
-    """The open file; what gzip has packed as it is in memory."""
-    packed = path.suffix.lower() == ".gz"
-    return io.BytesIO(gzip.decompress(path.read_bytes())) if packed else path.open("rb")
 
 
 def _sheet(file: BinaryIO) -> BinaryIO:

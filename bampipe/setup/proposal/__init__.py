@@ -19,6 +19,7 @@ from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.lists import join_names
 from bampipe.physics.device import Device
+from bampipe.physics.robot import Robot
 from bampipe.setup.mounting import Mounting
 from bampipe.setup.proposal.device import (
     DEVICE,
@@ -95,15 +96,13 @@ def propose(
     match = Matcher(found, clock.t, set(clock.columns), registers)
     if chosen is None:
         chosen = new_device(folder, match, notes)
-    elif chosen.device.robot is not None:
-        columns = find_robot_columns(
-            folder, chosen.device, chosen.device.robot, found, clock.t, notes
-        )
-        chosen = _with_guessed_motors(folder, chosen, columns, match.scale_sd)
+    elif (robot := chosen.device.robot) is not None:
+        columns = find_robot_columns(folder, chosen.device, robot, found, clock.t, notes)
         match.robot = columns
+        chosen = _with_guessed_motors(folder, chosen, match)
         if columns.mounting is not None:
             chosen = _hung(folder, chosen, columns.mounting, notes)
-        chosen = _check_robot(chosen, columns, notes)
+        chosen = _check_robot(chosen, robot, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
     if len(match.rivals) > 1 and len(chosen.device.coordinates) == 1:
@@ -167,16 +166,11 @@ def _head(folder: Path, device: str, rate: str) -> list[str]:
     ]
 
 
-def _with_guessed_motors(
-    folder: Path, chosen: ChosenDevice, columns: RobotColumns, scale_sd: dict[str, str]
-) -> ChosenDevice:
-    """A new device file with the torque constants or reductions that the drawing suggests.
-
-    ``scale_sd`` is given what all estimates then rest on.
-    """
-    sizes = [abs(drive.share) for drive in columns.drives.values()]
-    robot = chosen.device.robot
+def _with_guessed_motors(folder: Path, chosen: ChosenDevice, match: Matcher) -> ChosenDevice:
+    """A new device file with the torque constants or reductions that the drawing suggests."""
+    columns, scale_sd, robot = match.robot, match.scale_sd, chosen.device.robot
     assert robot is not None
+    sizes = [abs(drive.share) for drive in columns.drives.values()]
     if not robot.motors:
         scale_sd |= dict.fromkeys(columns.gears, _GUESSED_GEAR)
     if not chosen.text or not all(drive.is_sure for drive in columns.drives.values()) or not sizes:
@@ -219,10 +213,10 @@ def _hung(folder: Path, chosen: ChosenDevice, mounting: Mounting, notes: Notes) 
     return with_gravity(folder, chosen, said) if chosen.text else chosen
 
 
-def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> ChosenDevice:
+def _check_robot(
+    chosen: ChosenDevice, robot: Robot, columns: RobotColumns, notes: Notes
+) -> ChosenDevice:
     """The robot without torque constants that nothing tells; what else to look at is noted."""
-    robot = chosen.device.robot
-    assert robot is not None
     if "tip =" in chosen.text:
         notes.check.append(f"{chosen.name}: the robot ends at {robot.tip}; is that its last link?")
     if not columns.drives:

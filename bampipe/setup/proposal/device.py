@@ -176,9 +176,8 @@ def _complete(folder: Path, text: str) -> Device:
 
 
 def _device_file(folder: Path, wanted: str) -> ChosenDevice:
-    path = next((path for path in (folder / wanted, Path(wanted)) if path.is_file()), None)
-    if path is None:
-        raise InputError("no such file", where=wanted)
+    path = folder / wanted if (folder / wanted).is_file() else Path(wanted)
+    device = registry.device_from(read_device_file(path), str(path))
     full, root = path.resolve(), folder.resolve()
     if not full.is_relative_to(root):
         raise InputError(
@@ -186,7 +185,6 @@ def _device_file(folder: Path, wanted: str) -> ChosenDevice:
             where=wanted,
             remedy=f"copy it to {folder}",
         )
-    device = registry.device_from(read_device_file(path), str(path))
     return ChosenDevice(full.relative_to(root).as_posix(), device)
 
 

@@ -293,11 +293,9 @@ def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
             "ask who wrote the logger; rad/s, rev/min and mm/s are usual",
         )
         return entry(column.name, UNKNOWN) + note
-    said = spelled(column.unit, _SPEED_UNITS) if column.si == si else ""
-    return entry(column.name, said or si) + notes.guess(
-        f"no position was recorded: that of {axis.name} is the integral of {column.name}, in"
-        f" {said or si}"
-    )
+    said = (spelled(column.unit, _SPEED_UNITS) if column.si == si else "") or si
+    integral = f"that of {axis.name} is the integral of {column.name}, in {said}"
+    return entry(column.name, said) + notes.guess(f"no position was recorded: {integral}")
 
 
 def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: Notes) -> str:
