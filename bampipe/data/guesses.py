@@ -25,7 +25,7 @@ RATES_HZ = (4.0, 30_000.0)
 
 _DATES = ((30_000.0, 80_000.0), (720_000.0, 760_000.0))
 """Days since 1900 or 0, as spreadsheets and MATLAB count them."""
-_SPANS, _STEP = (0.5, 4.0 * np.pi), 0.01
+_SPANS, _STEP = (0.5, 10.0 * np.pi), 0.01
 """Angles that a joint spans while it is logged, rad, and a step of their logarithm."""
 _WEIGHT_LEAVES, _SURE_TURNING = 0.5, 0.03
 """Of what a straight line leaves of the drive, what a sine may leave, and the relative standard
@@ -193,8 +193,8 @@ def find_turning(t: np.ndarray, q: np.ndarray, drive: np.ndarray) -> Turning | N
         rest = fitted(x)[1]
         return float(rest @ rest)
 
-    # What an angle spans, by its logarithm: from half a radian to two turns.
-    tried = np.linspace(math.log(_SPANS[0]), math.log(_SPANS[1]), 60)
+    # What an angle spans, by its logarithm: from half a radian to five turns.
+    tried = np.linspace(math.log(_SPANS[0]), math.log(_SPANS[1]), 110)
     costs = [left(x) for x in tried]
     best = int(np.argmin(costs))
     if best in (0, len(tried) - 1):

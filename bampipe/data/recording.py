@@ -323,12 +323,8 @@ def describe_spans(spans: Mapping[str, Mapping[str, float]]) -> list[str]:
             ratio = span / max(float(np.median(others)), 1e-300) if len(others) > 1 else 1.0
             size = max(ratio, 1.0 / max(ratio, 1e-300))
             if any(low < size < 2.0 * low for low in (40.0, 700.0)):
-                much = (
-                    f"{ratio:.3g} times as far as" if ratio > 1.0 else f"{size:.3g} times less than"
-                )
-                said.append(
-                    f"{name}: {axis} goes {much} in the others: is it logged in another unit?"
-                )
+                much = f"{ratio:.3g} times as far as in the others"
+                said.append(f"{name}: {axis} goes {much}: is it logged in another unit?")
     return said
 
 

@@ -43,14 +43,14 @@ _MOST_SCANNED = 1 << 30
 """Bytes of text in which other recordings are looked for; reading them takes some seconds."""
 _WHOLE = 2
 """Of logs that hold both a motion and what drives it."""
-_RISES = 0.95
+_RISES = 0.8
 """Share of samples at which a clock rises, if what else it does is an accident."""
 _GENERAL = frozenset(["joint", "axis", "x", "y", "z", "data", "column"])
 """Words in the name of a column that say less of it than the name of its file."""
 _WORDS = {
     "time": "t time timestamp stamp zeit clock timestep tout seconds sec secs nanosec nsec nsecs"
     " nanoseconds millis micros milliseconds microseconds temps tiempo tempo tijd"
-    " tid czas cas zaman aika ido",
+    " tid czas cas zaman aika ido ipoc",
     "reference": "goal ref reference setpoint target desired des cmd command soll sollwert demand"
     " wanted con ctrl action ziel consigne consigna referencia riferimento planned requested",
     "brake": "brake bremse",
@@ -63,8 +63,9 @@ _WORDS = {
     "voltage": "volt volts voltage pwm duty supply vin vbat vbus battery bus spannung tension"
     " voltaje tensao tensione",
     "position": "pos position ang angle theta phi psi q enc encoder disp displacement dist x stroke"
-    " winkel weg lage hub joint deflection yaw pitch extension carriage counts posicion posicao"
-    " posizione angulo angolo hoek vinkel kat uhel aci konum poloha course",
+    " winkel weg lage hub joint deflection yaw pitch extension carriage counts pot poti"
+    " posicion posicao posizione angulo angolo hoek vinkel kat uhel aci konum poloha course"
+    " inkremente",
 }
 _SIGNS = {
     "加速度": "acc", "速度": "velocity", "力矩": "torque", "扭矩": "torque", "转矩": "torque",
@@ -207,8 +208,6 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
     sound = []
     for trial in trials:
         try:
-            if read:
-                logs.compare(trial, common)
             several = logs.recordings(trial)
             read = read or logs.read(several[0], common)
             sound += several
@@ -218,8 +217,15 @@ def survey(folder: Path, names: Sequence[str] = (), episodes: str = "") -> Surve
         raise logs.fault()
     columns, guessed = _by_looks(_with_commands(list(read)), folder)
     if guessed and sound[0].file.lower().endswith(".json"):
-        beside = objects.stated_units(folder / sound[0].file)
-        columns = tuple(_with_unit_beside(c, columns, beside) for c in columns)
+        # The first unit of a quantity is that of the first column which looks like it.
+        beside = objects.stated_units(folder / sound[0].file).items()
+        units = {_role(name, u): u for name, u in reversed(beside) if unit(u) is not None}
+        columns = tuple(
+            replace(c, unit=units.pop(c.role), by_looks=False)
+            if c.by_looks and c.role in units
+            else c
+            for c in columns
+        )
     if dataset is not None:
         logs.remarks = [lerobot.REMARK]
     return Survey(tuple(sound), columns, (*logs.remarks, *guessed), tuple(logs.passed))
@@ -238,7 +244,6 @@ class _Logs:
     found: dict[str, dict[str, str]] = field(default_factory=dict)
     passed: list[tuple[str, str]] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
-    first: str = ""
     scanned: int = 0
 
     def paths(self) -> list[Path]:
@@ -437,7 +442,6 @@ class _Logs:
         first = sorted(ordered, key=lambda c: (c not in times, _role(c, labels[c]) != "position"))
         raw = read_recording(self.folder, trial, first, clock, self.dialect)
         sound = _complete_rows(raw.columns, clock.column)
-        self.first = trial.file
         if not (trial.parts or trial.recording or is_text(trial.file)):
             self.remarks += raw.remarks
         # Times of one name, beside the readings that each is of.
@@ -463,17 +467,6 @@ class _Logs:
             unit = _unit(column, said, role)
             found.append(SurveyedColumn(column, said, role, unit, raw.columns[column][sound]))
         return tuple(found)
-
-    def compare(self, trial: TrialEntry, wanted: Sequence[str]) -> None:
-        """Raise InputError where a log states another unit than the first that was read."""
-        for column in wanted:
-            here, there = self.found[trial.file].get(column), self.found[self.first].get(column)
-            known, other = unit(here or ""), unit(there or "")
-            if here and there and known and other and known != other:
-                raise InputError(
-                    f"gives {column} in {here}, {self.first} in {there}",
-                    remedy="export both in one unit, or put it into a session of its own",
-                )
 
     def recordings(self, trial: TrialEntry) -> list[TrialEntry]:
         """The recordings that one text file or list of structs holds; others as they are.
@@ -565,16 +558,6 @@ def _by_looks(
     ), [guessed]
 
 
-def _with_unit_beside(
-    column: SurveyedColumn, columns: Sequence[SurveyedColumn], beside: Mapping[str, str]
-) -> SurveyedColumn:
-    """A column that is known by its looks with the first unit ``beside`` of its quantity."""
-    first = next((c for c in columns if c.role == column.role), None)
-    said = next((u for name, u in beside.items() if _role(name, u) == column.role), "")
-    known = column.by_looks and column is first and unit(said) is not None
-    return replace(column, unit=said, by_looks=False) if known else column
-
-
 def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:
     """The columns, with commanded forces, currents or voltages for inputs if none was measured.
 
@@ -584,19 +567,14 @@ def _with_commands(columns: list[SurveyedColumn]) -> tuple[SurveyedColumn, ...]:
     """
     measured = [column.role for column in columns if column.role in DRIVERS]
     wanted = ("current",) if measured == ["force"] else () if measured else DRIVERS
-    return tuple(
-        replace(column, role=role)
-        if column.role == "reference" and (role := _role_apart(column)) in wanted
-        else column
-        for column in columns
-    )
-
-
-def _role_apart(column: SurveyedColumn) -> str:
-    """The role that the unit or the rest of the name gives to a reference."""
-    said = set(words(column.name)) - REFERENCE_WORDS
-    named = (role for role in DRIVERS if said & set(_WORDS[role].split()))
-    return _role_by_unit(column.stated) or next(named, "")
+    found = []
+    for column in columns:
+        said = set(words(column.name)) - REFERENCE_WORDS
+        named = (role for role in DRIVERS if said & set(_WORDS[role].split()))
+        role = _role_by_unit(column.stated) or next(named, "")
+        commands = column.role == "reference" and role in wanted
+        found.append(replace(column, role=role) if commands else column)
+    return tuple(found)
 
 
 def words(name: str) -> list[str]:
@@ -641,7 +619,9 @@ def _role(name: str, stated: str) -> str:
     if said & _PLAIN_POSITIONS and said & _PRESENT:
         said -= _PRESENT  # the position that is current, and no current
     roles = [role for role, text in _WORDS.items() if said & set(text.split())]
-    if len(roles) > 1 and max(map(len, said)) == 1:
+    if len(roles) > 1 and (longer := {word for word in said if len(word) > 1}):
+        roles = [r for r in roles if longer & set(_WORDS[r].split())] or roles  # T.Angle
+    elif len(roles) > 1:
         # x_F: letters that stand for several quantities
         return next(
             (_role_by_unit(x) for x in re.split(r"[_\W]+", name)[1:] if x in "AV" and x), ""

@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 
@@ -55,11 +56,14 @@ _SPELLINGS = {
 }  # fmt: skip
 """Of single factors; those in the plural are found without their s."""
 _CELSIUS = frozenset(["degc", "°c", "c", "celsius"])
+_NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
+_BESIDE = re.compile(r"(?i)(?:\A|(?<=[./]))units?[./]|(?:\A|[ _./])units?\Z")
+"""What makes the name of a text that gives a unit of that of what it is of."""
 _TOKEN = re.compile(
     r"(?P<number>(?<![^\W_])\d+(?:\.\d+)?(?:[eE]-?\d+)?|\.\d+)"
     r"|(?P<over>\s*(?:/|\bper\b)\s*)"
     r"|(?P<word>[^\W\d_]+|%|[°º][A-Za-z]?)(?:(?:\^|\*\*)?(?P<power>-[1-4]|[2-4])(?![\d.]))?"
-    r"|\s*[*·⋅.\s-]\s*"
+    r"|\s*[*·⋅・.\s-]\s*"
 )  # fmt: skip
 
 
@@ -77,6 +81,33 @@ def spelled(text: str, among: Sequence[str]) -> str:
 def bare(text: str) -> str:
     """A unit without the brackets in which some files have it."""
     return text.strip().strip("[]()").strip()
+
+
+def units_in(names: Iterable[str]) -> dict[str, str]:
+    """Units in names such as ``force [N]``; a number, as in ``q[0]`` or ``pos (1)``, is an index.
+
+    Beside units of other columns, ``[1]`` is one, unless the name comes with other numbers too.
+    """
+    # A number behind the unit tells two of one name apart.
+    plain = {name: re.sub(r"(?<=[\])]) \(\d+\)\Z", "", name) for name in names}
+    matches = {n: match for n, said in plain.items() if (match := _NAME_WITH_UNIT.match(said))}
+    numbered = Counter(m["name"] for m in matches.values() if m["unit"].isdigit())
+    others = any(not match["unit"].isdigit() for match in matches.values())
+    return {
+        name: match["unit"]
+        for name, match in matches.items()
+        if match["name"]
+        and not (
+            match["unit"].isdigit()
+            and (match["unit"] != "1" or not others or numbered[match["name"]] > 1)
+        )
+    }
+
+
+def units_beside(texts: Mapping[str, str]) -> dict[str, str]:
+    """Units by what they are of, from texts in a file: ``q_unit``, ``q.unit``, ``units.q``."""
+    found = ((_BESIDE.sub("", name, count=1), name) for name in texts)
+    return {of: texts[name] for of, name in found if of != name}
 
 
 def unit(text: str) -> RecordedUnit | None:
@@ -119,9 +150,9 @@ def unit(text: str) -> RecordedUnit | None:
 
 def _factor(word: str) -> list[tuple[str, float]] | None:
     """SI unit and scale of one factor, or of two written without anything between them."""
-    pair = re.fullmatch(r"(.*N)(m|cm|mm)", word)
+    pair = re.fullmatch(r"(.*N)(m|cm|mm|M)", word)
     if pair:
-        parts = [_factor(each) for each in pair.groups()]
+        parts = [_factor(each) for each in (pair[1], pair[2].lower())]
         return [found for part in parts if part for found in part] if all(parts) else None
     low = word.lower()
     singular = low.removesuffix("s") if len(low) > 2 else low

@@ -476,3 +476,21 @@ def test_a_missing_extra_names_the_command(tmp_path, monkeypatch, ending, module
     line = refused(path, ("/a:b",) if extra == "ros" else ("t",))
     package = module.partition(".")[0]
     assert f"needs {package}, which is not installed; pip install 'bampipe[{extra}]'" in line
+
+
+def test_units_in_names_and_beside_the_columns_are_heard_in_every_format(tmp_path):
+    table, units = {"t [ms]": T, "f (mN.m)": F, "q": Q}, {"q": "deg"}
+    frame = pd.DataFrame(table)
+    frame.attrs = {"units": units}
+    frame.to_parquet(tmp_path / "a.parquet")
+    (tmp_path / "b.json").write_text(json.dumps(frame.to_dict("list") | {"units": units}))
+    (tmp_path / "c.json").write_text(json.dumps({"q_unit": "deg", "log": frame.to_dict("records")}))
+    with h5py.File(tmp_path / "d.h5", "w") as file:
+        file["log"] = frame.to_records(index=False)
+        file["log"].attrs["units"] = ["", "", "deg"]
+    scipy.io.savemat(tmp_path / "e.mat", {"log": {"q": Q, "units": units}})
+    units |= {"t [ms]": "ms", "f (mN.m)": "mN.m"}
+    for path in tmp_path.iterdir():
+        found = {x.removeprefix("log."): unit for x, unit in columns_of(path).items()}
+        assert units.items() >= found.items() and found["q"] == "deg"
+    assert read_trial(tmp_path / "a.parquet", ("t [ms]",)).units == {"t [ms]": "ms"}

@@ -123,9 +123,12 @@ def test_units_of_properties_are_heard(tmp_path: Path):
     assert columns_of(path) == {"t": "s", "q": "rad", "u": "N*m"}
 
 
-def test_words_for_no_reading_are_no_numbers(tmp_path: Path):
+def test_words_for_no_reading_are_no_numbers_and_pages_begin_no_recording(tmp_path: Path):
     path = tmp_path / "a.csv"
     text = lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n").split("\n")
+    path.write_text("\n".join([*text[:31], text[0], *text[31:]]))
+    entry, clock = TrialEntry(file="a.csv", kind="free"), Clock(column="t", unit="s")
+    assert len(read_recording(tmp_path, entry, ("t", "q"), clock)) == 60
     text[7], text[9], text[11] = "0.06,#DIV/0!,1", "0.08,OVERLOAD,1", "0.10,1.#QNAN,1"
     path.write_text("\n".join(text))
     trial = read_trial(path, ("t", "q", "u"))
@@ -162,13 +165,6 @@ def test_signals_in_rows_of_their_own_are_put_beside_one_another(tmp_path: Path)
     np.testing.assert_allclose(raw.columns["u"], 2.0 * raw.columns["q"])
 
 
-def test_a_header_on_every_page_begins_no_recording(tmp_path: Path):
-    head, *rows = lines("{t:.3f},{q:.4f},{u:.4f}", "t,q,u\n").split("\n")
-    (tmp_path / "a.csv").write_text("\n".join([head, *rows[:30], head, *rows[30:]]))
-    entry, clock = TrialEntry(file="a.csv", kind="free"), Clock(column="t", unit="s")
-    assert len(read_recording(tmp_path, entry, ("t", "q"), clock)) == 60
-
-
 @pytest.mark.parametrize(
     "form",
     [
@@ -199,11 +195,13 @@ def test_words_of_names_in_other_languages(name: str, said: list[str]):
     assert words(name) == said
 
 
-@pytest.mark.parametrize(("encoding", "time"), [("gbk", "时间"), ("shift_jis", "時間")])
-def test_encodings_of_chinese_and_japanese(tmp_path: Path, encoding: str, time: str):
+@pytest.mark.parametrize(
+    ("encoding", "time", "unit"), [("gbk", "时间", "N·m"), ("shift_jis", "時間", "N・m")]
+)
+def test_encodings_of_chinese_and_japanese(tmp_path: Path, encoding: str, time: str, unit: str):
     path = tmp_path / "a.csv"
-    path.write_bytes(lines("{t:.3f},{q:.4f}", f"{time}[s],位置[deg]\n").encode(encoding))
-    assert columns_of(path) == {f"{time}[s]": "s", "位置[deg]": "deg"}
+    path.write_bytes(lines("{t:.3f},{q:.4f}", f"{time}[s],力矩({unit})\n").encode(encoding))
+    assert columns_of(path) == {f"{time}[s]": "s", f"力矩({unit})": unit}
     path.write_bytes(lines("{t:.3f},{q:.4f}", "temps (s),angle mesuré (°)\n").encode("cp1252"))
     assert list(columns_of(path)) == ["temps (s)", "angle mesuré (°)"]
 
@@ -232,9 +230,10 @@ def test_channels_go_by_the_names_beside_them(tmp_path: Path):
     assert list(columns_of(tmp_path / "c.h5")) == ["log/t", "log/q", "log/u"]
     trial = read_trial(tmp_path / "c.h5", ("log/t", "log/u"))
     np.testing.assert_array_equal(trial.columns["log/u"], U)
-    content = {"log": [{"name": n, "values": [*v, *v]} for n, v in (("q", Q), ("u", U))]}
+    signals = (("q", Q, "rad"), ("u", U, "Nm"))
+    content = {"log": [{"name": n, "values": [*v, *v], "unit": u} for n, v, u in signals]}
     (tmp_path / "d.json").write_text(json.dumps(content | {"meta": {"fs": 100}}))
-    assert set(columns_of(tmp_path / "d.json")) == {"log[q].values", "log[u].values", "meta.fs"}
+    assert columns_of(tmp_path / "d.json") == {"log.q": "rad", "log.u": "Nm", "meta.fs": ""}
     (tmp_path / "d.json").write_text(json.dumps([{"q": f"{q:.4f}"} for q in Q]))
     np.testing.assert_array_equal(read_trial(tmp_path / "d.json", ("q",)).columns["q"], Q)
     heads = np.array(["t", "q", "u"], dtype=object)
@@ -278,19 +277,18 @@ def test_a_unit_that_is_not_known_is_asked_for(tmp_path: Path, header: str, aske
     assert any(asked in line for line in propose(tmp_path).fill_in)
 
 
-def test_a_log_that_is_written_backwards_is_refused(tmp_path: Path):
-    t = np.arange(2000)[::-1] / 200.0
+@pytest.mark.parametrize("order", [np.arange(2000)[::-1], np.arange(2000) * 1237 % 2000])
+def test_a_log_out_of_order_is_refused(tmp_path: Path, order: np.ndarray):
+    t = order / 200.0
     write(tmp_path / "a.csv", "time_s,q,torque", t, np.sin(3 * t), np.cos(3 * t))
-    with pytest.raises(
-        InputError, match=r"time_s falls from row to row.*turn the order of its rows"
-    ):
+    with pytest.raises(InputError, match=r"time_s falls from row to row.*sort its rows"):
         propose(tmp_path)
 
 
 def test_units_that_labs_write():
     for text, scale in (
         ("U/min", 0.10472), ("gon", 0.0157080), ("grados", 0.0174533), ("daN", 10.0),
-        ("10^-3 s", 1e-3),
+        ("10^-3 s", 1e-3), ("NM", 1.0), ("N・m", 1.0),
     ):  # fmt: skip
         found = unit(text)
         assert found is not None and found.scale == pytest.approx(scale, rel=1e-4)

@@ -176,10 +176,10 @@ def test_tables_of_any_extension_are_read_and_prose_beside_them_is_no_table(tmp_
 
 def test_the_unit_of_joints_without_names_is_asked_once() -> None:
     notes = Notes()
-    comments = [notes.ask_unit(f"column_{n}", f"joint_{n}") for n in (1, 2)]
-    assert comments[1].endswith("column_2, which looks like the position of joint_2")
-    (question,) = notes.questions
-    assert question.startswith("the unit of column_1 and column_2, which look like the positions")
+    looks = [f"column_{n}, which looks like the position of joint_{n}" for n in (1, 2)]
+    comments = [notes.ask("the unit of {}", "the manual", of) for of in looks]
+    assert comments[1].endswith(looks[1])
+    assert notes.questions == [f"the unit of {looks[0]} and {looks[1]}. To find it: the manual"]
 
 
 def arm_log(turned: float = 0.0) -> dict[str, np.ndarray]:
@@ -261,36 +261,6 @@ def test_the_measured_axis_is_understood_from_its_motion(tmp_path):
     assert len(samples(tmp_path / "axis", tmp_path / "out", "record_2")) > 3000
 
 
-def test_a_signed_register_is_seen(tmp_path):
-    logs = ROOT.parent / "shared/real/servo_pendulum/raw"
-    if not logs.is_dir():
-        pytest.skip(f"{logs} is not here")
-    shutil.copytree(logs, tmp_path / "servo/raw")
-    session, _ = proposed(tmp_path / "servo", "servo_pendulum")
-    assert session["encoders"]["joint"]["column"] == "position"
-    duty, supply = session["channels"]["duty"], session["channels"]["supply"]
-    assert duty["column"] == "load" and duty["wrap_bits"] == 16 and duty["signed"]
-    assert supply["column"] == "input_volts"
-    assert len(session["trials"]) == 16
-
-
-def test_what_only_a_person_knows_is_left_open(tmp_path):
-    session = ROOT.parent / "shared/sessions/open-01"
-    if not session.is_dir():
-        pytest.skip(f"{session} is not here")
-    shutil.copytree(session / "trials", tmp_path / "arm/trials")
-    read, proposal = proposed(tmp_path / "arm")
-    assert read["device"] == "bam" and read["time"] == {"column": "time_us", "unit": "us"}
-    assert [t["kind"] for t in read["trials"]] == ["free"] * 5 + ["locked"] * 3
-    assert len(proposal.fill_in) == 5
-    text = (tmp_path / "arm/session.toml").read_text()
-    assert text.count("# fill in: ") == 5 and "# guess: " in text
-    with pytest.raises(InputError, match="counts_per_unit: found 0, expected the number of counts"):
-        ingest.execute(
-            RunFolder(tmp_path), tmp_path, ingest.Config(session=str(tmp_path / "arm")), silent
-        )
-
-
 def test_nothing_is_overwritten(tmp_path, command: Command):
     write_joint_logs(tmp_path, 1)
     (tmp_path / "device.toml").write_text("x = 1\n")
@@ -342,22 +312,23 @@ def test_a_clock_of_no_likely_unit_is_left_open_and_costs_no_time(tmp_path):
         read_session(tmp_path)
 
 
-def test_each_axis_is_checked_by_a_velocity_of_its_own(tmp_path):
+def test_a_built_in_device_is_known_by_its_axes_and_each_has_a_velocity_of_its_own(tmp_path):
     t = np.arange(600) / 200.0
     columns = {
         "t_s": t,
         "yaw_rad": np.sin(t),
         "pitch_rad": np.cos(t),
-        "extension_m": 1.0 + 0.1 * np.sin(2 * t),
+        "extension": np.rint(33_333.0 + 3333.0 * np.sin(2 * t)),
         "pitch_velocity [deg/s]": np.rad2deg(-np.sin(t)),
-        "force_x": np.sin(3 * t),
-        "force_y": np.cos(3 * t),
-        "force_z": np.sin(5 * t),
     }
-    write_table(tmp_path / "a.csv", columns)
-    lines = propose(tmp_path, "bam").session.splitlines()
-    with_velocity = [line.split(" = ")[0] for line in lines if ", velocity = " in line]
-    assert with_velocity == ["pitch"]
+    forces = {f"force_{c}_v": np.sin(w * t) for c, w in (("x", 3), ("y", 4), ("z", 5))}
+    write_table(tmp_path / "t01_locked_yaw.csv", columns | forces)
+    proposal = propose(tmp_path)
+    lines = proposal.session.splitlines()
+    assert 'device = "bam"' in lines and 'locked_axis = "yaw"' in lines
+    assert [line.split(" = ")[0] for line in lines if ", velocity = " in line] == ["pitch"]
+    asked = [line.split()[0].strip(",") for line in proposal.fill_in]
+    assert asked == ["counts_per_unit", "calibration_n_per_v", "zero_v"]
 
 
 def stage_log() -> dict[str, np.ndarray]:
@@ -664,7 +635,10 @@ def test_the_gear_of_a_motor_is_what_the_weight_says_and_missed_in_its_torque(tm
     session, proposal = proposed(tmp_path)
     assert session["encoders"]["joint"]["gear_ratio"] == pytest.approx(70.0, rel=0.02)
     assert any("times for one turn of it, by its weight" in line for line in proposal.check)
-    assert "moment" in proposal.device
+    assert "moment" in proposal.device and session["encoders"]["joint"]["scale_sd"] < 0.02
+    (tmp_path / "c").mkdir()
+    write_table(tmp_path / "c/a.parquet", pendulum("T.t,exp.position,exp.torque", 0.159155, 1.0))
+    assert proposed(tmp_path / "c")[0]["encoders"]["joint"]["unit"] == "rev"  # of no stated unit
     (tmp_path / "b").mkdir()
     write_table(tmp_path / "b/a.parquet", pendulum("t,motor_deg,motor_torque_mNm", 4000.0, 14.0))
     session, proposal = proposed(tmp_path / "b")
@@ -687,7 +661,8 @@ def test_of_joints_in_a_message_the_one_that_moves_is_the_axis(tmp_path):
 
 
 def test_recordings_in_a_list_are_trials(tmp_path):
-    runs = [{n: [*map(float, v)] for n, v in pendulum("t,q,tau", 1.0, 1.0).items()}] * 2
+    run = {n: [*map(float, v)] for n, v in pendulum("t,q,tau", 1.0, 1.0).items()}
+    runs = [{"trial": 1, **run}, {"trial": 2, **run}]
     (tmp_path / "all.json").write_text(json.dumps({"rig": "a", "runs": runs}))
     session, proposal = proposed(tmp_path)
     assert [trial["recording"] for trial in session["trials"]] == [1, 2]

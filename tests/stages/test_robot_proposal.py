@@ -33,7 +33,9 @@ URDF = """<?xml version="1.0"?><robot name="arm">
 </joint></robot>"""
 
 
-def write_log(folder: Path, gains: tuple[float, float] = (1.0, 1.0), swing: float = 1.0) -> None:
+def write_log(
+    folder: Path, gains: tuple[float, float] = (1.0, 1.0), swing: float = 1.0
+) -> pd.DataFrame:
     """A log of both joints at 200 Hz, 20 s; ``gains``: of the logged torque over the joint's."""
     (folder / "arm.urdf").write_text(URDF)
     (folder / "x.toml").write_text('name = "arm"\n[robot]\nurdf = "arm.urdf"\n')
@@ -58,8 +60,9 @@ def write_log(folder: Path, gains: tuple[float, float] = (1.0, 1.0), swing: floa
     torque = (torque + np.random.default_rng(0).normal(0.0, 0.05, torque.shape)) * gains
     table = {"time_s": t, "q1": q[:, 0], "q2": q[:, 1], "tau1": torque[:, 0], "tau2": torque[:, 1]}
     # An acceleration beside them is never taken for a drive.
-    accelerations = {"acc1": qdd[:, 0], "acc2": qdd[:, 1]}
-    pd.DataFrame(table | accelerations).to_parquet(folder / "log.parquet")
+    frame = pd.DataFrame(table | {"acc1": qdd[:, 0], "acc2": qdd[:, 1]})
+    frame.to_parquet(folder / "log.parquet")
+    return frame
 
 
 def record_logs(folder: Path, *arm_of: Any, **how: Any) -> dict[str, Any]:
@@ -76,23 +79,8 @@ def proposed(folder: Path) -> ProposedSession:
 
 
 def about(proposal: ProposedSession, column: str) -> list[str]:
-    return [
-        line for line in proposal.check if line.startswith(f"{column} is ") and "drawing" in line
-    ]
-
-
-def test_joints_are_paired_with_columns_in_their_order(tmp_path: Path) -> None:
-    write_log(tmp_path)
-    proposal = proposed(tmp_path)
-    session = read_session(tmp_path)
-    assert {e.name: e.column for e in session.encoders} == {"shoulder": "q1", "elbow": "q2"}
-    assert {c.name: c.column for c in session.channels} == {
-        "torque_shoulder": "tau1",
-        "torque_elbow": "tau2",
-    }
-    assert about(proposal, "tau1") == about(proposal, "tau2") == []
-    assert any("agree with weight and inertia" in line for line in proposal.check)
-    assert proposal.fill_in == []
+    own = (line for line in proposal.check if line.startswith(f"{column} is "))
+    return [line for line in own if "drawing" in line]
 
 
 def test_signs_and_reductions_are_tested_against_weight_and_inertia(tmp_path: Path) -> None:
@@ -134,8 +122,7 @@ def test_a_position_beyond_the_range_that_the_drives_agree_with_is_said(tmp_path
 def test_a_position_beyond_the_range_that_nothing_explains_may_be_that_of_a_motor(
     tmp_path: Path,
 ) -> None:
-    write_log(tmp_path)
-    table = pd.read_parquet(tmp_path / "log.parquet")
+    table = write_log(tmp_path)
     rng = np.random.default_rng(0)
     table[["q1", "q2"]] *= 50.0
     table[["tau1", "tau2"]] = rng.normal(size=(len(table), 2))
@@ -285,26 +272,26 @@ def test_reductions_of_a_device_file_beside_the_logs_are_taken(tmp_path: Path) -
     assert proposal.device == ""
 
 
+@pytest.mark.parametrize("gain", [0.01, 1.0])
 def test_many_radians_of_a_motor_are_no_degrees_though_these_stay_in_the_range(
-    tmp_path: Path,
+    tmp_path: Path, gain: float
 ) -> None:
-    """A hundred turns read as degrees are 1.7 times the joint's angle."""
-    write_log(tmp_path, gains=(0.01, 0.01))
-    table = pd.read_parquet(tmp_path / "log.parquet")
+    """A hundred turns read as degrees are 1.7 times the joint's angle; torques are of either."""
+    table = write_log(tmp_path, gains=(gain, gain))
     table[["q1", "q2"]] *= 100.0
     table.to_parquet(tmp_path / "log.parquet")
     proposed(tmp_path)
     encoders = read_session(tmp_path).encoders
     assert [encoder.stated_unit for encoder in encoders] == ["rad"] * 2
     np.testing.assert_allclose([e.gear_ratio for e in encoders], 100.0, rtol=0.03)
+    assert [encoder.scale_sd for encoder in encoders] == [0.1] * 2
 
 
 @pytest.mark.parametrize("names", [("tau1", "tau2"), ("effort_shoulder", "effort_elbow")])
 def test_a_drive_that_was_not_logged_is_asked_for_and_the_other_stays_where_it_is(
     tmp_path: Path, names: tuple[str, str]
 ) -> None:
-    write_log(tmp_path)
-    table = pd.read_parquet(tmp_path / "log.parquet").drop(columns="tau1")
+    table = write_log(tmp_path).drop(columns="tau1")
     table.rename(columns={"tau2": names[1]}).to_parquet(tmp_path / "log.parquet")
     proposal = proposed(tmp_path)
     assert proposal.fill_in == ["the column of torque_shoulder in N.m. To find it: " + COLUMNS]
@@ -314,32 +301,40 @@ def test_a_drive_that_was_not_logged_is_asked_for_and_the_other_stays_where_it_i
     assert "channels.torque_shoulder.column" in str(caught.value)
 
 
-def test_a_xacro_file_beside_the_logs_is_to_be_expanded(tmp_path: Path) -> None:
-    write_log(tmp_path)
-    (tmp_path / "arm.urdf").rename(tmp_path / "arm.urdf.xacro")
-    with pytest.raises(InputError, match=r"macros that are no URDF yet; expand it first: xacro"):
-        propose(tmp_path)
-
-
 FINGERS = """<link name="left"/><link name="right"/>
 <joint name="finger_left" type="prismatic"><parent link="lower"/><child link="left"/></joint>
 <joint name="finger_right" type="prismatic"><parent link="lower"/><child link="right"/></joint>
 </robot>"""
 
 
-def test_a_robot_with_fingers_ends_before_them(tmp_path: Path) -> None:
-    write_log(tmp_path)
+def test_a_robot_with_fingers_that_rest_ends_before_them(tmp_path: Path) -> None:
+    """And joints in units of their own, with encoders on both sides of their gears, are paired."""
+    log = write_log(tmp_path)
     (tmp_path / "arm.urdf").write_text(URDF.replace("</robot>", FINGERS))
+    moved = {"q1_deg": np.rad2deg(log["q1"]), "q2_rad": log["q2"], "finger_left_pos": 0.02}
+    motors = {f"motor_q{k}": 50.0 * log[f"q{k}"] for k in (1, 2)}
+    drives = {"torque_1": log["tau1"], "force_2": log["tau2"]}
+    table = log[["time_s", "acc1", "acc2"]].assign(**moved, **motors, **drives)
+    table.to_parquet(tmp_path / "log.parquet")
     proposal = proposed(tmp_path)
+    session = read_session(tmp_path)
+    encoders = [(e.column, e.stated_unit) for e in session.encoders]
+    assert encoders == [("q1_deg", "deg"), ("q2_rad", "rad")] and proposal.fill_in == []
+    assert [c.column for c in session.channels] == ["torque_1", "force_2"]
+    assert any("agree with weight and inertia" in line for line in proposal.check)
     assert any("the robot ends at lower" in line for line in proposal.check)
     device = registry.device_from(read_device_file(tmp_path / "device.toml"))
     assert [c.name for c in device.coordinates] == ["shoulder", "elbow"]
 
 
-def test_of_several_urdf_files_none_is_guessed(tmp_path: Path) -> None:
+def test_files_of_which_none_is_that_of_the_robot_are_refused(tmp_path: Path) -> None:
     write_log(tmp_path)
     (tmp_path / "other.urdf").write_text(URDF)
     with pytest.raises(InputError, match=r"2 files of robots: arm.urdf, other.urdf"):
+        propose(tmp_path)
+    (tmp_path / "other.urdf").unlink()
+    (tmp_path / "arm.urdf").rename(tmp_path / "arm.urdf.xacro")
+    with pytest.raises(InputError, match=r"macros that are no URDF yet; expand it first: xacro"):
         propose(tmp_path)
 
 
@@ -492,8 +487,7 @@ def test_joint_states_in_a_bag_go_to_the_joints_that_they_name(tmp_path: Path) -
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
-    write_log(tmp_path, gains=(1.0, -1.0))
-    table = pd.read_parquet(tmp_path / "log.parquet")
+    table = write_log(tmp_path, gains=(1.0, -1.0))
     (tmp_path / "log.parquet").unlink()
     store = get_typestore(Stores.ROS2_HUMBLE)
     kinds = ("sensor_msgs/msg/JointState", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
@@ -542,3 +536,19 @@ def test_zeros_of_a_log_from_the_motors_side(tmp_path: Path) -> None:
         assert encoder.zero == pytest.approx(np.rad2deg(zero) * turns, rel=0.05, abs=1e-9)
     turned = {c.name for c in read_session(tmp_path / "log").channels if c.scale < 0.0}
     assert turned == {"torque_elbow"}
+
+
+def test_what_nothing_tells_of_counts_currents_and_shares_is_asked_once(tmp_path: Path) -> None:
+    table = write_log(tmp_path)
+    share = table.rename(columns={"tau1": "tau1 (%)", "tau2": "tau2 (%)"})
+    share.to_parquet(tmp_path / "log.parquet")
+    (asked,) = propose(tmp_path).fill_in
+    assert asked.startswith("the scale of torque_shoulder and torque_elbow, N.m for one %")
+    table[["q1", "q2"]] = np.rint(652.0 * table[["q1", "q2"]])
+    table.columns = table.columns.str.replace("tau", "current")
+    table.to_parquet(tmp_path / "log.parquet")
+    constants, counts = proposed(tmp_path).fill_in
+    assert constants.startswith("torque_constant of each motor in device.toml")
+    assert counts.startswith("counts_per_unit of shoulder and elbow, the counts in one rad")
+    with pytest.raises(InputError, match=r'torque_constant: found "\?"'):
+        registry.device_from(read_device_file(tmp_path / "device.toml"))

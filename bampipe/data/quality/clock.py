@@ -1,6 +1,7 @@
 """Time stamps: seconds from whatever was logged, without steps back, gaps or a rolled counter."""
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,18 +53,14 @@ def unroll(t: Array) -> tuple[Array, int, NDArray[np.intp]]:
     ahead = steps[steps > 0.0]
     if len(drops) and len(ahead):
         usual = float(np.median(ahead))
-        for bits in _BITS:
-            for scale in _SCALES:
-                period = scale * 2.0**bits
-                goes_on = steps[drops] + period
-                if (
-                    np.ptp(t) <= period
-                    and usual < 0.1 * period
-                    and np.all((goes_on > 0.0) & (goes_on < _NEAR_ROLL * usual))
-                ):
-                    turns = np.zeros(len(t))
-                    turns[drops + 1] = period
-                    return t + np.cumsum(turns), bits, drops + 1
+        for bits, scale in product(_BITS, _SCALES):
+            period = scale * 2.0**bits
+            goes_on = steps[drops] + period
+            near = np.all((goes_on > 0.0) & (goes_on < _NEAR_ROLL * usual))
+            if near and np.ptp(t) <= period and usual < 0.1 * period:
+                turns = np.zeros(len(t))
+                turns[drops + 1] = period
+                return t + np.cumsum(turns), bits, drops + 1
     return t, 0, np.empty(0, dtype=np.intp)
 
 
@@ -144,6 +141,10 @@ def find_fresh_rows(columns: Sequence[Array]) -> NDArray[np.intp] | None:
 
 def keep_fresh_rows(table: TrialTable) -> None:
     """Drop rows that repeat the positions before them: a logger is faster than its source."""
+    twice = np.logical_and.reduce([np.diff(values) == 0.0 for values in table.columns.values()])
+    if twice.any() and twice.sum() == np.sum(np.diff(table.t) == 0.0):
+        table.keep(np.concatenate([[True], ~twice]))
+        table.repairs.append(f"{count_noun(int(twice.sum()), 'row')} that stand twice left out")
     encoders = table.session.encoders
     kept = find_fresh_rows([table.columns[encoder.column] for encoder in encoders])
     if kept is not None:

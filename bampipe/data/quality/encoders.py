@@ -1,6 +1,7 @@
 """Encoder readings: whole counts, no wraps, no jumps; and motion as the kind of trial has it."""
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from bampipe.arrays import Array, Indices
 from bampipe.data.quality.channels import fill_missing, take_out
@@ -99,7 +100,7 @@ def interpolate_jumps(table: TrialTable, encoder: Encoder) -> None:
     than any of these axes can go.
     """
     values = table.columns[encoder.column]
-    if len(table) < 4:
+    if len(table) <= 2 * table.limits.nan_run:
         return
     steps = np.abs(np.diff(values))
     fastest = FASTEST[encoder.unit] * float(np.median(np.diff(table.t))) / encoder.scale
@@ -108,29 +109,13 @@ def interpolate_jumps(table: TrialTable, encoder: Encoder) -> None:
     if len(jumps) == 0:
         return
     run, total = table.limits.nan_run, len(table)
-    wild = np.zeros(total, dtype=bool)
-    lasting = []
-    number = 0
-    while number < len(jumps):
-        here = int(jumps[number])
-        after = int(jumps[number + 1]) if number + 1 < len(jumps) else total
-        if (
-            after - here <= run
-            and after + 1 < total
-            and (abs(values[after + 1] - values[here]) <= limit)
-        ):
-            wild[here + 1 : after + 1] = True
-            number += 2
-            continue
-        if here < run:
-            wild[: here + 1] = True
-        elif total - 1 - here <= run:
-            wild[here + 1 :] = True
-        else:
-            lasting.append(here)
-        number += 1
-    if lasting or wild.sum() > table.limits.nan_share * total:
-        at = lasting[0] if lasting else int(jumps[0])
+    windows = sliding_window_view(np.pad(values, run, mode="edge"), 2 * run + 1)
+    level = np.median(windows, axis=1)
+    level[:run], level[total - run :] = level[run], level[total - run - 1]
+    wild = np.abs(values - level) > limit
+    lasting = np.flatnonzero(np.abs(np.diff(level)) > limit)
+    if len(lasting) or wild.sum() > table.limits.nan_share * total:
+        at = int(lasting[0] if len(lasting) else jumps[0])
         size = abs(values[at + 1] - values[at]) * abs(encoder.scale)
         raise table.fault(
             f"jumps by {size:.3g} {encoder.unit} from one sample to the next "

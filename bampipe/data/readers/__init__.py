@@ -10,13 +10,15 @@ because somebody made it so: no reader gets more memory than its file can be wor
 
 import re
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
 from bampipe.data.readers import arrays, bag, hdf5, mat, objects, parquet, tdms, text
 from bampipe.data.readers.trial import LARGEST_BYTES, Dialect, RawTrial, Wanted
+from bampipe.data.units import unit, units_in
 from bampipe.errors import InputError, located
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".log", ".mot", ".sto", ".lvm")
@@ -91,7 +93,7 @@ def read_trial(
             trial: RawTrial = reader.read(path, wanted)
         if columns and len(trial) == 0:
             raise InputError("a header but no samples")
-    return trial
+    return replace(trial, units={**_units_in_names(reader, trial.columns), **trial.units})
 
 
 def is_log(path: Path) -> bool:
@@ -119,7 +121,17 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
         more = (dialect,) if reader is text else ()
         with _safely(path):
             columns: dict[str, str] = reader.columns(path, *more)
-    return columns
+    named = _units_in_names(reader, columns)
+    return {column: stated or named.get(column, "") for column, stated in columns.items()}
+
+
+def _units_in_names(reader: ModuleType, names: Iterable[str]) -> dict[str, str]:
+    """Units that stand in the names of columns; a text has told those of its header itself.
+
+    What is in brackets may be an index or a joint as well, as it is in all names of a bag.
+    """
+    said = {} if reader in (text, bag) else units_in(names)
+    return {name: u for name, u in said.items() if not u.isdigit() and unit(u) is not None}
 
 
 @contextmanager

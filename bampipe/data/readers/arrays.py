@@ -7,6 +7,7 @@ array are columns, too. Pickled objects, which may run any program, are not read
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,6 +18,7 @@ import numpy as np
 
 from bampipe.data.readers import moments
 from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns, check_size
+from bampipe.data.units import units_beside
 from bampipe.errors import InputError, located
 
 LARGEST_WIDTH = 64
@@ -48,6 +50,9 @@ class Stored:
     unit: str = ""
 
 
+_NAMES = ("name", "label", "signalname", "signal", "channel")
+_VALUES = ("values", "value", "data")
+"""Fields that hold the name of a signal, and its samples."""
 Arrays = Mapping[str, Stored]
 """What a file holds, by name."""
 
@@ -73,7 +78,7 @@ def read_arrays(arrays: Arrays, wanted: Wanted, what: str) -> RawTrial:
         variable, index = split_index(column, known)
         array = known.get(variable)
         if array is None or array.kind not in _NUMBERS + _STAMPED:
-            raise _fault(variable, known, f"{what} '{column}'")
+            raise _fault(column if array is None else variable, known, f"{what} '{column}'")
         check_size(math.prod(array.shape), wanted)
         with located(f"{what} '{column}'"):
             values[column] = _read_column(array, index, wanted.datetimes.get(column))
@@ -136,6 +141,28 @@ def columns_of_arrays(arrays: Arrays) -> dict[str, str]:
         for column in labels(name, array.shape)
         if column in kept
     }
+
+
+def called_signals(labels: Iterable[str], texts: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    """Names and units of arrays by their labels, out of the ``texts`` beside them.
+
+    Structs of a list that say what they are called go by that name, and units beside an array are
+    its own: so scopes and recorders write their channels.
+    """
+    names, units = dict[str, str](), units_beside(texts)
+    for label, text in texts.items():
+        owner, _, key = label.rpartition(".")
+        if key.lower() in _NAMES and owner.endswith("]"):
+            names.setdefault(owner, re.sub(r"[^\w ./+-]|[\[\]]", "", text))
+    several = Counter((owner.rpartition("[")[0], name) for owner, name in names.items())
+    found: dict[str, tuple[str, str]] = {}
+    for label in labels:
+        owner, _, key = label.rpartition(".")
+        kept, sampled, name = owner.rpartition("[")[0], key.lower() in _VALUES, label
+        if owner in names and several[kept, names[owner]] == 1:
+            name = f"{kept}.{names[owner]}" + ("" if sampled else f".{key}")
+        found[label] = name, units.get(label) or (units.get(owner, "") if sampled else "")
+    return found
 
 
 def split_index(column: str, names: Container[str]) -> tuple[str, int | None]:

@@ -14,7 +14,7 @@ from itertools import islice
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER, Dialect, check_columns
-from bampipe.data.units import bare, unit
+from bampipe.data.units import bare, unit, units_in
 from bampipe.errors import InputError
 
 HEAD = 1 << 16
@@ -27,7 +27,6 @@ _COMMA = re.compile(r"[-+]?(\d+,\d*|,\d+)([eE][-+]?\d+)?\Z")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+\Z")
 _GROUPED = re.compile(r"[-+]?(\d{1,3}(,\d{3})+\.\d*|\d{1,3}(\.\d{3})+,\d*)\Z")
 _UNIT = re.compile(r"[\[(]?\s*(?=.*[A-Za-z%°Ωµμ#1\-])[A-Za-z0-9%°Ωµμ#./*^²³· _\-]{0,16}\s*[\])]?\Z")
-_NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
 _REMARK = re.compile(r"\s*(#|%|//|\"#)+\s?")
 _MOTION = re.compile(r"(?i)\binDegrees\s*=\s*yes\b")
 _NO_ANGLE = re.compile(
@@ -118,7 +117,7 @@ def find_layout(head: bytes, columns: Sequence[str], dialect: Dialect) -> TableL
     delimiters: list[str] = [dialect.delimiter] if dialect.delimiter else list(DELIMITERS)
     index, delimiter, header = _header(lines, columns, dialect, delimiters)
     body = lines[index + 1 :]
-    units = _units_in(header) | _units_of_motion([line.text for line in lines[:index]], header)
+    units = units_in(header) | _units_of_motion([line.text for line in lines[:index]], header)
     remarks = []
     if delimiter != "," and not dialect.delimiter:
         remarks.append(f"columns are separated by {DELIMITERS[delimiter]}")
@@ -414,7 +413,9 @@ def _above(lines: list[Line], first: int, delimiter: str) -> int:
     fitting = [
         n
         for n, row in rows.items()
-        if width - 1 <= len(row) <= width and not all(map(_POINT.match, row))
+        if width - 1 <= len(row) <= width
+        and not all(map(_POINT.match, row))
+        and all(any(map(str.isalnum, cell)) for cell in row if cell)
     ]
     while len(fitting) > 1 and any(re.match(r"[A-Za-z ]+:\s+\S", c) for c in rows[fitting[-1]]):
         fitting.pop()  # Type: double
@@ -525,27 +526,6 @@ def _is_unit_row(row: list[str], header: list[str], columns: Sequence[str]) -> b
 def _are_units(row: list[str]) -> bool:
     """Whether every cell is a unit that is known, or stands in brackets."""
     return any(row) and all(re.match(r"[\[(]", cell) or unit(cell) is not None for cell in row)
-
-
-def _units_in(header: list[str]) -> dict[str, str]:
-    """Units in names such as ``force [N]``; a number, as in ``q[0]`` or ``pos (1)``, is an index.
-
-    Beside units of other columns, ``[1]`` is one, unless the name comes with other numbers too.
-    """
-    # A number behind the unit tells two of one name apart.
-    plain = {name: re.sub(r"(?<=[\])]) \(\d+\)\Z", "", name) for name in header}
-    matches = {n: match for n in header if (match := _NAME_WITH_UNIT.match(plain[n]))}
-    numbered = Counter(m["name"] for m in matches.values() if m["unit"].isdigit())
-    others = any(not match["unit"].isdigit() for match in matches.values())
-    return {
-        name: match["unit"]
-        for name, match in matches.items()
-        if match["name"]
-        and not (
-            match["unit"].isdigit()
-            and (match["unit"] != "1" or not others or numbered[match["name"]] > 1)
-        )
-    }
 
 
 def _units_of_motion(above: list[str], header: list[str]) -> dict[str, str]:

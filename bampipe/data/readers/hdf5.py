@@ -5,7 +5,6 @@ or a column of a matrix (``log/pose[2]``). What lies outside the file is not fol
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -71,16 +70,16 @@ def _arrays(file: Any, alone: bool = False) -> Iterator[tuple[str, Stored]]:
             if not (alone and names):
                 yield label if field is None else f"{label}.{field}", array
             for place, name in enumerate(names):
-                column = replace(
-                    array, shape=(max(data.shape),), load=partial(_column, data, place)
-                )
+                load, said = partial(_read, data, None, place), _unit(data, place)
+                column = Stored((max(data.shape),), array.kind, load, said)
                 yield f"{label}/{name}", column
 
 
 def _stored(data: Any, field: str | None) -> Stored:
     kind = (data.dtype if field is None else data.dtype[field]).kind
     kind = "U" if data.attrs.get("MATLAB_class") == b"char" else kind
-    return Stored(data.shape, kind, partial(_read, data, field), _unit(data))
+    place = data.dtype.names.index(field) if field else 0
+    return Stored(data.shape, kind, partial(_read, data, field), _unit(data, place))
 
 
 def _datasets(group: Any, prefix: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
@@ -114,8 +113,8 @@ def _names(data: Any) -> list[str]:
     return texts if data.ndim == 2 and len(texts) == width and len(set(texts)) == width else []
 
 
-def _read(data: Any, field: str | None) -> np.ndarray:
-    """A dataset, or a field of all its rows; texts as objects."""
+def _read(data: Any, field: str | None, place: int | None = None) -> np.ndarray:
+    """A dataset, a field of all its rows, or its column at a place; texts as objects."""
     kind = data.dtype if field is None else data.dtype[field]
     if kind.kind == "S" and kind.itemsize > moments.LONGEST:
         raise InputError(f"a text of {kind.itemsize} bytes, expected a date and time")
@@ -125,23 +124,17 @@ def _read(data: Any, field: str | None) -> np.ndarray:
         starts = range(0, max(data.shape[:1], default=0), _BLOCK_ROWS)
         parts = [data[k : k + _BLOCK_ROWS][field] for k in starts]
         cells = np.concatenate(parts) if parts else np.asarray(data[field])
+    if place is not None:
+        return pick(cells, place)
     return np.array(_texts(cells), dtype=object) if kind.kind in "OS" else cells
-
-
-def _column(data: Any, place: int) -> np.ndarray:
-    return pick(_read(data, None), place)
 
 
 def _texts(cells: Iterable[Any]) -> list[str]:
     return [x.decode("utf-8", "replace") if isinstance(x, bytes) else str(x) for x in cells]
 
 
-def _unit(data: Any) -> str:
-    """Unit that the file states for a dataset."""
-    for key in ("unit", "units", "Unit", "Units"):
-        value = data.attrs.get(key)
-        if isinstance(value, bytes):
-            value = value.decode("utf-8", "replace")
-        if isinstance(value, str):
-            return value
-    return ""
+def _unit(data: Any, place: int) -> str:
+    """Unit that the file states for a dataset, or in a list for the columns or fields of it."""
+    stated = (data.attrs[key] for key in ("unit", "units", "Unit", "Units") if key in data.attrs)
+    said = _texts(np.atleast_1d(next(stated, "")))
+    return said[0] if len(said) == 1 else said[place] if place < len(said) else ""

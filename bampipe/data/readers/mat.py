@@ -4,14 +4,19 @@ import math
 import re
 import struct
 import zlib
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from bampipe.data.readers import hdf5
-from bampipe.data.readers.arrays import Stored, columns_of_arrays, read_arrays, stored
+from bampipe.data.readers.arrays import (
+    Stored,
+    called_signals,
+    columns_of_arrays,
+    read_arrays,
+    stored,
+)
 from bampipe.data.readers.trial import RawTrial, Wanted
 from bampipe.errors import InputError
 
@@ -23,9 +28,6 @@ _CELL_CLASS, _STRUCT_CLASS, _TEXT_CLASS, _NUMERIC_CLASSES, _OPAQUE_CLASS = 1, 2,
 _COMPLEX = 0x0800
 _DEEPEST = 8
 _MOST_FIELDS = 4096
-_NAMES = ("name", "label", "signalname", "channel")
-_VALUES = ("values", "value", "data")
-"""Fields that hold the name of a signal, and its samples."""
 
 
 def read(path: Path, wanted: Wanted) -> RawTrial:
@@ -68,8 +70,7 @@ def _is_level_5(path: Path) -> bool:
 def _arrays(path: Path) -> tuple[dict[str, Stored], str]:
     """Arrays of a file, each struct followed by what is in it; and what is left out of the names.
 
-    Structs of a list that say what they are called go by that name, and units beside an array are
-    its own: so scopes and recorders write their channels. A struct that is all of the file and has
+    A struct that is all of the file and has
     a number in its name, as recorders count their files, is left out of the names.
 
     scipy.io reads the same files, but past its buffers where a damaged one lies about a length,
@@ -92,13 +93,6 @@ def _arrays(path: Path) -> tuple[dict[str, Stored], str]:
 
 def _called(found: dict[str, np.ndarray | str | None]) -> tuple[dict[str, Stored], str]:
     texts = {label: text for label, text in found.items() if isinstance(text, str) and text}
-    names, units = dict[str, str](), dict[str, str]()
-    for label, text in texts.items():
-        owner, _, key = label.rpartition(".")
-        if key.lower() in _NAMES and owner.endswith("]"):
-            names.setdefault(owner, re.sub(r"[^\w ./+-]|[\[\]]", "", text))
-        elif key.lower() in ("unit", "units"):
-            units[owner] = text
     lists: dict[str, dict[int, str]] = {}
     for label, text in texts.items():
         if item := re.fullmatch(r"(.+)\[(\d+)\]", label):
@@ -112,19 +106,14 @@ def _called(found: dict[str, np.ndarray | str | None]) -> tuple[dict[str, Stored
             del found[label]
             table = value if sides[0] >= sides[1] else value.T
             found |= {f"{label}.{own[k]}": table[:, k] for k in sorted(own)}
-    several = Counter((owner.rpartition("[")[0], name) for owner, name in names.items())
     whole = {label.partition(".")[0] for label in found}
     root = f"{whole.pop()}." if len(whole) == 1 else ""
     root = root if re.search(r"\d", root) else ""
     arrays: dict[str, Stored] = {}
-    for label, value in found.items():
-        owner, _, key = label.rpartition(".")
-        kept, sampled = owner.rpartition("[")[0], key.lower() in _VALUES
-        if owner in names and several[kept, names[owner]] == 1:
-            label = f"{kept}.{names[owner]}" + ("" if sampled else f".{key}")
-        unit = units.get(owner, "") if sampled else ""
+    for label, (name, unit) in called_signals(found, texts).items():
+        value = found[label]
         array = None if isinstance(value, str) else value
-        arrays[label.removeprefix(root)] = stored(array, unit)
+        arrays[name.removeprefix(root)] = stored(array, unit)
     return arrays, root
 
 

@@ -6,18 +6,25 @@ as many names stands beside them, they have these.
 """
 
 import json
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import Stored, columns_of_arrays, read_arrays, stored
+from bampipe.data.readers.arrays import (
+    Stored,
+    called_signals,
+    columns_of_arrays,
+    read_arrays,
+    stored,
+)
 from bampipe.data.readers.nested import MISSING, as_number, find, is_number, leaves, reads_as_number
-from bampipe.data.readers.trial import RawTrial, Wanted, aligned, check_columns
-from bampipe.errors import InputError, located
+from bampipe.data.readers.trial import RawTrial, Wanted
+from bampipe.data.units import units_beside
+from bampipe.errors import InputError
 
 
 def read(path: Path, wanted: Wanted) -> RawTrial:
@@ -28,51 +35,23 @@ def read(path: Path, wanted: Wanted) -> RawTrial:
     Raises:
         InputError: not JSON, no such list, a column missing or not of numbers.
     """
-    samples, constants, notes = _samples(path)
-    if isinstance(samples, dict):
-        fixed = [column for column in wanted.columns if column in constants]
-        alone = {c: stored(np.array([as_number(constants[c], f"'{c}'")])) for c in fixed}
-        return replace(read_arrays(alone | samples, wanted, "array"), notes=notes)
-    first, values = samples[0], {}
-    beside = [column for column in wanted.columns if find(first, column) is MISSING]
-    unknown = [column for column in beside if column not in constants]
-    check_columns([path for path, _ in leaves(first)] + list(constants), unknown)
-    for column in wanted.columns:
-        parts = [constants] if column in beside else samples
-        cells = [None if (c := find(part, column)) is MISSING else c for part in parts]
-        places = (f"sample {n}, '{column}'" for n, _ in enumerate(cells, 1))
-        if column in wanted.datetimes:
-            for cell, where in zip(cells, places, strict=True):
-                if not isinstance(cell, str | None):
-                    raise InputError(f"found {cell!r:.40}, expected a date and time", where=where)
-            with located(f"'{column}'"):
-                stamps = moments.nanoseconds(cells, wanted.datetimes[column])
-            values[column] = moments.seconds(stamps)
-        else:
-            values[column] = np.fromiter(map(as_number, cells, places), float, len(cells))
-    return RawTrial(aligned(values, "value"), first_row=1, notes=notes)
+    arrays, notes = _contents(path, wanted.columns)
+    return replace(read_arrays(arrays, wanted, "value"), notes=notes)
 
 
 def columns(path: Path) -> dict[str, str]:
     """Names of the values that are numbers, or moments (unit "datetime"), in the first sample."""
-    samples, constants, _ = _samples(path)
-    if isinstance(samples, dict):
-        return columns_of_arrays(samples) | dict.fromkeys(constants, "")
-    found = {}
-    for column, cell in leaves(samples[0]):
-        if reads_as_number(cell):
-            found[column] = ""
-        elif isinstance(cell, str) and moments.is_moment(cell):
-            found[column] = "datetime"
-    return found | {c: "" for c in constants if c not in found}
+    return columns_of_arrays(_contents(path)[0])
 
 
 def stated_units(path: Path) -> dict[str, str]:
     """Units stated beside the samples, such as ``"force units": "kip"``, by quantity."""
-    content = _parsed(path.read_text(encoding="utf-8-sig"))
-    items = content.items() if isinstance(content, dict) else ()
-    parts = [(re.split(r"[ _]units?$", str(key), flags=re.I), value) for key, value in items]
-    return {key[0]: value for key, value in parts if len(key) > 1 and isinstance(value, str)}
+    return units_beside(_texts(_parsed(path.read_text(encoding="utf-8-sig"))))
+
+
+def _texts(content: object) -> dict[str, str]:
+    """The texts in a parsed file, by their paths."""
+    return {path: text for path, text in leaves(content) if isinstance(text, str)}
 
 
 def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
@@ -92,10 +71,8 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
                     yield label, array
     elif isinstance(value, list) and value:
         if isinstance(value[0], dict):
-            own = [next((str(x[key]) for key in _CALLED if key in x), "") for x in value]
-            places = own if all(own) and len(set(own)) == len(own) else range(len(value))
-            for place, item in zip(places, value, strict=True):
-                yield from _arrays(item, f"{path}[{place}]")
+            for place, item in enumerate(value):
+                yield from _arrays(item, f"{path or 'data'}[{place}]")
             return
         if isinstance(value[0], str):
             if moments.is_moment(value[0]) and all(isinstance(x, str | None) for x in value):
@@ -109,10 +86,6 @@ def _arrays(value: object, path: str = "") -> Iterator[tuple[str, np.ndarray]]:
             yield path or "data", array
 
 
-_CALLED = ("name", "label", "signal", "channel")
-"""Keys of what an object is called."""
-
-
 def _with_lists(content: object, depth: int = 2) -> object:
     """What was parsed, with lists for objects whose keys are numbers of rows, as pandas writes."""
     if not isinstance(content, dict) or depth == 0:
@@ -122,10 +95,8 @@ def _with_lists(content: object, depth: int = 2) -> object:
     return {key: _with_lists(item, depth - 1) for key, item in content.items()}
 
 
-def _samples(
-    path: Path,
-) -> tuple[list[object] | dict[str, Stored], Mapping[str, object], tuple[str, ...]]:
-    """Samples of a file, or its arrays; the numbers beside them, and what was left out."""
+def _contents(path: Path, wanted: Sequence[str] = ()) -> tuple[dict[str, Stored], tuple[str, ...]]:
+    """What a file holds by name, what is ``wanted`` by other names too, and what was left out."""
     data = path.read_bytes()
     try:
         text = data.decode("utf-8-sig")
@@ -147,14 +118,20 @@ def _samples(
         content = _with_lists(_parsed(text))
     items = content.items() if isinstance(content, dict) else [("", content)]
     lists = {str(k): v for k, v in items if isinstance(v, list) and v and isinstance(v[0], dict)}
-    # Objects are samples rather than recordings, whose values are long lists.
-    single = all(any(reads_as_number(x) for _, x in leaves(v[0])) for v in lists.values())
+    # Objects are samples rather than recordings, whose values are lists longer than that of them.
+    single = all(
+        any(reads_as_number(x) for _, x in leaves(v[0]))
+        and not any(isinstance(x, list) and len(x) > len(v) for x in v[0].values())
+        for v in lists.values()
+    )
+    texts = _texts(content)
+    units = units_beside(texts)
+    alone = {key: _column([value], "", units) for key, value in _numbers(content).items()}
     if not (lists and single) and (arrays := dict(_arrays(content))):
-        units = {label: find(content, f"{label.rpartition('.')[0]}.unit") for label in arrays}
-        stated = {label: unit if isinstance(unit, str) else "" for label, unit in units.items()}
         kinds = {label: "M" * (array.dtype.kind == "O") for label, array in arrays.items()}
-        held = {label: stored(a, stated[label], kinds[label]) for label, a in arrays.items()}
-        return held, _numbers(content), notes
+        called = called_signals(arrays, texts).items()
+        held = {name: stored(arrays[x], unit, kinds[x]) for x, (name, unit) in called}
+        return held | alone, notes
     if not isinstance(content, list) and len(lists) != 1:
         raise InputError(
             f"{len(lists)} lists of samples: {', '.join(lists)}"
@@ -168,7 +145,25 @@ def _samples(
     for count, sample in enumerate(samples, 1):
         if not isinstance(sample, dict):
             raise InputError("not an object with named values", where=f"sample {count}")
-    return samples, _numbers(content), notes
+    named = [x for x, cell in leaves(samples[0]) if reads_as_number(cell) or _is_moment(cell)]
+    named += [name for name in wanted if find(samples[0], name) is not MISSING]
+    found = {name: _column(samples, name, units) for name in dict.fromkeys(named)}
+    return {**found, **{x: alone[x] for x in alone if x not in found}}, notes
+
+
+def _column(samples: Sequence[object], name: str, units: Mapping[str, str]) -> Stored:
+    """What stands at ``name`` in the samples, or these themselves; null where nothing does."""
+    found = (find(sample, name) if name else sample for sample in samples)
+    cells = [None if cell is MISSING else cell for cell in found]
+    if any(map(_is_moment, cells)):
+        return stored(np.array(cells, dtype=object), kind="M")
+    places = (f"sample {n}, '{name}'" for n, _ in enumerate(cells, 1))
+    load = partial(np.fromiter, map(as_number, cells, places), float, len(cells))
+    return Stored((len(cells),), "f", load, units.get(name, ""))
+
+
+def _is_moment(cell: object) -> bool:
+    return isinstance(cell, str) and moments.is_moment(cell)
 
 
 def _parsed(text: str, where: str = "") -> object:

@@ -1,5 +1,6 @@
 """Parquet files: one row a sample; columns of vectors element by element."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from bampipe.data.readers import lerobot, moments
+from bampipe.data.readers.nested import leaves
 from bampipe.data.readers.trial import RawTrial, Wanted, check_columns, check_size
+from bampipe.data.units import units_beside
 from bampipe.errors import InputError, located
 
 BATCH_ROWS = 1 << 16
@@ -62,12 +65,15 @@ def columns(path: Path) -> dict[str, str]:
     """Names of the columns that hold numbers or moments; the unit is "datetime" for these."""
     schema = pq.read_schema(path)
     found = dict.fromkeys(lerobot.vector_columns(path, schema), "")
+    attributes = json.loads((schema.metadata or {}).get(b"PANDAS_ATTRS", b"{}"))
+    beside = units_beside({k: u for k, u in leaves(attributes) if isinstance(u, str)})
     for field in schema:
         if field.name in lerobot.NO_READINGS and lerobot.EPISODE in schema.names:
             continue
         if any(check(field.type) for check in _NUMBERS):
-            stated = (field.metadata or {}).get(b"unit") or b""
-            found[field.name] = stated.decode("utf-8", "replace")
+            own = field.metadata or {}
+            stated = (own.get(b"unit") or own.get(b"units") or b"").decode("utf-8", "replace")
+            found[field.name] = stated or beside.get(field.name, "")
         elif pa.types.is_timestamp(field.type):
             found[field.name] = "datetime"
     return found

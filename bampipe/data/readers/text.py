@@ -30,14 +30,8 @@ _LEAST_ROWS, _MANY_ROWS = 0.05, 0.5
 """Share of rows of numbers in a table's first lines, and where its extension tells nothing."""
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _WESTERN = "cp1252"
-_TAKEN_AS = {
-    encoding: f"not UTF-8: names and units are taken as {what}"
-    for encoding, what in (
-        (_WESTERN, "Windows-1252"),
-        ("gb18030", "GBK"),
-        ("shift_jis", "Shift-JIS"),
-    )
-}
+_TAKEN_AS = {_WESTERN: "Windows-1252", "gb18030": "GBK", "shift_jis": "Shift-JIS"}
+"""Encodings of what is not UTF-8, by their usual names."""
 
 
 def read(path: Path, wanted: Wanted) -> RawTrial:
@@ -111,7 +105,8 @@ def _opened(path: Path, dialect: Dialect) -> Iterator[tuple[BinaryIO, Dialect, t
                 f"not sound {encoding.upper()} text ({error.reason})",
                 remedy="save it as UTF-8, or say another encoding under [csv]",
             ) from error
-        said = () if dialect.encoding or encoding not in _TAKEN_AS else (_TAKEN_AS[encoding],)
+        taken = "" if dialect.encoding else _TAKEN_AS.get(encoding, "")
+        said = (f"not UTF-8: names and units are taken as {taken}",) if taken else ()
         if form is not None:
             text = re.sub(r"[^\r\n]+", lambda line: form.rewrite(line[0]), text)
             said = (*said, form.said) if form.said else said
@@ -153,8 +148,8 @@ def _asian(head: bytes) -> str:
     runs = re.findall(rb"[\x80-\xff]+", head)
     if not runs or _sound(head, "utf-8"):
         return ""
-    # Letters of Western Europe stand alone among others.
-    lone = re.search(rb"[A-Za-z][\x80-\xff]{2}(?![\x80-\xff])", head)
+    # Letters of Western Europe stand alone among others; below b0, GBK has dots and other signs.
+    lone = re.search(rb"[A-Za-z][\xb0-\xff][\x80-\xff](?![\x80-\xff])", head)
     if not lone and all(len(run) % 2 == 0 for run in runs) and _sound(head, "gb2312"):
         return "gb18030"
     japanese = re.findall(rb"[\x82\x83\x88-\x9f][\x40-\xfc]", head)

@@ -6,7 +6,7 @@ a radian, is left at a value that the session reader refuses with a line saying 
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,9 +19,11 @@ from bampipe.errors import InputError
 from bampipe.files import write_text
 from bampipe.lists import join_names
 from bampipe.physics.device import Device
+from bampipe.physics.robot import Robot
 from bampipe.setup.mounting import Mounting
 from bampipe.setup.proposal.device import (
     DEVICE,
+    UNKNOWN_CONSTANT,
     ChosenDevice,
     find_device,
     new_device,
@@ -39,6 +41,10 @@ _TRIALS = frozenset({"trial", "run", "condition", "test", "block", "versuch"})
 """Words in the name of a column that numbers trials."""
 _LEAP_S, _SHORTEST_S, _MOST_CUTS = 1.0, 2.0, 200
 """Length, s, of what lies between two trials and of a trial, the least; cuts, the most."""
+
+
+_GUESSED_GEAR = ", scale_sd = 0.1"
+"""Of a reduction that weight shows beside bodies that are drawn to 15 %."""
 
 
 @dataclass(frozen=True)
@@ -90,15 +96,13 @@ def propose(
     match = Matcher(found, clock.t, set(clock.columns), registers)
     if chosen is None:
         chosen = new_device(folder, match, notes)
-    elif chosen.device.robot is not None:
-        columns = find_robot_columns(
-            folder, chosen.device, chosen.device.robot, found, clock.t, notes
-        )
-        chosen = _with_guessed_motors(folder, chosen, columns)
+    elif (robot := chosen.device.robot) is not None:
+        columns = find_robot_columns(folder, chosen.device, robot, found, clock.t, notes)
         match.robot = columns
+        chosen = _with_guessed_motors(folder, chosen, match)
         if columns.mounting is not None:
             chosen = _hung(folder, chosen, columns.mounting, notes)
-        _check_robot(chosen, columns, notes)
+        chosen = _check_robot(chosen, robot, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
     if len(match.rivals) > 1 and len(chosen.device.coordinates) == 1:
@@ -115,7 +119,7 @@ def propose(
     lines = [
         *_head(folder, chosen.name, clock.rate),
         *(["[csv]", f"names = [{', '.join(map(quoted, names))}]", ""] if names else []),
-        *clock.lines,
+        *("[time]", *clock.lines, ""),
         *encoders,
         *inputs,
         *([f"# not used: {', '.join(left)}", ""] if left else []),
@@ -162,9 +166,13 @@ def _head(folder: Path, device: str, rate: str) -> list[str]:
     ]
 
 
-def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColumns) -> ChosenDevice:
+def _with_guessed_motors(folder: Path, chosen: ChosenDevice, match: Matcher) -> ChosenDevice:
     """A new device file with the torque constants or reductions that the drawing suggests."""
+    columns, scale_sd, robot = match.robot, match.scale_sd, chosen.device.robot
+    assert robot is not None
     sizes = [abs(drive.share) for drive in columns.drives.values()]
+    if not robot.motors:
+        scale_sd |= dict.fromkeys(columns.gears, _GUESSED_GEAR)
     if not chosen.text or not all(drive.is_sure for drive in columns.drives.values()) or not sizes:
         return chosen
     joints = [c.name for c in chosen.device.coordinates]
@@ -175,14 +183,18 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, columns: RobotColum
         guessed = {j: (n, 1.0 / size) for j, n, size in found}
         # Where most is carried, errors of single bodies count least.
         size = {
-            joint: float(np.nanstd(columns.columns[name].values) / abs(drive.share))
-            for joint, (name, drive) in zip(joints, columns.drives.items(), strict=True)
+            name: float(np.nanstd(columns.columns[name].values) / abs(drive.share))
+            for name, drive in columns.drives.items()
         }
-        return with_motors(folder, chosen, guessed, max(size, key=lambda joint: size[joint]))
+        reference = max(size, key=lambda name: size[name])
+        scale_sd[reference] = f", scale_sd = {robot.uncertainty}"
+        return with_motors(folder, chosen, guessed, reference.removeprefix("current_"))
     if columns.gears and all(LEAST_AT_JOINT < size < 1.0 / LEAST_AT_JOINT for size in of_motor):
+        scale_sd |= dict.fromkeys(columns.drives, _GUESSED_GEAR)
         return with_motors(folder, chosen, {j: (columns.gears.get(j, 1.0), None) for j in joints})
     if not columns.gears and all(size < LEAST_AT_JOINT for size in sizes):
         gears = {j: (1.0 / size, None) for j, size in zip(joints, sizes, strict=True)}
+        scale_sd |= dict.fromkeys(columns.drives, f", scale_sd = {robot.uncertainty}")
         return with_motors(folder, chosen, gears)
     return chosen
 
@@ -201,10 +213,10 @@ def _hung(folder: Path, chosen: ChosenDevice, mounting: Mounting, notes: Notes) 
     return with_gravity(folder, chosen, said) if chosen.text else chosen
 
 
-def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> None:
-    """What a look at the columns does not show of a robot."""
-    robot = chosen.device.robot
-    assert robot is not None
+def _check_robot(
+    chosen: ChosenDevice, robot: Robot, columns: RobotColumns, notes: Notes
+) -> ChosenDevice:
+    """The robot without torque constants that nothing tells; what else to look at is noted."""
     if "tip =" in chosen.text:
         notes.check.append(f"{chosen.name}: the robot ends at {robot.tip}; is that its last link?")
     if not columns.drives:
@@ -213,11 +225,6 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
             f"positions and torques are those of the joints, {joints}: if they are of motors, give"
             " [robot.motors] and the reductions"
         )
-        if chosen.device.force_unit == "A" and chosen.text:
-            notes.check.append(
-                f"{chosen.name}: torque_constant 1.0 is not yours yet: all forces and inertias"
-                " scale with it"
-            )
     notes.check += [
         f"no body has this, and the nearest that one can have is taken: {line}"
         for line in robot.impossible
@@ -226,6 +233,13 @@ def _check_robot(chosen: ChosenDevice, columns: RobotColumns, notes: Notes) -> N
         notes.check.append(
             f"no mass is drawn on {join_names(robot.undrawn)}: put it in where there is a body"
         )
+    if UNKNOWN_CONSTANT not in chosen.text:
+        return chosen
+    note = notes.ask(
+        f"torque_constant of each motor in {chosen.name}, N.m/A at the joint",
+        "the drive's data sheet, times the reduction",
+    )
+    return replace(chosen, text=chosen.text.replace(UNKNOWN_CONSTANT, f'= "{UNKNOWN}"{note}'))
 
 
 def _trials_tables(

@@ -26,6 +26,7 @@ from bampipe.setup.proposal.positions import (
     SLIDING,
     in_counts,
     is_force,
+    is_velocity,
     needs_gain,
     position_in_si,
     scale_to,
@@ -35,10 +36,14 @@ from bampipe.setup.proposal.starter import Drive, starter_device, weight_of
 
 DEVICE = "device.toml"
 _SCHEMA = "bampipe.device/1"
+UNKNOWN_CONSTANT = "= 1  # guess: N.m/A, gears included"
+"""Stands for the torque constant of a motor until a drawing or a person tells."""
 _MAY_SLIDE = " (no unit says that it slides: if it does, bampipe init FOLDER --device slider)"
 _MAY_TURN = " (by a force in N alone: if it turns, call its column {0}_rad or {0}_deg)"
 _HEAD_BYTES = 1 << 16
 """Of an XML file, in which its first element is looked for."""
+_NEAR = 0.05
+"""Share by which what a radian reads by the weight may differ from that of its unit."""
 _SAME_DRIVE = 0.8
 """Correlation beyond which a current and a force are of one drive: that of a coil has its own."""
 
@@ -171,9 +176,8 @@ def _complete(folder: Path, text: str) -> Device:
 
 
 def _device_file(folder: Path, wanted: str) -> ChosenDevice:
-    path = next((path for path in (folder / wanted, Path(wanted)) if path.is_file()), None)
-    if path is None:
-        raise InputError("no such file", where=wanted)
+    path = folder / wanted if (folder / wanted).is_file() else Path(wanted)
+    device = registry.device_from(read_device_file(path), str(path))
     full, root = path.resolve(), folder.resolve()
     if not full.is_relative_to(root):
         raise InputError(
@@ -181,7 +185,6 @@ def _device_file(folder: Path, wanted: str) -> ChosenDevice:
             where=wanted,
             remedy=f"copy it to {folder}",
         )
-    device = registry.device_from(read_device_file(path), str(path))
     return ChosenDevice(full.relative_to(root).as_posix(), device)
 
 
@@ -219,7 +222,7 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
     driver, role = match.driver(position)
     supply = match.supply(driver) if role == "duty" else None
     coil = role == "force" and _has_coil(driver, match, notes)
-    read, position = position, position if linear else _at_joint(position, driver, match)
+    read, position = (position, position) if linear else _at_joint(position, driver, match)
     fit = _rough_fit(position, driver, role, linear, match.t)
     if driver is not None and fit.feeds:
         # A sensor at the foot of a motor shows what the axis does to that.
@@ -236,7 +239,8 @@ def new_device(folder: Path, match: Matcher, notes: Notes) -> ChosenDevice:
         drive = replace(drive, scaled=role == "force" and not levered)
     width = 0.0 if in_counts(position) else _sign_width(position, match.t, linear)
     weight, on_gravity = weight_of(position, fit, linear, found)
-    starter = starter_device(position.name, linear, drive, fit, weight, width)
+    name = position.name.removesuffix(f" [{read.stated}]")
+    starter = starter_device(name, linear, drive, fit, weight, width)
     match.given = {starter.axis: read}
     if match.turning and role == "force" and driver is not None and "motor" in words(driver.name):
         notes.check.append(
@@ -275,7 +279,9 @@ def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bo
     currents = [c for c in found if "motor" not in words(c.name)]
     if driver is None:
         return bool(currents)
-    alike = [c for c in currents if _go_together(c.values, driver.values)]
+    pairs = (np.nan_to_num([c.values, driver.values]) for c in currents)
+    together = [abs(float(np.corrcoef(pair)[0, 1])) > _SAME_DRIVE for pair in pairs]
+    alike = [c for c, same in zip(currents, together, strict=True) if same]
     for current in alike:
         match.used.add(current.name)
         notes.check.append(
@@ -292,25 +298,30 @@ def _has_coil(driver: SurveyedColumn | None, match: Matcher, notes: Notes) -> bo
     return bool(coils)
 
 
-def _go_together(one: np.ndarray, other: np.ndarray) -> bool:
-    known = np.isfinite(one) & np.isfinite(other)
-    return abs(float(np.corrcoef(one[known], other[known])[0, 1])) > _SAME_DRIVE
-
-
 def _at_joint(
     position: SurveyedColumn, driver: SurveyedColumn | None, match: Matcher
-) -> SurveyedColumn:
-    """The angle of the joint, where counts or a motor's angle are read and the weight shows it."""
+) -> tuple[SurveyedColumn, SurveyedColumn]:
+    """What is read, and the angle of the joint, by the weight on it, which goes with its sine.
+
+    That tells the unit of a position that has none, and the size of counts and of a motor's angle.
+    """
     far = position.si == "rad" and np.ptp(position.values) * position.scale > MOST_TRAVEL
-    if driver is None or not (far or in_counts(position)):
-        return position
+    unsaid = not position.stated and position.si is None
+    if driver is None or not (far or unsaid or in_counts(position)) or is_velocity(position):
+        return position, position
     values = np.nan_to_num(driver.values)
     worth = guesses.find_turning(match.t, np.nan_to_num(position.values), values)
     if worth is None:
-        return position
+        return position, position
+    if not in_counts(position):
+        named = [replace(position, unit=name) for name in ("rad", "deg", "rev")]
+        named = [position] if far else named
+        fitting = [p for p in named if abs(p.scale * worth.size - 1.0) < _NEAR]
+        if fitting or not far:
+            return ((fitting or [position])[0],) * 2
     match.turning = {position.name: worth}
     angle = (position.values - worth.zero) / worth.size
-    return replace(position, values=angle, stated="rad", unit="rad")
+    return position, replace(position, values=angle, stated="rad", unit="rad")
 
 
 def _sign_width(position: SurveyedColumn, t: np.ndarray, linear: bool) -> float:

@@ -61,7 +61,11 @@ def pair_joints(
 
 def chain_logged(chains: Mapping[str, Sequence[tuple[str, str]]], found: Survey) -> str:
     """The link at which the chain ends whose joints the columns name most; "" if they name none."""
-    said = [_tokens(column.name) for column in found.of("position")]
+    said = [
+        _tokens(column.name, column.unit)
+        for column in found.of("position")
+        if not column.is_constant
+    ]
     logged = [
         [end for end in chain if any(_without(own, _tokens(end[0])) is not None for own in said)]
         for chain in chains.values()
@@ -74,7 +78,9 @@ def _incomplete(
     names: Sequence[str], columns: Sequence[SurveyedColumn], positions: Group
 ) -> Iterator[Mapping[str, SurveyedColumn]]:
     """Groups with columns for some of ``names``: by their names, or numbered as ``positions``."""
-    split = {column.name: _tokens(column.name) for column in (*columns, *positions.columns)}
+    split = {
+        column.name: _tokens(column.name, column.unit) for column in (*columns, *positions.columns)
+    }
     said = {name: _tokens(name) for name in names}
     yield from _named_alike(said, columns, split).values()
     for numbered in _numbered_alike(positions.columns, split).values():
@@ -87,7 +93,7 @@ def _incomplete(
 
 def _groups(names: Sequence[str], columns: Sequence[SurveyedColumn]) -> list[Group]:
     """Groups with a column for each of ``names``, by their names first; a column is in one."""
-    split = {column.name: _tokens(column.name) for column in columns}
+    split = {column.name: _tokens(column.name, column.unit) for column in columns}
     wanted = {name: _tokens(name) for name in names}
     bare = {name: tuple(t for t in said if t not in _GENERAL) for name, said in wanted.items()}
     found: list[Group] = []
@@ -104,6 +110,8 @@ def _groups(names: Sequence[str], columns: Sequence[SurveyedColumn]) -> list[Gro
         for group in _numbered_alike(columns, split).values()
         if len(group) == len(names)
     ]
+    # What is on the side of the motors stands for their joints only where nothing else does.
+    found.sort(key=lambda group: "motor" in _tokens(group.columns[0].name))
     taken: set[str] = set()
     chosen = []
     for group in found:
@@ -144,15 +152,20 @@ def _numbered_alike(
     return groups
 
 
-def _tokens(name: str) -> Tokens:
-    """Words and numbers of a name, in lower case; a unit in brackets is left out."""
+def _tokens(name: str, unit_of: str = "") -> Tokens:
+    """Words and numbers of a name, in lower case, without a unit in brackets or at its end.
+
+    A force is called a torque, as that of a joint that slides is among others.
+    """
+    name = re.sub(rf"(?<=.)[_\W]+{re.escape(unit_of)}\Z", "", name) if unit_of else name
     bare = re.sub(
         r"[\[(]([^\])]*[A-Za-z%°][^\])]*)[\])]",
         lambda said: " " if unit(said[1]) is not None or "°" in said[1] else f" {said[1]} ",
         name,
     )
     parts = re.findall(r"[A-Z]?[a-z]+|[A-Z]+|\d+", bare)
-    return tuple(str(int(p)) if p.isdigit() else p.lower() for p in parts)
+    lower = (str(int(p)) if p.isdigit() else p.lower() for p in parts)
+    return tuple("torque" if word == "force" else word for word in lower)
 
 
 def _without(tokens: Tokens, part: Tokens) -> Tokens | None:

@@ -36,6 +36,7 @@ class Matcher:
         given: columns that are known, by name of axis or input.
         reacting: the column of a drive that has the sign of the reaction, "" where none has.
         rivals: names of columns that may be the position, where there are several.
+        scale_sd: field of the uncertainty of a scale that is guessed, by name of axis or input.
     """
 
     found: Survey
@@ -47,6 +48,7 @@ class Matcher:
     given: Mapping[str, SurveyedColumn] = field(default_factory=dict)
     reacting: str = ""
     rivals: list[str] = field(default_factory=list)
+    scale_sd: dict[str, str] = field(default_factory=dict)
 
     def named(self, name: str, *roles: str) -> SurveyedColumn | None:
         """The column that has the words of ``name``, of one of the roles."""

@@ -25,7 +25,7 @@ from bampipe.setup.drawn_bodies import (
 from bampipe.setup.mounting import Mounting, find_mounting
 from bampipe.setup.proposal.joints import Group, pair_joints
 from bampipe.setup.proposal.notes import Notes
-from bampipe.setup.proposal.positions import position_in_si, scale_to
+from bampipe.setup.proposal.positions import in_counts, position_in_si, scale_to
 
 BEYOND = 1.5
 """Times its range that a joint must travel for the position to be another's."""
@@ -148,9 +148,10 @@ class Logged:
                 left = np.sqrt([max(drive.left, 1e-12) for drive in judged])
                 if not in_torque:
                     return np.asarray(left)
-                # A torque of the motor is that of the joint over the reduction, as drawn.
-                size = np.array([max(abs(drive.share), 1e-9) for drive in judged])
-                return np.concatenate([left, _DRAWN * np.log(size[moved] * tried[moved])])
+                # A torque is that of the joint as drawn, or of the motor: over the reduction.
+                size = np.log([max(abs(drive.share), 1e-9) for drive in judged])[moved]
+                off = np.stack([size, size + np.log(tried[moved])])
+                return np.concatenate([left, _DRAWN * off[np.abs(off).sum(axis=1).argmin()]])
 
             found = least_squares(misfit, np.log(ratio[moved]), diff_step=1e-3, max_nfev=40)
             best = at_joint.copy()
@@ -222,7 +223,7 @@ def find_robot_columns(
             notes.check.append(f"of several {what}, {groups[0]} are taken, not {listed}")
     positions, drives = next(iter(by_position), None), next(iter(by_drive), None)
     turns, logged, joints = _turns(device, robot), Logged(device, robot, t), _joints(device)
-    if positions is None or drives is None:
+    if positions is None or drives is None or any(map(in_counts, positions.columns)):
         columns = dict(zip(joints, positions.columns, strict=True)) if positions else {}
         columns |= dict(zip(device.forces, drives.columns, strict=True)) if drives else {}
         return RobotColumns(joints, {**columns, **some_drives})

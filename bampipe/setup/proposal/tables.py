@@ -1,7 +1,7 @@
 """The tables of a proposal that say what its columns are, ``[time]`` to ``[channels]``."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +16,10 @@ from bampipe.lists import join_names
 from bampipe.physics.device import Coordinate, Device
 from bampipe.setup.proposal.device import ChosenDevice
 from bampipe.setup.proposal.matching import Match, Matcher
-from bampipe.setup.proposal.notes import UNITS, UNKNOWN, Notes, entry, quoted, say_unit
+from bampipe.setup.proposal.notes import UNITS, UNKNOWN, Notes, entry, quoted
 from bampipe.setup.proposal.positions import in_counts, is_force, is_velocity, needs_gain
 
+UNKNOWN_RATE = f'sample_rate_hz = "{UNKNOWN}"'
 _RECORDED = ":@time"
 """End of the name under which the reader of ROS bags has the time of recording."""
 _LIKELY_RATE_HZ = 100.0
@@ -27,8 +28,8 @@ _COUNTERS = frozenset(["tick", "ticks", "cycle", "cycles", "timestep", "timestep
 """Words in the name of a clock that counts at a rate of its own."""
 _SECONDS = {"sec", "secs", "seconds"}
 _NANOSECONDS = {"nanosec", "nsec", "nsecs", "nanosecs", "nanoseconds"}
-_FALLING = 0.9
-"""Share of steps at which the time of a log that is written backwards falls, the least."""
+_MIXED = 0.1
+"""Share of steps at which times fall that are all different, of rows that stand out of order."""
 _SLOW_HZ = 40.0
 """Below, accelerations of a joint that stops within a tenth of a second are not seen."""
 _OF_ROWS = (
@@ -54,13 +55,13 @@ class ProposedClock:
 
     Attributes:
         t: (T,) time stamps, s; columns: that the time takes up.
-        lines: the table ``[time]``; rate: the line on the sample rate, above all tables.
+        lines: of the table ``[time]``; rate: the line on the sample rate, above all tables.
     """
 
     t: np.ndarray
     columns: tuple[str, ...]
-    lines: tuple[str, ...]
-    rate: str
+    lines: Sequence[str]
+    rate: str = UNKNOWN_RATE
 
 
 def clock_of(found: Survey, notes: Notes) -> ProposedClock:
@@ -101,9 +102,9 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
     if counter and tick:
         size = float(tick[1]) * SECONDS[tick[2]]
         note = notes.guess(f"a count of {column.name} is {tick[0]}, by its name")
-        table = _table(named, 'unit = "ticks"', f"ticks_per_s = {1.0 / size:.10g}{note}")
-        rate = _stamped_rate(guesses.sample_rate(stamps * size), notes)
-        return ProposedClock(stamps * size, (column.name,), table, rate)
+        lines = [named, 'unit = "ticks"', f"ticks_per_s = {1.0 / size:.10g}{note}"]
+        t = stamps * size
+        return ProposedClock(t, (column.name,), lines, _stamped_rate(t, notes))
     if not kind:
         if counter:
             step = float(np.median(np.diff(stamps)))
@@ -113,18 +114,16 @@ def _in_one_column(column: SurveyedColumn, notes: Notes) -> ProposedClock:
                 "the clock of the timer or processor, in its data sheet or firmware; else what it"
                 " counted over the seconds that the recording took",
             )
-            table = _table(named, 'unit = "ticks"', f"ticks_per_s = 0.0{note}")
+            lines = [named, 'unit = "ticks"', f"ticks_per_s = 0.0{note}"]
         else:
             note = notes.ask("the unit of time: no unit gives a likely rate", _OF_ROWS)
-            table = _table(named, f'unit = "{UNKNOWN}"{note}')
-        rate = f'sample_rate_hz = "{UNKNOWN}"'
-        samples = np.arange(len(stamps)) / _LIKELY_RATE_HZ
-        return ProposedClock(samples, (column.name,), table, rate)
+            lines = [named, f'unit = "{UNKNOWN}"{note}']
+        return ProposedClock(np.arange(len(stamps)) / _LIKELY_RATE_HZ, (column.name,), lines)
     t = stamps * SECONDS.get(kind, 1.0)
     said = kind == "datetime" or spelled(column.unit, tuple(SECONDS)) == kind
-    note = "" if said else notes.guess(f"time is in {say_unit(kind)}, by the rate that it gives")
-    rate = _stamped_rate(guesses.sample_rate(t), notes)
-    return ProposedClock(t, (column.name,), _table(named, f'unit = "{kind}"{note}'), rate)
+    note = "" if said else notes.guess(f"time is in {kind}, by the rate that it gives")
+    lines = [named, f'unit = "{kind}"{note}']
+    return ProposedClock(t, (column.name,), lines, _stamped_rate(t, notes))
 
 
 def _in_two_columns(seconds: SurveyedColumn, rest: SurveyedColumn, notes: Notes) -> ProposedClock:
@@ -132,9 +131,8 @@ def _in_two_columns(seconds: SurveyedColumn, rest: SurveyedColumn, notes: Notes)
     t = seconds.values - seconds.values[0] + 1e-9 * (rest.values - rest.values[0])
     note = notes.guess(f"seconds in {seconds.name}, nanoseconds on top in {rest.name}")
     on_top = f"nanoseconds = {quoted(rest.name)}{note}"
-    table = _table(f"column = {quoted(seconds.name)}", 'unit = "s"', on_top)
-    rate = _stamped_rate(guesses.sample_rate(t), notes)
-    return ProposedClock(t, (seconds.name, rest.name), table, rate)
+    lines = (f"column = {quoted(seconds.name)}", 'unit = "s"', on_top)
+    return ProposedClock(t, (seconds.name, rest.name), lines, _stamped_rate(t, notes))
 
 
 def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
@@ -149,7 +147,7 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
     if step_s > 0.0:
         note = notes.guess(f"samples are counted, and {name} sets the rate")
         rate = f"sample_rate_hz = {1.0 / step_s:g}"
-        return ProposedClock(step_s * samples, (name,), _table(f'unit = "samples"{note}'), rate)
+        return ProposedClock(step_s * samples, (name,), (f'unit = "samples"{note}',), rate)
     numbers = next((c for c in found.columns if not c.role and _numbers_rows(c)), None)
     if numbers is not None:
         note = notes.ask(
@@ -159,27 +157,21 @@ def _count_samples(found: Survey, notes: Notes) -> ProposedClock:
         )
         lines = f"column = {quoted(numbers.name)}", 'unit = "ticks"', f"ticks_per_s = 0.0{note}"
         t = (numbers.values - numbers.values[0]) / _LIKELY_RATE_HZ
-        rate = f'sample_rate_hz = "{UNKNOWN}"'
-        return ProposedClock(t, (numbers.name,), _table(*lines), rate)
+        return ProposedClock(t, (numbers.name,), lines)
     stamps = next((column for column in found.of("time") if not column.is_constant), None)
-    if stamps is not None and _FALLING < np.mean(np.diff(stamps.values) < 0.0):
-        raise InputError(
-            f"{stamps.name} falls from row to row: the log is written backwards",
-            where=found.trials[0].file,
-            remedy="turn the order of its rows round",
-        )
-    why = "no column increases like a time" if stamps is None else _describe_stamps(stamps)
+    why = "no column increases like a time"
+    if stamps is not None:
+        steps = np.diff(stamps.values[np.isfinite(stamps.values)])
+        if np.all(steps) and _MIXED < np.mean(steps < 0.0):
+            raise InputError(
+                f"{stamps.name} falls from row to row: it is written backwards, or out of order",
+                where=found.trials[0].file,
+                remedy="sort its rows by their time",
+            )
+        why = f"{stamps.name} falls at {np.sum(steps < 0)} and stands at {np.sum(steps == 0)} steps"
     note = notes.guess(f"samples are counted: {why}")
-    rate = f'sample_rate_hz = "{UNKNOWN}"' + notes.ask("sample_rate_hz, rows a second", _OF_ROWS)
-    return ProposedClock(samples / _LIKELY_RATE_HZ, (), _table(f'unit = "samples"{note}'), rate)
-
-
-def _describe_stamps(column: SurveyedColumn) -> str:
-    """Why the stamps of a column that is called a time are none."""
-    steps = np.diff(column.values[np.isfinite(column.values)])
-    falls, stops = int(np.sum(steps < 0)), int(np.sum(steps == 0))
-    what = f"falls at {falls}" if falls > stops else f"does not change at {stops}"
-    return f"{column.name} {what} of {len(steps)} steps"
+    rate = UNKNOWN_RATE + notes.ask("sample_rate_hz, rows a second", _OF_ROWS)
+    return ProposedClock(samples / _LIKELY_RATE_HZ, (), (f'unit = "samples"{note}',), rate)
 
 
 def _counts_on(column: SurveyedColumn) -> bool:
@@ -195,12 +187,8 @@ def _numbers_rows(column: SurveyedColumn) -> bool:
     return bool(np.min(steps, initial=1.0) >= 1.0 and np.median(steps) == 1.0 < np.max(steps))
 
 
-def _table(*lines: str) -> tuple[str, ...]:
-    return ("[time]", *lines, "")
-
-
-def _stamped_rate(rate_hz: float, notes: Notes) -> str:
-    slowest, fastest = guesses.RATES_HZ
+def _stamped_rate(t: np.ndarray, notes: Notes) -> str:
+    (slowest, fastest), rate_hz = guesses.RATES_HZ, guesses.sample_rate(t)
     doubt = "" if rate_hz > _SLOW_HZ else "; too slow for inertia and quick reversals: log faster"
     if not slowest <= rate_hz <= fastest:
         doubt = "; motion is not logged so: is its unit right?"
@@ -223,7 +211,7 @@ def encoders_table(
     for axis in device.coordinates:
         column = match.position(axis.name, len(device.coordinates), notes)
         if column is None:
-            note = notes.ask_column(axis.name, axis.unit, "position")
+            note = notes.ask_column(f"the position of {axis.name}", axis.unit)
             lines.append(f"{axis.name} = {entry(UNKNOWN, axis.unit)}{note}")
             continue
         axes[axis.name] = column
@@ -250,6 +238,7 @@ def _encoder(
         turns, sd = (column.scale * part for part in (worth.size, worth.sd))
         said = spelled(column.unit, _POSITION_UNITS)
         fields = f", gear_ratio = {turns:.4g}, zero_counts = {worth.zero:.4g}"
+        fields += f", scale_sd = {_rounded(sd / turns)}"
         return entry(column.name, said, fields) + notes.guess(
             f"{column.name} is the position of the motor of {axis.name}, which turns {turns:.4g} ±"
             f" {_rounded(sd)} times for one turn of it, by its weight, which goes with the sine of"
@@ -257,9 +246,9 @@ def _encoder(
         )
     right, geared = column.si == axis.unit, axis.name in match.robot.gears
     if (column.by_looks or column.is_foreign) and not right:
-        said = f"the unit of {column.name}, stated as '{column.stated}'"
-        foreign = column.is_foreign
-        note = notes.ask(said, UNITS) if foreign else notes.ask_unit(column.name, axis.name)
+        looks = f"which looks like the position of {axis.name}"
+        said = f"stated as '{column.stated}'" if column.is_foreign else looks
+        note = notes.ask("the unit of {}", UNITS, f"{column.name}, {said}")
         return entry(column.name, UNKNOWN, _velocity_beside(axis, alone, match, notes)) + note
     by_size = "" if right else guesses.likely_unit(axis.unit, column.values)
     said = (spelled(column.unit, _POSITION_UNITS) if right else by_size) or axis.unit
@@ -269,7 +258,7 @@ def _encoder(
     if geared:
         guess = f"is the position of the motor of {axis.name}, in {said}"
     elif right:
-        guess = "" if column.stated or how else f"is in {say_unit(column.unit)}"
+        guess = "" if column.stated or how else f"is in {bare(column.unit)}"
     guess += ("; it " if guess and how else "") + how
     return entry(column.name, said, fields) + (
         notes.guess(f"{column.name} {guess}") if guess else ""
@@ -282,9 +271,9 @@ def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -
     ``turns``: of what the encoder sits on, for one of the axis.
     """
     direction, zero = match.robot.counting.get(axis.name, (1.0, 0.0))
-    fields, ways = "", []
+    fields, ways = match.scale_sd.get(axis.name, ""), []
     if direction * turns != 1.0:
-        fields = f", gear_ratio = {direction * turns:.10g}"
+        fields += f", gear_ratio = {direction * turns:.10g}"
     if direction < 0.0:
         ways.append("counts the other way than the drawing")
     if zero:
@@ -304,11 +293,9 @@ def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
             "ask who wrote the logger; rad/s, rev/min and mm/s are usual",
         )
         return entry(column.name, UNKNOWN) + note
-    said = spelled(column.unit, _SPEED_UNITS) if column.si == si else ""
-    return entry(column.name, said or si) + notes.guess(
-        f"no position was recorded: that of {axis.name} is the integral of {column.name}, in"
-        f" {said or si}"
-    )
+    said = (spelled(column.unit, _SPEED_UNITS) if column.si == si else "") or si
+    integral = f"that of {axis.name} is the integral of {column.name}, in {said}"
+    return entry(column.name, said) + notes.guess(f"no position was recorded: {integral}")
 
 
 def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: Notes) -> str:
@@ -320,6 +307,7 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: No
     is_power = abs(turn - power) < max(_SURE * sd, _NEAR * power)
     size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}" if turn > 0.0 else "0.0"
     counting = f"counts_per_unit = {size}, zero_counts = {zero:.0f}"
+    counting += f", scale_sd = {_rounded(sd / turn)}" if turn > 0.0 and not is_power else ""
     table = f'{{ column = {quoted(column.name)}, {counting}, unit = "{axis.unit}" }}'
     if worth is not None:
         taken = f" ({power:.0f}, a power of two, is taken)" if is_power else ""
@@ -329,10 +317,12 @@ def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: No
             " in the encoder's counts a turn, times the gear, by 2 pi"
         )
     return table + notes.ask(
-        f"counts_per_unit of {axis.name}, the counts in one {axis.unit}; zero_counts is a guess",
+        f"counts_per_unit of {{}}, the counts in one {axis.unit}; zero_counts is a guess"
+        + (" of what is read where the drawing has 0" if match.robot.joints else ""),
         "counts a turn in the encoder's data sheet, times the gear, by 2 pi"
         if axis.unit == "rad"
         else "the scale's data sheet",
+        axis.name,
     )
 
 
@@ -496,7 +486,7 @@ def _channel(
     register = match.registers.get(column.name)
     fields = register.fields if register else ""
     turned = name in match.robot.turned or column.name == match.reacting
-    fields += ", scale = -1.0" if turned else ""
+    fields += (", scale = -1.0" if turned else "") + match.scale_sd.get(name, "")
     slides = (column.si, si) == ("N", "N.m")  # the drive of a sliding joint
     if column.si == si or slides:
         table = entry(column.name, bare(column.unit), fields)
@@ -512,6 +502,13 @@ def _channel(
             "the drive's table of registers",
         )
         return entry(column.name, UNKNOWN, fields) + note
+    if column.conversion is not None and column.si != si:
+        note = notes.ask(
+            f"the scale of {{}}, {si} for one {bare(column.unit)}, in which its column is",
+            "of a share, what is rated, in the drive's data sheet",
+            name,
+        )
+        return entry(column.name, si, f"{fields}, scale = 0.0") + note
     likely = si if register else guesses.likely_unit(si, column.values) or si
     if name == "supply" and column.is_integer and float(np.nanmedian(column.values)) > _MOST_VOLTS:
         likely = "0.1V"
