@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
-from bampipe.diagnosis.criteria import Criteria, most_probable
+from bampipe.diagnosis.criteria import Criteria, cap_probability
 
 TENTHS = np.linspace(0.0, 1.0, 11)
 
@@ -51,7 +51,7 @@ class Scores:
         """Of each effect of any probable set; no surer than chance allows."""
         p_values = {e: p for e, (_, p) in self.drops.items()}
         return {
-            e: min(p, most_probable(p_values.get(e, 0.0))) for e, p in self.effects_found.items()
+            e: min(p, cap_probability(p_values.get(e, 0.0))) for e, p in self.effects_found.items()
         }
 
     def finds_unknown(self, criteria: Criteria) -> bool:

@@ -11,14 +11,14 @@ from bampipe.trials.likelihood import NOTHING
 from bampipe.trials.residuals import ModelOnTrial
 
 
-def added_columns(evidence: Evidence, item: Candidate, searched: Array) -> Array:
+def compute_columns(evidence: Evidence, item: Candidate, searched: Array) -> Array:
     """What a candidate adds at given values of its searched parameters, low-passed, all trials.
 
     Returns:
         Columns of its linear strengths, (n, n_q, m); where it has none the change of the residual.
     """
     e, system = evidence, item.system
-    count, p = len(system.parameters) - len(item.parameters), parameters_with(e, item, searched)
+    count, p = len(system.parameters) - len(item.parameters), make_parameters(e, item, searched)
     axes = list(range(len(system.coordinates)) if system.moves_sensors else system.touched)
     probes = [p.copy() for _ in item.linear_indices or (None,)]
     for probe, i in zip(probes, item.linear_indices, strict=False):
@@ -26,7 +26,7 @@ def added_columns(evidence: Evidence, item: Candidate, searched: Array) -> Array
     rows = (
         values[part]
         for base in e.along
-        for each in [_added_residuals(item, probes, base)]
+        for each in [_compute_added_residuals(item, probes, base)]
         for values in [np.concatenate([r[:, axes] for r in each], axis=1)]
         for part in base.motion.parts
     )
@@ -37,7 +37,7 @@ def added_columns(evidence: Evidence, item: Candidate, searched: Array) -> Array
     return thin.transpose(0, 2, 1)
 
 
-def parameters_with(
+def make_parameters(
     evidence: Evidence, item: Candidate, searched: Array, strengths: Array | float = 0.0
 ) -> Array:
     """The parameters of a candidate's system beside a fitted model, (n_p,)."""
@@ -54,15 +54,17 @@ def parameters_with(
     return p
 
 
-def added_residual(item: Candidate, p: Array, base: ModelOnTrial) -> Array:
+def compute_added_residual(item: Candidate, p: Array, base: ModelOnTrial) -> Array:
     """What a candidate adds to the residual of a model along a motion, (T, n_q), N.m or N.
 
     ``p`` are the parameters of its system, its own last; ``base`` is the model without it.
     """
-    return _added_residuals(item, [p], base)[0]
+    return _compute_added_residuals(item, [p], base)[0]
 
 
-def _added_residuals(item: Candidate, probes: Sequence[Array], base: ModelOnTrial) -> list[Array]:
+def _compute_added_residuals(
+    item: Candidate, probes: Sequence[Array], base: ModelOnTrial
+) -> list[Array]:
     """`added_residual` at parameters that give the same internal states."""
     system, moves = item.system, _moves(item)
     motion = base.motion if moves else base.mechanism

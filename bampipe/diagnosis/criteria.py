@@ -52,7 +52,7 @@ class Criteria:
         return float(np.exp(lambertw(-odds_against / np.e, -1).real))
 
 
-def most_probable(p_value: float) -> float:
+def cap_probability(p_value: float) -> float:
     """The highest probability that an effect can have which chance imitates with a p-value.
 
     At even odds before (Sellke, Bayarri and Berger 2001, The American Statistician 55, 62).

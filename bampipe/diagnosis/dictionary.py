@@ -10,7 +10,7 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
-from bampipe.diagnosis.columns import added_columns, parameters_with
+from bampipe.diagnosis.columns import compute_columns, make_parameters
 from bampipe.diagnosis.ranges import MachineScale, SearchRange
 from bampipe.physics.system import System
 from bampipe.trials.evidence import Evidence
@@ -118,7 +118,7 @@ class Dictionary:
         """Compute a candidate at one shape; None where it does nothing in these trials."""
         e, item, values = self.evidence, self.candidates[key[0]], self.values(key)
         with np.errstate(all="ignore"):
-            columns = added_columns(e, item, values)
+            columns = compute_columns(e, item, values)
         found = {}
         for axis, here in enumerate(self.samples):
             rows = columns[here.rows, axis]
@@ -132,8 +132,8 @@ class Dictionary:
         ):
             return None
         one_each = np.eye(len(item.linear_indices)) if item.linear_indices else np.zeros((1, 0))
-        slopes = self._slopes(item, [parameters_with(e, item, values, b) for b in one_each])
-        return Atom(found, slopes, self._gain(item, parameters_with(e, item, values), slopes))
+        slopes = self._slopes(item, [make_parameters(e, item, values, b) for b in one_each])
+        return Atom(found, slopes, self._gain(item, make_parameters(e, item, values), slopes))
 
     def gain_with(self, name: str, parameters: Mapping[str, float]) -> Array:
         """`Atom.gain` of a candidate with given parameters of its own, by name."""

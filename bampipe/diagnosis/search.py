@@ -9,17 +9,17 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Key
-from bampipe.diagnosis.set_cost import SetCosts, Solution, added, names
+from bampipe.diagnosis.set_cost import SetCosts, Solution, added_effects, effect_names
 from bampipe.trials.likelihood import solve_scaled
 
 _STEP = 0.02
 """Of a shape's range: the step of its slope."""
-_FARTHEST = 0.2
+_LONGEST_STEP = 0.2
 
-_BESIDE, _PROMISING, _SWAPPED = 12, 8, 5
+_ADDITIONS, _REPLACEMENTS, _SWAPS_REFINED = 12, 8, 5
 """Candidates weighed exactly beside a set that grows, beside one that lost a member, and of those
 the ones whose shapes are refined."""
-_SWAPS, _POLISHED = 3, 4
+_SWAP_ROUNDS, _SETS_REFINED = 3, 4
 _ROUNDS = 12
 """Of the refinement of shapes, as long as each gains: an impact moves with the width of its gap,
 and one that comes too late looks like none."""
@@ -37,11 +37,11 @@ class Search(SetCosts):
         Of whatever size: chance has no other.
         """
         any_size = copy(self)
-        any_size.least_size, any_size._solved = 0.0, {}
-        beside = any_size.best_beside((), _PROMISING)
+        any_size.least_size, any_size._solutions = 0.0, {}
+        beside = any_size.rank_additions((), _REPLACEMENTS)
         return (any_size.cost(()) - beside[0][0], beside[0][1][0]) if beside else (0.0, "")
 
-    def best_beside(
+    def rank_additions(
         self, keys: Sequence[Key], most: int, shapes: int = 2
     ) -> list[tuple[float, Key]]:
         """Cost of a set with each candidate added, best first, of those that promise most."""
@@ -54,7 +54,7 @@ class Search(SetCosts):
         tried: dict[str, float] = {}
         best: dict[str, tuple[float, Key]] = {}
         for k in np.argsort(-gains):
-            key = self.places[k]
+            key = self.grid_keys[k]
             name = key[0]
             if not gains[k] > 0.0:
                 break
@@ -73,19 +73,23 @@ class Search(SetCosts):
         current = [tuple(sorted(s)) for s in sets]
         moving = [any(shape for _, shape in s) for s in current]
         for _ in range(rounds):
-            wanted = [k for s, m in zip(current, moving, strict=True) if m for k in added(s)]
+            wanted = [
+                k for s, m in zip(current, moving, strict=True) if m for k in added_effects(s)
+            ]
             self.ensure(k for key in wanted for k in _neighbours(key))
-            proposed = [self._step(s) if m else None for s, m in zip(current, moving, strict=True)]
+            proposed = [
+                self._propose_shapes(s) if m else None for s, m in zip(current, moving, strict=True)
+            ]
             trials = [
-                list(_shares(s, to)) if to is not None else []
+                list(_shorten_steps(s, to)) if to is not None else []
                 for s, to in zip(current, proposed, strict=True)
             ]
-            self.ensure(key for each in trials for one in each[:1] for key in added(one))
+            self.ensure(key for each in trials for one in each[:1] for key in added_effects(one))
             for i, each in enumerate(trials):
                 before = self.cost(current[i]) if moving[i] else 0.0
                 moved = False
                 for one in each:
-                    self.ensure(added(one))
+                    self.ensure(added_effects(one))
                     cost = self.cost(one)
                     if cost < before - 0.02:
                         current[i], moved = tuple(sorted(one)), True
@@ -96,18 +100,18 @@ class Search(SetCosts):
                 break
         return current
 
-    def _step(self, keys: tuple[Key, ...]) -> tuple[Key, ...] | None:
+    def _propose_shapes(self, keys: tuple[Key, ...]) -> tuple[Key, ...] | None:
         """Where a linear step in all shapes leads."""
         found, all_keys = self.solve(keys), keys
-        keys = added(keys)
+        keys = added_effects(keys)
         if not np.isfinite(found.cost):
             return None
         slopes = self.shape_slopes(keys, found.strengths)
         if slopes is None:
             return None
-        more = {a: c * self.p.likelihood.root[a][:, None] for a, c in slopes.items()}
+        more = {a: c * self.problem.likelihood.root[a][:, None] for a, c in slopes.items()}
         solved = self._solve_with_shapes(all_keys, more, found)
-        steps = iter(np.clip(solved, -_FARTHEST, _FARTHEST))
+        steps = iter(np.clip(solved, -_LONGEST_STEP, _LONGEST_STEP))
         moved = [
             (name, tuple(float(np.clip(u + next(steps), 0.0, 1.0)) for u in shape))
             for name, shape in keys
@@ -123,8 +127,8 @@ class Search(SetCosts):
             all_keys: the set; known: its solution.
             more: weighted slopes by the shapes, by axis, each (n, d).
         """
-        keys, left = added(all_keys), self.residual_rows(all_keys)
-        p, nb, weight = self.p, self.bb.shape[1], known.weight
+        keys, left = added_effects(all_keys), self.residual_rows(all_keys)
+        p, nb, weight = self.problem, self.bb.shape[1], known.weight
         xx, xy, places = self._sums(keys)
         m, extra = xx.shape[1], next(iter(more.values())).shape[1]
         b = np.concatenate([known.base, *known.strengths])
@@ -135,7 +139,7 @@ class Search(SetCosts):
         normal[nb:m, nb:m] += (expected := self._expected(keys))
         right[:nb] += p.moment - p.precision @ known.base
         right[nb:m] -= expected @ b[nb:]
-        normal[m:, m:] = np.eye(extra) / _FARTHEST**2
+        normal[m:, m:] = np.eye(extra) / _LONGEST_STEP**2
         for axis, slopes in more.items():
             w = weight[axis]
             normal[:nb, m:] += w * (p.base[axis].T @ slopes)
@@ -167,63 +171,63 @@ class Search(SetCosts):
                     x = (there.columns[axis] @ b if axis in there.columns else 0.0) - (
                         here.columns[axis] @ b if axis in here.columns else 0.0
                     )
-                    block = found.setdefault(axis, np.zeros((len(self.p.y[axis]), total)))
+                    block = found.setdefault(axis, np.zeros((len(self.problem.y[axis]), total)))
                     block[:, place + j] = x / step
             place += len(key[1])
         return found
 
-    def without_one(self, keys: tuple[Key, ...]) -> list[tuple[Key, ...]]:
+    def drop_each(self, keys: tuple[Key, ...]) -> list[tuple[Key, ...]]:
         """A set without each of its members, and without each effect of the model itself."""
         less = [keys[:i] + keys[i + 1 :] for i, key in enumerate(keys) if key[0][0] != "-"]
         gone = {name for name, _ in keys}
         return less + [
             tuple(sorted((*keys, (f"-{name}", ()))))
-            for name in self.p.absence
+            for name in self.problem.absence
             if f"-{name}" not in gone
         ]
 
-    def keep(self, pool: Pool, keys: tuple[Key, ...]) -> None:
+    def add_to_pool(self, pool: Pool, keys: tuple[Key, ...]) -> None:
         """Enter a set into a pool unless the same effects are there with better shapes."""
-        cost, known = self.cost(keys), pool.get(names(keys))
+        cost, known = self.cost(keys), pool.get(effect_names(keys))
         if np.isfinite(cost) and (known is None or cost < known[0]):
-            pool[names(keys)] = cost, tuple(sorted(keys))
+            pool[effect_names(keys)] = cost, tuple(sorted(keys))
 
-    def swaps(self, keys: tuple[Key, ...], pool: Pool) -> list[tuple[Key, ...]]:
+    def list_swaps(self, keys: tuple[Key, ...], pool: Pool) -> list[tuple[Key, ...]]:
         """The best sets with another effect in the place of one, that are not in ``pool`` yet."""
         found = [
             (cost, tuple(sorted((*rest, key))))
-            for rest in self.without_one(keys)
-            for cost, key in self.best_beside(rest, _PROMISING)[:_SWAPPED]
+            for rest in self.drop_each(keys)
+            for cost, key in self.rank_additions(rest, _REPLACEMENTS)[:_SWAPS_REFINED]
         ]
-        fresh = [swap for _, swap in sorted(found) if names(swap) not in pool]
+        fresh = [swap for _, swap in sorted(found) if effect_names(swap) not in pool]
         return fresh[: self.criteria.beam]
 
-    def beam(self, most: int) -> Iterator[list[tuple[float, tuple[Key, ...]]]]:
+    def grow_sets(self, most: int) -> Iterator[list[tuple[float, tuple[Key, ...]]]]:
         """Best sets of 1, 2, ... ``most`` effects: lists of cost and set, best first."""
         wide, start = self.criteria.beam, tuple[Key, ...]()
         beam = [(self.cost(start), start)]
         for _ in range(most):
             grown: Pool = {}
             for _, keys in beam:
-                for _, key in self.best_beside(keys, _BESIDE):
-                    self.keep(grown, (*keys, key))
+                for _, key in self.rank_additions(keys, _ADDITIONS):
+                    self.add_to_pool(grown, (*keys, key))
             if not grown:
                 return
             pool: Pool = {}
             for keys in self.refine([keys for _, keys in sorted(grown.values())[:wide]], 2):
-                self.keep(pool, keys)
-            for _ in range(_SWAPS):
+                self.add_to_pool(pool, keys)
+            for _ in range(_SWAP_ROUNDS):
                 lead = min(pool.values())[1]
-                for rest in self.without_one(lead):
-                    self.keep(pool, rest)
-                swaps = self.swaps(lead, pool)
+                for rest in self.drop_each(lead):
+                    self.add_to_pool(pool, rest)
+                swaps = self.list_swaps(lead, pool)
                 for keys in self.refine(swaps, 2):
-                    self.keep(pool, keys)
+                    self.add_to_pool(pool, keys)
                 if min(pool.values())[1] == lead:
                     break
-            best = [keys for _, keys in sorted(pool.values())[:_POLISHED]]
+            best = [keys for _, keys in sorted(pool.values())[:_SETS_REFINED]]
             for keys in self.refine(best, _ROUNDS):
-                self.keep(pool, keys)
+                self.add_to_pool(pool, keys)
             beam = sorted(pool.values())[:wide]
             yield beam
 
@@ -238,7 +242,7 @@ def _neighbours(key: Key) -> list[Key]:
     return found
 
 
-def _shares(keys: tuple[Key, ...], to: tuple[Key, ...]) -> Iterator[tuple[Key, ...]]:
+def _shorten_steps(keys: tuple[Key, ...], to: tuple[Key, ...]) -> Iterator[tuple[Key, ...]]:
     """The whole way to a proposed set, a third, and a tenth of it."""
     aims = dict(to)
     for share in (1.0, 0.35, 0.1):

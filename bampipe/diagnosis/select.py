@@ -9,7 +9,7 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
-from bampipe.diagnosis.probability import Weighed, weigh_sets
+from bampipe.diagnosis.probability import Probabilities, weigh_sets
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import Pool, Search
 from bampipe.diagnosis.session import (
@@ -17,12 +17,12 @@ from bampipe.diagnosis.session import (
     Session,
     bounds_of,
     candidates_of,
-    shared,
+    change_effects,
     system_of,
-    without_members,
+    worker_state,
     workers,
 )
-from bampipe.diagnosis.set_cost import added, gone, names
+from bampipe.diagnosis.set_cost import added_effects, effect_names, removed_effects
 from bampipe.physics.recipe import Recipe
 from bampipe.results.compare import NOTICEABLE
 
@@ -30,16 +30,16 @@ Progress = Callable[[float, str], None]
 """Called with a fraction of the work done and what is being done."""
 
 _MOST_ROUNDS = 6
-PARTS = 8
+TASKS_PER_PROCESS = 8
 """Tasks a process into which columns are divided: one candidate may take as long as ten others."""
-_MINOR = 0.05
+_MINOR_SHARE = 0.05
 """Share of the gain of a set that the next effect must bring to be added before the set is fitted:
 linearised far from the truth, a model leaves more than that."""
-_WORTH = 0.5
+_LEAST_GAIN = 0.5
 """Fall of the cost, nats, that makes another set worth fitting."""
-_TRIED = 2
+_MOST_FITS = 2
 """Sets fitted in a round before only smaller ones are: these keep more of what they promise."""
-_DEEP = 3
+_MOST_ADDED = 3
 """Effects added at once beside a set that has been fitted."""
 
 
@@ -59,9 +59,9 @@ class Selection:
 
     initial: Fit
     final: Fit
-    weighed: Weighed
-    chance: tuple[float, ...]
-    beside: tuple[float, str]
+    probabilities: Probabilities
+    replicate_gains: tuple[float, ...]
+    largest_gain: tuple[float, str]
     gains: dict[str, float]
     steps: tuple[Fit, ...]
     cut_short: bool
@@ -95,7 +95,7 @@ def open_search(
     with workers(dictionary, session.jobs) as spread:
 
         def make(keys: Sequence[Key]) -> Iterable[tuple[Key, Atom | None]]:
-            parts = min(len(keys), PARTS * session.jobs)
+            parts = min(len(keys), TASKS_PER_PROCESS * session.jobs)
             if session.jobs <= 1 or parts < 2:
                 return dictionary.make_all(keys)
             made = spread(make_columns, [keys[k::parts] for k in range(parts)])
@@ -106,7 +106,7 @@ def open_search(
 
 def make_columns(keys: Sequence[Key]) -> list[tuple[Key, Atom | None]]:
     """Make columns by the dictionary that a worker process shares."""
-    dictionary: Dictionary = shared()
+    dictionary: Dictionary = worker_state()
     return dictionary.make_all(keys)
 
 
@@ -154,14 +154,14 @@ def select_effects(
             known = search
             none = search.cost(())
             if not gains:
-                beside = search.best_beside((), len(search.dictionary.candidates))
+                beside = search.rank_additions((), len(search.dictionary.candidates))
                 gains = {key[0]: none - cost for cost, key in beside}
             room = session.criteria.most_effects - len(current.recipe.effects) + len(recipe.effects)
-            pool = _explore(search, room, deep=room if number == 0 else min(_DEEP, room))
+            pool = _explore(search, room, deep=room if number == 0 else min(_MOST_ADDED, room))
             moved, kept = None, dict[tuple[str, ...], float]()
             last |= number >= _MOST_ROUNDS - 1
             if not last:
-                better = [k for c, k in sorted(pool.values()) if c < none - _WORTH]
+                better = [k for c, k in sorted(pool.values()) if c < none - _LEAST_GAIN]
                 better += _without_weakest(search, recipe.effects)
                 tell = partial(progress, 0.15 + 0.1 * number)
                 moved, kept = _fit_better(session, search, current, better, fits, tell)
@@ -172,22 +172,22 @@ def select_effects(
                 pool = {
                     n: (none - kept[n] if n in kept else c, k)
                     for n, (c, k) in pool.items()
-                    if n in kept or c >= none - _WORTH
+                    if n in kept or c >= none - _LEAST_GAIN
                 }
                 progress(0.9, "holding the model against chance")
                 replays = range(session.criteria.replicates)
-                chance = tuple(search.of_replay(k).largest_gain()[0] for k in replays)
-                weighed = weigh_sets(
+                chance = tuple(search.on_replicate(k).largest_gain()[0] for k in replays)
+                probabilities = weigh_sets(
                     search, current, pool, recipe.effects, session.criteria, session.seed
                 )
                 moved = (
                     None
                     if number == _MOST_ROUNDS
-                    else _leave_out(session, search, current, weighed, recipe.effects)
+                    else _leave_out(session, search, current, probabilities, recipe.effects)
                 )
                 if moved is None:
                     return Selection(
-                        initial, current, weighed, chance, search.largest_gain(), gains,
+                        initial, current, probabilities, chance, search.largest_gain(), gains,
                         tuple(steps), number >= _MOST_ROUNDS - 1 or room <= 0,
                     )  # fmt: skip
                 # A second time, nothing more is added.
@@ -214,7 +214,7 @@ def _fit_better(
     broken: list[set[Key]] = []
     kept: dict[tuple[str, ...], float] = {}
     for keys in better:
-        if added(keys) and len(broken) >= _TRIED and len(keys) >= min(map(len, broken)):
+        if added_effects(keys) and len(broken) >= _MOST_FITS and len(keys) >= min(map(len, broken)):
             continue
         # A larger set promises no more than the one in it whose fit fell short.
         if any(one <= {*keys} for one in broken):
@@ -222,13 +222,13 @@ def _fit_better(
         wider = change_set(current.recipe, keys)
         members = frozenset(wider.effects)
         if fresh := members not in fits:
-            tell(f"fitting {', '.join(names(keys))}")
+            tell(f"fitting {', '.join(effect_names(keys))}")
             fits[members] = session.try_fit(wider, start_of(search, keys, wider))
         moved = fits[members]
         if moved is not None:
             gain = gain_when_fitted(current, moved, search, keys)
-            if gain <= _WORTH:
-                kept[names(keys)] = gain
+            if gain <= _LEAST_GAIN:
+                kept[effect_names(keys)] = gain
             elif _held_out_error(moved) < _held_out_error(current) + NOTICEABLE:
                 return moved, kept
         broken.append({*keys})
@@ -242,14 +242,14 @@ def _without_weakest(search: Search, given: Collection[str]) -> list[tuple[Key, 
 
     How far they do a linear problem at the shapes they have beside it does not say.
     """
-    own = [e for e in search.p.absence if e not in given]
+    own = [e for e in search.problem.absence if e not in given]
     weakest = min(own, key=lambda e: search.cost(((f"-{e}", ()),)), default=None)
-    shaped = any(search.p.shapes[e] for e in own if e != weakest)
+    shaped = any(search.problem.shapes[e] for e in own if e != weakest)
     return [((f"-{weakest}", ()),)] if shaped else []
 
 
 def _leave_out(
-    session: Session, search: Search, fit: Fit, weighed: Weighed, given: Collection[str]
+    session: Session, search: Search, fit: Fit, probabilities: Probabilities, given: Collection[str]
 ) -> Fit | None:
     """The model without the effects that came out improbable; None where there are none.
 
@@ -258,11 +258,13 @@ def _leave_out(
     """
     least = 1.0 - session.criteria.probability
     own = [e for e in fit.recipe.effects if e not in given]
-    out = {e for e in own if weighed.by_name.get(e, 0.0) < least} or _misleading(fit, weighed, own)
+    out = {e for e in own if probabilities.if_all_known.get(e, 0.0) < least} or _find_misleading(
+        fit, probabilities, own
+    )
     if not out:
         return None
-    best = next(one.keys for one in weighed.sets if one.unknown is None)
-    best = best if out & gone(best) else ()
+    best = next(one.keys for one in probabilities.sets if one.unknown is None)
+    best = best if out & removed_effects(best) else ()
     keys = tuple(sorted({*best, *((f"-{e}", ()) for e in out)}))
     less = change_set(fit.recipe, keys)
     if np.isfinite(search.cost(keys)):
@@ -270,11 +272,11 @@ def _leave_out(
     return session.try_fit(less, start_at(search, np.zeros(search.bb.shape[1]), {}, less))
 
 
-def _misleading(fit: Fit, weighed: Weighed, own: Sequence[str]) -> set[str]:
+def _find_misleading(fit: Fit, probabilities: Probabilities, own: Sequence[str]) -> set[str]:
     """Effects that are rather not there, and make the error on trials not seen larger."""
 
     out, least = set[str](), _held_out_error(fit)
-    while doubtful := [e for e in own if e not in out and weighed.effects.get(e, 0.0) < 0.5]:
+    while doubtful := [e for e in own if e not in out and probabilities.effects.get(e, 0.0) < 0.5]:
         left, worst = min((_held_out_error(fit, {*out, e}), e) for e in doubtful)
         if left >= least:
             break
@@ -312,24 +314,24 @@ def gain_when_fitted(before: Fit, after: Fit, search: Search, keys: Sequence[Key
 def _explore(search: Search, room: int, deep: int) -> Pool:
     """Sets near the fitted one: without a member, with another in its place, and with more."""
     pool: Pool = {}
-    search.keep(pool, ())
+    search.add_to_pool(pool, ())
     lead = search.cost(())
     rest: tuple[Key, ...] | None = ()
     while rest is not None:  # backward elimination, as far as each member less is more probable
-        fewer, least = search.without_one(rest), search.cost(rest)
+        fewer, least = search.drop_each(rest), search.cost(rest)
         for keys in fewer:
-            search.keep(pool, keys)
+            search.add_to_pool(pool, keys)
         rest = min(
             (keys for keys in fewer if search.cost(keys) < least), key=search.cost, default=None
         )
-    for keys in search.refine(search.swaps((), pool), 2):
-        search.keep(pool, keys)
-    for beam in search.beam(deep):
+    for keys in search.refine(search.list_swaps((), pool), 2):
+        search.add_to_pool(pool, keys)
+    for beam in search.grow_sets(deep):
         for _, keys in beam:
-            search.keep(pool, keys)
+            search.add_to_pool(pool, keys)
         best = min(cost for cost, _ in beam)
         gained, total = lead - best, search.cost(()) - best
-        if gained < _WORTH or gained < _MINOR * total:
+        if gained < _LEAST_GAIN or gained < _MINOR_SHARE * total:
             # What is minor beside the rest is weighed once that has been fitted.
             if gained > 0.0 and gained < total:
                 largest = max(len(keys) for _, keys in beam)
@@ -342,13 +344,13 @@ def _explore(search: Search, room: int, deep: int) -> Pool:
 
 def change_set(recipe: Recipe, keys: Sequence[Key]) -> Recipe:
     """The model of ``recipe`` with the changes of a set."""
-    return without_members(recipe, gone(keys), [name for name, _ in added(keys)])
+    return change_effects(recipe, removed_effects(keys), [name for name, _ in added_effects(keys)])
 
 
 def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
     """Parameters of a changed model from the solution of its linear problem, (n_p,)."""
     solution, known = search.solve(keys), dict[str, float]()
-    for key, strength in zip(added(tuple(sorted(keys))), solution.strengths, strict=True):
+    for key, strength in zip(added_effects(tuple(sorted(keys))), solution.strengths, strict=True):
         item = search.dictionary.candidates[key[0]]
         values = search.dictionary.values(key)
         share = 1.0 if item.linear_indices else float(strength[0])
@@ -370,7 +372,7 @@ def start_at(search: Search, base: Array, known: Mapping[str, float], wider: Rec
     """
     evidence = search.dictionary.evidence
     found = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
-    change = search.p.to_parameters @ base
+    change = search.problem.to_parameters @ base
     for place, number in enumerate(evidence.free):
         found[evidence.system.parameters[number].name] += change[place]
     found |= known

@@ -29,10 +29,10 @@ from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.likelihood import (
     Likelihood,
+    LinearSolution,
     Noise,
     Problem,
     Samples,
-    Solved,
     describe_noise,
     dry_friction,
     lay_out_samples,
@@ -48,8 +48,8 @@ from bampipe.workers import process_pool
 
 Seed = tuple[int, ...]
 
-_STEPS = 8
-_SHARES = (1.0, 0.3, 0.1, 0.03)
+_MOST_STEPS = 8
+_STEP_LENGTHS = (1.0, 0.3, 0.1, 0.03)
 _CONVERGED = 0.2
 """Fall of the negative log likelihood that a step promises, nats, below which a fit ends."""
 _STOPPING_WIDTH = 0.125
@@ -84,39 +84,39 @@ def candidates_of(recipe: Recipe, names: Sequence[str]) -> list[Candidate]:
 
 def acting_axes(recipe: Recipe, effect: str) -> tuple[int, ...]:
     """Numbers of the axes whose equation an effect changes, beside a model that may have it."""
-    system = candidates_of(without_members(recipe, (effect,)), (effect,))[0].system
+    system = candidates_of(change_effects(recipe, (effect,)), (effect,))[0].system
     touched = range(len(system.coordinates)) if system.moves_sensors else system.touched
     item = next(item for item in system.model.effects if item.name == effect)
     named = [system.coordinates.index(axis) for axis in item.axes]
     return tuple(axis for axis in named if axis in touched) or tuple(touched)
 
 
-_shared: Any = None
+_worker_state: Any = None
 """In a worker process: what its tasks are about, inherited from the process that started it."""
 
 
-def _share(state: object) -> None:
-    global _shared
-    _shared = state
+def _set_worker_state(state: object) -> None:
+    global _worker_state
+    _worker_state = state
 
 
-def shared() -> Any:
+def worker_state() -> Any:
     """What the tasks of this worker process are about."""
-    return _shared
+    return _worker_state
 
 
 @contextmanager
 def workers(state: object, jobs: int) -> Iterator[Callable[..., Iterator[Any]]]:
     """A `map` over processes that inherit ``state``, for `shared` to return."""
-    _share(state)
+    _set_worker_state(state)
     try:
         if jobs <= 1:
             yield map
             return
-        with process_pool(jobs, _share, state) as pool:
+        with process_pool(jobs, _set_worker_state, state) as pool:
             yield pool.map
     finally:
-        _share(None)
+        _set_worker_state(None)
 
 
 @dataclass(frozen=True)
@@ -134,14 +134,17 @@ class Session:
     criteria: Criteria
     jobs: int = 1
     seed: int = 0
-    also: tuple[str, ...] = ()
+    requested_effects: tuple[str, ...] = ()
 
     def candidate_names(self, recipe: Recipe, without: Collection[str] = ()) -> tuple[str, ...]:
         """Effects that the model of ``recipe`` could have and has not."""
         extra = [effect_from(e) for e in recipe.extra]
         present = (*recipe.effects, *without)
         names = list_candidates(recipe.model().device, present, extra)
-        return (*names, *(name for name in self.also if name not in (*present, *names)))
+        return (
+            *names,
+            *(name for name in self.requested_effects if name not in (*present, *names)),
+        )
 
     def linearise(
         self, recipe: Recipe, p: Array, like: Evidence | None = None, judged: bool = False
@@ -150,7 +153,7 @@ class Session:
 
         Or, where asked for, on those by which it is ``judged``.
         """
-        t = self._chosen[judged]
+        t = self._trial_subsets[judged]
         return gather_evidence(
             system_of(recipe), t.motions, t.band, p, t.folds,
             most_iterations=0, timing=t.timing,
@@ -158,13 +161,15 @@ class Session:
         )  # fmt: skip
 
     @cached_property
-    def _chosen(self) -> list[MeasuredTrials]:
+    def _trial_subsets(self) -> list[MeasuredTrials]:
         """The trials that choose a model, and those by which one is judged."""
         choosing = np.array(self.trials.folds.groups) != HELD_OUT
         both = choosing, self.trials.folds.judged
         return [self.trials.subset(np.flatnonzero(counts).tolist()) for counts in both]
 
-    def replay(self, evidence: Evidence, p: Array, count: int, first: int = 0) -> Sequence[Array]:
+    def replicate(
+        self, evidence: Evidence, p: Array, count: int, first: int = 0
+    ) -> Sequence[Array]:
         """Residuals of a model on replays of itself, by trial, each (K, n_q, count).
 
         Args:
@@ -175,9 +180,9 @@ class Session:
             Runaway: the simulated motion grows without bounds.
         """
         seeds = [(self.seed, _SEED, k) for k in range(first, first + count)]
-        return self._replay(evidence, evidence.system, p, self.trials.sensors, seeds)
+        return self._replicate(evidence, evidence.system, p, self.trials.sensors, seeds)
 
-    def _replay(
+    def _replicate(
         self, e: Evidence, system: System, p: Array, sensors: Sensors, seeds: Sequence[Seed]
     ) -> Sequence[Array]:
         simulated = SimulatedTrials(system, p, e.motions, sensors.rate_hz)
@@ -187,10 +192,10 @@ class Session:
         tasks = [(trial, part) for trial in trials for part in parts]
         state = e, simulated, sensors, self.trials.kinematics
         with workers(state, min(self.jobs, len(tasks))) as spread:
-            found = spread(_residuals_of_replays, tasks)
+            found = spread(_replicate_trial, tasks)
             return KeptItems(np.concatenate([next(found) for _ in parts], axis=2) for _ in trials)
 
-    def replay_stopping(self, recipe: Recipe, evidence: Evidence) -> list[Array]:
+    def replicate_stopping(self, recipe: Recipe, evidence: Evidence) -> list[Array]:
         """Residual of a model on a replay without noise whose friction truly stops it, by trial.
 
         How abruptly a machine stops no log says. Zero where the motion is given, and where such a
@@ -208,7 +213,7 @@ class Session:
         )
         narrow = system_of(recipe.with_sign_widths(_STOPPING_WIDTH))
         try:
-            found = self._replay(evidence, narrow, evidence.p, exact, [(self.seed,)])
+            found = self._replicate(evidence, narrow, evidence.p, exact, [(self.seed,)])
         except Runaway:
             return nothing
         return [values[:, :, 0] for values in found]
@@ -228,8 +233,8 @@ class Session:
         c = self.criteria
         samples = lay_out_samples(evidence, c.block_s)
         if noise is None:
-            replays = self.replay(evidence, evidence.p, count or c.replicates)
-            stopping = self.replay_stopping(recipe, evidence)
+            replays = self.replicate(evidence, evidence.p, count or c.replicates)
+            stopping = self.replicate_stopping(recipe, evidence)
             noise = describe_noise(replays, stopping, evidence, samples)
         force_sd = self.trials.sensors.force_sd
         return Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy, force_sd)
@@ -273,12 +278,12 @@ class Session:
         if sum(map(len, problem.y)) <= count:
             raise ValueError("fewer samples clear of standstill than parameters")
         here = problem.solve_nuisance(count).cost
-        for _ in range(_STEPS):
+        for _ in range(_MOST_STEPS):
             promised = problem.solve()
             if here - promised.cost < _CONVERGED:
                 break
             step = problem.to_parameters @ promised.base
-            for share in _SHARES:
+            for share in _STEP_LENGTHS:
                 p = evidence.p.copy()
                 p[list(evidence.free)] += share * step[:count]
                 try:
@@ -304,7 +309,7 @@ class Session:
         """
         evidence = self.linearise(recipe, p, judged=True)
         likelihood = self.weight_samples(recipe, evidence, count=count)
-        return Fit(recipe, evidence, likelihood, likelihood.pose_problem(evidence), given=True)
+        return Fit(recipe, evidence, likelihood, likelihood.pose_problem(evidence), is_given=True)
 
     def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
         """Fit a model with noise that is the same for all samples of an axis, without replays."""
@@ -348,7 +353,7 @@ class Fit:
     likelihood: Likelihood
     problem: Problem
     log_likelihood: float = float("nan")
-    given: bool = False
+    is_given: bool = False
 
     @property
     def effect_parameters(self) -> dict[str, float]:
@@ -359,9 +364,9 @@ class Fit:
         return {item.name: float(value) for item, value in pairs}
 
     @cached_property
-    def solved(self) -> Solved:
+    def solution(self) -> LinearSolution:
         """The solution of its linear problem, next to zero but for the nuisance parameters."""
-        if self.given:
+        if self.is_given:
             return self.problem.solve_nuisance(len(self.evidence.free))
         return self.problem.solve()
 
@@ -369,7 +374,7 @@ class Fit:
     def bias(self) -> tuple[Array, ...]:
         """The bias of filters and of friction that stops, as fitted, by axis, each (n,)."""
         noise, n_q = self.likelihood.noise, len(self.likelihood.samples)
-        factors = (self.problem.to_parameters @ self.solved.base)[-2 * n_q :]
+        factors = (self.problem.to_parameters @ self.solution.base)[-2 * n_q :]
         pairs = zip(noise.bias, noise.stopping, factors[:n_q], factors[n_q:], strict=True)
         return tuple(beta * b + gamma * c for b, c, beta, gamma in pairs)
 
@@ -409,7 +414,7 @@ class Fit:
     def rows_beyond_bias(self) -> tuple[Array, ...]:
         """What is left once the bias is taken off, by axis, each (n,), N.m or N."""
         rows = zip(self.problem.y, self.problem.base, self.likelihood.root, strict=True)
-        return tuple((y + x @ self.solved.base) / root for y, x, root in rows)
+        return tuple((y + x @ self.solution.base) / root for y, x, root in rows)
 
     def count_independent(self, criteria: Criteria) -> tuple[Samples, ...]:
         """The samples of each axis, with the number that are independent in what is left."""
@@ -437,7 +442,7 @@ class Fit:
         for k, own in enumerate(zip(*p.sums_of(parts, len(groups)), strict=True)):
             xx, xy, yy = (whole - is_unseen * part for whole, part in zip(sums, own, strict=True))
             yy = np.maximum(yy, 1e-300)
-            others = solve_bounded(p, xx, xy, yy, absent=absent, weight=self.solved.weight)
+            others = solve_bounded(p, xx, xy, yy, absent=absent, weight=self.solution.weight)
             change = (p.to_parameters @ others.base)[: slopes[0].shape[1]]
             for axis, part in enumerate(parts):
                 left = plain[axis][part == k] + slopes[axis][part == k] @ change
@@ -450,9 +455,9 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
-def _residuals_of_replays(task: tuple[int, Sequence[Seed]]) -> Array:
+def _replicate_trial(task: tuple[int, Sequence[Seed]]) -> Array:
     """The residuals of one trial on replays of it, by seed, (K, n_q, seeds)."""
-    (e, simulated, sensors, kinematics), (trial, seeds) = shared(), task
+    (e, simulated, sensors, kinematics), (trial, seeds) = worker_state(), task
     rows = []
     for seed in seeds:
         rng = np.random.default_rng([*seed, trial])
@@ -474,6 +479,6 @@ def _narrower_friction(evidence: Evidence) -> list[Array]:
     return [values * used for values, used in zip(thin, e.used, strict=True)]
 
 
-def without_members(recipe: Recipe, gone: Collection[str], more: Sequence[str] = ()) -> Recipe:
+def change_effects(recipe: Recipe, gone: Collection[str], more: Sequence[str] = ()) -> Recipe:
     """The model without some of its effects, and with others."""
     return replace(recipe, effects=(*(e for e in recipe.effects if e not in gone), *more))

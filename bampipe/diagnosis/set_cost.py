@@ -33,7 +33,7 @@ from bampipe.trials.scale import log_of_share
 
 _LEAST_SLOPE = 0.2
 """Geometric mean of what a set leaves of the slope by the force; below, nothing has a scale."""
-_A_SHAPE = 2.5
+_SHAPE_COST = 2.5
 """Half the logarithm of the information on a shape over its range, as it comes out on the whole."""
 
 Make = Callable[[Sequence[Key]], Iterable[tuple[Key, Atom | None]]]
@@ -73,14 +73,19 @@ class SetCosts:
         criteria: Criteria,
         known: Mapping[Key, Atom | None],
     ) -> None:
-        self.p, self.dictionary, self.make, self.criteria = problem, dictionary, make, criteria
+        self.problem, self.dictionary, self.make, self.criteria = (
+            problem,
+            dictionary,
+            make,
+            criteria,
+        )
         self.log_prior = log_prior(criteria, len(dictionary.candidates))
         p = problem
         self.n_q = len(p.y)
         self.bb, self.by, self.yy = p.sums()
         self.atoms: dict[Key, Atom | None] = dict(known)
-        self._with_base: dict[Key, dict[int, tuple[Array, Array, Array]]] = {}
-        self._solved: dict[tuple[Key, ...], Solution] = {}
+        self._products_by_key: dict[Key, dict[int, tuple[Array, Array, Array]]] = {}
+        self._solutions: dict[tuple[Key, ...], Solution] = {}
         self._own_penalties: dict[str, float] = {}
         self.least_size = criteria.size
         self._squares: dict[Key, dict[int, Array]] = {}
@@ -92,7 +97,7 @@ class SetCosts:
         grid = [key for name in dictionary.candidates for key in dictionary.grid(name)]
         self.ensure(grid)
         places = {key: atom for key in grid if (atom := self.atoms[key]) is not None}
-        self.places = list(places)
+        self.grid_keys = list(places)
         self._lay_out(places)
 
     def ensure(self, keys: Iterable[Key]) -> None:
@@ -107,7 +112,7 @@ class SetCosts:
         self.first = np.concatenate([[0], np.cumsum(widths)])[:-1].astype(int)
         self.widths = np.array(widths, dtype=int)
         m = int(sum(widths))
-        p = self.p
+        p = self.problem
         self.columns, self.at = [], []
         self.own = np.zeros(
             (self.n_q, len(places), int(max(widths, default=1)), int(max(widths, default=1)))
@@ -132,26 +137,28 @@ class SetCosts:
         self.low, self.high = np.array(bounds).reshape(-1, 2).T
         self.spread = np.array([v for key in places for v in self.dictionary.spreads(key[0])])
 
-    def of_replay(self, replay: int) -> Self:
+    def on_replicate(self, replay: int) -> Self:
         """The same with the residual of a replay in place of the measured trials."""
         other = copy(self)
-        p, noise = self.p, self.p.likelihood.noise
+        p, noise = self.problem, self.problem.likelihood.noise
         rows = zip(noise.residuals, p.likelihood.root, strict=True)
-        other.p = replace(p, y=tuple(r[replay] * root for r, root in rows))
+        other.problem = replace(p, y=tuple(r[replay] * root for r, root in rows))
         other._moves_noise = False
-        other.by = np.array([b.T @ y for b, y in zip(p.base, other.p.y, strict=True)])
-        other.yy = np.array([float(y @ y) for y in other.p.y])
-        other.xy = [x.T @ y for x, y in zip(self.columns, other.p.y, strict=True)]
-        other._with_base, other._solved = {}, {}
+        other.by = np.array([b.T @ y for b, y in zip(p.base, other.problem.y, strict=True)])
+        other.yy = np.array([float(y @ y) for y in other.problem.y])
+        other.xy = [x.T @ y for x, y in zip(self.columns, other.problem.y, strict=True)]
+        other._products_by_key, other._solutions = {}, {}
         other._weight = p.independent / np.maximum(other.yy, 1e-300)
         return other
 
     def with_independent(self, samples: tuple[Samples, ...]) -> Self:
         """The same with other numbers of independent samples."""
         other = copy(self)
-        other.p = replace(self.p, likelihood=replace(self.p.likelihood, samples=samples))
-        other._solved, other._own_penalties = {}, {}
-        other._weight = other.p.independent / np.maximum(self.yy, 1e-300)
+        other.problem = replace(
+            self.problem, likelihood=replace(self.problem.likelihood, samples=samples)
+        )
+        other._solutions, other._own_penalties = {}, {}
+        other._weight = other.problem.independent / np.maximum(self.yy, 1e-300)
         return other
 
     def _atom(self, key: Key) -> Atom:
@@ -162,35 +169,35 @@ class SetCosts:
 
     def _products(self, key: Key) -> dict[int, tuple[Array, Array, Array]]:
         """By axis: weighted columns of an atom, their products with the base and with y."""
-        if key not in self._with_base:
-            atom, p = self._atom(key), self.p
+        if key not in self._products_by_key:
+            atom, p = self._atom(key), self.problem
             found = {}
             for axis, columns in atom.columns.items():
                 x = columns * p.likelihood.root[axis][:, None]
                 found[axis] = x, p.base[axis].T @ x, x.T @ p.y[axis]
-            self._with_base[key] = found
-        return self._with_base[key]
+            self._products_by_key[key] = found
+        return self._products_by_key[key]
 
     def solve(self, keys: Sequence[Key]) -> Solution:
         """The best strengths of a set within their bounds, and its cost."""
         keys = tuple(sorted(keys))
-        if keys not in self._solved:
-            self._solved[keys] = self._solve(keys)
-        return self._solved[keys]
+        if keys not in self._solutions:
+            self._solutions[keys] = self._solve(keys)
+        return self._solutions[keys]
 
     def cost(self, keys: Sequence[Key]) -> float:
         """Negative log evidence of a set, nats."""
         return self.solve(keys).cost
 
     def _solve(self, all_keys: tuple[Key, ...]) -> Solution:
-        p, nb = self.p, self.bb.shape[1]
+        p, nb = self.problem, self.bb.shape[1]
         absent = {
             place: change
             for name, _ in all_keys
             if name[0] == "-"
             for place, change in p.absence[name[1:]].items()
         }
-        keys = added(all_keys)
+        keys = added_effects(all_keys)
         if any(self.atoms.get(key) is None for key in keys):
             return Solution(np.inf)
         xx, xy, places = self._sums(keys)
@@ -306,7 +313,7 @@ class SetCosts:
             all_keys: the set; number: of the effect; strengths: of each; b: all unknowns, (n,).
             products: weighted, of all columns, (n, n).
         """
-        key = added(all_keys)[number]
+        key = added_effects(all_keys)[number]
         rest = self.solve(tuple(other for other in all_keys if other != key))
         if not np.isfinite(rest.cost):
             return 0.0
@@ -334,7 +341,7 @@ class SetCosts:
 
     def _expected(self, keys: Sequence[Key]) -> Array:
         """What is known of the strengths of a set beforehand, see `expect_strengths`, (m, m)."""
-        applied = self.p.likelihood.applied
+        applied = self.problem.likelihood.applied
         parts = [self._squares_of(key) for key in keys]
         blocks = [expect_strengths([*x.values()], [applied[a] for a in x]) for x in parts]
         return np.asarray(block_diag(*blocks)) if blocks else np.zeros((0, 0))
@@ -342,8 +349,8 @@ class SetCosts:
     def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
         """`Solution.volume` of a set with the parameters of a model that was fitted with it."""
         known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
-        gains = [self.dictionary.gain_with(name, known) for name, _ in added(keys)]
-        gains += [self._without(name)[1] for name in gone(keys)]
+        gains = [self.dictionary.gain_with(name, known) for name, _ in added_effects(keys)]
+        gains += [self._without(name)[1] for name in removed_effects(keys)]
         filters: list[tuple[dict[int, Array], Array]] = [({}, gain) for gain in gains]
         scale = evidence.log_scale[0] - self.dictionary.evidence.log_scale[0]
         rows = self._log_of_slopes(filters, self.solve(keys).scale)
@@ -358,23 +365,23 @@ class SetCosts:
         left = self.dictionary.evidence.log_scale[0] + means
         if (left < np.log(_LEAST_SLOPE)).any():
             return None
-        return np.asarray(self.p.independent * means * self._moves_noise)
+        return np.asarray(self.problem.independent * means * self._moves_noise)
 
     def _log_slopes(
         self, keys: Sequence[Key], strengths: Sequence[Array], scale: Array
     ) -> list[Array]:
         """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
-        atoms = [self._atom(key) for key in added(keys)]
+        atoms = [self._atom(key) for key in added_effects(keys)]
         each = [
             ({axis: slope @ b for axis, slope in atom.slopes.items()}, atom.gain)
             for atom, b in zip(atoms, strengths, strict=True)
         ]
-        return self._log_of_slopes([*each, *map(self._without, gone(keys))], scale)
+        return self._log_of_slopes([*each, *map(self._without, removed_effects(keys))], scale)
 
     def _without(self, name: str) -> tuple[dict[int, Array], Array]:
         """Slopes and gain that it adds to take one of the model's own effects away."""
         if name not in self._scale_without:
-            absence = self.p.absence[name]
+            absence = self.problem.absence[name]
             self._scale_without[name] = self.dictionary.scale_without(name, absence)
         return self._scale_without[name]
 
@@ -382,7 +389,7 @@ class SetCosts:
         self, each: Sequence[tuple[Mapping[int, Array], Array]], scale: Array
     ) -> list[Array]:
         """The same of slopes, by axis, (n, n_forces), and gains of each effect."""
-        found = [np.zeros(len(y)) for y in self.p.y]
+        found = [np.zeros(len(y)) for y in self.problem.y]
         moved: dict[int, Array] = {}
         gains = np.ones(self.n_q)
         for slopes, gain in each:
@@ -392,10 +399,10 @@ class SetCosts:
         # A filter takes off the noise of the forces, and what is beyond that of replays; that of
         # the motion stays.
         for axis in map(int, np.flatnonzero(gains != 1.0)):
-            kept = (1.0 - self.p.likelihood.force_share[axis]) / max(float(scale[axis]), 1.0)
+            kept = (1.0 - self.problem.likelihood.force_share[axis]) / max(float(scale[axis]), 1.0)
             found[axis] = found[axis] + 0.5 * np.log(kept + (1.0 - kept) * gains[axis])
         for axis, slope in moved.items():
-            found[axis] = found[axis] + log_of_share(self.p.likelihood.slopes[axis], slope)
+            found[axis] = found[axis] + log_of_share(self.problem.likelihood.slopes[axis], slope)
         return found
 
     def penalty_of(self, keys: Sequence[Key]) -> float:
@@ -403,15 +410,15 @@ class SetCosts:
 
         Of effects of the model, what is gained where they are taken away.
         """
-        away = gone(keys)
+        away = removed_effects(keys)
         saved = sum(self._penalty_of_own(name) for name in away)
-        return self.log_prior * (len(away) - len(added(keys))) - saved
+        return self.log_prior * (len(away) - len(added_effects(keys))) - saved
 
     def _penalty_of_own(self, name: str) -> float:
         """What the priors of the parameters of one of the model's effects cost."""
         if name not in self._own_penalties:
             # Of a candidate, too, the information on its strengths is that at its shape.
-            p, shapes = self.p, self.p.shapes[name]
+            p, shapes = self.problem, self.problem.shapes[name]
             away = {k: change for k, change in p.absence[name].items() if k not in shapes}
             free = p.hold(dict.fromkeys(shapes, 0.0))[1]
             to = p.to_parameters[list(away)] @ free
@@ -426,8 +433,12 @@ class SetCosts:
     def residual_rows(self, keys: Sequence[Key]) -> list[Array]:
         """What a set leaves, in units of the noise, by axis, each (n,)."""
         solution = self.solve(keys)
-        left = [y + b @ solution.base for y, b in zip(self.p.y, self.p.base, strict=True)]
-        for key, strength in zip(added(tuple(sorted(keys))), solution.strengths, strict=True):
+        left = [
+            y + b @ solution.base for y, b in zip(self.problem.y, self.problem.base, strict=True)
+        ]
+        for key, strength in zip(
+            added_effects(tuple(sorted(keys))), solution.strengths, strict=True
+        ):
             for axis, (x, _, _) in self._products(key).items():
                 left[axis] = left[axis] + x @ strength
         return left
@@ -438,7 +449,7 @@ class SetCosts:
         Root mean square over that of the applied force, of the axis where that is largest.
         """
         rows = zip(self.residual_rows(((f"-{name}", ()),)), self.residual_rows(()), strict=True)
-        moved = [(a - b) / r for (a, b), r in zip(rows, self.p.likelihood.root, strict=True)]
+        moved = [(a - b) / r for (a, b), r in zip(rows, self.problem.likelihood.root, strict=True)]
         return max(float(np.sqrt(x @ x / f)) for x, f in zip(moved, self.applied, strict=True))
 
     def volume_rows(self, keys: Sequence[Key]) -> list[Array]:
@@ -448,13 +459,13 @@ class SetCosts:
 
     def _free_of(self, keys: Sequence[Key], n: int) -> Array:
         """Directions in which n unknowns may move while effects that a set takes away stay away."""
-        away = [place for name in gone(keys) for place in self.p.absence[name]]
-        return self.p.hold(dict.fromkeys(away, 0.0), n)[1]
+        away = [place for name in removed_effects(keys) for place in self.problem.absence[name]]
+        return self.problem.hold(dict.fromkeys(away, 0.0), n)[1]
 
     def gains(self, keys: Sequence[Key]) -> Array:
         """What each place of the grid would take off the cost beside a set, at its weights."""
-        known, p, nb = self.solve(keys), self.p, self.bb.shape[1]
-        all_keys, keys = keys, added(tuple(sorted(keys)))
+        known, p, nb = self.solve(keys), self.problem, self.bb.shape[1]
+        all_keys, keys = keys, added_effects(tuple(sorted(keys)))
         weight = known.weight
         xx, _, places = self._sums(keys)
         n = xx.shape[1]
@@ -484,7 +495,7 @@ class SetCosts:
         own = np.einsum("kww->kw", np.tensordot(weight, self.own, 1))
         least = np.maximum(1e-6 * own, (NOTHING / np.where(valid, self.spread[place], 1.0)) ** 2)
         active = valid & (np.einsum("kww->kw", block) > least)
-        gain = np.zeros(len(self.places))
+        gain = np.zeros(len(self.grid_keys))
         for _ in range(widest + 1):
             masked = block * (active[:, :, None] & active[:, None, :])
             diagonal = np.einsum("kww->kw", masked)
@@ -532,20 +543,20 @@ def penalise(information: Array, spread: Array, strengths: Array, shapes: int) -
     wide = np.maximum(spread, np.abs(strengths))
     scaled = information * wide[..., :, None] * wide[..., None, :]
     found = 0.5 * np.linalg.slogdet(np.eye(len(information)) + scaled)[1]
-    return np.asarray(found + _A_SHAPE * shapes)
+    return np.asarray(found + _SHAPE_COST * shapes)
 
 
-def added(keys: Sequence[Key]) -> tuple[Key, ...]:
+def added_effects(keys: Sequence[Key]) -> tuple[Key, ...]:
     """The effects of a set that the model does not have; ``-name`` takes one of its own away."""
     return tuple(key for key in keys if key[0][0] != "-")
 
 
-def gone(keys: Sequence[Key]) -> set[str]:
+def removed_effects(keys: Sequence[Key]) -> set[str]:
     """The effects of the model that a set takes away."""
     return {name[1:] for name, _ in keys if name[0] == "-"}
 
 
-def names(keys: Sequence[Key]) -> tuple[str, ...]:
+def effect_names(keys: Sequence[Key]) -> tuple[str, ...]:
     """The effects of a set, in order."""
     return tuple(sorted(name for name, _ in keys))
 

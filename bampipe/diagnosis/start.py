@@ -13,18 +13,18 @@ from bampipe.arrays import Array
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.select import open_search, start_of
 from bampipe.diagnosis.session import Fit, Session, system_of
-from bampipe.diagnosis.set_cost import gone, names
+from bampipe.diagnosis.set_cost import effect_names, removed_effects
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.measured import MeasuredTrials
 
 _ANY_SIZE = 1e-9
 _REPLICATES = 6
-_STOPS = 0.125
+_STOPPING_FACTOR = 0.125
 """Width, times the device's, of a machine that is nearer to a true stop than to its device file.
 Friction that rises as the speed falls, where the model lacks it, can make a third of the width
 likelier on a machine that does yield over all of it, but not an eighth."""
-_NARROWER = (1.0 / 3.0, _STOPS, 1.0 / 32.0)
-WORTH = 0.03
+_NARROW_FACTORS = (1.0 / 3.0, _STOPPING_FACTOR, 1.0 / 32.0)
+LEAST_DROP = 0.03
 """Least drop of the log error for a narrower width: `benchmarks/chosen_sign_width.py`."""
 
 
@@ -43,9 +43,11 @@ def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
     fit = _fit(session, current, session.fit_plainly(current, system_of(current).prior).evidence.p)
     while left:
         with open_search(session, fit, only=left) as search:
-            sets = [s for beam in search.beam(len(left)) for s in beam if not gone(s[1])]
+            sets = [
+                s for beam in search.grow_sets(len(left)) for s in beam if not removed_effects(s[1])
+            ]
             keys = min(sets, key=lambda s: (-len(s[1]), s[0]))[1] if sets else ()
-            found = names(keys) or left[:1]
+            found = effect_names(keys) or left[:1]
             current = replace(current, effects=(*current.effects, *found))
             start = start_of(search, keys, current)
         fit, left = _fit(session, current, start), tuple(e for e in left if e not in found)
@@ -78,7 +80,10 @@ def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
     Raises:
         ValueError: the trials are too short to be fitted.
     """
-    fits = {1.0: fit_width(trials, recipe, 1.0), _STOPS: fit_width(trials, recipe, _STOPS)}
+    fits = {
+        1.0: fit_width(trials, recipe, 1.0),
+        _STOPPING_FACTOR: fit_width(trials, recipe, _STOPPING_FACTOR),
+    }
     declared = fits[1.0].held_out_rmse
     count = fits[1.0].problem.independent
 
@@ -86,12 +91,12 @@ def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
         ratio = np.log(declared / np.maximum(fits[factor].held_out_rmse, 1e-300))
         return float(count @ ratio / max(count.sum(), 1.0))
 
-    if not drop(_STOPS) > WORTH:
+    if not drop(_STOPPING_FACTOR) > LEAST_DROP:
         return SignWidth(1.0, declared, declared)
-    for factor in _NARROWER:
+    for factor in _NARROW_FACTORS:
         if factor not in fits:
             fits[factor] = fit_width(trials, recipe, factor)
-    best = max(_NARROWER, key=drop)
+    best = max(_NARROW_FACTORS, key=drop)
     return SignWidth(best, declared, fits[best].held_out_rmse)
 
 

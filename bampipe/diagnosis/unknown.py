@@ -13,7 +13,7 @@ import numpy as np
 
 from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.dictionary import Key
-from bampipe.diagnosis.set_cost import SetCosts, gone
+from bampipe.diagnosis.set_cost import SetCosts, removed_effects
 from bampipe.diagnosis.shape import since_reversal
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import solve_scaled, take_samples
@@ -66,9 +66,9 @@ class Splines:
     products: tuple[Array, Array, Array]
 
 
-def lay_splines(costs: SetCosts, axis: int) -> Splines | None:
+def build_splines(costs: SetCosts, axis: int) -> Splines | None:
     """The functions that are weighed on an axis; None where the axis does not move."""
-    p, e = costs.p, costs.dictionary.evidence
+    p, e = costs.problem, costs.dictionary.evidence
     if len(p.y[axis]) <= costs.bb.shape[1]:
         return None
     width = e.system.model.device.coordinates[axis].sign_width
@@ -140,9 +140,9 @@ class _ModelWithout:
     """The linear problem of a model without some of its effects, to which functions are added."""
 
     def __init__(self, costs: SetCosts, splines: Splines, keys: tuple[Key, ...]) -> None:
-        p = self.p = costs.p
+        p = self.p = costs.problem
         self.splines, axis = splines, splines.axis
-        absent = {k: v for name in gone(keys) for k, v in p.absence[name].items()}
+        absent = {k: v for name in removed_effects(keys) for k, v in p.absence[name].items()}
         self.fixed, self.free = p.hold(absent)
         self.base = [b @ self.free for b in p.base]
         self.y = [v + b @ self.fixed for v, b in zip(p.y, p.base, strict=True)]

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bampipe.diagnosis.criteria import most_probable
-from bampipe.diagnosis.probability import chance_of
+from bampipe.diagnosis.criteria import cap_probability
+from bampipe.diagnosis.probability import compute_p_value
 from bampipe.diagnosis.select import Selection
 from bampipe.diagnosis.session import Session, acting_axes, rms
 from bampipe.results.diagnose import (
@@ -38,12 +38,16 @@ class Conclusion:
 
 def conclude(session: Session, selection: Selection) -> Conclusion:
     """Say of each axis what is missing there, how probable that is, and what remains."""
-    c, weighed = session.criteria, selection.weighed
+    c, probabilities = session.criteria, selection.probabilities
     initial, final = selection.initial, selection.final
-    p_values = {e: chance_of(drop, selection.chance) for e, drop in weighed.drops.items()}
+    p_values = {
+        e: compute_p_value(drop, selection.replicate_gains)
+        for e, drop in probabilities.drops.items()
+    }
     # Of what chance gives as well, nothing is sure.
     probability = {
-        e: min(share, most_probable(p_values.get(e, 0.0))) for e, share in weighed.effects.items()
+        e: min(share, cap_probability(p_values.get(e, 0.0)))
+        for e, share in probabilities.effects.items()
     }
     where = {e: acting_axes(initial.recipe, e) for e in probability}
     selected = tuple(e for e in selection.effects if probability.get(e, 0.0) >= 1.0 - c.probability)
@@ -52,17 +56,17 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
         here = {e: p for e, p in probability.items() if axis in where[e]}
         listed = {e: p for e, p in here.items() if p >= 1.0 - c.probability}
         listed = dict(sorted(listed.items(), key=lambda pair: -pair[1]))
-        unknown = min(float(weighed.unknown[axis]), 1.0)
+        unknown = min(float(probabilities.unknown[axis]), 1.0)
         axes.append(_judge(session, selection, axis, name, listed, unknown))
     ranking = rank_effects(selection, probability, p_values, 1.0 - c.probability)
     return Conclusion(
-        tuple(axes), selected, tuple(ranking), _sets(selection),
+        tuple(axes), selected, tuple(ranking), _list_sets(selection),
         NullDistribution(
-            replicates=len(selection.chance),
-            largest=tuple(map(float, selection.chance)),
-            measured=selection.beside[0],
-            effect=selection.beside[1],
-            p_value=chance_of(selection.beside[0], selection.chance),
+            replicates=len(selection.replicate_gains),
+            largest=tuple(map(float, selection.replicate_gains)),
+            measured=selection.largest_gain[0],
+            effect=selection.largest_gain[1],
+            p_value=compute_p_value(selection.largest_gain[0], selection.replicate_gains),
         ),
     )  # fmt: skip
 
@@ -98,7 +102,7 @@ def _judge(
     force = rms(final.likelihood.applied[axis])
     excess = max(before**2 - level**2, 0.0)
     left = max(after**2 - level**2, 0.0)
-    function = selection.weighed.functions[axis]
+    function = selection.probabilities.functions[axis]
     share = min(max(function.share, 0.0), 1.0) if function else 0.0
     rest = after**2 * (1.0 - share) / max(before**2, 1e-300)
     return AxisVerdict(
@@ -141,12 +145,14 @@ def rank_effects(
     own = {item.name: item.parameters for item in final.evidence.system.model.effects}
     unchosen = (e for e in selection.gains if e not in selection.effects)
     others = sorted(unchosen, key=lambda e: -selection.gains[e])
-    chosen = sorted(selection.effects, key=lambda e: -selection.weighed.drops.get(e, 0.0))
-    left, rows = initial.problem.independent * initial.solved.left, []
+    chosen = sorted(selection.effects, key=lambda e: -selection.probabilities.drops.get(e, 0.0))
+    left, rows = initial.problem.independent * initial.solution.left, []
     for effect in (*chosen, *others):
         is_chosen = effect in selection.effects
         fit = final if is_chosen else initial
-        gain = selection.weighed.drops.get(effect, 0.0) if is_chosen else selection.gains[effect]
+        gain = (
+            selection.probabilities.drops.get(effect, 0.0) if is_chosen else selection.gains[effect]
+        )
         axis = max(acting_axes(initial.recipe, effect), key=lambda a: float(left[a]))
         before = after = float(fit.held_out_rmse[axis])
         if is_chosen:
@@ -162,28 +168,28 @@ def rank_effects(
                 held_out_rmse_after=after,
                 unit=system.torque_units[axis],
                 probability=min(probability.get(effect, 0.0), 1.0),
-                p_value=p_values.get(effect, chance_of(gain, selection.chance)),
+                p_value=p_values.get(effect, compute_p_value(gain, selection.replicate_gains)),
                 score=gain,
                 parameters={q.name: values[q.name] for q in own.get(effect, ())},
-                indistinguishable_from=_alike(selection, effect, mentioned),
+                indistinguishable_from=_find_twins(selection, effect, mentioned),
             )
         )
     return rows
 
 
-def _alike(selection: Selection, effect: str, mentioned: float) -> tuple[str, ...]:
+def _find_twins(selection: Selection, effect: str, mentioned: float) -> tuple[str, ...]:
     """Effects that take the place of one in a set which is as good as undecided against it."""
     best = {*selection.effects}
     found = []
-    for one in selection.weighed.sets:
+    for one in selection.probabilities.sets:
         swapped = {*one.effects} ^ best
         if len(swapped) == 2 and effect in swapped and one.probability >= mentioned:
             found += [e for e in swapped if e != effect]
     return tuple(sorted({*found}))
 
 
-def _sets(selection: Selection) -> tuple[WeighedSet, ...]:
-    sets = selection.weighed.sets
+def _list_sets(selection: Selection) -> tuple[WeighedSet, ...]:
+    sets = selection.probabilities.sets
     listed = [s for s in sets if s.probability >= 0.001] or sets[:1]
     return tuple(
         WeighedSet(

@@ -166,7 +166,7 @@ def _effect(term: Term, file: str) -> DraftedEffect:
             mean=mean,
             low=mean - NORMAL_95 * sd,
             high=mean + NORMAL_95 * sd,
-            beside={quantity.words: span.high for quantity, span in form.beside},
+            beside={quantity.words: span.high for quantity, span in form.other_quantities},
         ),
     )
 

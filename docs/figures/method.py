@@ -138,7 +138,7 @@ def draw_selection(found: Selection, search: Search) -> None:
     left.set(xlabel="gain of one effect beside the bare model, nats")
     left.tick_params(axis="y", labelsize=6.5)
     sizes, best = [0], [0.0]
-    for beam in search.beam(4):
+    for beam in search.grow_sets(4):
         sizes.append(len(sizes))
         best.append(search.cost(()) - beam[0][0])
     right.plot(sizes, best, "o-", color="C0", ms=3, label="best set of so many effects")
@@ -146,7 +146,7 @@ def draw_selection(found: Selection, search: Search) -> None:
     low, high = level + min(found.chance), level + max(found.chance)
     right.axhspan(low, high, color="C1", alpha=0.4, lw=0,
                   label="one more effect, on replicates")  # fmt: skip
-    right.plot(len(found.effects) + 1, level + found.beside[0], "s", ms=4, color="C3",
+    right.plot(len(found.effects) + 1, level + found.largest_gain[0], "s", ms=4, color="C3",
                label="one more effect, measured")  # fmt: skip
     right.set(xlabel="effects in the set", ylabel="log evidence, nats", xticks=sizes)
     right.legend(frameon=False, fontsize=6.5)

@@ -70,7 +70,7 @@ def take_timing_off(trials: MeasuredTrials, recipe: Recipe) -> MeasuredTrials:
     half = 0.5 / trials.band.rate_hz
     timed = replace(trials, limit_s=half, timed=True)
     fit = Session(timed, Criteria()).fit_plainly(recipe, system_of(recipe).prior)
-    change = fit.problem.to_parameters @ fit.solved.base
+    change = fit.problem.to_parameters @ fit.solution.base
     return timed.with_input_timing(float(change[len(fit.evidence.free)]))
 
 

@@ -125,7 +125,7 @@ AXIS = MachineScale(
 def test_what_only_an_axis_far_above_the_noise_shows_is_as_sure_as_its_share(without, probability):
     rows = {(): (20.0, 1.0), (("-stribeck:yaw", ()),): without}
     search = SimpleNamespace(
-        p=SimpleNamespace(independent=np.array([100.0, 100.0])),
+        problem=SimpleNamespace(independent=np.array([100.0, 100.0])),
         residual_rows=lambda keys: [np.full(50, level) for level in rows[keys]],
     )
     found = _share_explained(search, "stribeck:yaw", np.array([True, False]))

@@ -156,7 +156,7 @@ def test_a_formula_in_what_is_measured_is_told_from_chance(clean):
     session, _, fit = clean
     search = open_forms(session, fit, 1, "bump_by_position")
     assert weigh_chance(search).p_value > session.criteria.largest_p_value
-    bump = search.atoms[search.places[0]].columns[1][:, 0] * fit.likelihood.root[1]
+    bump = search.atoms[search.grid_keys[0]].columns[1][:, 0] * fit.likelihood.root[1]
     y = list(fit.problem.y)
     y[1] = y[1] + 5.0 * bump / np.linalg.norm(bump) * np.linalg.norm(y[1])
     bumped = replace(fit, problem=replace(fit.problem, y=tuple(y)))
@@ -227,10 +227,10 @@ def test_a_form_that_cancels_the_drive_gains_nothing(clean):
         return forms._volume(forms._log_slopes((place,), [strengths], np.ones(forms.n_q)))
 
     # A rise of this height from load zero is the load itself, against the motion.
-    assert volume(search, key, np.array([-0.2 * reach]))[0] < -0.05 * search.p.independent[0]
+    assert volume(search, key, np.array([-0.2 * reach]))[0] < -0.05 * search.problem.independent[0]
     assert volume(search, key, np.array([-reach])) is None
     own = open_forms(session, fit, 0, "slope_by_extension")
-    at = own.places[0]
+    at = own.grid_keys[0]
     assert volume(own, at, np.ones(own.atoms[at].width)) == pytest.approx(0.0)
 
 

@@ -43,7 +43,7 @@ def test_delays_shorter_than_the_true_one_promise_what_they_can_at_their_bounds(
     fit = session.fit_plainly(recipe, system_of(recipe).prior)
     with open_search(session, fit, only=("actuator_delay",)) as search:
         gains = search.gains(())
-        shorter = [search.dictionary.values(key)[0] < 8e-3 for key in search.places]
+        shorter = [search.dictionary.values(key)[0] < 8e-3 for key in search.grid_keys]
         assert sum(shorter) >= 3
         assert (np.diff(gains[shorter]) > 0.0).all() and (gains[shorter] > 0.0).all()
 
@@ -72,7 +72,7 @@ def test_a_drive_that_hardly_acts_any_more_explains_nothing(tmp_path: Path) -> N
         ends.append(session.fit_plainly(weak, p))
     for end in ends:
         assert end.evidence.p[-1] == pytest.approx(ends[0].evidence.p[-1], rel=1e-3, abs=1e-6)
-        assert end.solved.cost <= before.solved.cost + 0.01
+        assert end.solution.cost <= before.solution.cost + 0.01
 
 
 def test_a_sagging_drive_leaves_the_scale_that_its_curve_has(tmp_path: Path) -> None:

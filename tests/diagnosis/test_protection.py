@@ -132,7 +132,7 @@ def test_a_delay_that_the_timing_takes_over_only_beyond_its_bounds_has_a_size(re
     session = Session(replace(trials, motions=tuple(late)), criteria)
     fit = session.fit_plainly(recipe, system_of(recipe).prior)
     with open_search(session, fit, only=(name,)) as search:
-        ((cost, key),) = search.best_beside((), 1)
+        ((cost, key),) = search.rank_additions((), 1)
         assert search.cost(()) - cost > 20.0
         # With a timing that knows no bounds little would be left of it.
         assert max(search.solve((key,)).sizes) < criteria.size

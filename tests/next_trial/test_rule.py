@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from diagnosis.sessions import TRUTH, bam, made
 
-from bampipe.diagnosis.criteria import Criteria, most_probable
+from bampipe.diagnosis.criteria import Criteria, cap_probability
 from bampipe.diagnosis.dictionary import Dictionary, Key
-from bampipe.diagnosis.probability import chance_of, least_gain
+from bampipe.diagnosis.probability import compute_p_value, find_required_gain
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.session import Fit, Session, candidates_of, system_of
@@ -57,7 +57,7 @@ def key_of(dictionary: Dictionary, name: str, values) -> Key:
 def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_it(session, fit):
     detectability = find_detectability(session, fit)
     found = {one.alternative.name: one for one in detectability.limits}
-    assert detectability.needed == least_gain(CRITERIA, ()) - log_prior(
+    assert detectability.needed == find_required_gain(CRITERIA, ()) - log_prior(
         CRITERIA, len(session.candidate_names(fit.recipe))
     )
     noise, scale = fit.likelihood.noise, detectability.comparison.scale
@@ -91,13 +91,13 @@ def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_
 @pytest.mark.parametrize("count", [12, 400])
 def test_what_is_needed_is_what_the_rule_of_the_diagnosis_takes(count):
     by_chance = np.random.default_rng(0).gumbel(-3.0, 2.0, count)
-    least = least_gain(CRITERIA, by_chance)
+    least = find_required_gain(CRITERIA, by_chance)
     for gain, is_missing in ((least - 0.01, False), (least + 0.01, True)):
-        surely = most_probable(chance_of(gain, by_chance)) >= CRITERIA.probability
+        surely = cap_probability(compute_p_value(gain, by_chance)) >= CRITERIA.probability
         assert (surely and gain > np.log(9.0)) == is_missing
-    assert least_gain(CRITERIA) == pytest.approx(np.log(9.0))
+    assert find_required_gain(CRITERIA) == pytest.approx(np.log(9.0))
     # No dozen of replays makes anything that sure.
-    assert least_gain(Criteria(probability=0.9999), by_chance) == np.inf
+    assert find_required_gain(Criteria(probability=0.9999), by_chance) == np.inf
 
 
 def made_diagnosis(sets, verdict="undecided") -> SimpleNamespace:

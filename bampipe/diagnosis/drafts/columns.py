@@ -165,7 +165,7 @@ class FormDictionary:
         """`make` each."""
         return [(key, self.make(key)) for key in keys]
 
-    def thinned(self, words: str) -> Array:
+    def thin(self, words: str) -> Array:
         """A coordinate where the residual is, low-passed as that is, (n,)."""
         cutoff = float(self.evidence.band.cutoff_hz[self.axis])
         found = [
@@ -176,7 +176,7 @@ class FormDictionary:
 
     def _where_left(self, words: str, span: Span, left: Array) -> Span:
         """The part of the range of a coordinate that holds nearly all of a residual."""
-        at = self.thinned(words)
+        at = self.thin(words)
         order = np.argsort(at, kind="stable")
         mass = np.cumsum(left[order] ** 2)
         ends = np.searchsorted(mass, mass[-1] * np.array([0.005, 0.995]))

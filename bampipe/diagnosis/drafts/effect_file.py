@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bampipe.diagnosis.drafts.forms import rounded
+from bampipe.diagnosis.drafts.forms import round_constant
 from bampipe.diagnosis.drafts.search import Term
 from bampipe.results.intervals import NORMAL_95
 from bampipe.results.rounding import round_with_sd
@@ -44,7 +44,7 @@ def _numbers(term: Term, name: str, entry: Mapping[str, Any]) -> dict[str, float
     kind = term.form.shape.searched.get(name)
     if kind is None:
         size = max(2.0 * abs(value), 1e-6)
-        return {"sd": rounded(size), "typical": rounded(value)}
+        return {"sd": round_constant(size), "typical": round_constant(value)}
     low, high = entry["lower"], entry["upper"]
     if kind == "place":
         width = term.values.get("width")
@@ -59,9 +59,9 @@ def _numbers(term: Term, name: str, entry: Mapping[str, Any]) -> dict[str, float
         reach = 2.0 * np.pi * _WAVES / span.width
         low, high = max(value - reach, 0.5 * value), value + reach
     return {
-        "prior": rounded(value),
-        "sd": rounded(0.25 * (high - low)),
-        "lower": rounded(low),
-        "upper": rounded(high),
-        "typical": rounded(value),
+        "prior": round_constant(value),
+        "sd": round_constant(0.25 * (high - low)),
+        "lower": round_constant(low),
+        "upper": round_constant(high),
+        "typical": round_constant(value),
     }

@@ -171,13 +171,13 @@ class Form:
     span: Span
     times: Span
     scale: float
-    beside: tuple[tuple[Quantity, Span], ...] = ()
+    other_quantities: tuple[tuple[Quantity, Span], ...] = ()
     prefix: str = ""
 
     @property
     def quantities(self) -> tuple[tuple[Quantity, Span], ...]:
         """Everything that it follows, with the spans."""
-        return ((self.coordinate, self.span), *self.beside)
+        return ((self.coordinate, self.span), *self.other_quantities)
 
     @property
     def name(self) -> str:
@@ -186,7 +186,7 @@ class Form:
             return f"{self.prefix}{self.shape.name}_of_reading"
         head = self.prefix + ("" if self.factor == FORCE else f"{self.factor}_")
         tail = "" if self.is_own else f"_on_{self.axis.name}"
-        by = "" if self.beside else f"_by_{self.coordinate.name}"
+        by = "" if self.other_quantities else f"_by_{self.coordinate.name}"
         return f"{head}{self.shape.name}{by}{tail}"
 
     @property
@@ -249,7 +249,7 @@ class Form:
     @property
     def looks_like(self) -> str:
         """How it shows in a residual."""
-        seen = "" if self.beside else f", {_ACTS_AND_SHOWS[self.factor][1]}"
+        seen = "" if self.other_quantities else f", {_ACTS_AND_SHOWS[self.factor][1]}"
         return f"residual that {self._words}{seen}"
 
     def fixed(self) -> dict[str, tuple[float, str]]:
@@ -265,11 +265,11 @@ class Form:
                 "settling": (0.5 * self.times.low, "s"),
             }
             value, unit = known[name.rstrip("0123456789")]
-            found[name] = (rounded(value), unit)
+            found[name] = (round_constant(value), unit)
         if self.factor == DAMPING:
-            found["top_speed"] = (rounded(self.scale), f"{self.axis.unit}/s")
+            found["top_speed"] = (round_constant(self.scale), f"{self.axis.unit}/s")
         if self.factor == INERTIA:
-            found["top_acceleration"] = (rounded(self.scale), f"{self.axis.unit}/s2")
+            found["top_acceleration"] = (round_constant(self.scale), f"{self.axis.unit}/s2")
         return found
 
     def constants_at(self, searched: Mapping[str, float], interval: float) -> dict[str, float]:
@@ -297,10 +297,12 @@ class Form:
                 "unit": self.unit, "prior": 0.0, "sd": 1.0, "strength": True, "description": words,
             }  # fmt: skip
         for name, (low, high, of) in self.limits().items():
-            low, high = rounded(low), rounded(high)
-            middle = rounded(0.5 * (low + high) if low <= 0.0 else float(np.sqrt(low * high)))
+            low, high = round_constant(low), round_constant(high)
+            middle = round_constant(
+                0.5 * (low + high) if low <= 0.0 else float(np.sqrt(low * high))
+            )
             found[name] = {
-                "unit": of, "prior": middle, "sd": rounded(0.1 * (high - low)),
+                "unit": of, "prior": middle, "sd": round_constant(0.1 * (high - low)),
                 "lower": low, "upper": high,
                 "description": KINDS_IN_WORDS[self.shape.searched[name]],
             }  # fmt: skip
@@ -372,6 +374,6 @@ KINDS_IN_WORDS = {
 }
 
 
-def rounded(value: float) -> float:
+def round_constant(value: float) -> float:
     """Six digits: enough for any constant, and the same on every machine."""
     return float(f"{value:.6g}")

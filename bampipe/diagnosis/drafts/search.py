@@ -19,10 +19,10 @@ from bampipe.diagnosis.dictionary import Dictionary, Key
 from bampipe.diagnosis.drafts import symbolic
 from bampipe.diagnosis.drafts.columns import FormDictionary
 from bampipe.diagnosis.drafts.forms import Form
-from bampipe.diagnosis.probability import chance_of
+from bampipe.diagnosis.probability import compute_p_value
 from bampipe.diagnosis.search import Search
-from bampipe.diagnosis.select import PARTS, Progress, make_columns, start_at
-from bampipe.diagnosis.session import Fit, Session, shared, workers
+from bampipe.diagnosis.select import TASKS_PER_PROCESS, Progress, make_columns, start_at
+from bampipe.diagnosis.session import Fit, Session, worker_state, workers
 from bampipe.physics.recipe import Recipe
 from bampipe.results.draft import ChanceOfDraft
 
@@ -60,7 +60,7 @@ class Term:
         direction of motion where it is friction, and at the upper end of what else it follows.
         """
         x = np.linspace(self.form.span.low, self.form.span.high, count)[:, None]
-        others = [np.full((count, 1), span.high) for _, span in self.form.beside]
+        others = [np.full((count, 1), span.high) for _, span in self.form.other_quantities]
         x = np.hstack([x, *others])
         values = np.array(list(self.values.values()))
         middle, steps = self._at(x, values), np.diag(1e-4 * np.maximum(np.abs(values), 1e-9))
@@ -70,7 +70,7 @@ class Term:
 
     def _at(self, x: Array, values: Array) -> Array:
         known = dict(zip(self.values, values, strict=True))
-        columns = self.form.shape.columns(x, self.form.constants_at(known, 0.0), drawn=True)
+        columns = self.form.shape.columns(x, self.form.constants_at(known, 0.0), is_quick=True)
         return np.asarray(columns @ [known[n] for n in self.form.shape.strengths])
 
 
@@ -126,7 +126,7 @@ class FormSearch(Search):
         self.forms, self.fit = forms, fit
         known = cast(Dictionary, forms)  # to a search they are alike
         keys = [key for name in forms.candidates for key in forms.grid(name)]
-        parts = PARTS * session.jobs
+        parts = TASKS_PER_PROCESS * session.jobs
         with workers(forms, session.jobs) as spread:
             made = spread(make_columns, [keys[k::parts] for k in range(parts)])
             atoms = {key: atom for part in made for key, atom in part}
@@ -135,12 +135,12 @@ class FormSearch(Search):
     def best_forms(self, count: int, jobs: int) -> list[Key]:
         """The forms that gain most, their shapes refined, best first."""
         with workers(self, jobs) as spread:
-            found = list(spread(_refine, [key for _, key in self.best_beside((), count)]))
+            found = list(spread(_refine, [key for _, key in self.rank_additions((), count)]))
         self.ensure(found)
         found = [key for key in found if self.cost((key,)) < self.cost(())]
         return sorted(found, key=lambda key: self.cost((key,)))
 
-    def refined(self, key: Key) -> Key:
+    def refine_form(self, key: Key) -> Key:
         """A form with its shape where the cost is least nearby."""
         name, shape = key
         if not shape:
@@ -161,8 +161,8 @@ class FormSearch(Search):
 
 
 def _refine(key: Key) -> Key:
-    search: FormSearch = shared()
-    return search.refined(key)
+    search: FormSearch = worker_state()
+    return search.refine_form(key)
 
 
 def draft_formulas(
@@ -289,24 +289,24 @@ class _AxisSearch:
         for key, term, (wider, _), (cost, held_out, p) in zip(
             keys, terms, tasks, fits, strict=True
         ):
-            gain = search.fit.solved.cost - cost - search.solve((key,)).penalty
+            gain = search.fit.solution.cost - cost - search.solve((key,)).penalty
             found.append(Option(term, held_out, current.log_evidence + gain, wider, p))
         return found
 
 
 def _fit_form(task: tuple[Recipe, Array]) -> tuple[float, float, Array]:
     """Cost and held-out error of a model with a form, and its parameters."""
-    search, noise = shared()
+    search, noise = worker_state()
     fit = search.session.fit(*task, noise)
-    return fit.solved.cost, float(fit.held_out_rmse[search.axis]), fit.evidence.p
+    return fit.solution.cost, float(fit.held_out_rmse[search.axis]), fit.evidence.p
 
 
 def weigh_chance(search: FormSearch) -> ChanceOfDraft:
     """Hold the gain of the best form against that on replays of the model, which lacks nothing."""
     replays = range(search.criteria.replicates)
-    gains = tuple(search.of_replay(k).largest_gain()[0] for k in replays)
+    gains = tuple(search.on_replicate(k).largest_gain()[0] for k in replays)
     gain, _ = search.largest_gain()
-    return ChanceOfDraft(gain=gain, gains=gains, p_value=chance_of(gain, gains))
+    return ChanceOfDraft(gain=gain, gains=gains, p_value=compute_p_value(gain, gains))
 
 
 def _terms(fit: Fit, option: Option) -> tuple[Term, ...]:

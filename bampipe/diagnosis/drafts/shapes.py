@@ -31,8 +31,8 @@ class Memory:
 
     rate: str
     initial: str
-    along: Callable[[Array, Constants], Array]
-    drawn: Callable[[Array, Constants], Array]
+    course: Callable[[Array, Constants], Array]
+    quick_course: Callable[[Array, Constants], Array]
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Shape:
     words: str
     states: Mapping[str, Memory] = field(default_factory=dict)
 
-    def columns(self, x: Array, constants: Constants, drawn: bool = False) -> Array:
+    def columns(self, x: Array, constants: Constants, is_quick: bool = False) -> Array:
         """What each strength adds at one, (T, m).
 
         Args:
@@ -67,7 +67,7 @@ class Shape:
         """
         known = dict(constants) | {_x(k): column for k, column in enumerate(x.T)}
         for name, state in self.states.items():
-            known[name] = (state.drawn if drawn else state.along)(x[:, 0], known)
+            known[name] = (state.quick_course if is_quick else state.course)(x[:, 0], known)
         tree, nothing = _parsed(self.text), dict.fromkeys(self.strengths, 0.0)
         values = [_evaluate(tree, known | nothing | {name: 1.0}) for name in self.strengths]
         return np.column_stack([np.broadcast_to(value, len(x)) for value in values])
@@ -116,13 +116,13 @@ def _slip(name: str, play: str) -> dict[str, Memory]:
     """The state that x drags along with a ``play``, within the time ``settling``."""
     rate = f"(x - {name} - clip(x - {name}, -{play}, {play}))/settling"
 
-    def along(x: Array, c: Constants) -> Array:
+    def course(x: Array, c: Constants) -> Array:
         return np.asarray(drag_along(np.ascontiguousarray(x), np.array([float(c[play])])))[:, 0]
 
-    def drawn(x: Array, c: Constants) -> Array:
+    def quick_course(x: Array, c: Constants) -> Array:
         return np.asarray(np.maximum(x - c[play], x.min() + c[play]))
 
-    return {name: Memory(rate, "x", along, drawn)}
+    return {name: Memory(rate, "x", course, quick_course)}
 
 
 _RELAXING = Memory(

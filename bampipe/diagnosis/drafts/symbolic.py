@@ -71,7 +71,7 @@ def _ratios(forms: FormDictionary, quantity: Quantity) -> Array:
     """A quantity over its reach where the residual is, (n,), low-passed as that is."""
     span = forms.spans[quantity.words]
     middle = span.middle if quantity.quantity == "position" else 0.0
-    return (forms.thinned(quantity.words) - middle) / (0.5 * span.width)
+    return (forms.thin(quantity.words) - middle) / (0.5 * span.width)
 
 
 def _breed_expressions(wanted: Array, base: Array, x: Array) -> list[str]:
