@@ -1,9 +1,8 @@
 """Probabilities of sets of effects, of single effects, and of something unknown.
 
-The log evidence of a set near the most probable one is a sum over samples. Blocks of time are drawn
-anew, as in a bootstrap, and the probabilities averaged over the draws: an event that a single block
-shows decides nothing (pseudo-Bayesian model averaging with a bootstrap, after Yao, Vehtari, Simpson
-and Gelman 2018, Bayesian Analysis 13, 917).
+The log evidence of a set is a sum over samples. Blocks of time are resampled, and probabilities are
+averaged over the draws, so that no single event decides (pseudo-Bayesian model averaging with a
+bootstrap: Yao, Vehtari, Simpson and Gelman 2018, Bayesian Analysis 13, 917).
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,22 +21,21 @@ from bampipe.diagnosis.unknown import Splines, Unknown, build_splines, weigh_unk
 
 _DRAWS = 1000
 _MARGIN = 14.0
-"""Log evidence below the best, nats, beyond which a set is none of the alternatives: one in a
-million."""
+"""Difference in log evidence, nats, above which a set is no alternative: odds of a million."""
 _MOST_SETS = 40
 LEAST_P_VALUE = 1e-4
-"""No chance is known to be smaller from a dozen replays."""
+"""Smallest p-value: a dozen replicates do not support a smaller one."""
 
 
 @dataclass(frozen=True)
 class SetProbability:
-    """A set of effects.
+    """A set of effects with its probability.
 
     Attributes:
-        keys: as changes of the most probable one.
-        effects: that the model then has, beyond those of the model diagnosed.
-        unknown: axis on which something unknown stands beside them; None if nowhere.
-        log_evidence: over that of the most probable set, nats; probability: of the set.
+        keys: its changes of the most probable model.
+        effects: effects that it adds to the model diagnosed.
+        unknown: index of the axis of an unknown function beside the effects, or None.
+        log_evidence: log evidence over that of the most probable model, nats.
     """
 
     keys: tuple[Key, ...]
@@ -49,15 +47,15 @@ class SetProbability:
 
 @dataclass(frozen=True)
 class Probabilities:
-    """How probable everything is.
+    """Probabilities of sets, of effects, and of something unknown.
 
     Attributes:
-        sets: the most probable first.
-        effects: probability of each effect of any of them; by_name: the same where nothing is
-            unknown.
+        sets: the sets, most probable first.
+        effects: probability of each effect of any set.
+        if_all_known: the same if nothing unknown is missing.
         unknown: probability that an axis lacks something unknown, (n_q,).
-        functions: what that would be, by axis; None where an axis does not move.
-        drops: log evidence lost without each effect, where nothing takes its place, nats.
+        functions: unknown function of each axis; None for an axis that does not move.
+        drops: log evidence lost without each effect if nothing replaces it, nats.
     """
 
     sets: tuple[SetProbability, ...]
@@ -71,19 +69,19 @@ class Probabilities:
 def weigh_sets(
     by_noise: SetCosts, fit: Fit, pool: Pool, given: Sequence[str], criteria: Criteria, seed: int
 ) -> Probabilities:
-    """Weigh the sets of a pool, each member's absence, and unknown functions beside them.
+    """Compute the probabilities of the sets of a pool and of unknown functions beside them.
 
-    Whether something unknown remains is weighed by the noise; which effects there are, by the
-    samples that are independent in what remains.
+    The number of independent samples is that of the noise for something unknown, and that of the
+    residual for effects.
 
     Args:
         by_noise: costs of sets beside the most probable model; fit: that model.
         pool: sets near it, with costs by the noise.
         given: effects of the model diagnosed, which are not in question.
-        seed: of the bootstrap.
+        seed: seed of the bootstrap.
     """
     costs = by_noise.with_independent(fit.count_independent(criteria))
-    # What a set fell short by when it was fitted.
+    # A fit may gain less than its linear problem promised.
     shortfall = {k: c - by_noise.cost(k) for c, k in pool.values()}
     pool = {n: (costs.cost(k) + shortfall[k], k) for n, (_, k) in pool.items()}
     none = costs.cost(())
@@ -126,7 +124,7 @@ def weigh_sets(
             )
             for keys, found in _beside_unknown(costs, splines, here, acting)
         ]  # fmt: skip
-        # What one axis lacks is independent of what another one does.
+        # The axes are independent in what they lack.
         with_unknown = _compute_probabilities(costs, [*named, *beside], given, seed)
         here_too = _sum_by_effect(with_unknown)
         unknown[axis] = sum(s.probability for s in with_unknown if s.unknown is not None)
@@ -140,22 +138,22 @@ def weigh_sets(
     unknown[far] = 1.0
     doubtful = (unknown >= criteria.probability) & fit.is_above_floor
     for effect in own if doubtful.any() else ():
-        # In doubt is not absent: the model keeps it, and the report mentions it.
+        # A doubtful effect is not absent: the model keeps it, and the report mentions it.
         most = max(_share_explained(costs, effect, doubtful), 1.0 - criteria.probability)
         effects[effect] = min(effects[effect], most)
     return Probabilities(sets, effects, if_all_known, unknown, tuple(functions), drops)
 
 
 def _sum_squares(costs: SetCosts, keys: tuple[Key, ...]) -> Array:
-    """Sum of squares that a set leaves, in units of the noise, (n_q,)."""
+    """Return the sum of squares of the residual of a set in units of the noise, (n_q,)."""
     return np.array([max(float(rows @ rows), 1e-300) for rows in costs.residual_rows(keys)])
 
 
 def _share_explained(costs: SetCosts, effect: str, far: Flags) -> float:
-    """Of the error without an effect, what it takes on axes that are ``far``; the largest.
+    """Return the largest share of the error without an effect that it explains on ``far`` axes.
 
-    What is missing there may resemble an effect that takes less than that leaves. 1 of an effect
-    that the other axes show, or show more than these.
+    Something unknown there may resemble an effect that leaves a large error. The share is 1 if the
+    other axes support the effect by `_MARGIN`, or more than these.
     """
     now, without = _sum_squares(costs, ()), _sum_squares(costs, ((f"-{effect}", ()),))
     gain = 0.5 * costs.problem.independent * np.log(without / now)
@@ -166,7 +164,7 @@ def _share_explained(costs: SetCosts, effect: str, far: Flags) -> float:
 
 @dataclass(frozen=True)
 class _SetEvidence:
-    """A set with its log evidence over that of the most probable one, by block of time, too."""
+    """A set with its gain in log evidence over the most probable model, in all and by block."""
 
     keys: tuple[Key, ...]
     unknown: int | None
@@ -177,7 +175,7 @@ class _SetEvidence:
 def _compute_probabilities(
     costs: SetCosts, listed: Sequence[_SetEvidence], given: Sequence[str], seed: int
 ) -> tuple[SetProbability, ...]:
-    """Probabilities of sets, the most probable first."""
+    """Return the sets with their probabilities, most probable first."""
     total, blocks = np.array([s.gain for s in listed]), np.array([s.by_block for s in listed])
     count = blocks.shape[1]
     rng = np.random.default_rng([seed, count])
@@ -191,7 +189,7 @@ def _compute_probabilities(
 
 
 def _find_evidence_losses(sets: Sequence[SetProbability]) -> dict[str, float]:
-    """For each effect, what the best set with it loses if nothing takes its place, nats."""
+    """Return the log evidence that the best set with each effect loses without it, nats."""
     found = {}
     for effect in dict.fromkeys(e for one in sets for e in one.effects):
         held = [one for one in sets if effect in one.effects]
@@ -213,9 +211,9 @@ def _sum_by_effect(sets: Sequence[SetProbability]) -> dict[str, float]:
 def _beside_unknown(
     costs: SetCosts, splines: Splines, here: Unknown, acting: Sequence[str]
 ) -> list[tuple[tuple[Key, ...], Unknown]]:
-    """Sets beside an unknown function: the whole one, and less each effect whose place it takes.
+    """Return sets beside an unknown function, by backward elimination of the ``acting`` effects.
 
-    An effect of the model may be a mere resemblance of what is missing.
+    An effect of the model may merely resemble the missing one.
     """
     keys: tuple[Key, ...] = ()
     found = [(keys, here)]
@@ -239,7 +237,7 @@ def _list_effects(costs: SetCosts, keys: Sequence[Key], given: Sequence[str]) ->
 def _split_evidence(
     costs: SetCosts, keys: tuple[Key, ...], unknown: Unknown | None, shortfall: float = 0.0
 ) -> Array:
-    """Log likelihood of a set over that of none, less ``short``, nats, by block of time, (n,)."""
+    """Return the log evidence of a set over that of none, less ``shortfall``, by block, (n,)."""
     p = costs.problem
     before = costs.residual_rows(())
     after = list(unknown.residual) if unknown else costs.residual_rows(keys)
@@ -261,10 +259,10 @@ def _split_evidence(
 
 
 def find_required_gain(criteria: Criteria, replicate_gains: Sequence[float] = ()) -> float:
-    """The log evidence from which on an effect alone is called missing, nats.
+    """Return the log evidence from which a single effect is called missing, nats.
 
-    Its probability is what the criteria ask for, and chance gives as much rarely enough, see
-    `chance_of` (infinite where no replays can say so).
+    Both its probability and its p-value then meet the criteria. The gain is infinite if they ask
+    for less than `LEAST_P_VALUE`.
     """
     odds, p = float(logit(criteria.probability)), criteria.largest_p_value
     if not len(replicate_gains):
@@ -278,10 +276,10 @@ def find_required_gain(criteria: Criteria, replicate_gains: Sequence[float] = ()
 
 
 def compute_p_value(gain: float, replicate_gains: Sequence[float]) -> float:
-    """Probability that chance gives a largest gain of ``gain`` or more, from those of replays.
+    """Return the probability that chance gives a largest gain of at least ``gain``.
 
-    By the law of largest values (Gumbel 1935), with their median and quartiles, and no less than
-    the share of the replays that gave as much.
+    It follows from the Gumbel distribution with the median and quartiles of the largest gains on
+    replicates, and is at least the share of replicates with as large a gain.
     """
     middle, scale = _law_of_largest(replicate_gains)
     beyond = (gain - middle) / scale - np.log(np.log(2.0))
@@ -290,8 +288,8 @@ def compute_p_value(gain: float, replicate_gains: Sequence[float]) -> float:
 
 
 def _law_of_largest(values: Sequence[float]) -> tuple[float, float]:
-    """Median and scale of the law of largest values."""
+    """Return the median and the scale of the Gumbel distribution of largest gains."""
     low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-    # The evidence of one candidate alone scatters by half a nat a strength.
+    # The log evidence of a single candidate scatters by half a nat per strength.
     scale = max(float(high - low) / (np.log(np.log(4.0)) - np.log(np.log(4.0 / 3.0))), 1.0)
     return float(middle), scale

@@ -1,9 +1,7 @@
-"""What a set of effects costs: its negative log evidence beside a model.
+"""The cost of a set of effects: its negative log evidence beside a model.
 
-Half of n log s^2 on each axis, with s^2 what the set leaves in units of the noise; the logarithm of
-what it takes off the measured quantity, so that nothing is explained by making both sides of the
-equation small; and by the priors of its parameters (Laplace) and of the set itself. Strengths are
-held within their bounds.
+The terms are those of docs/method_selection.md: misfit, change of variables, Occam factors, priors
+of the strengths and of the set. Strengths stay within their bounds.
 """
 
 from __future__ import annotations
@@ -32,24 +30,26 @@ from bampipe.trials.likelihood import (
 from bampipe.trials.scale import log_of_share
 
 _LEAST_SLOPE = 0.2
-"""Geometric mean of what a set leaves of the slope by the force; below, nothing has a scale."""
+"""Smallest geometric mean of dτ/df: below it, the equation of motion has no scale."""
 _SHAPE_COST = 2.5
-"""Half the logarithm of the information on a shape over its range, as it comes out on the whole."""
+"""Occam factor of a shape, nats: a typical half logarithm of the information over its range."""
 
 Make = Callable[[Sequence[Key]], Iterable[tuple[Key, Atom | None]]]
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A set with its best strengths.
+    """A set with its most likely strengths.
 
     Attributes:
         cost: negative log evidence, nats.
-        strengths: of each effect, in the order of the set.
+        strengths: strengths of each effect, in the order of the set.
         base: change of the model's own reduced parameters.
-        scale: s^2 by axis, (n_q,).
-        volume: log of what is left of the measured quantity, summed over samples, by axis.
-        penalty: what the priors take off.
+        scale: s^2 of each axis, (n_q,).
+        volume: term of the change of variables, by axis, (n_q,).
+        penalty: Occam factors and priors, nats.
+        sizes: irreplaceable size of each effect, see `SetCosts._sizes`.
+        weight: weight of the squares of each axis, (n_q,).
     """
 
     cost: float
@@ -92,7 +92,7 @@ class SetCosts:
         self._scale_without: dict[str, tuple[dict[int, Array], Array]] = {}
         self.applied = [max(float(f @ f), 1e-300) for f in p.likelihood.applied]
         self._weight = p.independent / np.maximum(self.yy, 1e-300)
-        # Columns have the noise of the measured force: they scale or filter that in the residual.
+        # Columns that take part of the measured force scale or filter its noise, too.
         self._moves_noise = True
         grid = [key for name in dictionary.candidates for key in dictionary.grid(name)]
         self.ensure(grid)
@@ -101,13 +101,13 @@ class SetCosts:
         self._lay_out(places)
 
     def ensure(self, keys: Iterable[Key]) -> None:
-        """Make the columns of what has none yet."""
+        """Compute the columns that are missing."""
         missing = [key for key in dict.fromkeys(keys) if key not in self.atoms]
         if missing:
             self.atoms |= dict(self.make(missing))
 
     def _lay_out(self, places: Mapping[Key, Atom]) -> None:
-        """All columns of the grid side by side, axis by axis, and their products with the base."""
+        """Join the columns of the grid by axis, and compute their products with the base."""
         widths = [a.width for a in places.values()]
         self.first = np.concatenate([[0], np.cumsum(widths)])[:-1].astype(int)
         self.widths = np.array(widths, dtype=int)
@@ -137,12 +137,12 @@ class SetCosts:
         self.low, self.high = np.array(bounds).reshape(-1, 2).T
         self.spread = np.array([v for key in places for v in self.dictionary.spreads(key[0])])
 
-    def on_replicate(self, replay: int) -> Self:
-        """The same with the residual of a replay in place of the measured trials."""
+    def on_replicate(self, number: int) -> Self:
+        """Return the costs on the residual of a replicate instead of the measured one."""
         other = copy(self)
         p, noise = self.problem, self.problem.likelihood.noise
         rows = zip(noise.residuals, p.likelihood.root, strict=True)
-        other.problem = replace(p, y=tuple(r[replay] * root for r, root in rows))
+        other.problem = replace(p, y=tuple(r[number] * root for r, root in rows))
         other._moves_noise = False
         other.by = np.array([b.T @ y for b, y in zip(p.base, other.problem.y, strict=True)])
         other.yy = np.array([float(y @ y) for y in other.problem.y])
@@ -152,7 +152,7 @@ class SetCosts:
         return other
 
     def with_independent(self, samples: tuple[Samples, ...]) -> Self:
-        """The same with other numbers of independent samples."""
+        """Return the costs with other numbers of independent samples."""
         other = copy(self)
         other.problem = replace(
             self.problem, likelihood=replace(self.problem.likelihood, samples=samples)
@@ -162,13 +162,13 @@ class SetCosts:
         return other
 
     def _atom(self, key: Key) -> Atom:
-        """The columns of a candidate that does something in these trials."""
+        """Return the columns of a candidate that has an effect in these trials."""
         atom = self.atoms[key]
         assert atom is not None
         return atom
 
     def _products(self, key: Key) -> dict[int, tuple[Array, Array, Array]]:
-        """By axis: weighted columns of an atom, their products with the base and with y."""
+        """Return weighted columns of a candidate and their products with base and y, by axis."""
         if key not in self._products_by_key:
             atom, p = self._atom(key), self.problem
             found = {}
@@ -179,14 +179,14 @@ class SetCosts:
         return self._products_by_key[key]
 
     def solve(self, keys: Sequence[Key]) -> Solution:
-        """The best strengths of a set within their bounds, and its cost."""
+        """Return the most likely strengths of a set within their bounds, and its cost."""
         keys = tuple(sorted(keys))
         if keys not in self._solutions:
             self._solutions[keys] = self._solve(keys)
         return self._solutions[keys]
 
     def cost(self, keys: Sequence[Key]) -> float:
-        """Negative log evidence of a set, nats."""
+        """Return the negative log evidence of a set, nats."""
         return self.solve(keys).cost
 
     def _solve(self, all_keys: tuple[Key, ...]) -> Solution:
@@ -205,7 +205,7 @@ class SetCosts:
             -1, 2
         )
         spread = np.array([s for key in keys for s in self.dictionary.spreads(key[0])])
-        # What a strength of any size leaves as it is has none.
+        # A strength that changes nothing over its whole prior is zero.
         bounds[np.einsum("a,akk->k", self._weight, xx[:, nb:, nb:]) * spread**2 < NOTHING**2] = 0.0
         expected = self._expected(keys)
         solved = solve_bounded(
@@ -220,12 +220,12 @@ class SetCosts:
         volume = self._volume(self._log_slopes(all_keys, strengths, scale))
         if volume is None:
             return Solution(np.inf)
-        # The cost has what its own parameters leave of the scale in second order, absent ones, too.
+        # The cost contains the scale to second order in the model's parameters, absent ones too.
         places_of, change = list(absent), np.array([*absent.values()])
         first = self.dictionary.evidence.log_scale[1][:, places_of] @ change
         volume = volume - p.independent * (first - 0.5 * first**2)
         sizes: tuple[float, ...] = ()
-        # What an effect of the model costs is not in the cost of the model as it is.
+        # The cost of the model does not contain the priors of its own effects.
         penalty = self.penalty_of(all_keys) + 0.5 * float(b[nb:] @ expected @ b[nb:])
         if keys:
             products = np.tensordot(weight, xx, 1)
@@ -233,7 +233,7 @@ class SetCosts:
             normal[:nb, :nb] += p.precision
             normal[nb:, nb:] += expected
             used = np.flatnonzero(~solved.held)
-            # What a set takes away does not move along: its place can be taken by a twin of it.
+            # A removed effect stays removed, so that a twin can take its place.
             if absent:
                 free = p.hold(absent, n)[1]
                 normal = free.T @ normal @ free
@@ -242,7 +242,7 @@ class SetCosts:
             member = np.repeat(np.arange(len(keys)), [h.stop - h.start for h in held])[used]
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)
             for k, size in enumerate(sizes):
-                # Nor can what others would take over beyond their bounds.
+                # Other parameters absorb an effect only within their bounds.
                 if (
                     size < self.least_size
                     and self._size_within_bounds(all_keys, k, strengths, b, products)
@@ -255,10 +255,9 @@ class SetCosts:
         return Solution(cost, strengths, b[:nb], scale, volume, penalty, sizes, weight)
 
     def _sums(self, keys: Sequence[Key]) -> tuple[Array, Array, list[slice]]:
-        """Products by axis of the base and the columns of a set, with each other and with y.
+        """Return products of base and columns with each other and with y, by axis.
 
-        Returns:
-            (n_q, n, n), (n_q, n), and the places of each member among the n.
+        They are (n_q, n, n) and (n_q, n); the slices of each member among the n come third.
         """
         nb, parts = self.bb.shape[1], [self._products(key) for key in keys]
         ends = nb + np.cumsum([0, *(self._atom(key).width for key in keys)], dtype=int)
@@ -283,9 +282,9 @@ class SetCosts:
         own: Array,
         place: Indices,
     ) -> tuple[float, ...]:
-        """What each effect adds as far as nothing else in the model takes its place.
+        """Return the size of each effect beyond what other parameters could absorb.
 
-        As a share of the applied force of the axis where that is largest.
+        It is a root mean square over that of the applied force, on the axis where it is largest.
         """
         spread, sizes = np.linalg.pinv(inside, hermitian=True), []
         for k, (key, strength) in enumerate(zip(keys, strengths, strict=True)):
@@ -307,11 +306,9 @@ class SetCosts:
         b: Array,
         products: Array,
     ) -> float:
-        """What an effect of a set adds as far as the best set without it, within bounds, does not.
+        """Return the size of one effect of a set beyond what the set without it could absorb.
 
-        Args:
-            all_keys: the set; number: of the effect; strengths: of each; b: all unknowns, (n,).
-            products: weighted, of all columns, (n, n).
+        ``b`` are all unknowns, (n,), and ``products`` the weighted products of all columns, (n, n).
         """
         key = added_effects(all_keys)[number]
         rest = self.solve(tuple(other for other in all_keys if other != key))
@@ -327,27 +324,27 @@ class SetCosts:
         return self._size(key, strengths[number]) * float(np.sqrt(max(share, 0.0)))
 
     def _size(self, key: Key, strength: Array) -> float:
-        """What an effect adds over the applied force of an axis, root mean square, the largest."""
+        """Return the root mean square of an effect over that of the applied force of an axis."""
         return max(
             float(np.sqrt(max(float(strength @ square @ strength), 0.0) / self.applied[axis]))
             for axis, square in self._squares_of(key).items()
         )
 
     def _squares_of(self, key: Key) -> dict[int, Array]:
-        """Products of the columns of a candidate with each other, by axis, (m, m), unweighted."""
+        """Return the unweighted products of a candidate's columns, by axis, (m, m)."""
         if key not in self._squares:
             self._squares[key] = {a: c.T @ c for a, c in self._atom(key).columns.items()}
         return self._squares[key]
 
     def _expected(self, keys: Sequence[Key]) -> Array:
-        """What is known of the strengths of a set beforehand, see `expect_strengths`, (m, m)."""
+        """Return the prior precision of the strengths of a set, `expect_strengths`, (m, m)."""
         applied = self.problem.likelihood.applied
         parts = [self._squares_of(key) for key in keys]
         blocks = [expect_strengths([*x.values()], [applied[a] for a in x]) for x in parts]
         return np.asarray(block_diag(*blocks)) if blocks else np.zeros((0, 0))
 
     def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
-        """`Solution.volume` of a set with the parameters of a model that was fitted with it."""
+        """Return `Solution.volume` of a set at the parameters of a model fitted with it."""
         known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
         gains = [self.dictionary.gain_with(name, known) for name, _ in added_effects(keys)]
         gains += [self._without(name)[1] for name in removed_effects(keys)]
@@ -357,9 +354,9 @@ class SetCosts:
         return self._volume([r + here for r, here in zip(rows, scale, strict=True)])
 
     def _volume(self, rows: Sequence[Array]) -> Array | None:
-        """By axis, independent samples times the mean log of what is left of what was measured.
+        """Return the change of variables of each axis, or None if the equation has no scale.
 
-        None where so little is left of the force that the equation has no scale.
+        ``rows`` are the logarithms of the factors on the measured force at each sample, by axis.
         """
         means = np.array([float(r.mean()) if len(r) else 0.0 for r in rows])
         left = self.dictionary.evidence.log_scale[0] + means
@@ -370,7 +367,7 @@ class SetCosts:
     def _log_slopes(
         self, keys: Sequence[Key], strengths: Sequence[Array], scale: Array
     ) -> list[Array]:
-        """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
+        """Return the log of the factor of a set on the measured force, by axis, (n,)."""
         atoms = [self._atom(key) for key in added_effects(keys)]
         each = [
             ({axis: slope @ b for axis, slope in atom.slopes.items()}, atom.gain)
@@ -379,7 +376,7 @@ class SetCosts:
         return self._log_of_slopes([*each, *map(self._without, removed_effects(keys))], scale)
 
     def _without(self, name: str) -> tuple[dict[int, Array], Array]:
-        """Slopes and gain that it adds to take one of the model's own effects away."""
+        """Return the slopes and the gain of the removal of one of the model's effects."""
         if name not in self._scale_without:
             absence = self.problem.absence[name]
             self._scale_without[name] = self.dictionary.scale_without(name, absence)
@@ -388,7 +385,7 @@ class SetCosts:
     def _log_of_slopes(
         self, each: Sequence[tuple[Mapping[int, Array], Array]], scale: Array
     ) -> list[Array]:
-        """The same of slopes, by axis, (n, n_forces), and gains of each effect."""
+        """Return `_log_slopes` of effects with given slopes, by axis, (n, n_forces), and gains."""
         found = [np.zeros(len(y)) for y in self.problem.y]
         moved: dict[int, Array] = {}
         gains = np.ones(self.n_q)
@@ -396,8 +393,8 @@ class SetCosts:
             for axis, slope in slopes.items():
                 moved[axis] = moved.get(axis, 0.0) + slope
             gains *= gain
-        # A filter takes off the noise of the forces, and what is beyond that of replays; that of
-        # the motion stays.
+        # A filter reduces the noise of the forces and any excess over the replicates, but not the
+        # noise of the motion.
         for axis in map(int, np.flatnonzero(gains != 1.0)):
             kept = (1.0 - self.problem.likelihood.force_share[axis]) / max(float(scale[axis]), 1.0)
             found[axis] = found[axis] + 0.5 * np.log(kept + (1.0 - kept) * gains[axis])
@@ -406,18 +403,15 @@ class SetCosts:
         return found
 
     def penalty_of(self, keys: Sequence[Key]) -> float:
-        """What the prior of a set costs, without that of the parameters it adds.
-
-        Of effects of the model, what is gained where they are taken away.
-        """
+        """Return the cost of the prior of a set, less the priors of the effects it removes."""
         away = removed_effects(keys)
         saved = sum(self._penalty_of_own(name) for name in away)
         return self.log_prior * (len(away) - len(added_effects(keys))) - saved
 
     def _penalty_of_own(self, name: str) -> float:
-        """What the priors of the parameters of one of the model's effects cost."""
+        """Return the cost of the priors of the parameters of one of the model's effects."""
         if name not in self._own_penalties:
-            # Of a candidate, too, the information on its strengths is that at its shape.
+            # As for a candidate, the information on the strengths is that at a given shape.
             p, shapes = self.problem, self.problem.shapes[name]
             away = {k: change for k, change in p.absence[name].items() if k not in shapes}
             free = p.hold(dict.fromkeys(shapes, 0.0))[1]
@@ -431,7 +425,7 @@ class SetCosts:
         return self._own_penalties[name]
 
     def residual_rows(self, keys: Sequence[Key]) -> list[Array]:
-        """What a set leaves, in units of the noise, by axis, each (n,)."""
+        """Return the residual of a set in units of the noise, by axis, (n,)."""
         solution = self.solve(keys)
         left = [
             y + b @ solution.base for y, b in zip(self.problem.y, self.problem.base, strict=True)
@@ -444,26 +438,26 @@ class SetCosts:
         return left
 
     def size_of_own(self, name: str) -> float:
-        """What an effect of the model adds as far as the model without it does not.
+        """Return the size of an effect of the model beyond what the rest could absorb.
 
-        Root mean square over that of the applied force, of the axis where that is largest.
+        It is a root mean square over that of the applied force, on the axis where it is largest.
         """
         rows = zip(self.residual_rows(((f"-{name}", ()),)), self.residual_rows(()), strict=True)
         moved = [(a - b) / r for (a, b), r in zip(rows, self.problem.likelihood.root, strict=True)]
         return max(float(np.sqrt(x @ x / f)) for x, f in zip(moved, self.applied, strict=True))
 
     def volume_rows(self, keys: Sequence[Key]) -> list[Array]:
-        """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
-        solved = self.solve(keys)
-        return self._log_slopes(tuple(sorted(keys)), solved.strengths, solved.scale)
+        """Return the log of the factor of a set on the measured force, by axis, (n,)."""
+        solution = self.solve(keys)
+        return self._log_slopes(tuple(sorted(keys)), solution.strengths, solution.scale)
 
     def _free_of(self, keys: Sequence[Key], n: int) -> Array:
-        """Directions in which n unknowns may move while effects that a set takes away stay away."""
+        """Return the directions of n unknowns that keep the effects removed by a set at zero."""
         away = [place for name in removed_effects(keys) for place in self.problem.absence[name]]
         return self.problem.hold(dict.fromkeys(away, 0.0), n)[1]
 
     def gains(self, keys: Sequence[Key]) -> Array:
-        """What each place of the grid would take off the cost beside a set, at its weights."""
+        """Return the fall of the cost of a set by each key of the grid, at the set's weights."""
         known, p, nb = self.solve(keys), self.problem, self.bb.shape[1]
         all_keys, keys = keys, added_effects(tuple(sorted(keys)))
         weight = known.weight
@@ -479,7 +473,7 @@ class SetCosts:
             for i, key in zip(places, keys, strict=True):
                 if axis in (part := self._products(key)):
                     cross[i, cols] += w * (part[axis][0].T @ self.columns[axis])
-        # As the set has been solved within bounds, from there.
+        # The gains start from the solution of the set within its bounds.
         b = np.concatenate([known.base, *known.strengths])
         moment = moment - cross.T @ b
         free = self._free_of(all_keys, n)
@@ -518,7 +512,7 @@ class SetCosts:
             if not out.any():
                 break
             active &= ~out
-        # Of one strength that its bounds hold, at the bound: a delay's columns of shorter ones.
+        # A single strength may gain at its bound, as those of shorter delays than the true one do.
         only = np.flatnonzero(self.widths == 1)
         square, moment = block[only, 0, 0], mom[only, 0]
         x = np.clip(moment / np.maximum(square, 1e-300), low[only, 0], high[only, 0])
@@ -528,17 +522,17 @@ class SetCosts:
 
 
 def log_prior(criteria: Criteria, number: int) -> float:
-    """Log of the prior odds of each of so many candidates."""
+    """Return the log prior odds of each of a ``number`` of candidates."""
     return min(float(np.log(criteria.expected_effects / max(number, 1))), 0.0)
 
 
 def penalise(information: Array, spread: Array, strengths: Array, shapes: int) -> Array:
-    """What the priors of effects take off their log evidence (Laplace), nats, one or (...).
+    """Return the Occam factors of effects (Laplace), nats, (...).
 
     Args:
-        information: on their strengths, (m, m).
-        spread: of these before any data, (m,); strengths: (..., m).
-        shapes: how many parameters beside them are fitted.
+        information: information on the strengths, (m, m).
+        spread: their prior standard deviations, (m,); strengths: (..., m).
+        shapes: number of searched shapes.
     """
     wide = np.maximum(spread, np.abs(strengths))
     scaled = information * wide[..., :, None] * wide[..., None, :]
@@ -547,21 +541,21 @@ def penalise(information: Array, spread: Array, strengths: Array, shapes: int) -
 
 
 def added_effects(keys: Sequence[Key]) -> tuple[Key, ...]:
-    """The effects of a set that the model does not have; ``-name`` takes one of its own away."""
+    """Return the effects that a set adds to the model; a key ``-name`` removes one."""
     return tuple(key for key in keys if key[0][0] != "-")
 
 
 def removed_effects(keys: Sequence[Key]) -> set[str]:
-    """The effects of the model that a set takes away."""
+    """Return the effects of the model that a set removes."""
     return {name[1:] for name, _ in keys if name[0] == "-"}
 
 
 def effect_names(keys: Sequence[Key]) -> tuple[str, ...]:
-    """The effects of a set, in order."""
+    """Return the names of the keys of a set in order."""
     return tuple(sorted(name for name, _ in keys))
 
 
 def _schur(normal: Array, nb: int) -> Array:
-    """Information on the strengths once the model's own parameters have moved along."""
+    """Return the information on the strengths after the model's own parameters have adapted."""
     cross = normal[:nb, nb:]
     return np.asarray(normal[nb:, nb:] - cross.T @ solve_scaled(normal[:nb, :nb], cross))

@@ -55,7 +55,7 @@ def test_where_drives_are_late_and_stops_are_looked_for():
     assert (lower.low, lower.high) == pytest.approx((-0.045, 0.075))
     ends = range_of("gas_spring:carriage", "end")
     shares = np.linspace(0.0, 1.0, 21)
-    found = np.array([ends.value_at(ends.within(share)) for share in shares])
+    found = np.array([ends.value_at(ends.interpolate(share)) for share in shares])
     above, below = found[shares > 0.5], found[shares < 0.5]
     # The travel goes from -0.05 to 0.2 m: nearly at it, and where any gas is a straight line.
     assert above.min() == pytest.approx(0.205)
@@ -83,7 +83,7 @@ def test_the_scale_of_a_session_is_that_of_its_motion():
 def test_no_ripple_falls_between_two_values_that_are_tried():
     """Of two wavenumbers a wave on the travel apart neither tells of the other."""
     waves = range_of("torque_ripple:carriage", "wavenumber")
-    values = [waves.within(share) for share in np.linspace(0.0, 1.0, waves.fewest)]
+    values = [waves.interpolate(share) for share in np.linspace(0.0, 1.0, waves.fewest)]
     on_travel = np.array(values) * 0.25 / (2.0 * np.pi)
     assert on_travel[-1] == pytest.approx(30.0)
     assert np.diff(on_travel).max() <= 0.6

@@ -49,7 +49,7 @@ def key_of(dictionary: Dictionary, name: str, values) -> Key:
     item, shape = dictionary.candidates[name], []
     shares = np.linspace(0.0, 1.0, 401)
     for limits, place in zip(dictionary.ranges[name], item.searched_indices, strict=True):
-        at = np.array([limits.value_at(limits.within(share)) for share in shares])
+        at = np.array([limits.value_at(limits.interpolate(share)) for share in shares])
         shape.append(float(shares[np.argmin(np.abs(at - values[place]))]))
     return name, tuple(shape)
 

@@ -21,9 +21,10 @@ from bampipe.diagnosis.drafts.columns import FormDictionary
 from bampipe.diagnosis.drafts.forms import Form
 from bampipe.diagnosis.probability import compute_p_value
 from bampipe.diagnosis.search import Search
-from bampipe.diagnosis.select import TASKS_PER_PROCESS, Progress, make_columns, start_at
+from bampipe.diagnosis.select import TASKS_PER_PROCESS, make_columns, start_at
 from bampipe.diagnosis.session import Fit, Session, worker_state, workers
 from bampipe.physics.recipe import Recipe
+from bampipe.progress import Progress, silent
 from bampipe.results.draft import ChanceOfDraft
 
 MOST_TERMS = 2
@@ -172,7 +173,7 @@ def draft_formulas(
     axes: Sequence[int],
     source: str,
     curves: bool = False,
-    progress: Progress = lambda fraction, message: None,
+    progress: Progress = silent,
 ) -> list[FoundDraft]:
     """Search a formula for what a model leaves on each of some axes, one after the other.
 
@@ -302,10 +303,8 @@ def _fit_form(task: tuple[Recipe, Array]) -> tuple[float, float, Array]:
 
 
 def weigh_chance(search: FormSearch) -> ChanceOfDraft:
-    """Hold the gain of the best form against that on replays of the model, which lacks nothing."""
-    replays = range(search.criteria.replicates)
-    gains = tuple(search.on_replicate(k).largest_gain()[0] for k in replays)
-    gain, _ = search.largest_gain()
+    """Compare the gain of the best form with the gains on replicates of the model."""
+    gains, gain = search.replicate_gains(), search.largest_gain()[0]
     return ChanceOfDraft(gain=gain, gains=gains, p_value=compute_p_value(gain, gains))
 
 
