@@ -153,7 +153,7 @@ class MachineScale:
         )  # fmt: skip
 
     def range_of(self, item: BoundEffect, parameter: Parameter) -> SearchRange:
-        """Where to look for a parameter of an effect in which the residual is not linear."""
+        """Return the search range of a parameter in which the residual is not linear."""
         reach = 4.0 * (abs(parameter.typical) if parameter.typical else parameter.sd)
         lower, upper = parameter.lower, parameter.upper
         if parameter.strength and lower < 0.0:

@@ -72,32 +72,26 @@ class Search(SetCosts):
                 best[name] = cost, key
         return sorted(best.values())
 
-    def refine(self, sets: Sequence[tuple[Key, ...]], rounds: int) -> list[tuple[Key, ...]]:
+    def refine(self, start: Sequence[tuple[Key, ...]], rounds: int) -> list[tuple[Key, ...]]:
         """Minimise the cost of each set over its shapes by Gauss-Newton steps."""
-        current = [tuple(sorted(s)) for s in sets]
-        moving = [any(shape for _, shape in s) for s in current]
+        current = [tuple(sorted(keys)) for keys in start]
+        moving = [i for i, keys in enumerate(current) if any(shape for _, shape in keys)]
         for _ in range(rounds):
-            wanted = [
-                k for s, m in zip(current, moving, strict=True) if m for k in added_effects(s)
-            ]
+            wanted = [key for i in moving for key in added_effects(current[i])]
             self.ensure(k for key in wanted for k in _neighbours(key))
-            trials = [
-                self._propose_sets(s) if m else [] for s, m in zip(current, moving, strict=True)
-            ]
-            self.ensure(key for each in trials for one in each[:1] for key in added_effects(one))
-            for i, each in enumerate(trials):
-                before = self.cost(current[i]) if moving[i] else 0.0
-                moved = False
-                for one in each:
-                    self.ensure(added_effects(one))
-                    cost = self.cost(one)
+            proposed = {i: self._propose_sets(current[i]) for i in moving}
+            first = [sets[0] for sets in proposed.values() if sets]
+            self.ensure(key for keys in first for key in added_effects(keys))
+            moving = []
+            for i, sets in proposed.items():
+                before = self.cost(current[i])
+                for keys in sets:
+                    self.ensure(added_effects(keys))
+                    cost = self.cost(keys)
                     if cost < before - 0.02:
-                        current[i], moved = tuple(sorted(one)), True
-                        moving[i] = cost < before - 0.3
+                        current[i] = tuple(sorted(keys))
+                        moving += [i] if cost < before - 0.3 else []
                         break
-                moving[i] &= moved
-            if not any(moving):
-                break
         return current
 
     def _propose_sets(self, all_keys: tuple[Key, ...]) -> list[tuple[Key, ...]]:

@@ -51,7 +51,6 @@ class Selection:
         replicate_gains: largest gain of any candidate on each replicate of the final model, nats.
         largest_gain: the same on the measured trials, and the candidate.
         gains: log evidence of each single effect beside the given model, nats.
-        steps: the fits, in order.
         cut_short: whether the search ended at a limit on effects or rounds.
     """
 
@@ -61,7 +60,6 @@ class Selection:
     replicate_gains: tuple[float, ...]
     largest_gain: tuple[float, str]
     gains: dict[str, float]
-    steps: tuple[Fit, ...]
     cut_short: bool
 
     @property
@@ -139,7 +137,7 @@ def select_effects(
     """
     progress(0.0, "simulating replicates of the model")
     initial = current = session.fit(recipe, start)
-    steps = [current]
+    earlier = [current]
     fits: dict[frozenset[str], Fit | None] = {frozenset(recipe.effects): current}
     gains: dict[str, float] = {}
     known: Search | None = None
@@ -162,7 +160,7 @@ def select_effects(
                 tell = partial(progress, 0.15 + 0.1 * number)
                 moved, kept = _fit_better(session, search, current, better, fits, tell)
                 # Under the noise of its own replicates, an earlier set may seem better again.
-                last |= any(moved is one for one in steps)
+                last |= any(moved is one for one in earlier)
             if moved is None:
                 # The gain of a fitted set is that of its fit, not that of its linear problem.
                 pool = {
@@ -183,13 +181,13 @@ def select_effects(
                 if moved is None:
                     return Selection(
                         initial, current, probabilities, replicate_gains, search.largest_gain(),
-                        gains, tuple(steps), number >= _MOST_ROUNDS - 1 or room <= 0,
+                        gains, number >= _MOST_ROUNDS - 1 or room <= 0,
                     )  # fmt: skip
                 # After a second removal, nothing more is added.
                 last |= bool(left_out)
                 left_out |= {*current.recipe.effects} - {*moved.recipe.effects}
         current = moved
-        steps.append(current)
+        earlier.append(current)
     raise AssertionError("the last round returns")
 
 

@@ -231,9 +231,9 @@ class Session:
         c = self.criteria
         samples = lay_out_samples(evidence, c.block_s)
         if noise is None:
-            replays = self.replicate(evidence, evidence.p, count or c.replicates)
+            residuals = self.replicate(evidence, evidence.p, count or c.replicates)
             stopping = self.replicate_stopping(recipe, evidence)
-            noise = describe_noise(replays, stopping, evidence, samples)
+            noise = describe_noise(residuals, stopping, evidence, samples)
         force_sd = self.trials.sensors.force_sd
         return Likelihood.of(evidence, samples, noise, c.bias_error, c.discrepancy, force_sd)
 
@@ -404,7 +404,7 @@ class Fit:
 
     @property
     def creeping_floor(self) -> Array:
-        """Error of replicates that creep through reversals, as the device says, (n_q,), N.m or N."""
+        """Error of replicates that creep through reversals, by axis, (n_q,), N.m or N."""
         return np.array([rms(rows) for rows in self.likelihood.noise.residuals])
 
     @cached_property
@@ -423,7 +423,7 @@ class Fit:
     def held_out_rmse(self) -> Array:
         """Error on trials that parameters and input delay have not seen, (n_q,), N.m or N.
 
-        It follows from the linear problem; for a single group of trials, it is the error of the fit.
+        It follows from the linear problem. For one group of trials, it is the error of the fit.
         """
         return self.held_out_without()
 

@@ -237,7 +237,11 @@ class SetCosts:
             if absent:
                 free = p.hold(absent, n)[1]
                 normal = free.T @ normal @ free
-            inside = _schur(normal, nb - (n - len(normal)))[np.ix_(used, used)]
+            # The information on the strengths after the model's own parameters have adapted.
+            start = nb - (n - len(normal))
+            cross = normal[:start, start:]
+            inside = normal[start:, start:] - cross.T @ solve_scaled(normal[:start, :start], cross)
+            inside = inside[np.ix_(used, used)]
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
             member = np.repeat(np.arange(len(keys)), [h.stop - h.start for h in held])[used]
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)
@@ -553,9 +557,3 @@ def removed_effects(keys: Sequence[Key]) -> set[str]:
 def effect_names(keys: Sequence[Key]) -> tuple[str, ...]:
     """Return the names of the keys of a set in order."""
     return tuple(sorted(name for name, _ in keys))
-
-
-def _schur(normal: Array, nb: int) -> Array:
-    """Return the information on the strengths after the model's own parameters have adapted."""
-    cross = normal[:nb, nb:]
-    return np.asarray(normal[nb:, nb:] - cross.T @ solve_scaled(normal[:nb, :nb], cross))

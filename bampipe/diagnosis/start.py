@@ -1,8 +1,7 @@
-"""Where an identification starts: the shapes of effects, and the width of a smoothed sign.
+"""Starting values of an identification: shapes of effects, and the width of the smoothed sign.
 
-A device file says over which speeds friction yields; a machine of its kind may truly stop. Where a
-test bench gives the motion nothing is integrated along the sign, and any width will do: the one
-with which trials that were left out are likeliest.
+A machine may yield over the speeds that its device file declares, or stop completely. On a test
+bench, nothing is integrated along the sign, so that held-out trials can choose the width.
 """
 
 from dataclasses import dataclass, replace
@@ -20,23 +19,18 @@ from bampipe.trials.measured import MeasuredTrials
 _ANY_SIZE = 1e-9
 _REPLICATES = 6
 _STOPPING_FACTOR = 0.125
-"""Width, times the device's, of a machine that is nearer to a true stop than to its device file.
-Friction that rises as the speed falls, where the model lacks it, can make a third of the width
-likelier on a machine that does yield over all of it, but not an eighth."""
+"""Factor on the width that reveals a machine that stops. If the model lacks friction that rises as
+the speed falls, a third of the width may be likelier on a machine that yields, an eighth is not."""
 _NARROW_FACTORS = (1.0 / 3.0, _STOPPING_FACTOR, 1.0 / 32.0)
 LEAST_DROP = 0.03
-"""Least drop of the log error for a narrower width: `benchmarks/chosen_sign_width.py`."""
+"""Smallest drop of the log error for a narrower width: `benchmarks/chosen_sign_width.py`."""
 
 
 def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
-    """Starting values of every parameter of a model.
+    """Return starting values of the parameters of a model within their bounds, (n_p,).
 
-    The device's parameters start at their priors and are fitted; the shapes of the effects are
-    searched over their range as a diagnosis does, all of them together as far as each has a
-    strength beside the others: a descent from the prior would stay in the nearest valley.
-
-    Returns:
-        (n_p,), within the bounds.
+    The device's parameters are fitted from their priors. The shapes of effects are searched over
+    their ranges as in a diagnosis, since a descent from the prior would end in the nearest minimum.
     """
     session = Session(trials, Criteria(size=_ANY_SIZE, replicates=_REPLICATES))
     current, left = replace(recipe, effects=()), recipe.effects
@@ -56,17 +50,17 @@ def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
 
 
 def _fit(session: Session, recipe: Recipe, start: Array) -> Fit:
-    """A fit with the noise and the bias of its replays, without them where it runs away."""
+    """Fit a model with noise from replicates, or with equal noise if it cannot be simulated."""
     return session.try_fit(recipe, start) or session.fit_plainly(recipe, start)
 
 
 @dataclass(frozen=True)
 class SignWidth:
-    """The chosen width of the sign in Coulomb friction, and its held-out errors.
+    """The chosen width of the sign in Coulomb friction.
 
     Attributes:
-        factor: times the device's; 1 where nothing speaks for a narrower one.
-        declared, chosen: error on trials left out with either, by axis, (n_q,), N.m or N.
+        factor: its ratio to the declared width, at most 1.
+        declared, chosen: held-out errors with either width, (n_q,), N.m or N.
     """
 
     factor: float
@@ -75,7 +69,7 @@ class SignWidth:
 
 
 def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
-    """Choose the width for a model by least squares on trials left out.
+    """Choose the width for a model by the held-out error of least squares.
 
     Raises:
         ValueError: the trials are too short to be fitted.
@@ -101,7 +95,7 @@ def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
 
 
 def fit_width(trials: MeasuredTrials, recipe: Recipe, factor: float) -> Fit:
-    """Fit a model with its widths times ``factor``."""
+    """Fit a model with its sign widths multiplied by ``factor``."""
     narrowed = recipe.with_sign_widths(factor)
     session = Session(trials, Criteria())
     return session.fit_plainly(narrowed, search_start(trials, narrowed))

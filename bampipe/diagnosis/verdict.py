@@ -1,4 +1,4 @@
-"""The rule: what is said of each axis, from the probabilities, the sizes and the noise floor."""
+"""The verdict of each axis, from the probabilities of effects and the noise floor."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,12 +21,12 @@ from bampipe.results.floor import compare_with_floor
 
 @dataclass(frozen=True)
 class Conclusion:
-    """What a diagnosis says.
+    """The conclusion of a diagnosis.
 
     Attributes:
-        axes: by coordinate, in order, without their sentences.
+        axes: verdict of each coordinate, in order, without its sentence.
         selected: effects to add; ranking: candidates, best first.
-        sets: by their probability; chance: the null distribution.
+        sets: sets, most probable first; chance: null distribution of the largest gain.
     """
 
     axes: tuple[AxisVerdict, ...]
@@ -37,14 +37,14 @@ class Conclusion:
 
 
 def conclude(session: Session, selection: Selection) -> Conclusion:
-    """Say of each axis what is missing there, how probable that is, and what remains."""
+    """Conclude which effects each axis lacks, with their probabilities, and what remains."""
     c, probabilities = session.criteria, selection.probabilities
     initial, final = selection.initial, selection.final
     p_values = {
         e: compute_p_value(drop, selection.replicate_gains)
         for e, drop in probabilities.drops.items()
     }
-    # Of what chance gives as well, nothing is sure.
+    # An effect whose gain chance can give is not certain.
     probability = {
         e: min(share, cap_probability(p_values.get(e, 0.0)))
         for e, share in probabilities.effects.items()
@@ -87,7 +87,7 @@ def _judge(
     named = tuple(e for e in listed if e in selection.effects)
     sure = [e for e, p in listed.items() if p >= c.probability]
     open_question = [e for e, p in listed.items() if p < c.probability]
-    # At the floor, an unknown function follows what the bias is off, not the machine.
+    # At the floor, an unknown function follows errors of the bias, not the machine.
     asked = unknown if against_floor == "above_floor" else 0.0
     remains = asked >= c.probability
     verdict: Verdict
@@ -133,12 +133,10 @@ def rank_effects(
     p_values: Mapping[str, float],
     mentioned: float,
 ) -> list[RankedEffect]:
-    """Effects of the most probable set, then the others by what each gains alone.
+    """Rank the effects of the most probable set, then the others by what each gains alone.
 
-    Sets that are ``mentioned`` have at least that probability.
-
-    The error with another effect alone follows from the log evidence by the independent samples of
-    the axis.
+    The error with one of the others follows from its log evidence and the independent samples of
+    the axis. Sets of at least the probability ``mentioned`` give the indistinguishable effects.
     """
     initial, final = selection.initial, selection.final
     values = final.effect_parameters
@@ -178,7 +176,7 @@ def rank_effects(
 
 
 def _find_twins(selection: Selection, effect: str, mentioned: float) -> tuple[str, ...]:
-    """Effects that take the place of one in a set which is as good as undecided against it."""
+    """Return the effects that replace one in another set of at least a given probability."""
     best = {*selection.effects}
     found = []
     for one in selection.probabilities.sets:

@@ -1,4 +1,4 @@
-"""Functions of one coordinate that a draft may use, with the constants that shape them.
+"""Shapes of drafts: functions of one quantity with their constants.
 
 Arguments of functions are ratios, so that every strength is a force or torque.
 """
@@ -21,12 +21,12 @@ Constants = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Memory:
-    """An internal state that follows the coordinate, in the unit of that.
+    """An internal state that follows the quantity, in the same unit.
 
     Attributes:
-        rate, initial: as an effect file writes them.
-        along: its course by that of the coordinate along a trial (T,) and the constants, (T,).
-        drawn: the same for motion that is quicker than what it remembers, upwards.
+        rate, initial: its expressions in an effect file.
+        course: its values (T,), from those of the quantity (T,) and the constants.
+        quick_course: the same for a quantity that rises too quickly for the state to relax.
     """
 
     rate: str
@@ -37,16 +37,16 @@ class Memory:
 
 @dataclass(frozen=True)
 class Shape:
-    """A function of one coordinate ``x``, linear in its strengths; or of ``x``, ``x2``, ...
+    """A function of quantities ``x``, ``x2``, ... that is linear in its strengths.
 
     Attributes:
-        name, text: as in names and in expressions, where ``x`` stands for the coordinate.
-        strengths: what it is linear in, each with what it means.
-        searched: constants that shape it, each with its kind: ``place``, ``length``,
-            ``wavenumber``, ``time``, ``number``.
-        fixed: constants that scale it and are not estimated: ``middle``, ``reach`` of the span.
-        words: what it does, of ``{x}``.
-        states: what it remembers, by name.
+        name, text: its name and its expression.
+        strengths: strengths with their descriptions.
+        searched: shape constants with their kinds: ``place``, ``length``, ``wavenumber``, ``time``
+            or ``number``.
+        fixed: constants that are not estimated, such as ``middle`` and ``reach`` of the span.
+        words: predicate about ``{x}`` in a sentence.
+        states: internal states by name.
     """
 
     name: str
@@ -58,12 +58,12 @@ class Shape:
     states: Mapping[str, Memory] = field(default_factory=dict)
 
     def columns(self, x: Array, constants: Constants, is_quick: bool = False) -> Array:
-        """What each strength adds at one, (T, m).
+        """Return the function for each strength at one, (T, m).
 
         Args:
-            x: what it follows along a trial, (T, k).
-            constants: searched and fixed ones; with states, the ``interval`` of samples, s.
-            drawn: whether the motion is quicker than what it remembers.
+            x: quantities along a trial, (T, k).
+            constants: searched and fixed constants, and the ``interval`` of samples, s.
+            is_quick: whether the motion is too quick for the states to relax.
         """
         known = dict(constants) | {_x(k): column for k, column in enumerate(x.T)}
         for name, state in self.states.items():
@@ -85,7 +85,7 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = {
 
 
 def _evaluate(node: ast.AST, known: Constants) -> Any:
-    """The value of a checked expression."""
+    """Return the value of a checked expression."""
     match node:
         case ast.Constant(value=value):
             return float(value)  # type: ignore[arg-type]
@@ -101,19 +101,19 @@ def _evaluate(node: ast.AST, known: Constants) -> Any:
 
 
 def _x(k: int) -> str:
-    """Name of the quantity number ``k`` from 0: ``x``, ``x2``, ``x3``."""
+    """Return the name of the quantity with index ``k``: ``x``, ``x2``, ``x3``."""
     return f"x{k + 1}" if k else "x"
 
 
 def _lagged(x: Array, c: Constants, first: float) -> Array:
-    """x behind a first-order lag of ``c["lag"]``."""
+    """Apply a first-order lag of ``c["lag"]`` to ``x``."""
     keeps = np.exp(-c["interval"] / c["lag"])
     gain = 0.5 * (1.0 - keeps)
     return np.asarray(lfilter([gain, gain], [1.0, -keeps], x - first)) + first
 
 
 def _slip(name: str, play: str) -> dict[str, Memory]:
-    """The state that x drags along with a ``play``, within the time ``settling``."""
+    """Return the state that ``x`` drags along with a ``play``, within the time ``settling``."""
     rate = f"(x - {name} - clip(x - {name}, -{play}, {play}))/settling"
 
     def course(x: Array, c: Constants) -> Array:
@@ -131,7 +131,7 @@ _RELAXING = Memory(
 )  # fmt: skip
 _TRAILING = Memory("(x - trail)/lag", "0", lambda x, c: _lagged(x, c, 0.0), lambda x, c: x)
 KNOTS = 16
-"""Points of a curve in an effect file: an expression has no room for many more."""
+"""Points of a curve; an expression of an effect file has no room for many more."""
 _AT_END = "what it comes to at the end of the range"
 _PER_REACH = "what it grows by over half the range"
 _LINEAR, _SQUARE = "its linear part at the end of the range", "its quadratic part there"
