@@ -209,8 +209,8 @@ def follow(
     """Diagnose, add all missing effects at once, and confirm the result by another diagnosis.
 
     An effect whose strength is not significant is removed again, and effects that did not improve
-    the model are not considered again. Effects that the confirmation finds are added as well, unless
-    the verdict is ``unknown_effect``: a further effect would only imitate the unknown one.
+    the model are not considered again. Effects that the confirmation finds are added as well,
+    unless the verdict is ``unknown_effect``: a further effect would only imitate the unknown one.
 
     Args:
         tell: called with a line on each finding and each step.

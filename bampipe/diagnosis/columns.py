@@ -26,8 +26,7 @@ def compute_columns(evidence: Evidence, item: Candidate, searched: Array) -> Arr
     rows = (
         values[part]
         for base in e.along
-        for each in [_compute_added_residuals(item, probes, base)]
-        for values in [np.concatenate([r[:, axes] for r in each], axis=1)]
+        for values in [np.hstack([r[:, axes] for r in _compute_changes(item, probes, base)])]
         for part in base.motion.parts
     )
     values = np.concatenate(e.band.thin_trials(rows, axes * len(probes)))
@@ -59,12 +58,10 @@ def compute_added_residual(item: Candidate, p: Array, base: ModelOnTrial) -> Arr
 
     ``p`` are the parameters of the candidate's system; ``base`` is the model without the candidate.
     """
-    return _compute_added_residuals(item, [p], base)[0]
+    return _compute_changes(item, [p], base)[0]
 
 
-def _compute_added_residuals(
-    item: Candidate, probes: Sequence[Array], base: ModelOnTrial
-) -> list[Array]:
+def _compute_changes(item: Candidate, probes: Sequence[Array], base: ModelOnTrial) -> list[Array]:
     """Return `compute_added_residual` for each of ``probes``, which share their internal states."""
     system, moves = item.system, _moves(item)
     motion = base.motion if moves else base.mechanism

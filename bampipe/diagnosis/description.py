@@ -37,11 +37,8 @@ class _Sine:
 
 def describe(evidence: Evidence, axis: int) -> str:
     """Return the shape of an axis' residual, by the variable that explains most of it."""
-    known = [
-        v
-        for v in variables(evidence.fitted, evidence.band, axis)
-        if v.name not in ("trial", "direction")
-    ]
+    every = variables(evidence.fitted, evidence.band, axis)
+    known = [v for v in every if v.name not in ("trial", "direction")]
     maps = [residual_map(evidence, axis, v, 3 * BINS) for v in known]
     best = int(np.argmax([m.share for m in maps]))
     most, variable = maps[best], known[best]

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -126,10 +126,7 @@ class Dictionary:
                 return None
             if rows.any():
                 found[axis] = rows
-        if not found or not all(
-            any(f[:, k].any() for f in found.values())
-            for k in range(next(iter(found.values())).shape[1])
-        ):
+        if not found or not np.any([f.any(axis=0) for f in found.values()], axis=0).all():
             return None
         one_each = np.eye(len(item.linear_indices)) if item.linear_indices else np.zeros((1, 0))
         slopes = self._slopes(item, [make_parameters(e, item, values, b) for b in one_each])
@@ -142,10 +139,6 @@ class Dictionary:
         own = [parameters[q.name] for q in item.parameters]
         p = np.concatenate([self.evidence.p[:count], own])
         return self._gain(item, p, self._slopes(item, [p]))
-
-    def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
-        """Apply `make` to each key."""
-        return [(key, self.make(key)) for key in keys]
 
     def _slopes(self, item: Candidate, probes: Sequence[Array]) -> dict[int, Array]:
         """Return `Atom.slopes` at the m ``probes``, (n_p,) each, which share internal states."""

@@ -78,7 +78,6 @@ def weigh_sets(
         by_noise: costs of sets beside the most probable model; fit: that model.
         pool: sets near it, with costs by the noise.
         given: effects of the model diagnosed, which are not in question.
-        seed: seed of the bootstrap.
     """
     costs = by_noise.with_independent(fit.count_independent(criteria))
     # A fit may gain less than its linear problem promised.
@@ -201,11 +200,8 @@ def _find_evidence_losses(sets: Sequence[SetProbability]) -> dict[str, float]:
 
 
 def _sum_by_effect(sets: Sequence[SetProbability]) -> dict[str, float]:
-    found: dict[str, float] = {}
-    for one in sets:
-        for effect in one.effects:
-            found[effect] = found.get(effect, 0.0) + one.probability
-    return found
+    names = dict.fromkeys(e for one in sets for e in one.effects)
+    return {e: sum(one.probability for one in sets if e in one.effects) for e in names}
 
 
 def _beside_unknown(

@@ -201,11 +201,11 @@ class MachineScale:
         speed, load = float(self.speed[i]), float(self.load[i])
         if not travel > 0.0 or not load > 0.0:
             return found
-        lightness = 1.0 / max(float(self.inertia[i]), 1e-300)
+        inertia = float(self.inertia[i])
+        lightness = 1.0 / max(inertia, 1e-300)
         highest = 2.0 * np.pi * _RESONANCE * self.band_hz[i]
         per_force = force.replace(".", "/")
         length = _GAP if item.effect.ahead else _TRAVEL
-        inertia = float(self.inertia[i])
         return found | {
             unit: (length[0] * travel, length[1] * travel),
             "kg.m2" if unit == "rad" else "kg": (_DRIVE[0] * inertia, _DRIVE[1] * inertia),

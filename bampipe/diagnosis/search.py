@@ -161,11 +161,12 @@ class Search(SetCosts):
                     return None
                 step = other[1][j] - key[1][j]
                 for axis in {*here.columns, *there.columns}:
-                    x = (there.columns[axis] @ b if axis in there.columns else 0.0) - (
-                        here.columns[axis] @ b if axis in here.columns else 0.0
-                    )
                     block = found.setdefault(axis, np.zeros((len(self.problem.y[axis]), total)))
-                    block[:, place + j] = x / step
+                    after, before = (
+                        atom.columns[axis] @ b if axis in atom.columns else 0.0
+                        for atom in (there, here)
+                    )
+                    block[:, place + j] = (after - before) / step
             place += len(key[1])
         return found
 

@@ -92,17 +92,19 @@ def open_search(
         def make(keys: Sequence[Key]) -> Iterable[tuple[Key, Atom | None]]:
             parts = min(len(keys), TASKS_PER_PROCESS * session.jobs)
             if session.jobs <= 1 or parts < 2:
-                return dictionary.make_all(keys)
+                return make_columns(keys, dictionary)
             made = spread(make_columns, [keys[k::parts] for k in range(parts)])
             return [pair for part in made for pair in part]
 
         yield Search(fit.problem, dictionary, make, session.criteria, _reusable(known, dictionary))
 
 
-def make_columns(keys: Sequence[Key]) -> list[tuple[Key, Atom | None]]:
-    """Compute columns with the dictionary of this worker process."""
-    dictionary: Dictionary = worker_state()
-    return dictionary.make_all(keys)
+def make_columns(
+    keys: Sequence[Key], dictionary: Dictionary | None = None
+) -> list[tuple[Key, Atom | None]]:
+    """Compute columns with a dictionary, by default that of this worker process."""
+    dictionary = dictionary or worker_state()
+    return [(key, dictionary.make(key)) for key in keys]
 
 
 def _reusable(known: Search | None, dictionary: Dictionary) -> dict[Key, Atom | None]:
@@ -253,13 +255,12 @@ def _leave_out(
     """
     least = 1.0 - session.criteria.probability
     own = [e for e in fit.recipe.effects if e not in given]
-    out = {e for e in own if probabilities.if_all_known.get(e, 0.0) < least} or _find_misleading(
-        fit, probabilities, own
-    )
+    out = {e for e in own if probabilities.if_all_known.get(e, 0.0) < least}
+    out = out or _find_misleading(fit, probabilities, own)
     if not out:
         return None
     best = next(one.keys for one in probabilities.sets if one.unknown is None)
-    best = best if out & removed_effects(best) else ()
+    best = best if out.intersection(removed_effects(best)) else ()
     keys = tuple(sorted({*best, *((f"-{e}", ()) for e in out)}))
     less = change_set(fit.recipe, keys)
     if np.isfinite(search.cost(keys)):

@@ -154,8 +154,7 @@ class Session:
         t = self._trial_subsets[judged]
         return gather_evidence(
             system_of(recipe), t.motions, t.band, p, t.folds,
-            most_iterations=0, timing=t.timing,
-            like=like,
+            most_iterations=0, timing=t.timing, like=like,
         )  # fmt: skip
 
     @cached_property
@@ -221,7 +220,6 @@ class Session:
         """Return the likelihood of the trials of ``evidence``, with noise from replicates.
 
         Args:
-            recipe: the model; evidence: its linearisation.
             noise: noise from replicates of another model, to use instead.
             count: number of replicates, at least two; by default that of the criteria.
 

@@ -73,14 +73,9 @@ class SetCosts:
         criteria: Criteria,
         known: Mapping[Key, Atom | None],
     ) -> None:
-        self.problem, self.dictionary, self.make, self.criteria = (
-            problem,
-            dictionary,
-            make,
-            criteria,
-        )
+        self.problem = p = problem
+        self.dictionary, self.make, self.criteria = dictionary, make, criteria
         self.log_prior = log_prior(criteria, len(dictionary.candidates))
-        p = problem
         self.n_q = len(p.y)
         self.bb, self.by, self.yy = p.sums()
         self.atoms: dict[Key, Atom | None] = dict(known)
@@ -114,9 +109,8 @@ class SetCosts:
         m = int(sum(widths))
         p = self.problem
         self.columns, self.at = [], []
-        self.own = np.zeros(
-            (self.n_q, len(places), int(max(widths, default=1)), int(max(widths, default=1)))
-        )
+        widest = int(max(widths, default=1))
+        self.own = np.zeros((self.n_q, len(places), widest, widest))
         self.xb, self.xy = [], []
         for axis in range(self.n_q):
             blocks, at = [], []
@@ -191,19 +185,14 @@ class SetCosts:
 
     def _solve(self, all_keys: tuple[Key, ...]) -> Solution:
         p, nb = self.problem, self.bb.shape[1]
-        absent = {
-            place: change
-            for name, _ in all_keys
-            if name[0] == "-"
-            for place, change in p.absence[name[1:]].items()
-        }
+        removed = removed_effects(all_keys)
+        absent = {k: change for name in removed for k, change in p.absence[name].items()}
         keys = added_effects(all_keys)
         if any(self.atoms.get(key) is None for key in keys):
             return Solution(np.inf)
         xx, xy, places = self._sums(keys)
-        bounds = np.array([x for key in keys for x in self.dictionary.bounds(key[0])]).reshape(
-            -1, 2
-        )
+        limits = [pair for key in keys for pair in self.dictionary.bounds(key[0])]
+        bounds = np.array(limits).reshape(-1, 2)
         spread = np.array([s for key in keys for s in self.dictionary.spreads(key[0])])
         # A strength that changes nothing over its whole prior is zero.
         bounds[np.einsum("a,akk->k", self._weight, xx[:, nb:, nb:]) * spread**2 < NOTHING**2] = 0.0
@@ -498,14 +487,10 @@ class SetCosts:
             masked = block * (active[:, :, None] & active[:, None, :])
             diagonal = np.einsum("kww->kw", masked)
             scale = np.where(active, 1.0 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
-            system = (
-                masked * scale[:, :, None] * scale[:, None, :]
-                + np.eye(widest) * np.where(active, 1e-9, 1.0)[:, :, None]
-            )
-            x = (
-                np.linalg.solve(system, (np.where(active, mom, 0.0) * scale)[:, :, None])[:, :, 0]
-                * scale
-            )
+            ridge = np.eye(widest) * np.where(active, 1e-9, 1.0)[:, :, None]
+            system = masked * scale[:, :, None] * scale[:, None, :] + ridge
+            right = (np.where(active, mom, 0.0) * scale)[:, :, None]
+            x = np.linalg.solve(system, right)[:, :, 0] * scale
             out = active & (
                 (x < np.minimum(low, 0.0) - 1e-12)
                 | (x > np.maximum(high, 0.0) + 1e-12)
@@ -549,9 +534,9 @@ def added_effects(keys: Sequence[Key]) -> tuple[Key, ...]:
     return tuple(key for key in keys if key[0][0] != "-")
 
 
-def removed_effects(keys: Sequence[Key]) -> set[str]:
+def removed_effects(keys: Sequence[Key]) -> tuple[str, ...]:
     """Return the effects of the model that a set removes."""
-    return {name[1:] for name, _ in keys if name[0] == "-"}
+    return tuple(name[1:] for name, _ in keys if name[0] == "-")
 
 
 def effect_names(keys: Sequence[Key]) -> tuple[str, ...]:

@@ -37,9 +37,8 @@ def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
     fit = _fit(session, current, session.fit_plainly(current, system_of(current).prior).evidence.p)
     while left:
         with open_search(session, fit, only=left) as search:
-            sets = [
-                s for beam in search.grow_sets(len(left)) for s in beam if not removed_effects(s[1])
-            ]
+            every = (s for beam in search.grow_sets(len(left)) for s in beam)
+            sets = [s for s in every if not removed_effects(s[1])]
             keys = min(sets, key=lambda s: (-len(s[1]), s[0]))[1] if sets else ()
             found = effect_names(keys) or left[:1]
             current = replace(current, effects=(*current.effects, *found))
@@ -87,9 +86,7 @@ def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
 
     if not drop(_STOPPING_FACTOR) > LEAST_DROP:
         return SignWidth(1.0, declared, declared)
-    for factor in _NARROW_FACTORS:
-        if factor not in fits:
-            fits[factor] = fit_width(trials, recipe, factor)
+    fits |= {f: fit_width(trials, recipe, f) for f in _NARROW_FACTORS if f not in fits}
     best = max(_NARROW_FACTORS, key=drop)
     return SignWidth(best, declared, fits[best].held_out_rmse)
 

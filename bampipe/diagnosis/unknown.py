@@ -1,8 +1,7 @@
 """An unknown function as a candidate for what no effect of the library explains.
 
-It is a sum of linear splines, each of one quantity (position, speed, load, time since the last
-reversal, or position of another axis), even or odd in the direction of motion, with a normal prior.
-Splines are added while the evidence, integrated over their coefficients, grows.
+It is a sum of linear splines, see docs/method_selection.md. Splines are added while the evidence,
+integrated over their coefficients, grows.
 """
 
 from dataclasses import dataclass

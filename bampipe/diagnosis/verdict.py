@@ -52,12 +52,11 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
     where = {e: acting_axes(initial.recipe, e) for e in probability}
     selected = tuple(e for e in selection.effects if probability.get(e, 0.0) >= 1.0 - c.probability)
     axes = []
-    for axis, name in enumerate(final.evidence.system.coordinates):
-        here = {e: p for e, p in probability.items() if axis in where[e]}
-        listed = {e: p for e, p in here.items() if p >= 1.0 - c.probability}
-        listed = dict(sorted(listed.items(), key=lambda pair: -pair[1]))
-        unknown = min(float(probabilities.unknown[axis]), 1.0)
-        axes.append(_judge(session, selection, axis, name, listed, unknown))
+    for axis in range(len(final.evidence.system.coordinates)):
+        likely = [(e, p) for e, p in probability.items() if p >= 1.0 - c.probability]
+        here = [pair for pair in likely if axis in where[pair[0]]]
+        listed = dict(sorted(here, key=lambda pair: -pair[1]))
+        axes.append(_judge(session, selection, axis, listed))
     ranking = rank_effects(selection, probability, p_values, 1.0 - c.probability)
     return Conclusion(
         tuple(axes), selected, tuple(ranking), _list_sets(selection),
@@ -72,13 +71,9 @@ def conclude(session: Session, selection: Selection) -> Conclusion:
 
 
 def _judge(
-    session: Session,
-    selection: Selection,
-    axis: int,
-    name: str,
-    listed: Mapping[str, float],
-    unknown: float,
+    session: Session, selection: Selection, axis: int, listed: Mapping[str, float]
 ) -> AxisVerdict:
+    """Judge one axis, with the probabilities of the effects ``listed`` there."""
     c, final, initial = session.criteria, selection.final, selection.initial
     floor = final.noise_floor
     before, after = float(initial.held_out_rmse[axis]), float(final.held_out_rmse[axis])
@@ -87,6 +82,7 @@ def _judge(
     named = tuple(e for e in listed if e in selection.effects)
     sure = [e for e, p in listed.items() if p >= c.probability]
     open_question = [e for e, p in listed.items() if p < c.probability]
+    unknown = min(float(selection.probabilities.unknown[axis]), 1.0)
     # At the floor, an unknown function follows errors of the bias, not the machine.
     asked = unknown if against_floor == "above_floor" else 0.0
     remains = asked >= c.probability
@@ -187,14 +183,12 @@ def _find_twins(selection: Selection, effect: str, mentioned: float) -> tuple[st
 
 
 def _list_sets(selection: Selection) -> tuple[WeighedSet, ...]:
-    sets = selection.probabilities.sets
+    sets, axes = selection.probabilities.sets, selection.final.evidence.system.coordinates
     listed = [s for s in sets if s.probability >= 0.001] or sets[:1]
     return tuple(
         WeighedSet(
             effects=one.effects,
-            unknown=None
-            if one.unknown is None
-            else selection.final.evidence.system.coordinates[one.unknown],
+            unknown=None if one.unknown is None else axes[one.unknown],
             probability=min(one.probability, 1.0),
             log_evidence=one.log_evidence,
         )

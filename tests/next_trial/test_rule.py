@@ -1,6 +1,7 @@
 """Next and its table judge as the diagnosis does: by its search, its record and its criteria."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from bampipe.diagnosis.dictionary import Dictionary, Key
 from bampipe.diagnosis.probability import compute_p_value, find_required_gain
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import Search
+from bampipe.diagnosis.select import make_columns
 from bampipe.diagnosis.session import Fit, Session, candidates_of, system_of
 from bampipe.diagnosis.set_cost import log_prior
 from bampipe.next_trial.sensitivity import find_detectability
@@ -41,7 +43,9 @@ def search_beside(fit: Fit, residual, known: Search | None = None) -> Search:
     y = tuple(r * root for r, root in zip(residual, fit.likelihood.root, strict=True))
     problem = replace(fit.likelihood.pose_problem(fit.evidence), y=y)
     atoms = known.atoms if known is not None else {}
-    return Search(problem, dictionary, dictionary.make_all, CRITERIA, atoms)
+    return Search(
+        problem, dictionary, partial(make_columns, dictionary=dictionary), CRITERIA, atoms
+    )
 
 
 def key_of(dictionary: Dictionary, name: str, values) -> Key:

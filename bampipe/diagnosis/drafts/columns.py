@@ -161,10 +161,6 @@ class FormDictionary:
         }
         return Atom(found, by_force, np.ones(len(self.samples)))
 
-    def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
-        """Apply `make` to each key."""
-        return [(key, self.make(key)) for key in keys]
-
     def thin(self, words: str) -> Array:
         """Return a quantity, low-passed like the residual and at its samples, (n,)."""
         cutoff = float(self.evidence.band.cutoff_hz[self.axis])
@@ -286,26 +282,21 @@ class FormDictionary:
     def _points(self, form: Form) -> list[dict[str, float]]:
         """Return the grid of the searched constants of a form."""
         span, names = form.span, tuple(form.shape.searched)
-        lengths = span.width * np.geomspace(*_LENGTHS)
-        points: Iterable[Sequence[float]] = [()]
-        if names == ("place", "width"):
-            points = [(at, width) for width in lengths for at in _places(span, width)]
-        elif names == ("place",):
-            points = product(_places(span, _PLACES_APART * span.width))
-        elif names == ("width",):
-            points = product(lengths)
-        elif names == ("width", "longer"):
-            points = combinations(lengths, 2)
-        elif names == ("lag",):
-            points = product(np.geomspace(4.0 * self.times.low, self.times.high, _LAGS))
-        elif names == ("wavenumber",):
-            most = _MOST_WAVES
-            if form.coordinate.quantity == "time":
-                cutoff = float(self.evidence.band.cutoff_hz[self.axis])
-                most = min(span.width * cutoff, _MOST_WAVES_IN_TIME)
-            waves = [*_PARTS_OF_A_WAVE, *np.arange(1.0, max(most, 2.0), _WAVES_APART)]
-            points = product(2.0 * np.pi * np.array(waves) / span.width)
-        return [dict(zip(names, map(float, point), strict=True)) for point in points]
+        lengths, most = span.width * np.geomspace(*_LENGTHS), _MOST_WAVES
+        if form.coordinate.quantity == "time":
+            cutoff = float(self.evidence.band.cutoff_hz[self.axis])
+            most = min(span.width * cutoff, _MOST_WAVES_IN_TIME)
+        waves = [*_PARTS_OF_A_WAVE, *np.arange(1.0, max(most, 2.0), _WAVES_APART)]
+        grids: dict[tuple[str, ...], Iterable[Sequence[float]]] = {
+            (): [()],
+            ("place",): product(_places(span, _PLACES_APART * span.width)),
+            ("place", "width"): [(at, w) for w in lengths for at in _places(span, w)],
+            ("width",): product(lengths),
+            ("width", "longer"): combinations(lengths, 2),
+            ("lag",): product(np.geomspace(4.0 * self.times.low, self.times.high, _LAGS)),
+            ("wavenumber",): product(2.0 * np.pi * np.array(waves) / span.width),
+        }
+        return [dict(zip(names, map(float, point), strict=True)) for point in grids[names]]
 
 
 def _places(span: Span, length: float) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -124,7 +125,8 @@ class FormSearch(Search):
         with workers(forms, session.jobs) as spread:
             made = spread(make_columns, [keys[k::parts] for k in range(parts)])
             atoms = {key: atom for part in made for key, atom in part}
-        super().__init__(fit.problem, known, forms.make_all, session.criteria, atoms)
+        make = partial(make_columns, dictionary=known)
+        super().__init__(fit.problem, known, make, session.criteria, atoms)
 
     def best_forms(self, count: int, jobs: int) -> list[Key]:
         """Return the forms that gain most, with refined shapes, best first."""

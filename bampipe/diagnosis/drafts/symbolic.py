@@ -155,7 +155,5 @@ def write_form(
     )  # fmt: skip
     (first, span), *beside = ((q, forms.spans[q.words]) for q in chosen)
     axis = forms.evidence.system.model.device.coordinates[forms.axis]
-    form = Form(
-        axis, forms.axis, FORCE, shape, first, span, forms.times, 1.0, tuple(beside)
-    )  # fmt: skip
+    form = Form(axis, forms.axis, FORCE, shape, first, span, forms.times, 1.0, tuple(beside))
     return form, {str(name): float(n) for n, name in names.items()}
