@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from independent_runs import record_trials
+from sessions import fit_from_priors
 
 from bampipe.diagnosis.candidates import build_candidate_model, compile_candidate, list_candidates
 from bampipe.diagnosis.columns import compute_added_residual
@@ -106,7 +107,7 @@ def test_the_right_effect_explains_most_and_has_the_true_size(
 ):
     trials, recipe, truth = record_trials(tmp_path, machine, seed, effect)
     session = Session(trials, Criteria())
-    fit = session.fit_plainly(recipe, system_of(recipe).prior)
+    fit = fit_from_priors(session, recipe)
     wider = replace(recipe, effects=(effect,))
     with open_search(session, fit, only=(effect, *rivals)) as search:
         best = search.refine([(key,) for _, key in search.rank_additions((), 4)], 8)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from sessions import TRUTH, bam, made
+from sessions import TRUTH, bam, fit_from_priors, made
 
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.search import Search
@@ -35,8 +35,7 @@ def session() -> Session:
 @pytest.fixture(scope="module")
 def bare(session: Session):
     """The bare device, fitted."""
-    recipe = bam()
-    return session.fit(recipe, session.fit_plainly(recipe, system_of(recipe).prior).evidence.p)
+    return session.fit(bam(), fit_from_priors(session, bam()).evidence.p)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +120,7 @@ def test_the_fit_starts_where_the_linear_problem_ends_and_is_the_truth(session, 
 
 def test_an_effect_of_the_model_that_is_not_there_is_taken_away(session):
     recipe = bam(("quadratic_drag:yaw",))
-    start = session.fit_plainly(recipe, system_of(recipe).prior).evidence.p
+    start = fit_from_priors(session, recipe).evidence.p
     without = [n for n in session.candidate_names(recipe) if n not in (*EFFECTS, *OTHERS)]
     found = select_effects(session, recipe, start, without)
     assert {*found.final.recipe.effects} == {*EFFECTS}

@@ -78,10 +78,10 @@ def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_
         shares = []
         for share in (0.5, 1.3):
             is_found = []
-            for replay in range(CRITERIA.replicates):
+            for replicate in range(CRITERIA.replicates):
                 residual = [
                     bias
-                    + np.sqrt(scale[axis]) * (noise.residuals[axis][replay] - bias)
+                    + np.sqrt(scale[axis]) * (noise.residuals[axis][replicate] - bias)
                     - share * (atom.columns[axis] @ strength if axis in atom.columns else 0.0)
                     for axis, bias in enumerate(noise.bias)
                 ]
@@ -100,7 +100,7 @@ def test_what_is_needed_is_what_the_rule_of_the_diagnosis_takes(count):
         surely = cap_probability(compute_p_value(gain, by_chance)) >= CRITERIA.probability
         assert (surely and gain > np.log(9.0)) == is_missing
     assert find_required_gain(CRITERIA) == pytest.approx(np.log(9.0))
-    # No dozen of replays makes anything that sure.
+    # No dozen of replicates makes anything that sure.
     assert find_required_gain(Criteria(probability=0.9999), by_chance) == np.inf
 
 
