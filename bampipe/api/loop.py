@@ -149,7 +149,9 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
     child = models.child_name(parent, tuple(named))
     for name in named:
         if "/" in name or not is_normal(child):
-            raise InputError(f"{name!r} is no name of an effect", remedy="see `bampipe effects`")
+            raise InputError(
+                f"{name!r} is not the name of an effect", remedy="see `bampipe effects`"
+            )
     try:
         with options.lock():
             models.ensure_base(root, *options.pipeline.base_model)
@@ -184,7 +186,7 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
     before = models.read(root, parent)
     for effect in named:
         if effect in before.effects:
-            raise InputError(f"model {parent!r} has {effect} already", where=str(root))
+            raise InputError(f"model {parent!r} already has {effect}", where=str(root))
     child = models.child_name(parent, tuple(named))
     effect_files = {
         path.name: path for path in (root / "models" / parent / "effects").glob("*.toml")
@@ -294,6 +296,6 @@ def _add(
         return child
     why = "the held-out error does not fall"
     if ladder[child].has_lost_its_floor(ladder[model]):
-        why = "there is no noise floor, or the error is far below it and cannot be judged"
+        why = "there is no noise floor, or the error is implausibly far below it"
     tell(f"{', '.join(effects)}: {why}, stopped at {model}")
     return ""

@@ -112,13 +112,13 @@ def compare_runs(
     differ = roots[0].name != roots[1].name
     a, b = (_Side.read(root, root.name if differ else str(root), model) for root in roots)
     notes = _require_one_device(a, b)
-    progress(0.1, f"the model of {a.name} on {b.name}, and the reverse")
+    progress(0.1, f"predicting {b.name} with the model of {a.name}, and the reverse")
     there, back = a.predict(b), b.predict(a)
     journeys = []
     for one, other, evidence in ((a, b, there), (b, a, back)):
-        progress(0.3, f"effects that the model of {one.name} lacks on {other.name}")
+        progress(0.3, f"looking for effects that the model of {one.name} lacks on {other.name}")
         journeys.append(_describe_journey(one, other, evidence))
-    progress(0.9, "residual by state")
+    progress(0.9, "comparing the residuals by state")
     parameters, alone = _compare_parameters(a, b)
     notes += [f"Only {name} has {join_names(some)}." for name, some in alone.items() if some]
     pair = PairResult(
@@ -136,7 +136,7 @@ def compare_runs(
 def _require_one_device(a: _Side, b: _Side) -> list[str]:
     """Refuse sessions that cannot be compared; return notes on the others."""
     if a.run.root.resolve() == b.run.root.resolve():
-        raise InputError("this is one run twice", where=str(a.run.root))
+        raise InputError("both runs are the same", where=str(a.run.root))
     facts = [_list_facts(side.system) for side in (a, b)]
     for what, here in facts[0].items():
         there = facts[1][what]

@@ -17,8 +17,8 @@ mentioned if the residual is scattered."""
 _RIPPLE = 0.5
 """Smallest part of that share that a sine must explain to be called a ripple."""
 _ALIKE = 0.6
-"""Correlation between both directions of motion above which a residual is called the same, as of a
-spring, or below minus which it is called opposite, as of friction."""
+"""Correlation of the residuals in both directions of motion above which they are called the same,
+or opposite if it is negative."""
 _BUMP_HEIGHT, _BUMP_WIDTH = 0.5, 1.0 / 3.0
 """Share of the largest mean residual above which a bin belongs to a bump, and largest share of the
 range that a bump covers; a wider one is a broad change."""
@@ -48,26 +48,26 @@ def describe(evidence: Evidence, axis: int) -> str:
         if vibration is not None and vibration.share > max(most.share, _VARIABLE):
             return (
                 f"a vibration of {significant(vibration.amplitude, 2)} {unit} at "
-                f"{vibration.frequency:.3g} Hz in time, whatever the machine does; it carries "
+                f"{vibration.frequency:.3g} Hz in time, independent of the motion; it explains "
                 f"{100 * vibration.share:.0f} % of the residual's variance"
             )
     if most.share < _VARIABLE:
         return (
-            "scattered over all motions; of all that the machine does, "
-            f"{most.variable} explains most of it, {100 * most.share:.0f} %"
+            f"scattered over all motions; of all variables, {most.variable} explains most, "
+            f"{100 * most.share:.0f} %"
             if most.share >= _MENTIONED
-            else "scattered over all motions; it follows nothing that the machine does"
+            else "scattered over all motions and independent of all variables of the motion"
         )
-    carries = f"{most.variable} carries {100 * most.share:.0f} % of the residual's variance"
+    explains = f"{most.variable} explains {100 * most.share:.0f} % of the residual's variance"
     turning = _by_direction(evidence, axis, variable)
     ripple = _ripple(evidence, axis, variable)
     if ripple is not None and ripple.share > _RIPPLE * most.share:
         period = 1.0 / ripple.frequency
         return (
             f"a ripple of {significant(ripple.amplitude, 2)} {unit} along {most.variable} that "
-            f"repeats every {period:.3g} {most.unit}, {turning}; {carries}"
+            f"repeats every {period:.3g} {most.unit}, {turning}; {explains}"
         )
-    return f"{_bumps(most, unit)}, {turning}; {carries}"
+    return f"{_bumps(most, unit)}, {turning}; {explains}"
 
 
 def _bumps(most: Map, torque_unit: str) -> str:
@@ -163,7 +163,7 @@ def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
     varied = np.ptp(np.array(means), axis=0).all()
     likeness = float(np.corrcoef(np.array(means).T)[0, 1]) if varied else 0.0
     if likeness > _ALIKE:
-        return "the same in both directions of motion, as of a spring"
+        return "the same in both directions of motion, like a spring"
     if likeness < -_ALIKE:
-        return "opposite in the two directions of motion, as of friction"
+        return "opposite in the two directions of motion, like friction"
     return "different in the two directions of motion"

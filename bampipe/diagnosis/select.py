@@ -175,11 +175,8 @@ def select_effects(
                 probabilities = weigh_sets(
                     search, current, pool, recipe.effects, session.criteria, session.seed
                 )
-                moved = (
-                    None
-                    if number == _MOST_ROUNDS
-                    else _leave_out(session, search, current, probabilities, recipe.effects)
-                )
+                if number < _MOST_ROUNDS:
+                    moved = _leave_out(session, search, current, probabilities, recipe.effects)
                 if moved is None:
                     return Selection(
                         initial, current, probabilities, replicate_gains, search.largest_gain(),

@@ -282,10 +282,9 @@ class Session:
             for share in _STEP_LENGTHS:
                 p = evidence.p.copy()
                 p[list(evidence.free)] += share * step[:count]
+                p = np.clip(p, *bounds_of(evidence.system))
                 try:
-                    moved = self.linearise(
-                        recipe, np.clip(p, *bounds_of(evidence.system)), evidence
-                    )
+                    moved = self.linearise(recipe, p, evidence)
                 except NotFinite:
                     continue
                 tried = likelihood.pose_problem(moved)

@@ -68,7 +68,7 @@ _ACTS_AND_SHOWS = {
     FRICTION: ("Friction on the axis", "opposite in the two directions of motion"),
     DAMPING: ("Damping on the axis", "in proportion to velocity"),
     INERTIA: ("Inertia on the axis", "in proportion to acceleration"),
-    READING: ("An error of the sensor", "as an error of what the force is read to be"),
+    READING: ("An error of the sensor", "as an error of the measured force"),
 }
 
 
@@ -363,11 +363,11 @@ def _number_of(name: str) -> int:
 
 
 KINDS_IN_WORDS = {
-    "place": "where it is",
-    "length": "how far it reaches",
-    "time": "time in which it follows",
-    "number": "number of the formula",
-    "wavenumber": "2 pi over the distance between two ripples",
+    "place": "position",
+    "length": "width",
+    "time": "time constant",
+    "number": "pure number of the formula",
+    "wavenumber": "2 pi over the distance of two ripples",
 }
 
 

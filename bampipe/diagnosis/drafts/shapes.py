@@ -132,9 +132,9 @@ _RELAXING = Memory(
 _TRAILING = Memory("(x - trail)/lag", "0", lambda x, c: _lagged(x, c, 0.0), lambda x, c: x)
 KNOTS = 16
 """Points of a curve; an expression of an effect file has no room for many more."""
-_AT_END = "what it comes to at the end of the range"
-_PER_REACH = "what it grows by over half the range"
-_LINEAR, _SQUARE = "its linear part at the end of the range", "its quadratic part there"
+_AT_END = "value at the end of the range"
+_PER_REACH = "increase over half the range"
+_LINEAR, _SQUARE = "linear part at the end of the range", "quadratic part there"
 _U = "((x - middle)/reach)"
 _V = "((x - place)/width)"
 _PLACED = {"place": "place", "width": "length"}
@@ -151,19 +151,19 @@ SHAPES = {
         ),
         Shape(
             "cubic", f"slope*{_U} + bow*{_U}**2 + twist*{_U}**3",
-            {"slope": _LINEAR, "bow": _SQUARE, "twist": "its cubic part there"}, {},
+            {"slope": _LINEAR, "bow": _SQUARE, "twist": "cubic part there"}, {},
             ("middle", "reach"), "follows a cubic curve in {x}",
         ),
         Shape(
-            "bump", f"height*exp(-{_V}**2)", {"height": "at its top"}, _PLACED, (),
+            "bump", f"height*exp(-{_V}**2)", {"height": "peak value"}, _PLACED, (),
             "has a bump at one {x}",
         ),
         Shape(
-            "snag", f"height*{_V}*exp((1 - {_V}**2)/2)", {"height": "at either bump"}, _PLACED, (),
+            "snag", f"height*{_V}*exp((1 - {_V}**2)/2)", {"height": "peak value"}, _PLACED, (),
             "has opposite bumps on the two sides of one {x}",
         ),
         Shape(
-            "step", f"height*tanh{_V}", {"height": "half of the step"}, _PLACED, (),
+            "step", f"height*tanh{_V}", {"height": "half the height of the step"}, _PLACED, (),
             "changes from one level to another at one {x}",
         ),
         Shape(
@@ -177,20 +177,20 @@ SHAPES = {
         Shape(
             "dead_zone", "height*(x - clip(x, place - width, place + width))/reach",
             {"height": _PER_REACH}, _PLACED, ("reach",),
-            "is nothing within a range of {x} and grows in proportion beyond either end of it",
+            "is zero within a range of {x} and grows in proportion beyond its ends",
         ),
         Shape(
             "ripple", "sine*sin(wavenumber*x) + cosine*cos(wavenumber*x)",
-            {"sine": "in phase with the sine", "cosine": "in phase with the cosine"},
+            {"sine": "amplitude of the sine", "cosine": "amplitude of the cosine"},
             {"wavenumber": "wavenumber"}, (), "ripples with {x}",
         ),
         Shape(
-            "decay", "height*exp(-x/width)", {"height": "at zero"}, {"width": "length"}, (),
+            "decay", "height*exp(-x/width)", {"height": "value at zero"}, {"width": "length"}, (),
             "fades as {x} grows",
         ),
         Shape(
             "relaxing", "height*(x - rest)/reach",
-            {"height": "what a quick motion over half the range builds up"}, {"lag": "time"},
+            {"height": "increase by a quick motion over half the range"}, {"lag": "time"},
             ("reach",), "builds up with {x} and relaxes with time", {"rest": _RELAXING},
         ),
         Shape(
@@ -200,30 +200,30 @@ SHAPES = {
         Shape(
             "play", "height*(trail - middle)/reach", {"height": _AT_END}, {"width": "length"},
             ("middle", "reach", "settling"),
-            "follows {x} with play, up to its width behind it", _slip("trail", "width"),
+            "follows {x} with play, at most a width behind it", _slip("trail", "width"),
         ),
         Shape(
-            "hysteresis", "height*clip((x - trail)/width, -1, 1)", {"height": "what it comes to"},
+            "hysteresis", "height*clip((x - trail)/width, -1, 1)", {"height": "largest value"},
             {"width": "length"}, ("settling",),
-            "builds up as {x} turns round and stays once that has changed by twice its width",
+            "builds up after a reversal of {x} until that has changed by twice a width",
             _slip("trail", "width"),
         ),
         Shape(
             "two_hystereses",
             "short*clip((x - near)/width, -1, 1) + long*clip((x - far)/longer, -1, 1)",
-            {"short": "what the part of the shorter width comes to",
-             "long": "what the other part comes to"},
+            {"short": "largest value of the part of shorter width",
+             "long": "largest value of the other part"},
             {"width": "length", "longer": "length"}, ("settling",),
-            "builds up in two parts as {x} turns round, each of which stays once that has changed "
-            "by twice its width",
+            "builds up in two parts after a reversal of {x}, each until that has changed by twice "
+            "its width",
             _slip("near", "width") | _slip("far", "longer"),
         ),
         Shape(
             "curve",
             " + ".join(f"h{k}*max(1 - abs((x - start)/spacing - {k}), 0)" for k in range(KNOTS)),
-            {f"h{k}": f"at point {k + 1} of {KNOTS}" for k in range(KNOTS)}, {},
+            {f"h{k}": f"value at point {k + 1} of {KNOTS}" for k in range(KNOTS)}, {},
             ("start", "spacing"),
-            f"is a curve through {KNOTS} points along {{x}}; it is no formula",
+            f"is a curve through {KNOTS} points along {{x}}, not a formula",
         ),
     )
 }  # fmt: skip

@@ -148,7 +148,7 @@ def write_form(
         text = re.sub(r"\bX(\d+)\b", ratio, str(p.xreplace(names)).replace("Abs(", "abs("))
         part = f"({text})" if p.is_Add else text
         texts.append(f"h{k + 1}" if p == 1 else f"h{k + 1}*{part}")
-    strengths = {f"h{k + 1}": f"of part {k + 1} of the formula" for k in range(len(products))}
+    strengths = {f"h{k + 1}": f"factor of part {k + 1}" for k in range(len(products))}
     shape = Shape(
         "formula", " + ".join(texts), strengths, {str(c): "number" for c in names.values()},
         tuple(fixed), "follows a formula in {x}",
