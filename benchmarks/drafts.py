@@ -295,7 +295,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--nothing", type=int, default=0, help="sessions with nothing hidden")
     parser.add_argument("--forced", type=int, default=0, help="the same, whatever a diagnosis says")
     parser.add_argument("--first-seed", type=int, default=4000)
-    parser.add_argument("--replicates", type=int, default=4, help="replays of the diagnosis")
+    parser.add_argument("--replicates", type=int, default=4, help="replicates of the diagnosis")
     parser.add_argument("--out", type=Path, help="write the outcomes as JSON, session by session")
     options = parser.parse_args(arguments)
     machines = ("bam", "joint", "axis")

@@ -26,7 +26,7 @@ class Scores:
         effects_found: probability of each effect of any probable set.
         sets: effects, axis of something unknown, log evidence (nats) and probability of each.
         drops: log evidence lost without each effect that is selected, nats, with p-values.
-        chance: largest gain of any candidate on each replay of the final model, nats.
+        chance: largest gain of any candidate on each replicate of the final model, nats.
         beside: the same on the measured trials.
         unknown: probability of something unknown, by axis.
         over_floor: held-out error over the noise floor, by axis.

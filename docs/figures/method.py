@@ -143,7 +143,7 @@ def draw_selection(found: Selection, search: Search) -> None:
         best.append(search.cost(()) - beam[0][0])
     right.plot(sizes, best, "o-", color="C0", ms=3, label="best set of so many effects")
     level = best[len(found.effects)]
-    low, high = level + min(found.chance), level + max(found.chance)
+    low, high = level + min(found.replicate_gains), level + max(found.replicate_gains)
     right.axhspan(low, high, color="C1", alpha=0.4, lw=0,
                   label="one more effect, on replicates")  # fmt: skip
     right.plot(len(found.effects) + 1, level + found.largest_gain[0], "s", ms=4, color="C3",
@@ -151,7 +151,7 @@ def draw_selection(found: Selection, search: Search) -> None:
     right.set(xlabel="effects in the set", ylabel="log evidence, nats", xticks=sizes)
     right.legend(frameon=False, fontsize=6.5)
     figure.savefig(HERE / "method_selection.svg", metadata={"Date": None})
-    print("largest gains of replicates, nats:", np.round(found.chance, 1))
+    print("largest gains of replicates, nats:", np.round(found.replicate_gains, 1))
 
 
 def main() -> None:
