@@ -190,7 +190,7 @@ def force_drafts(machine: str, seed: int) -> dict[str, tuple[float, tuple[str, .
         return {
             system.coordinates[axis.axis]: (
                 axis.chance[0].p_value,
-                tuple(term.form.canonical for term in axis.terms),
+                tuple(term.form.canonical_name for term in axis.terms),
             )
             for axis in found
         }

@@ -175,10 +175,7 @@ def _remove(options: LoopOptions, model: str) -> None:
 
 
 def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> None:
-    """Write the child of ``parent`` with the effects ``named`` and their files.
-
-    Its ``model.toml`` is written last.
-    """
+    """Write the child of ``parent`` with the effects ``named``, its ``model.toml`` last."""
     from bampipe.declarations.model import ModelFile
     from bampipe.declarations.model_file import load_model
     from bampipe.results.diagnose import DiagnoseResult

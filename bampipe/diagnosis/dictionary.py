@@ -80,11 +80,11 @@ class Dictionary:
         ranges = self.ranges[name]
         each = _ALONE if len(ranges) == 1 else _SEVERAL
         counts = [
-            max(each + _MORE * (r.by_ratio and r.high / r.low > _WIDE), r.fewest) for r in ranges
+            max(each + _MORE * (r.by_ratio and r.high / r.low > _WIDE), r.grid_size) for r in ranges
         ]
         states = self.candidates[name].system.model.effects[-1].effect.states
         most = _MOST_OF_STATES if len(ranges) > 3 else _MOST_OF_THREE
-        most = max(most if states else _MOST, math.prod(r.least for r in ranges))
+        most = max(most if states else _MOST, math.prod(r.least_count for r in ranges))
         while np.prod(counts) > most:
             dense = [(n - 1) / r.extent for n, r in zip(counts, ranges, strict=True)]
             counts[int(np.argmax(dense))] -= 1

@@ -61,25 +61,26 @@ class SearchRange:
     Attributes:
         low, high: its ends.
         by_ratio: whether grid values have equal ratios.
-        around: middle of the travel, for a position beyond it; ``low`` and ``high`` are then
+        travel_middle: middle of the travel, for a position beyond it; ``low`` and ``high`` are then
             reciprocals of the distance from there, negative on the lower side.
-        farthest: largest such distance.
-        apart: largest distance of two grid values, which are then evenly spaced.
-        least: smallest number of grid values.
+        largest_distance: largest such distance.
+        largest_spacing: largest distance of two grid values, which are then evenly spaced.
+        least_count: smallest number of grid values.
     """
 
     low: float
     high: float
     by_ratio: bool
-    around: float | None = None
-    farthest: float = np.inf
-    apart: float = np.inf
-    least: int = 1
+    travel_middle: float | None = None
+    largest_distance: float = np.inf
+    largest_spacing: float = np.inf
+    least_count: int = 1
 
     @property
-    def fewest(self) -> int:
+    def grid_size(self) -> int:
         """Smallest number of values of a grid."""
-        return max(self.least, 1 + int(np.ceil((self.high - self.low) / self.apart)))
+        count = 1 + int(np.ceil((self.high - self.low) / self.largest_spacing))
+        return max(self.least_count, count)
 
     @property
     def extent(self) -> float:
@@ -88,22 +89,22 @@ class SearchRange:
 
     def value_at(self, searched: float) -> float:
         """Return the value of the parameter for a number between ``low`` and ``high``."""
-        if self.around is None:
+        if self.travel_middle is None:
             return searched
-        distance = min(1.0 / max(abs(searched), 1e-300), self.farthest)
-        return self.around + float(np.copysign(distance, searched))
+        distance = min(1.0 / max(abs(searched), 1e-300), self.largest_distance)
+        return self.travel_middle + float(np.copysign(distance, searched))
 
     def value_like(self, value: float) -> float:
         """Return ``value`` if it is in the range, else a value in its middle or upper part."""
-        if self.around is not None:
-            distance = abs(value - self.around)
-            holds = 1.0 / self.high <= distance <= self.farthest
+        if self.travel_middle is not None:
+            distance = abs(value - self.travel_middle)
+            holds = 1.0 / self.high <= distance <= self.largest_distance
             return value if holds else self.value_at(self.interpolate(0.75))
         return value if self.low <= value <= self.high else self.interpolate(0.5)
 
     def interpolate(self, share: float) -> float:
         """Return the number a share of the way between the ends, by ratios if both are positive."""
-        if self.low > 0.0 and self.high > 0.0 and not np.isfinite(self.apart):
+        if self.low > 0.0 and self.high > 0.0 and not np.isfinite(self.largest_spacing):
             return float(self.low ** (1.0 - share) * self.high**share)
         return float(self.low + share * (self.high - self.low))
 
@@ -180,10 +181,10 @@ class MachineScale:
         if item.axes and parameter.unit == f"1/{self.coordinates[item.axes[0]][0]}":
             i = list(self.coordinates).index(item.axes[0])
             travel = max(float(self.highest[i] - self.lowest[i]), 1e-300)
-            return SearchRange(low, high, True, apart=2.0 * np.pi * _WAVES_APART / travel)
+            return SearchRange(low, high, True, largest_spacing=2.0 * np.pi * _WAVES_APART / travel)
         is_length = item.axes and parameter.unit == self.coordinates[item.axes[0]][0]
         least = 1 if item.effect.ahead is None else _GAPS if is_length else _DRIVES
-        return SearchRange(low, high, True, least=least)
+        return SearchRange(low, high, True, least_count=least)
 
     def _sizes(self, item: BoundEffect, parameter: Parameter) -> dict[str, tuple[float, float]]:
         """Return the range of sizes at the target of an effect, by unit."""

@@ -24,8 +24,10 @@ from bampipe.diagnosis.session import (
 )
 from bampipe.diagnosis.set_cost import added_effects, effect_names, removed_effects
 from bampipe.physics.recipe import Recipe
-from bampipe.progress import Progress, silent
 from bampipe.results.compare import NOTICEABLE
+
+Progress = Callable[[float, str], None]
+"""Called with the fraction of the work done and a description of the current step."""
 
 _MOST_ROUNDS = 6
 TASKS_PER_PROCESS = 8
@@ -126,7 +128,7 @@ def select_effects(
     recipe: Recipe,
     start: Array,
     without: Collection[str] = (),
-    progress: Progress = silent,
+    progress: Progress = lambda fraction, message: None,
 ) -> Selection:
     """Find the most probable set of effects that a model lacks.
 
@@ -285,8 +287,7 @@ def _held_out_error(fit: Fit, without: Collection[str] = ()) -> float:
 def gain_when_fitted(before: Fit, after: Fit, search: Search, keys: Sequence[Key]) -> float:
     """Return the log evidence that a set gains by its fit, under the weights of ``before``, nats.
 
-    ``before`` and ``after`` are fits without and with the set ``keys``; ``search`` is beside the
-    former.
+    ``before`` and ``after`` are fits without and with the set ``keys``.
     """
     if any(len(a) != len(b) for a, b in zip(before.problem.y, after.problem.y, strict=True)):
         return np.inf

@@ -104,13 +104,12 @@ class SetCosts:
     def _lay_out(self, places: Mapping[Key, Atom]) -> None:
         """Join the columns of the grid by axis, and compute their products with the base."""
         widths = [a.width for a in places.values()]
-        self.first = np.concatenate([[0], np.cumsum(widths)])[:-1].astype(int)
+        self.first_columns = np.concatenate([[0], np.cumsum(widths)])[:-1].astype(int)
         self.widths = np.array(widths, dtype=int)
-        m = int(sum(widths))
         p = self.problem
-        self.columns, self.at = [], []
+        self.columns, self.column_indices = [], []
         widest = int(max(widths, default=1))
-        self.own = np.zeros((self.n_q, len(places), widest, widest))
+        self.own_products = np.zeros((self.n_q, len(places), widest, widest))
         self.xb, self.xy = [], []
         for axis in range(self.n_q):
             blocks, at = [], []
@@ -118,18 +117,18 @@ class SetCosts:
                 if axis in atom.columns:
                     block = atom.columns[axis] * p.likelihood.root[axis][:, None]
                     w = block.shape[1]
-                    self.own[axis, k, :w, :w] = block.T @ block
+                    self.own_products[axis, k, :w, :w] = block.T @ block
                     blocks.append(block)
-                    at.append(np.arange(self.first[k], self.first[k] + w))
+                    at.append(np.arange(self.first_columns[k], self.first_columns[k] + w))
             x = np.concatenate(blocks, axis=1) if blocks else np.zeros((len(p.y[axis]), 0))
             self.columns.append(x)
-            self.at.append(np.concatenate(at) if at else np.zeros(0, dtype=int))
+            self.column_indices.append(np.concatenate(at) if at else np.zeros(0, dtype=int))
             self.xb.append(p.base[axis].T @ x)
             self.xy.append(x.T @ p.y[axis])
-        self.m = m
+        self.n_columns = int(sum(widths))
         bounds = [b for key in places for b in self.dictionary.bounds(key[0])]
-        self.low, self.high = np.array(bounds).reshape(-1, 2).T
-        self.spread = np.array([v for key in places for v in self.dictionary.spreads(key[0])])
+        self.lower, self.upper = np.array(bounds).reshape(-1, 2).T
+        self.prior_sd = np.array([v for key in places for v in self.dictionary.spreads(key[0])])
 
     def on_replicate(self, number: int) -> Self:
         """Return the costs on the residual of a replicate instead of the measured one."""
@@ -458,9 +457,9 @@ class SetCosts:
         n = xx.shape[1]
         normal = np.tensordot(weight, xx, 1)
         normal[:nb, :nb] += p.precision
-        cross, moment = np.zeros((n, self.m)), np.zeros(self.m)
+        cross, moment = np.zeros((n, self.n_columns)), np.zeros(self.n_columns)
         for axis in range(self.n_q):
-            w, cols = weight[axis], self.at[axis]
+            w, cols = weight[axis], self.column_indices[axis]
             cross[:nb, cols] += w * self.xb[axis]
             moment[cols] -= w * self.xy[axis]
             for i, key in zip(places, keys, strict=True):
@@ -471,16 +470,19 @@ class SetCosts:
         moment = moment - cross.T @ b
         free = self._free_of(all_keys, n)
         taken = free @ solve_scaled(free.T @ normal @ free, free.T @ cross)
-        widest = self.own.shape[2]
-        place = self.first[:, None] + np.minimum(np.arange(widest), self.widths[:, None] - 1)
-        valid = np.arange(widest) < self.widths[:, None]
-        block = np.tensordot(weight, self.own, 1)
+        widest = self.own_products.shape[2]
+        numbers, widths = np.arange(widest), self.widths[:, None]
+        place, valid = (
+            self.first_columns[:, None] + np.minimum(numbers, widths - 1),
+            numbers < widths,
+        )
+        block = np.tensordot(weight, self.own_products, 1)
         c, t = cross.T[place], taken.T[place]
         block = block - c @ t.transpose(0, 2, 1)
         mom = np.where(valid, moment[place], 0.0)
-        low, high = self.low[place], self.high[place]
-        own = np.einsum("kww->kw", np.tensordot(weight, self.own, 1))
-        least = np.maximum(1e-6 * own, (NOTHING / np.where(valid, self.spread[place], 1.0)) ** 2)
+        low, high = self.lower[place], self.upper[place]
+        own = np.einsum("kww->kw", np.tensordot(weight, self.own_products, 1))
+        least = np.maximum(1e-6 * own, (NOTHING / np.where(valid, self.prior_sd[place], 1.0)) ** 2)
         active = valid & (np.einsum("kww->kw", block) > least)
         gain = np.zeros(len(self.grid_keys))
         for _ in range(widest + 1):

@@ -69,9 +69,8 @@ def test_what_a_candidate_adds_beside_others_is_what_the_whole_residual_changes_
     item = compile_candidate(build_candidate_model(DAMPER, second, (), recipe.effects))
     p = np.concatenate([base.p, 0.3 + np.array([q.prior for q in item.parameters])])
     whole = ModelOnTrial(item.system, p, [base.motion]).residual
-    np.testing.assert_allclose(
-        compute_added_residual(item, p, base), whole - base.residual, atol=1e-9
-    )
+    added = compute_added_residual(item, p, base)
+    np.testing.assert_allclose(added, whole - base.residual, atol=1e-9)
 
 
 def test_only_effects_that_meet_are_taken_together():

@@ -173,7 +173,7 @@ def _hold_against_effect(recipe, evidence, samples, forms, name):
     }
     atom = forms.make(forms.key(name, searched))
     effect = replace(recipe, extra=(form.declaration("a test"),))
-    item = candidates_of(effect, (form.canonical,))[0]
+    item = candidates_of(effect, (form.canonical_name,))[0]
     short = [q.name.rpartition(".")[2] for q in item.parameters]
     no_ranges = SimpleNamespace(range_of=lambda effect, parameter: None)
     exact = Dictionary(evidence, samples, {name: item}, no_ranges)
@@ -185,11 +185,11 @@ def _hold_against_effect(recipe, evidence, samples, forms, name):
     for axis, found in atom.columns.items():
         off = np.linalg.norm(found[:, columns] - wanted.columns[axis], axis=0)
         # Made at a lower rate: a sharp edge at a reversal costs several per cent.
-        assert (off < 0.1 * np.linalg.norm(wanted.columns[axis], axis=0)).all(), form.canonical
+        assert (off < 0.1 * np.linalg.norm(wanted.columns[axis], axis=0)).all(), form.canonical_name
     for axis, slope in wanted.slopes.items():
         scale = np.abs(slope).max()
         off = np.median(np.abs(atom.slopes[axis][:, :, columns[0]] - slope))
-        assert off < 0.05 * scale, form.canonical
+        assert off < 0.05 * scale, form.canonical_name
 
 
 def _between(low, high):
@@ -201,7 +201,7 @@ def test_a_form_that_cancels_the_drive_gains_nothing(clean):
     session, _, fit = clean
     search = open_forms(session, fit, 0, "friction_rise_by_load")
     (name,) = search.forms.candidates
-    reach = search.forms.candidates[name].fixed()["reach"][0]
+    reach = search.forms.candidates[name].fixed_constants()["reach"][0]
     key = search.forms.key(name, {"place": 0.0})
     search.ensure([key])
 
@@ -221,7 +221,7 @@ def test_hysteresis_of_a_force_sensor_is_found(tmp_path):
     search = open_forms(session, fit, 0)
     best, *others = search.best_forms(8, 1)
     form, gain = search.forms.candidates[best[0]], search.cost(()) - search.cost((best,))
-    assert form.canonical in ("hysteresis_of_reading:x", "two_hystereses_of_reading:x")
+    assert form.canonical_name in ("hysteresis_of_reading:x", "two_hystereses_of_reading:x")
     plain = next(k for k in (best, *others) if k[0] == "hysteresis_of_reading:x")
     assert search.cost(()) - search.cost((plain,)) > 0.95 * gain
     rest = [k for k in others if "hyst" not in k[0]]
@@ -243,7 +243,7 @@ def test_every_form_is_an_effect_file(clean):
         for form in forms.candidates.values():
             text = toml_text(form.declaration("a test"))
             tried, faults = effect_faults(tomllib.loads(text), form.name, device)
-            assert form.canonical in tried
+            assert form.canonical_name in tried
             assert faults == []
 
 

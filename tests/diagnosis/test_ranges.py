@@ -73,7 +73,7 @@ def test_the_scale_of_a_session_is_that_of_its_motion():
 def test_no_ripple_falls_between_two_values_that_are_tried():
     """Of two wavenumbers a wave on the travel apart neither tells of the other."""
     waves = range_of("torque_ripple:carriage", "wavenumber")
-    values = [waves.interpolate(share) for share in np.linspace(0.0, 1.0, waves.fewest)]
+    values = [waves.interpolate(share) for share in np.linspace(0.0, 1.0, waves.grid_size)]
     on_travel = np.array(values) * 0.25 / (2.0 * np.pi)
     assert on_travel[-1] == pytest.approx(30.0)
     assert np.diff(on_travel).max() <= 0.6

@@ -84,7 +84,7 @@ class FormDictionary:
                         device.coordinates[self.axis], self.axis, factor, SHAPES[shape], quantity,
                         spans[quantity.words], self.times, self.scales.get(factor, 1.0),
                     )  # fmt: skip
-                    self.candidates[form.canonical] = form
+                    self.candidates[form.canonical_name] = form
 
     def grid(self, name: str) -> list[Key]:
         """Return the initial shapes of a form."""

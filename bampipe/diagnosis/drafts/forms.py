@@ -202,7 +202,7 @@ class Form:
         return self.axis.name if self.is_own else ""
 
     @property
-    def canonical(self) -> str:
+    def canonical_name(self) -> str:
         """Name in a model, ``name:target``."""
         return f"{self.name}:{self.target}" if self.target else self.name
 
@@ -214,7 +214,7 @@ class Form:
     @property
     def parameters(self) -> dict[str, str]:
         """Names of the estimated parameters in a model, strengths first, by short name."""
-        head = self.canonical.replace(":", ".")
+        head = self.canonical_name.replace(":", ".")
         return {n: f"{head}.{n}" for n in (*self.shape.strengths, *self.shape.searched)}
 
     @property
@@ -251,7 +251,7 @@ class Form:
         seen = "" if self.other_quantities else f", {_ACTS_AND_SHOWS[self.factor][1]}"
         return f"residual that {self._words}{seen}"
 
-    def fixed(self) -> dict[str, tuple[float, str]]:
+    def fixed_constants(self) -> dict[str, tuple[float, str]]:
         """Return the constants that are not estimated, with their units."""
         found = {}
         for name in self.shape.fixed:
@@ -273,7 +273,7 @@ class Form:
 
     def constants_at(self, searched: Mapping[str, float], interval: float) -> dict[str, float]:
         """Return all constants of the shape, and the time between samples, s."""
-        fixed = {name: value for name, (value, _) in self.fixed().items()}
+        fixed = {name: value for name, (value, _) in self.fixed_constants().items()}
         return fixed | {"interval": interval} | dict(searched)
 
     def limits(self) -> dict[str, tuple[float, float, str]]:
@@ -303,7 +303,7 @@ class Form:
                 "sd": round_constant(0.1 * (high - low)), "lower": low, "upper": high,
                 "description": KINDS_IN_WORDS[self.shape.searched[name]],
             }  # fmt: skip
-        for name, (value, of) in self.fixed().items():
+        for name, (value, of) in self.fixed_constants().items():
             found[name] = {
                 "unit": of, "prior": value, "sd": 0.0, "fixed": True,
                 "description": "scales the formula",

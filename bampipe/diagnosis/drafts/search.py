@@ -21,10 +21,9 @@ from bampipe.diagnosis.drafts.columns import FormDictionary
 from bampipe.diagnosis.drafts.forms import Form
 from bampipe.diagnosis.probability import compute_p_value
 from bampipe.diagnosis.search import Search
-from bampipe.diagnosis.select import TASKS_PER_PROCESS, make_columns, start_at
+from bampipe.diagnosis.select import TASKS_PER_PROCESS, Progress, make_columns, start_at
 from bampipe.diagnosis.session import Fit, Session, worker_state, workers
 from bampipe.physics.recipe import Recipe
-from bampipe.progress import Progress, silent
 from bampipe.results.draft import ChanceOfDraft
 
 MOST_TERMS = 2
@@ -168,7 +167,7 @@ def draft_formulas(
     axes: Sequence[int],
     source: str,
     curves: bool = False,
-    progress: Progress = silent,
+    progress: Progress = lambda fraction, message: None,
 ) -> list[FoundDraft]:
     """Search for formulas that explain the residual of a model, one axis after the other.
 
@@ -268,7 +267,7 @@ class _AxisSearch:
                 form = replace(form, prefix="other_")
             wider = replace(
                 current.recipe,
-                effects=(*current.recipe.effects, form.canonical),
+                effects=(*current.recipe.effects, form.canonical_name),
                 extra=(*current.recipe.extra, form.declaration(self.source)),
             )
             strengths = dict(zip(form.shape.strengths, solution.strengths[0], strict=True))
