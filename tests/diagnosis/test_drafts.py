@@ -188,7 +188,7 @@ def _hold_against_effect(recipe, evidence, samples, forms, name):
         assert (off < 0.1 * np.linalg.norm(wanted.columns[axis], axis=0)).all(), form.canonical_name
     for axis, slope in wanted.slopes.items():
         scale = np.abs(slope).max()
-        off = np.median(np.abs(atom.slopes[axis][:, :, columns[0]] - slope))
+        off = np.median(np.abs(atom.slopes[axis][:, :, columns] - slope))
         assert off < 0.05 * scale, form.canonical_name
 
 
