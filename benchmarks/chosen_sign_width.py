@@ -7,7 +7,7 @@
 Each session of an independent simulator hides nothing or one effect of its own. The bare device is
 fitted by least squares with several widths, times that of the device file; printed is by how much
 the log of the error on trials left out falls. `identify` takes a narrower width on a test bench
-where an eighth lowers it by `WORTH` of `bampipe.diagnosis.start`.
+where an eighth lowers it by `LEAST_DROP` of `bampipe.diagnosis.start`.
 """
 
 from __future__ import annotations

@@ -190,7 +190,7 @@ def force_drafts(machine: str, seed: int) -> dict[str, tuple[float, tuple[str, .
         return {
             system.coordinates[axis.axis]: (
                 axis.chance[0].p_value,
-                tuple(term.form.canonical for term in axis.terms),
+                tuple(term.form.canonical_name for term in axis.terms),
             )
             for axis in found
         }
@@ -295,7 +295,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--nothing", type=int, default=0, help="sessions with nothing hidden")
     parser.add_argument("--forced", type=int, default=0, help="the same, whatever a diagnosis says")
     parser.add_argument("--first-seed", type=int, default=4000)
-    parser.add_argument("--replicates", type=int, default=4, help="replays of the diagnosis")
+    parser.add_argument("--replicates", type=int, default=4, help="replicates of the diagnosis")
     parser.add_argument("--out", type=Path, help="write the outcomes as JSON, session by session")
     options = parser.parse_args(arguments)
     machines = ("bam", "joint", "axis")

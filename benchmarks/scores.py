@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
-from bampipe.diagnosis.criteria import Criteria, most_probable
+from bampipe.diagnosis.criteria import Criteria, cap_probability
 
 TENTHS = np.linspace(0.0, 1.0, 11)
 
@@ -26,7 +26,7 @@ class Scores:
         effects_found: probability of each effect of any probable set.
         sets: effects, axis of something unknown, log evidence (nats) and probability of each.
         drops: log evidence lost without each effect that is selected, nats, with p-values.
-        chance: largest gain of any candidate on each replay of the final model, nats.
+        chance: largest gain of any candidate on each replicate of the final model, nats.
         beside: the same on the measured trials.
         unknown: probability of something unknown, by axis.
         over_floor: held-out error over the noise floor, by axis.
@@ -52,7 +52,7 @@ class Scores:
         """Of each effect of any probable set; no surer than chance allows."""
         p_values = {e: p for e, (_, p) in self.drops.items()}
         return {
-            e: min(p, most_probable(p_values.get(e, 0.0))) for e, p in self.effects_found.items()
+            e: min(p, cap_probability(p_values.get(e, 0.0))) for e, p in self.effects_found.items()
         }
 
     def finds_unknown(self, criteria: Criteria) -> bool:

@@ -81,7 +81,7 @@ def record_trials(
 
 
 def diagnose(run: bampipe.Run) -> dict[str, Any]:
-    """Diagnose the newest model of ``run`` with few replays, in this process."""
+    """Diagnose the newest model of ``run`` with few replicates, in this process."""
     return bampipe.diagnose(run, replicates=4, jobs=1)
 
 

@@ -456,7 +456,7 @@ def test_an_effect_is_not_added_twice(ingested: Path, command: Command) -> None:
     (folder / "model.toml").write_text(text + 'device = "bam"\neffects = ["stribeck:yaw"]\n')
     extended = ("--model", "base+stribeck.yaw")
     error = one_line_error(*command("extend", ingested, "stribeck:yaw", *extended))
-    assert "has stribeck:yaw already" in error
+    assert "already has stribeck:yaw" in error
 
 
 @pytest.mark.parametrize(

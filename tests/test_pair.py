@@ -151,7 +151,7 @@ def test_sessions_that_cannot_be_compared_are_refused(
     sessions: dict[str, Path], tmp_path: Path
 ) -> None:
     first, same = sessions["first"], sessions["same"]
-    with pytest.raises(InputError, match="one run twice"):
+    with pytest.raises(InputError, match="both runs are the same"):
         bampipe.compare_runs(first, first)
     device = same / "ingest/device.toml"
     text = device.read_text()

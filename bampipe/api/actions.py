@@ -1,4 +1,4 @@
-"""The stages as functions, through the same cache as the command line."""
+"""The stages as functions, which share the cache of the command line."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,15 +29,13 @@ def run_session(
     force: bool = False,
     settings: Mapping[str, Mapping[str, object]] | None = None,
 ) -> Run:
-    """Run the stages of a pipeline that changed, from raw log to report.
+    """Run the stages of a pipeline whose inputs changed, from raw log to report.
 
     Args:
-        session: folder of the session.
-        runs: folder that holds the run folders.
-        pipeline: name of a pipeline, or a file of your own.
-        first: stage to start from; the first one if empty.
-        last: stage to stop after; the last one if empty.
-        force: run unchanged stages, too.
+        session: folder of the session; runs: folder of the run folders.
+        pipeline: name or file of a pipeline.
+        first, last: stages to start from and to stop after; empty for all.
+        force: whether to run unchanged stages, too.
         settings: by stage, then by name: ``{"identify": {"method": "least-squares"}}``.
 
     Raises:
@@ -66,66 +64,65 @@ def ingest(session: Path_, *, runs: Path_ = RUNS, **settings: object) -> Run:
     """Read a session's raw logs into SI units.
 
     Raises:
-        InputError: a mistake in the session file, or no trial is sound.
+        InputError: the session file has a mistake, or no trial is sound.
     """
     return run_session(session, runs=runs, last="ingest", settings={"ingest": settings})
 
 
 def filter(run: Run | Path_, **settings: object) -> pd.DataFrame:
     """Differentiate the motion; returns `Run.kinematics`."""
-    return _rerun(run, "filter", "", settings).kinematics
+    return _run_stage(run, "filter", "", settings)[0].kinematics
 
 
 def stiffness(run: Run | Path_, **settings: object) -> pd.DataFrame:
-    """Stiffness of the locked axes; returns `Run.stiffness`."""
-    return _rerun(run, "stiffness", "", settings).stiffness
+    """Estimate the stiffness of the locked axes; returns `Run.stiffness`."""
+    return _run_stage(run, "stiffness", "", settings)[0].stiffness
 
 
 def identify(run: Run | Path_, model: str = "", **settings: object) -> pd.DataFrame:
-    """Estimate the parameters of one model, or else of all; returns `Run.parameters`."""
-    return _rerun(run, "identify", model, settings).parameters(model)
+    """Estimate the parameters of one model, or of all; returns `Run.parameters`."""
+    return _run_stage(run, "identify", model, settings)[0].parameters(model)
 
 
 def validate(run: Run | Path_, model: str = "", **settings: object) -> pd.DataFrame:
-    """Predict held-out trials, by one model or all; returns `Run.validation`."""
-    return _rerun(run, "validate", model, settings).validation(model)
+    """Predict held-out trials with one model, or with all; returns `Run.validation`."""
+    return _run_stage(run, "validate", model, settings)[0].validation(model)
 
 
 def diagnose(run: Run | Path_, model: str = "", **settings: object) -> dict[str, Any]:
     """Find the missing effects of a model (default: the best one); returns `Run.diagnosis`."""
     chosen = model or _open(run).model
-    return _rerun(run, "diagnose", chosen, settings).diagnosis(chosen)
+    return _run_stage(run, "diagnose", chosen, settings)[0].diagnosis(chosen)
 
 
 def draft(run: Run | Path_, model: str = "", **settings: object) -> dict[str, Any]:
     """Draft a formula for an unexplained residual; returns `Run.drafts`."""
     chosen = model or _open(run).model
-    return _rerun(run, "draft", chosen, settings).drafts(chosen)
+    return _run_stage(run, "draft", chosen, settings)[0].drafts(chosen)
 
 
 def compare(run: Run | Path_, **settings: object) -> pd.DataFrame:
     """Compare the models on the same held-out trials; returns `Run.ladder`."""
-    return _rerun(run, "compare", "", settings).ladder
+    return _run_stage(run, "compare", "", settings)[0].ladder
 
 
 def write_report(run: Run | Path_, **settings: object) -> Path:
     """Write the report; returns the path of the PDF."""
-    return _rerun(run, "report", "", settings).root / "report" / "report.pdf"
+    return _run_stage(run, "report", "", settings)[0].root / "report" / "report.pdf"
 
 
 def extend(run: Run | Path_, effect: str | Sequence[str], model: str = "") -> Run:
-    """Add an effect to a model, or several, identify and validate it again, and compare.
+    """Add one or several effects to a model, identify and validate it again, and compare.
 
     Args:
-        run: a run, or its folder.
-        effect: ``name[:target]``, or ``file.toml[:target]`` for one of your own; or several.
-        model: the parent; the best confirmed one if empty.
+        effect: ``name[:target]``, ``file.toml[:target]`` for an effect of your own, or several.
+        model: the parent; by default the best confirmed model.
 
     Returns:
-        The run; its `Run.model` is the child if it lowers the held-out error.
+        The run; its `Run.model` is the child if that lowers the held-out error.
 
     Raises:
-        InputError: no such effect or parent, or one that the device cannot have.
+        InputError: the effect or the parent does not exist, or the device cannot have the effect.
     """
     opened = _open(run)
     effects = (effect,) if isinstance(effect, str) else tuple(effect)
@@ -157,30 +154,23 @@ def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object)
     """Run any stage on the results of earlier ones; returns its summary, a plain record.
 
     Args:
-        run: a run, or its folder.
         stage: name of the stage, as on the command line.
-        model: for stages that run once a model; if empty, base and the models run before.
+        model: model of a stage that runs for each; by default base and all models run before.
         settings: see ``bampipe STAGE --settings``.
 
     Raises:
-        InputError: no such stage, model or setting, or an earlier stage has not run.
+        InputError: the stage, model or setting does not exist, or an earlier stage has not run.
     """
     base.check_stage_name(stage)
-    steps = _run_stage(_open(run).root, stage, model, settings)
+    _, steps = _run_stage(run, stage, model, settings)
     return steps[0] if len(steps) == 1 else {"steps": steps}
 
 
-def _rerun(run: Run | Path_, stage: str, model: str, settings: Mapping[str, object]) -> Run:
-    """Run one stage and return the run with its results."""
-    root = _open(run).root
-    _run_stage(root, stage, model, settings)
-    return Run(root)
-
-
 def _run_stage(
-    root: Path, stage: str, model: str, settings: Mapping[str, object]
-) -> list[dict[str, Any]]:
-    """Run one stage, for one model or each, and return its summaries."""
+    run: Run | Path_, stage: str, model: str, settings: Mapping[str, object]
+) -> tuple[Run, list[dict[str, Any]]]:
+    """Run one stage, for one model or each; return the run with its results, and summaries."""
+    root = _open(run).root
     batch.limit_threads(1)
     outcome = runner.run_session(
         Request(
@@ -193,4 +183,4 @@ def _run_stage(
         ),
         ignore_event,
     )
-    return [step.summary for step in outcome.steps]
+    return Run(root), [step.summary for step in outcome.steps]

@@ -1,4 +1,4 @@
-"""The loop: extend a model by an effect, validate it, follow the diagnosis."""
+"""The loop: diagnose a model, extend it by the missing effects, and confirm the result."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MOST_ROUNDS = 4
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """Options of every step of the loop, as in `Request`."""
+    """Options of all steps of the loop, as in `Request`."""
 
     root: Path
     pipeline: Pipeline
@@ -68,10 +68,9 @@ class LoopOptions:
 
 
 def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
-    """Return the settings last given to each stage for ``model``, else for its parent.
+    """Return the last settings of each stage for ``model``, or else for its parent.
 
-    A child is thus identified and judged as its parent was, whether a pipeline or a command gave
-    the settings.
+    A child is thus identified and judged like its parent.
     """
     line = [model]
     while line[-1] in models.names(root) and models.read(root, line[-1]).parent:
@@ -83,13 +82,13 @@ def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
             step = made.get(f"{stage}:{name}")
             if step is not None:
                 used[stage] = {k: value for k, value in step.settings.items() if k != "model"}
-                if name != model:  # an effect useless in the parent may help the child
+                if name != model:  # an effect that is useless in the parent may help the child
                     used[stage].pop("without", None)
     return used
 
 
 def list_drafts(root: Path, model: str) -> dict[str, Path]:
-    """Return the files of the effects drafted for ``model``, by ``name[:target]``."""
+    """Return the files of the effects that were drafted for ``model``, by ``name[:target]``."""
     from bampipe.results.draft import DraftResult
 
     run = RunFolder(root)
@@ -101,9 +100,7 @@ def list_drafts(root: Path, model: str) -> dict[str, Path]:
 def _find_effect(text: str, drafts: Mapping[str, Path]) -> tuple[str, Path | None]:
     """Return the effect ``name[:target]`` and its file, if it is not built in.
 
-    Args:
-        text: ``name[:target]``, or ``file.toml[:target]``.
-        drafts: of the model that is extended; their target may be omitted.
+    ``text`` is ``name[:target]`` or ``file.toml[:target]``; a draft needs no target.
     """
     for name, file in drafts.items():
         if text in (name, name.partition(":")[0]):
@@ -137,15 +134,14 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
     """Extend ``parent`` by ``effects``; identify, validate and compare the child.
 
     Args:
-        effects: each ``name[:target]`` of the library or of a draft for the parent, or
-            ``file.toml[:target]`` for a lab's own.
+        effects: ``name[:target]`` of the library or of a draft, or ``file.toml[:target]``.
 
     Returns:
         The name of the child.
 
     Raises:
-        InputError: no such parent or effect, one that the device cannot have, or one that the
-            parent has already; nothing is left behind.
+        InputError: the parent or an effect does not exist, the device cannot have the effect, or
+            the parent has it already. No files remain.
     """
     root = options.root
     drafts = list_drafts(root, parent)
@@ -153,7 +149,9 @@ def extend(options: LoopOptions, parent: str, effects: Sequence[str]) -> str:
     child = models.child_name(parent, tuple(named))
     for name in named:
         if "/" in name or not is_normal(child):
-            raise InputError(f"{name!r} is no name of an effect", remedy="see `bampipe effects`")
+            raise InputError(
+                f"{name!r} is not the name of an effect", remedy="see `bampipe effects`"
+            )
     try:
         with options.lock():
             models.ensure_base(root, *options.pipeline.base_model)
@@ -177,11 +175,7 @@ def _remove(options: LoopOptions, model: str) -> None:
 
 
 def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> None:
-    """Write the child of ``parent`` with more effects; its ``model.toml`` comes last.
-
-    Args:
-        named: ``name[:target]`` of each effect, and its file if it is not built in.
-    """
+    """Write the child of ``parent`` with the effects ``named``, its ``model.toml`` last."""
     from bampipe.declarations.model import ModelFile
     from bampipe.declarations.model_file import load_model
     from bampipe.results.diagnose import DiagnoseResult
@@ -189,7 +183,7 @@ def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> N
     before = models.read(root, parent)
     for effect in named:
         if effect in before.effects:
-            raise InputError(f"model {parent!r} has {effect} already", where=str(root))
+            raise InputError(f"model {parent!r} already has {effect}", where=str(root))
     child = models.child_name(parent, tuple(named))
     effect_files = {
         path.name: path for path in (root / "models" / parent / "effects").glob("*.toml")
@@ -213,14 +207,13 @@ def follow(
 ) -> str:
     """Diagnose, add all missing effects at once, and confirm the result by another diagnosis.
 
-    With ``draft``, effects drafted for the unexplained rest are added too. An effect whose strength
-    is identified as zero is removed again, and effects that did not improve the model are not
-    weighed again. Effects that the confirmation finds are added likewise, unless the remainder is
-    unknown: then no effect is more probable than not, and a further one would only imitate it.
+    An effect whose strength is not significant is removed again, and effects that did not improve
+    the model are not considered again. Effects that the confirmation finds are added as well,
+    unless the verdict is ``unknown_effect``: a further effect would only imitate the unknown one.
 
     Args:
         tell: called with a line on each finding and each step.
-        draft: whether to draft a formula if no known effect explains the residual.
+        draft: whether to draft and add a formula if no known effect explains the residual.
 
     Returns:
         The name of the last model that is better than its parent.
@@ -251,7 +244,7 @@ def follow(
         if child:
             model, left_out = child, {}
         elif set(found) <= set(diagnosis.selected):
-            # Diagnosed once more: effects that did not improve the model are not proposed again.
+            # The next diagnosis does not propose effects that did not improve the model.
             left_out = {"diagnose": {"without": (*diagnosis.not_weighed, *found)}}
         else:
             break
@@ -262,7 +255,7 @@ def follow(
 
 
 def _list_open_questions(diagnosis: DiagnoseResult) -> Iterator[str]:
-    """Yield which of several likely effects is added, and the trial that would decide."""
+    """Yield a line on each undecided axis: the effect added, and the trial that would decide."""
     from bampipe.phrases import diagnosis as phrases
 
     trial, open_effects = diagnosis.suggested_trial, phrases.find_open_effects(diagnosis)
@@ -281,7 +274,7 @@ def _list_open_questions(diagnosis: DiagnoseResult) -> Iterator[str]:
 def _add(
     options: LoopOptions, model: str, effects: tuple[str, ...], tell: Callable[[str], None]
 ) -> str:
-    """Extend ``model`` by the effects with a strength; return "" if that is no better."""
+    """Extend ``model`` by the effects with a strength; return "" if it does not improve."""
     from bampipe.results.compare import CompareResult
     from bampipe.results.identify import IdentifyResult
 
@@ -300,6 +293,6 @@ def _add(
         return child
     why = "the held-out error does not fall"
     if ladder[child].has_lost_its_floor(ladder[model]):
-        why = "there is no noise floor, or the error is far below it and cannot be judged"
+        why = "there is no noise floor, or the error is implausibly far below it"
     tell(f"{', '.join(effects)}: {why}, stopped at {model}")
     return ""

@@ -1,4 +1,4 @@
-"""A run folder as an object: every result as a table or a plain record, read on demand."""
+"""A run folder as an object, whose results are tables and plain records."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the report, an SVG file; notebooks show it."""
+    """A figure of the report, an SVG file that notebooks show."""
 
     path: Path
 
@@ -36,15 +36,15 @@ class Picture:
 class Run:
     """The results of one session, for reading only; each result is read once, on first use.
 
-    All values are in SI units. Models are named as in the run folder: ``base``,
-    ``base+stribeck.yaw``; where a method takes a model, the default is the best confirmed one.
+    All values are in SI units. Models are named as in the run folder, such as ``base`` or
+    ``base+stribeck.yaw``. Methods take the best confirmed model by default.
 
     Args:
         root: the run folder.
 
     Raises:
-        InputError: there is no run; and from every attribute whose stage has not run, with the
-            command that runs it.
+        InputError: there is no run. Every attribute whose stage has not run raises it as well, with
+            the command that runs the stage.
     """
 
     def __init__(self, root: str | Path) -> None:
@@ -95,22 +95,22 @@ class Run:
 
     @property
     def model(self) -> str:
-        """The best confirmed model, the default of the methods below."""
+        """The best confirmed model."""
         return models.default_model(self.root)
 
     def effects(self, model: str = "") -> tuple[str, ...]:
-        """The effects that a model has beyond the bare device."""
+        """The effects of a model."""
         return self._results.effects(self._choose_model(model))
 
     def parameters(self, model: str = "") -> pd.DataFrame:
-        """One row per parameter: estimate, sd, unit, and further results of identification."""
+        """One row per parameter: estimate, sd, unit, and further results of the identification."""
         frame = _make_frame(self._read(IdentifyResult, model).parameters)
         first = [name for name in ("estimate", "sd", "unit") if name in frame]
         order = self._results.order_parameters(frame.index)
         return frame.loc[list(order), first + [c for c in frame if c not in first]]
 
     def covariance(self, model: str = "") -> pd.DataFrame:
-        """Covariance of the estimates, parameters by parameters."""
+        """Covariance matrix of the estimates."""
         found = self._read(IdentifyResult, model).covariance
         return pd.DataFrame(found.matrix, list(found.names), list(found.names))
 
@@ -123,12 +123,12 @@ class Run:
         return _make_frame(self._read(ValidateResult, model).axes)
 
     def free_run(self, model: str = "") -> dict[str, Any]:
-        """Error of the free-running model, or the reason why there is none."""
+        """Error of a free run of the model, or the reason why there is none."""
         found = self._read(ValidateResult, model).free_run
         return {} if found is None else found.model_dump(mode="json")
 
     def residuals(self, model: str = "") -> pd.DataFrame:
-        """Measured and predicted torque and force, with parameters from other trials."""
+        """Measured torque and force, and their prediction with parameters from other trials."""
         return self._table(f"models/{self._choose_model(model)}/residuals.parquet", "validate")
 
     def diagnosis(self, model: str = "") -> dict[str, Any]:
@@ -157,7 +157,7 @@ class Run:
 
     @property
     def figures(self) -> Mapping[str, Picture]:
-        """The figures of the report by name; empty where it has not been made."""
+        """The figures of the report by name; empty if there is no report."""
         paths = sorted((self.root / "report" / "figures").glob("*.svg"))
         return {path.stem: Picture(path) for path in paths}
 
@@ -189,10 +189,7 @@ def _make_frame(entries: Mapping[str, Record]) -> pd.DataFrame:
 
 
 def open_run(path: str | Path) -> Run:
-    """Open a run folder, or the one in ``runs/`` that has this name.
-
-    Args:
-        path: such as ``runs/2026-10-03_s01`` or ``2026-10-03_s01``.
+    """Open a run by its folder, or by its name in ``runs/``.
 
     Raises:
         InputError: there is no such run.

@@ -1,4 +1,4 @@
-"""Comparison of two sessions of one device: changed parameters, and whether models travel."""
+"""Comparison of two sessions of one device, and prediction of each by the model of the other."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ from bampipe.trials.measured import read_measured_trials
 _MAPPED_VARIABLES = ("position", "velocity", "direction")
 _MAP_BINS, _FEWEST_SAMPLES, _MOST_REFITS = 8, 12, 5
 _LEAST_GAIN = 0.03
-"""Share of an axis' error above its limit that a further parameter has to remove."""
+"""Smallest fall of the log error above the limits for which another parameter is refitted."""
 _REFIT_STEPS = 4
-"""Gauss-Newton steps of a refit of parameters in which the residual is not linear."""
+"""Gauss-Newton steps of a refit if the residual is not linear in its parameters."""
 
 
 @dataclass(frozen=True)
 class _Side:
-    """A session with one of its models."""
+    """A session and one of its models."""
 
     name: str
     run: RunFolder
@@ -74,14 +74,14 @@ class _Side:
         return tuple(effect.name for effect in self.system.model.effects)
 
     def predict(self, other: _Side) -> Evidence:
-        """Return this model on the trials of ``other``, not refitted."""
+        """Evaluate this model on the trials of ``other`` without a refit."""
         trials = read_measured_trials(other.run, self.system, timing=other.found.input_timing)
         return gather_evidence(
             self.system, trials.motions, trials.band, self.p, trials.folds, most_iterations=0
         )
 
     def covariance(self, evidence: Evidence) -> Array:
-        """Return the covariance of the free parameters, (n_free, n_free); 0 if not estimated."""
+        """Return the covariance of the free parameters, (n, n); 0 if they were not estimated."""
         known = self.found.covariance
         free = [self.system.parameters[i].name for i in evidence.free]
         frame = pd.DataFrame(known.matrix, list(known.names), list(known.names))
@@ -102,24 +102,23 @@ def compare_runs(
 
     Args:
         first, second: run folders.
-        model: of both sessions; if empty, the best confirmed one of each.
-        progress: called with the share done.
+        model: model of both sessions; by default the best confirmed one of each.
 
     Raises:
-        InputError: devices, axes or parameters differ, a run is given twice, or a stage has not
+        InputError: devices, axes or parameters differ, both runs are the same, or a stage has not
             run.
     """
     roots = [open_run(run).root for run in (first, second)]
     differ = roots[0].name != roots[1].name
     a, b = (_Side.read(root, root.name if differ else str(root), model) for root in roots)
     notes = _require_one_device(a, b)
-    progress(0.1, f"the model of {a.name} on {b.name}, and the reverse")
+    progress(0.1, f"predicting {b.name} with the model of {a.name}, and the reverse")
     there, back = a.predict(b), b.predict(a)
     journeys = []
     for one, other, evidence in ((a, b, there), (b, a, back)):
-        progress(0.3, f"effects that the model of {one.name} lacks on {other.name}")
+        progress(0.3, f"looking for effects that the model of {one.name} lacks on {other.name}")
         journeys.append(_describe_journey(one, other, evidence))
-    progress(0.9, "residual by state")
+    progress(0.9, "comparing the residuals by state")
     parameters, alone = _compare_parameters(a, b)
     notes += [f"Only {name} has {join_names(some)}." for name, some in alone.items() if some]
     pair = PairResult(
@@ -137,7 +136,7 @@ def compare_runs(
 def _require_one_device(a: _Side, b: _Side) -> list[str]:
     """Refuse sessions that cannot be compared; return notes on the others."""
     if a.run.root.resolve() == b.run.root.resolve():
-        raise InputError("this is one run twice", where=str(a.run.root))
+        raise InputError("both runs are the same", where=str(a.run.root))
     facts = [_list_facts(side.system) for side in (a, b)]
     for what, here in facts[0].items():
         there = facts[1][what]
@@ -159,7 +158,7 @@ def _require_one_device(a: _Side, b: _Side) -> list[str]:
 
 
 def _list_facts(system: System) -> dict[str, set[str]]:
-    """Return the device, axes and own parameters, which sessions of one device share."""
+    """Return the device, its axes and its parameters, which two sessions must share."""
     of_effects = {q.name for effect in system.model.effects for q in effect.parameters}
     own = (q for q in system.parameters if q.name not in of_effects)
     return {
@@ -172,7 +171,7 @@ def _list_facts(system: System) -> dict[str, set[str]]:
 def _compare_parameters(
     a: _Side, b: _Side
 ) -> tuple[dict[str, ParameterChange], dict[str, list[str]]]:
-    """Return the common parameters, and those of one model only, by session."""
+    """Return the changes of common parameters, and the other parameters of each session."""
     tables: list[dict[str, ParameterEstimate | BaseEstimate]] = []
     for side in (a, b):
         every, inertial = side.found.parameters, side.found.inertial
@@ -208,7 +207,7 @@ def correct_p_values(z: Sequence[float]) -> list[float]:
 
 
 def _compare_states(a: _Side, here: Evidence, there: Evidence) -> tuple[StateChange, ...]:
-    """Return the residual of the model of ``a`` on both sessions by state, in equal bins."""
+    """Return the residual of the model of ``a`` on both sessions, in equal bins of the state."""
     spread, found, every = a.covariance(here), [], []
     for axis, name in enumerate(a.system.coordinates):
         known = [variables(e.fitted, e.band, axis) for e in (here, there)]
@@ -239,9 +238,9 @@ def _compare_states(a: _Side, here: Evidence, there: Evidence) -> tuple[StateCha
 
 
 def _bin_residual(e: Evidence, axis: int, values: Array, edges: Array) -> pd.DataFrame:
-    """Return, by bin, centre, mean residual, its standard error sd, count and mean slopes.
+    """Return centre, mean residual, its standard error, count and mean slopes of each bin.
 
-    The standard error is the larger one of those within and between trials.
+    The standard error is the larger of those within and between trials.
     """
     use = np.concatenate([used[:, axis] for used in e.used])
     trial = np.repeat(np.arange(len(e.used)), [len(used) for used in e.used])[use]
@@ -268,7 +267,7 @@ def _make_map(bins: pd.DataFrame, unit: str) -> ResidualMap:
 
 
 def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
-    """Return the model of one session on the trials of the other, and refits that travel."""
+    """Predict the trials of one session with the model of the other, and refit it if it fails."""
     judged = list(np.flatnonzero(e.folds.judged))
     count = np.maximum(e.sums.count[judged].sum(axis=0), 1.0)
     of_spread = np.einsum("kaij,ij->a", e.sums.xx[judged], model.covariance(e))
@@ -279,7 +278,7 @@ def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
         judge = trials.validated.axes[axis]
         least = judge.noise_floor
         if least is None or model.validated.axes[axis].standing != "at_floor":
-            # It lacks something on its own trials too: that is no change.
+            # A model that fails on its own trials may have the same error on the others.
             least = max(judge.held_out_rmse, least or 0.0)
         limit = AT_FLOOR * math.hypot(least, spread[i]) + FLOOR_SDS * judge.noise_floor_sd
         axes[axis] = Travel(
@@ -304,7 +303,7 @@ def _describe_journey(model: _Side, trials: _Side, e: Evidence) -> Journey:
 
 
 def _refit_together(e: Evidence, limits: Array) -> Refit | None:
-    """Refit parameters, added one at a time while each brings some axis nearer to its limit."""
+    """Refit parameters, one more at a time while an axis comes closer to its limit."""
     chosen: list[int] = []
     error = e.rmse()
     while len(chosen) < len(e.free) and np.any(error > limits):
@@ -324,7 +323,7 @@ def _sum_excess(error: Array, limits: Array) -> float:
 
 
 def _refit(e: Evidence, chosen: list[int], limits: Array) -> Refit:
-    """Refit the free parameters numbered ``chosen``, the others held."""
+    """Refit the free parameters with indices ``chosen`` and hold the others."""
     start, free = e.p, list(e.free)
     step, error = _solve(e, chosen, limits)
     if not all(e.system.constant[free[k]] for k in chosen):
@@ -345,7 +344,7 @@ def _refit(e: Evidence, chosen: list[int], limits: Array) -> Refit:
 
 
 def _solve(e: Evidence, chosen: list[int], limits: Array) -> tuple[Array, Array]:
-    """Return a linear step of some free parameters and its error on held-out trials, (n_q,)."""
+    """Return a linear step of some free parameters, and its held-out error, (n_q,)."""
     sums, groups = e.sums, np.array(e.folds.groups)
     fitted, judged = np.array(e.folds.fitted), np.array(e.folds.judged)
     xx = sums.xx[:, :, chosen][:, :, :, chosen]
@@ -368,7 +367,7 @@ def _solve(e: Evidence, chosen: list[int], limits: Array) -> tuple[Array, Array]
 
 
 def _find_lacking(model: _Side, trials: _Side, axes: Collection[str]) -> dict[str, object]:
-    """Return what a model with the same effects lacks in the other session, by axis."""
+    """Return the effects that a model with the same effects lacks in the other session."""
     root, found = trials.run.root, models.names(trials.run.root)
     alike = (m for m in found if {*models.read(root, m).effects} == {*model.effects})
     name = next(alike, trials.model)

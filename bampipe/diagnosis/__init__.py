@@ -1,1 +1,1 @@
-"""Which effects a model lacks: one likelihood, one search over sets, one rule."""
+"""The diagnosis: the effects that a model lacks, by one likelihood, one search and one rule."""

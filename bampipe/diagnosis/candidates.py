@@ -1,4 +1,4 @@
-"""Candidate effects: which there are, and the model in which each is compiled."""
+"""Candidate effects of a device, and the model in which each is compiled."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ class Candidate:
     """One effect at one target.
 
     Attributes:
-        name: canonical, ``stribeck:yaw``.
-        system: the device with this effect alone; with the other effects of the model before it
-            where it acts on what they leave.
-        is_joint: whether it is with them.
-        linear_indices: places among the effect's parameters of strengths in which the residual is
-            linear; searched_indices: of those that are searched.
+        name: ``effect:target``, such as ``stribeck:yaw``.
+        system: the device with this effect, the last of the model.
+        is_joint: whether ``system`` also has the other effects of the model, because they interact.
+        parameters: the parameters of the effect.
+        linear_indices: indices of the strengths in which the residual is linear.
+        searched_indices: indices of the other free parameters, whose values are searched.
     """
 
     name: str
@@ -34,16 +34,16 @@ class Candidate:
 
     @property
     def replaces_motion(self) -> bool:
-        """Whether all that it does is that the model sees another motion than was measured."""
+        """Whether the effect changes the motion that the model sees, and nothing else."""
         return self.system.model.effects[-1].effect.kind == "measurement"
 
 
 def list_candidates(
     device: Device, present: Sequence[str], extra: Sequence[Effect] = (), on_request: bool = False
 ) -> tuple[str, ...]:
-    """Return the names of effects that could be added to ``device`` and are not ``present``.
+    """Return the names of the effects that ``device`` could have, except those ``present``.
 
-    Effects that are weighed on request only are left out unless ``on_request`` is set.
+    With ``on_request``, they include the effects that are weighed only on request.
     """
     known = {name: built_in(name) for name in effect_names()} | {e.name: e for e in extra}
     names = [
@@ -58,9 +58,7 @@ def list_candidates(
 def build_candidate_model(
     device: Device, name: str, extra: Sequence[Effect] = (), present: Sequence[str] = ()
 ) -> Model:
-    """Return the model in which an effect is a candidate for one that has the effects ``present``.
-
-    That is ``device`` with the effect alone, last with those present where they act on each other.
+    """Return ``device`` with a candidate, which follows the effects ``present`` if they interact.
 
     Raises:
         InputError: there is no such effect or target.
@@ -73,12 +71,13 @@ def build_candidate_model(
 
 
 def compile_candidate(model: Model) -> Candidate:
-    """Compile the candidate that is the last effect of ``model``; see `build_candidate_model`."""
+    """Compile the last effect of ``model`` as a candidate; see `build_candidate_model`."""
     system, item = compile_model(model), model.effects[-1]
     is_joint = len(model.effects) > 1
     judged = system
     if is_joint and item.effect.pulls:
-        # A load that a spring is part of takes a tenth or so of what it adds: as good as linear.
+        # A load-dependent loss takes only about a tenth of a spring's force, so that the residual
+        # is nearly linear in the spring.
         judged = compile_model(Model(model.device, (item.name,), (item.effect,)))
     parameters = system.parameters[len(system.parameters) - len(item.parameters) :]
     is_linear = judged.linear[len(judged.linear) - len(parameters) :]

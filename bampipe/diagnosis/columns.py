@@ -1,4 +1,4 @@
-"""What a candidate adds to the residual of a fitted model: columns of a linear problem."""
+"""The change of a fitted model's residual by a candidate, as columns of a linear problem."""
 
 from collections.abc import Sequence
 
@@ -11,14 +11,14 @@ from bampipe.trials.likelihood import NOTHING
 from bampipe.trials.residuals import ModelOnTrial
 
 
-def added_columns(evidence: Evidence, item: Candidate, searched: Array) -> Array:
-    """What a candidate adds at given values of its searched parameters, low-passed, all trials.
+def compute_columns(evidence: Evidence, item: Candidate, searched: Array) -> Array:
+    """Return the low-passed change of the residual by each linear strength, (n, n_q, m).
 
-    Returns:
-        Columns of its linear strengths, (n, n_q, m); where it has none the change of the residual.
+    The rows are those of all trials. A candidate without a linear strength has one column, its
+    whole change of the residual. ``searched`` are the values of its searched parameters.
     """
     e, system = evidence, item.system
-    count, p = len(system.parameters) - len(item.parameters), parameters_with(e, item, searched)
+    count, p = len(system.parameters) - len(item.parameters), make_parameters(e, item, searched)
     axes = list(range(len(system.coordinates)) if system.moves_sensors else system.touched)
     probes = [p.copy() for _ in item.linear_indices or (None,)]
     for probe, i in zip(probes, item.linear_indices, strict=False):
@@ -26,8 +26,7 @@ def added_columns(evidence: Evidence, item: Candidate, searched: Array) -> Array
     rows = (
         values[part]
         for base in e.along
-        for each in [_added_residuals(item, probes, base)]
-        for values in [np.concatenate([r[:, axes] for r in each], axis=1)]
+        for values in [np.hstack([r[:, axes] for r in _compute_changes(item, probes, base)])]
         for part in base.motion.parts
     )
     values = np.concatenate(e.band.thin_trials(rows, axes * len(probes)))
@@ -37,16 +36,16 @@ def added_columns(evidence: Evidence, item: Candidate, searched: Array) -> Array
     return thin.transpose(0, 2, 1)
 
 
-def parameters_with(
+def make_parameters(
     evidence: Evidence, item: Candidate, searched: Array, strengths: Array | float = 0.0
 ) -> Array:
-    """The parameters of a candidate's system beside a fitted model, (n_p,)."""
+    """Return the parameters of a candidate's system, the model's own as fitted, (n_p,)."""
     e, system = evidence, item.system
     count = len(system.parameters) - len(item.parameters)
     p = np.array([q.prior for q in system.parameters])
     beside_others = item.is_joint or _moves(item)
     for k, q in enumerate(system.parameters[:count]):
-        # Where the fit took a parameter away, an effect of it would be none: its prior stands in.
+        # An effect that scales a parameter needs its prior if the fit put it at its lower bound.
         if beside_others or k not in e.free or e.p[k] - q.lower > NOTHING * q.sd:
             p[k] = e.p[k]
     p[[count + i for i in item.searched_indices]] = searched
@@ -54,16 +53,16 @@ def parameters_with(
     return p
 
 
-def added_residual(item: Candidate, p: Array, base: ModelOnTrial) -> Array:
-    """What a candidate adds to the residual of a model along a motion, (T, n_q), N.m or N.
+def compute_added_residual(item: Candidate, p: Array, base: ModelOnTrial) -> Array:
+    """Return the change of a model's residual by a candidate along a motion, (T, n_q), N.m or N.
 
-    ``p`` are the parameters of its system, its own last; ``base`` is the model without it.
+    ``p`` are the parameters of the candidate's system; ``base`` is the model without the candidate.
     """
-    return _added_residuals(item, [p], base)[0]
+    return _compute_changes(item, [p], base)[0]
 
 
-def _added_residuals(item: Candidate, probes: Sequence[Array], base: ModelOnTrial) -> list[Array]:
-    """`added_residual` at parameters that give the same internal states."""
+def _compute_changes(item: Candidate, probes: Sequence[Array], base: ModelOnTrial) -> list[Array]:
+    """Return `compute_added_residual` for each of ``probes``, which share their internal states."""
     system, moves = item.system, _moves(item)
     motion = base.motion if moves else base.mechanism
     u = motion.inputs(system.inputs)
@@ -85,6 +84,6 @@ def _added_residuals(item: Candidate, probes: Sequence[Array], base: ModelOnTria
 
 
 def _moves(item: Candidate) -> bool:
-    """Whether the mechanism moves otherwise with a candidate: by its own offset, or by its load."""
+    """Return whether a candidate's parameters change the motion of the mechanism."""
     count = len(item.system.parameters) - len(item.parameters)
     return any(number >= count for number in item.system.moved_by)

@@ -1,4 +1,4 @@
-"""The numbers that decide a verdict: one record, passed to whatever judges."""
+"""The criteria of a verdict."""
 
 from typing import Annotated
 
@@ -14,23 +14,23 @@ Fraction = Annotated[float, Field(gt=0, lt=1)]
 
 @checked_dataclass(frozen=True, config=STRICT)
 class Criteria:
-    """What it takes for an effect to be called missing; each described in docs/method_selection.
+    """The criteria for calling an effect missing; docs/method_selection.md describes each.
 
     Attributes:
-        probability: the probability from which an effect is called missing; one that has less than
-            one minus that is not mentioned.
-        size: the smallest share of the applied force of an axis, root mean square, that an effect
-            must add to matter, beyond what other parameters could take over.
+        probability: probability P from which effects are called missing; below 1 - P, they are not
+            mentioned.
+        size: smallest share of the applied force of an axis (root mean square) that an effect must
+            add beyond what other parameters could absorb.
         replicates: number of replicates of the fitted model, as in a parametric bootstrap.
-        expected_effects: number of effects that a model is expected to lack.
+        expected_effects: prior number of missing effects.
         most_effects: largest number of effects that a set adds to the model.
-        bias_error: relative error of the bias that filters cause where friction reverses.
-        discrepancy: error of any model, root mean square, as a share of the applied force.
+        bias_error: relative error of the biases that filters cause where friction reverses.
+        discrepancy: root mean square error of any model, as a share of the applied force.
         tails: degrees of freedom of Student's t distribution of the errors.
-        block_s: length of stretches of time that count as independent, s: one must not decide.
+        block_s: length of independent blocks of time, s; no single block decides a verdict.
         beam: number of sets of effects that are pursued side by side.
-        doubt: scale of what is left on an axis, in units of noise and discrepancy, from which on it
-            is something unknown for certain.
+        doubt: scale of the residual of an axis, in units of noise and discrepancy, above which
+            something unknown is certain.
     """
 
     probability: Annotated[float, Field(gt=0.5, lt=1)] = 0.9
@@ -47,15 +47,15 @@ class Criteria:
 
     @property
     def largest_p_value(self) -> float:
-        """The p-value from which on `most_probable` is below ``probability``."""
+        """The p-value at which `cap_probability` equals ``probability``."""
         odds_against = (1.0 - self.probability) / self.probability
         return float(np.exp(lambertw(-odds_against / np.e, -1).real))
 
 
-def most_probable(p_value: float) -> float:
-    """The highest probability that an effect can have which chance imitates with a p-value.
+def cap_probability(p_value: float) -> float:
+    """Return the highest probability of an effect whose gain has a given p-value.
 
-    At even odds before (Sellke, Bayarri and Berger 2001, The American Statistician 55, 62).
+    The prior odds are even (Sellke, Bayarri and Berger 2001, The American Statistician 55, 62).
     """
     p = min(max(p_value, 1e-300), 1.0 / np.e)
     return float(1.0 / (1.0 - np.e * p * np.log(p)))

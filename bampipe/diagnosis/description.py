@@ -1,4 +1,4 @@
-"""The shape of a residual in one sentence: what it varies with, where, which way round."""
+"""The shape of a residual in one sentence."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,23 +12,23 @@ from bampipe.results.rounding import significant
 from bampipe.trials.evidence import Evidence
 
 _VARIABLE, _MENTIONED = 0.2, 0.005
-"""Least share of a residual's variance that a variable carries to be named, and to be mentioned
-where the residual is scattered."""
+"""Smallest share of a residual's variance that a variable must explain to name its shape, and to be
+mentioned if the residual is scattered."""
 _RIPPLE = 0.5
-"""Least share of that which a sine carries to be called a ripple."""
+"""Smallest part of that share that a sine must explain to be called a ripple."""
 _ALIKE = 0.6
-"""Correlation of the residual in both directions from which on it is called the same, as of a
-spring, or opposite, as of friction."""
+"""Correlation of the residuals in both directions of motion above which they are called the same,
+or opposite if it is negative."""
 _BUMP_HEIGHT, _BUMP_WIDTH = 0.5, 1.0 / 3.0
-"""Share of the largest mean residual from which on a place belongs to a bump, and share of the
-range up to which it is one and not a broad change."""
+"""Share of the largest mean residual above which a bin belongs to a bump, and largest share of the
+range that a bump covers; a wider one is a broad change."""
 _SIGNIFICANT = 0.01
-"""Chance of a vibration where there is none."""
+"""Probability of reporting a vibration that is not there."""
 
 
 @dataclass(frozen=True)
 class _Sine:
-    """Best sine through scattered values: share of their variance, amplitude, cycles a unit."""
+    """A sine fitted to a residual: share of variance, amplitude, cycles per unit of abscissa."""
 
     share: float
     amplitude: float
@@ -36,12 +36,9 @@ class _Sine:
 
 
 def describe(evidence: Evidence, axis: int) -> str:
-    """The residual's shape in one sentence: what it varies with most, where, which way."""
-    known = [
-        v
-        for v in variables(evidence.fitted, evidence.band, axis)
-        if v.name not in ("trial", "direction")
-    ]
+    """Return the shape of an axis' residual, by the variable that explains most of it."""
+    every = variables(evidence.fitted, evidence.band, axis)
+    known = [v for v in every if v.name not in ("trial", "direction")]
     maps = [residual_map(evidence, axis, v, 3 * BINS) for v in known]
     best = int(np.argmax([m.share for m in maps]))
     most, variable = maps[best], known[best]
@@ -51,26 +48,26 @@ def describe(evidence: Evidence, axis: int) -> str:
         if vibration is not None and vibration.share > max(most.share, _VARIABLE):
             return (
                 f"a vibration of {significant(vibration.amplitude, 2)} {unit} at "
-                f"{vibration.frequency:.3g} Hz in time, whatever the machine does; it carries "
+                f"{vibration.frequency:.3g} Hz in time, independent of the motion; it explains "
                 f"{100 * vibration.share:.0f} % of the residual's variance"
             )
     if most.share < _VARIABLE:
         return (
-            "scattered over all motions; of all that the machine does, "
-            f"{most.variable} explains most of it, {100 * most.share:.0f} %"
+            f"scattered over all motions; of all variables, {most.variable} explains most, "
+            f"{100 * most.share:.0f} %"
             if most.share >= _MENTIONED
-            else "scattered over all motions; it follows nothing that the machine does"
+            else "scattered over all motions and independent of all variables of the motion"
         )
-    carries = f"{most.variable} carries {100 * most.share:.0f} % of the residual's variance"
+    explains = f"{most.variable} explains {100 * most.share:.0f} % of the residual's variance"
     turning = _by_direction(evidence, axis, variable)
     ripple = _ripple(evidence, axis, variable)
     if ripple is not None and ripple.share > _RIPPLE * most.share:
         period = 1.0 / ripple.frequency
         return (
             f"a ripple of {significant(ripple.amplitude, 2)} {unit} along {most.variable} that "
-            f"repeats every {period:.3g} {most.unit}, {turning}; {carries}"
+            f"repeats every {period:.3g} {most.unit}, {turning}; {explains}"
         )
-    return f"{_bumps(most, unit)}, {turning}; {carries}"
+    return f"{_bumps(most, unit)}, {turning}; {explains}"
 
 
 def _bumps(most: Map, torque_unit: str) -> str:
@@ -94,7 +91,7 @@ def _bumps(most: Map, torque_unit: str) -> str:
 
 
 def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:
-    """A sine along ``variable`` with at least two periods within its range."""
+    """Return the best sine along ``variable`` with at least two periods within its range."""
     use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
     r = np.concatenate([x[:, axis] for x in evidence.residual])[use]
     v = np.concatenate(variable.values)[use]
@@ -105,9 +102,9 @@ def _ripple(evidence: Evidence, axis: int, variable: Variable) -> _Sine | None:
 
 
 def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
-    """A sine in time, of any phase in each trial; None where chance may give one as strong.
+    """Return the best sine in time, or None if chance could give one as strong.
 
-    Of noise, the share at one frequency is a sum of exponential variates, one a trial (Lomb 1976).
+    The share of noise at one frequency is a sum of one exponential variate per trial (Lomb 1976).
     """
     band = evidence.band
     trials = []
@@ -127,9 +124,9 @@ def _vibration(evidence: Evidence, axis: int) -> _Sine | None:
 
 
 def _best_sine(trials: Sequence[tuple[Array, Array]], frequencies: Array) -> _Sine:
-    """Best least-squares sine about the mean, of any phase and size in each trial (Lomb 1976).
+    """Return the best least-squares sine, with a phase and size of its own in each trial.
 
-    ``trials`` are place or time, and residual, (T,) each.
+    ``trials`` are pairs of abscissa and residual, (T,) each (Lomb 1976).
     """
     centred = [(x, r - r.mean()) for x, r in trials]
     count = sum(len(r) for _, r in trials)
@@ -150,7 +147,7 @@ def _best_sine(trials: Sequence[tuple[Array, Array]], frequencies: Array) -> _Si
 
 
 def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
-    """Whether the residual keeps its sign when the motion turns round, as friction does not."""
+    """Compare the residual in both directions of motion, in words."""
     r = np.concatenate([x[:, axis] for x in evidence.residual])
     v = np.concatenate(variable.values)
     kept = [evidence.band.thinned_rows(len(m.t)) for m in evidence.motions]
@@ -166,7 +163,7 @@ def _by_direction(evidence: Evidence, axis: int, variable: Variable) -> str:
     varied = np.ptp(np.array(means), axis=0).all()
     likeness = float(np.corrcoef(np.array(means).T)[0, 1]) if varied else 0.0
     if likeness > _ALIKE:
-        return "the same in both directions of motion, as of a spring"
+        return "the same in both directions of motion, like a spring"
     if likeness < -_ALIKE:
-        return "opposite in the two directions of motion, as of friction"
+        return "opposite in the two directions of motion, like friction"
     return "different in the two directions of motion"

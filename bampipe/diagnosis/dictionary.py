@@ -1,8 +1,8 @@
-"""Columns of candidates: what each adds to the residual, over a grid of its shapes, made once."""
+"""The columns that candidates add to the residual, each computed once per shape."""
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
-from bampipe.diagnosis.columns import added_columns, parameters_with
+from bampipe.diagnosis.columns import compute_columns, make_parameters
 from bampipe.diagnosis.ranges import MachineScale, SearchRange
 from bampipe.physics.system import System
 from bampipe.trials.evidence import Evidence
@@ -19,15 +19,15 @@ from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.scale import NO_SLOPE, Spectra, find_spectra, gain_of_filter, slopes_by_force
 
 _ALONE, _SEVERAL = 7, 5
-"""Values of a shape on the grid: of an effect with one, and of each of an effect with several."""
+"""Grid values per shape, for an effect with one shape and with several."""
 _WIDE = 300.0
-"""Ratio of the ends of a range from which on its grid has `_MORE` values more."""
 _MORE = 4
+"""A range whose ends have a ratio above `_WIDE` gets `_MORE` more grid values."""
 _MOST, _MOST_OF_THREE, _MOST_OF_STATES = 60, 120, 300
-"""Shapes on a grid: of an effect without and with internal states, whose shape decides when things
-happen, not only how large they are; three of them at most, or more."""
+"""Largest grid of an effect without internal states, with up to three shapes and with more. States
+need a finer grid, since their shapes decide when something happens, not only how strongly."""
 _DIVERGED = 1e30
-"""An internal state that is too stiff to be integrated at the sampling rate ends above this."""
+"""An internal state too stiff for the sampling rate exceeds this value."""
 
 Key = tuple[str, tuple[float, ...]]
 """A candidate and its shape: each searched parameter as a share, 0 to 1, of its range."""
@@ -38,11 +38,11 @@ class Atom:
     """A candidate with one shape.
 
     Attributes:
-        columns: by the number of each axis that it changes, (n, m) for its m strengths.
-        slopes: derivative of what it adds by each measured force, by axis, (n, n_forces, m), for
-            each of its strengths at one; empty where it passes a constant force as it is.
-        gain: share of the variance of white noise of the measured force that it leaves in the
-            band where it filters that force, by axis, (n_q,); else one.
+        columns: by the index of each axis that it changes, (n, m) for its m strengths.
+        slopes: derivative of the columns by each measured force, by axis, (n, n_forces, m); empty
+            if a constant force passes unchanged.
+        gain: share of the variance of white force noise that passes its filter within the band, by
+            axis, (n_q,); one without a filter.
     """
 
     columns: Mapping[int, Array]
@@ -57,7 +57,7 @@ class Atom:
 
 @dataclass
 class Dictionary:
-    """The candidates, by name, beside one fitted model, and its samples that count."""
+    """The candidates of one fitted model by name, and the samples of the model that count."""
 
     evidence: Evidence
     samples: Sequence[Samples]
@@ -66,7 +66,7 @@ class Dictionary:
 
     @cached_property
     def ranges(self) -> Mapping[str, tuple[SearchRange, ...]]:
-        """Where the parameters of each candidate are searched."""
+        """Ranges of the searched parameters of each candidate."""
         return {
             name: tuple(
                 self.scale.range_of(c.system.model.effects[-1], c.parameters[i])
@@ -76,49 +76,49 @@ class Dictionary:
         }
 
     def grid(self, name: str) -> list[Key]:
-        """The shapes of a candidate at which its columns are made to begin with."""
+        """Return the initial shapes of a candidate."""
         ranges = self.ranges[name]
         each = _ALONE if len(ranges) == 1 else _SEVERAL
         counts = [
-            max(each + _MORE * (r.by_ratio and r.high / r.low > _WIDE), r.fewest) for r in ranges
+            max(each + _MORE * (r.by_ratio and r.high / r.low > _WIDE), r.grid_size) for r in ranges
         ]
         states = self.candidates[name].system.model.effects[-1].effect.states
         most = _MOST_OF_STATES if len(ranges) > 3 else _MOST_OF_THREE
-        most = max(most if states else _MOST, math.prod(r.least for r in ranges))
+        most = max(most if states else _MOST, math.prod(r.least_count for r in ranges))
         while np.prod(counts) > most:
             dense = [(n - 1) / r.extent for n, r in zip(counts, ranges, strict=True)]
             counts[int(np.argmax(dense))] -= 1
-        # Few values are better off amid the parts of a range than at its ends.
+        # If there are few values, they lie in the middle of equal parts of the range.
         axes = [np.linspace(0.0, 1.0, n) if n > 3 else (np.arange(n) + 0.5) / n for n in counts]
         return [(name, tuple(map(float, shape))) for shape in itertools.product(*axes)]
 
     def values(self, key: Key) -> Array:
-        """The searched parameters of a candidate, in its unit."""
+        """Return the searched parameters of a candidate, each in its unit."""
         name, shape = key
         pairs = zip(self.ranges[name], shape, strict=True)
-        return np.array([r.value_at(r.within(share)) for r, share in pairs])
+        return np.array([r.value_at(r.interpolate(share)) for r, share in pairs])
 
     def bounds(self, name: str) -> list[tuple[float, float]]:
-        """Least and largest strength of each column of a candidate."""
+        """Return the smallest and largest strength of each column of a candidate."""
         c = self.candidates[name]
         if not c.linear_indices:
-            # What may have either sign is as good as linear below the least on the grid.
+            # An effect of either sign is nearly linear below the smallest strength on the grid.
             least = 0.0 if any(r.low < 0.0 for r in self.ranges[name]) else _MULTIPLE[0]
             return [(least, _MULTIPLE[1])]
         return [(c.parameters[i].lower, c.parameters[i].upper) for i in c.linear_indices]
 
     def spreads(self, name: str) -> list[float]:
-        """Standard deviation of each strength before any data, by the effect's file."""
+        """Return the prior standard deviation of each strength, from the effect's file."""
         c = self.candidates[name]
         if not c.linear_indices:
             return [1.0]
         return [c.parameters[i].sd for i in c.linear_indices]
 
     def make(self, key: Key) -> Atom | None:
-        """Compute a candidate at one shape; None where it does nothing in these trials."""
+        """Compute a candidate at one shape; None if it has no effect in these trials."""
         e, item, values = self.evidence, self.candidates[key[0]], self.values(key)
         with np.errstate(all="ignore"):
-            columns = added_columns(e, item, values)
+            columns = compute_columns(e, item, values)
         found = {}
         for axis, here in enumerate(self.samples):
             rows = columns[here.rows, axis]
@@ -126,32 +126,22 @@ class Dictionary:
                 return None
             if rows.any():
                 found[axis] = rows
-        if not found or not all(
-            any(f[:, k].any() for f in found.values())
-            for k in range(next(iter(found.values())).shape[1])
-        ):
+        if not found or not np.any([f.any(axis=0) for f in found.values()], axis=0).all():
             return None
         one_each = np.eye(len(item.linear_indices)) if item.linear_indices else np.zeros((1, 0))
-        slopes = self._slopes(item, [parameters_with(e, item, values, b) for b in one_each])
-        return Atom(found, slopes, self._gain(item, parameters_with(e, item, values), slopes))
+        slopes = self._slopes(item, [make_parameters(e, item, values, b) for b in one_each])
+        return Atom(found, slopes, self._gain(item, make_parameters(e, item, values), slopes))
 
     def gain_with(self, name: str, parameters: Mapping[str, float]) -> Array:
-        """`Atom.gain` of a candidate with given parameters of its own, by name."""
+        """Return `Atom.gain` of a candidate at given values of its parameters, by name."""
         item = self.candidates[name]
         count = len(item.system.parameters) - len(item.parameters)
         own = [parameters[q.name] for q in item.parameters]
         p = np.concatenate([self.evidence.p[:count], own])
         return self._gain(item, p, self._slopes(item, [p]))
 
-    def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
-        """`make` each."""
-        return [(key, self.make(key)) for key in keys]
-
     def _slopes(self, item: Candidate, probes: Sequence[Array]) -> dict[int, Array]:
-        """Slopes of what a candidate adds by each measured force, by axis, (n, n_forces, m).
-
-        At parameters ``probes``, m times (n_p,), that give it the same internal states.
-        """
+        """Return `Atom.slopes` at the m ``probes``, (n_p,) each, which share internal states."""
         e, system = self.evidence, item.system
         if not (system.driven or system.force_fed):
             return {}
@@ -166,17 +156,14 @@ class Dictionary:
         return {axis: slope for axis, slope in enumerate(found) if (np.abs(slope) > NO_SLOPE).any()}
 
     def _gain(self, item: Candidate, p: Array, slopes: Mapping[int, Array]) -> Array:
-        """What a candidate leaves of the noise of the forces, `Atom.gain`.
-
-        ``slopes`` are what it changes of a constant force; a filter passes that.
-        """
+        """Return `Atom.gain`; a candidate with ``slopes`` is no filter."""
         if slopes or item.linear_indices or not item.system.force_fed:
             return np.ones(len(self.samples))
         return gain_of_filter(self._spectra, self._spectra_of(item.system, p), self.evidence.band)
 
     @cached_property
     def _spectra(self) -> Spectra:
-        """Of the applied force by the model."""
+        """Spectra of the force that the model applies."""
         return find_spectra(self.evidence.thin(lambda at: at.applied))
 
     def _spectra_of(self, system: System, p: Array) -> Spectra:
@@ -186,9 +173,9 @@ class Dictionary:
     def scale_without(
         self, name: str, absence: Mapping[int, float]
     ) -> tuple[dict[int, Array], Array]:
-        """Slopes by the forces that it adds to take one of the model's own effects away, and gain.
+        """Return `Atom.slopes` and `Atom.gain` of the removal of one of the model's effects.
 
-        ``absence`` is the change of each free parameter that takes it away.
+        ``absence`` is the change of each free parameter that removes it.
         """
         e, unchanged = self.evidence, np.ones(len(self.samples))
         moved = {e.free[place]: change for place, change in absence.items() if change}
@@ -206,5 +193,4 @@ class Dictionary:
 
 
 _MULTIPLE = (0.5, 2.0)
-"""Of an effect that is not linear in its strength, by how much what it adds may be more or less
-than at its shape on the grid."""
+"""Bounds of the factor on the column of an effect that is not linear in its strength."""

@@ -1,9 +1,8 @@
 """Probabilities of sets of effects, of single effects, and of something unknown.
 
-The log evidence of a set near the most probable one is a sum over samples. Blocks of time are drawn
-anew, as in a bootstrap, and the probabilities averaged over the draws: an event that a single block
-shows decides nothing (pseudo-Bayesian model averaging with a bootstrap, after Yao, Vehtari, Simpson
-and Gelman 2018, Bayesian Analysis 13, 917).
+The log evidence of a set is a sum over samples. Blocks of time are resampled, and probabilities are
+averaged over the draws, so that no single event decides (pseudo-Bayesian model averaging with a
+bootstrap: Yao, Vehtari, Simpson and Gelman 2018, Bayesian Analysis 13, 917).
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,28 +15,27 @@ from bampipe.arrays import Array, Flags
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Pool
-from bampipe.diagnosis.session import Fit, acting_axes, without_members
-from bampipe.diagnosis.set_cost import SetCosts, added, gone
-from bampipe.diagnosis.unknown import Splines, Unknown, lay_splines, weigh_unknown
+from bampipe.diagnosis.session import Fit, acting_axes, change_effects
+from bampipe.diagnosis.set_cost import SetCosts, added_effects, removed_effects
+from bampipe.diagnosis.unknown import Splines, Unknown, build_splines, weigh_unknown
 
 _DRAWS = 1000
-_NEAR = 14.0
-"""Log evidence below the best, nats, beyond which a set is none of the alternatives: one in a
-million."""
-_MOST = 40
-LEAST_CHANCE = 1e-4
-"""No chance is known to be smaller from a dozen replays."""
+_MARGIN = 14.0
+"""Difference in log evidence, nats, above which a set is no alternative: odds of a million."""
+_MOST_SETS = 40
+LEAST_P_VALUE = 1e-4
+"""Smallest p-value: a dozen replicates do not support a smaller one."""
 
 
 @dataclass(frozen=True)
-class WeighedSet:
-    """A set of effects.
+class SetProbability:
+    """A set of effects with its probability.
 
     Attributes:
-        keys: as changes of the most probable one.
-        effects: that the model then has, beyond those of the model diagnosed.
-        unknown: axis on which something unknown stands beside them; None if nowhere.
-        log_evidence: over that of the most probable set, nats; probability: of the set.
+        keys: its changes of the most probable model.
+        effects: effects that it adds to the model diagnosed.
+        unknown: index of the axis of an unknown function beside the effects, or None.
+        log_evidence: log evidence over that of the most probable model, nats.
     """
 
     keys: tuple[Key, ...]
@@ -48,21 +46,21 @@ class WeighedSet:
 
 
 @dataclass(frozen=True)
-class Weighed:
-    """How probable everything is.
+class Probabilities:
+    """Probabilities of sets, of effects, and of something unknown.
 
     Attributes:
-        sets: the most probable first.
-        effects: probability of each effect of any of them; by_name: the same where nothing is
-            unknown.
+        sets: the sets, most probable first.
+        effects: probability of each effect of any set.
+        if_all_known: the same if nothing unknown is missing.
         unknown: probability that an axis lacks something unknown, (n_q,).
-        functions: what that would be, by axis; None where an axis does not move.
-        drops: log evidence lost without each effect, where nothing takes its place, nats.
+        functions: unknown function of each axis; None for an axis that does not move.
+        drops: log evidence lost without each effect if nothing replaces it, nats.
     """
 
-    sets: tuple[WeighedSet, ...]
+    sets: tuple[SetProbability, ...]
     effects: Mapping[str, float]
-    by_name: Mapping[str, float]
+    if_all_known: Mapping[str, float]
     unknown: Array
     functions: tuple[Unknown | None, ...]
     drops: Mapping[str, float]
@@ -70,43 +68,42 @@ class Weighed:
 
 def weigh_sets(
     by_noise: SetCosts, fit: Fit, pool: Pool, given: Sequence[str], criteria: Criteria, seed: int
-) -> Weighed:
-    """Weigh the sets of a pool, each member's absence, and unknown functions beside them.
+) -> Probabilities:
+    """Compute the probabilities of the sets of a pool and of unknown functions beside them.
 
-    Whether something unknown remains is weighed by the noise; which effects there are, by the
-    samples that are independent in what remains.
+    The number of independent samples is that of the noise for something unknown, and that of the
+    residual for effects.
 
     Args:
         by_noise: costs of sets beside the most probable model; fit: that model.
         pool: sets near it, with costs by the noise.
         given: effects of the model diagnosed, which are not in question.
-        seed: of the bootstrap.
     """
     costs = by_noise.with_independent(fit.count_independent(criteria))
-    # What a set fell short by when it was fitted.
-    short = {k: c - by_noise.cost(k) for c, k in pool.values()}
-    pool = {n: (costs.cost(k) + short[k], k) for n, (_, k) in pool.items()}
+    # A fit may gain less than its linear problem promised.
+    shortfall = {k: c - by_noise.cost(k) for c, k in pool.values()}
+    pool = {n: (costs.cost(k) + shortfall[k], k) for n, (_, k) in pool.items()}
     none = costs.cost(())
-    own = [e for e in costs.p.absence if e not in given]
-    bare = without_members(fit.recipe, own)
-    near = sorted((c, k) for c, k in pool.values() if c < none + _NEAR and k)[:_MOST]
+    own = [e for e in costs.problem.absence if e not in given]
+    bare = change_effects(fit.recipe, own)
+    near = sorted((c, k) for c, k in pool.values() if c < none + _MARGIN and k)[:_MOST_SETS]
     absent = [((f"-{e}", ()),) for e in own]
     named = [
-        _Listed(
-            keys, None, none - costs.cost(keys) - short.get(keys, 0.0),
-            _by_block(costs, keys, None, short.get(keys, 0.0)),
+        _SetEvidence(
+            keys, None, none - costs.cost(keys) - shortfall.get(keys, 0.0),
+            _split_evidence(costs, keys, None, shortfall.get(keys, 0.0)),
         )
         for keys in dict.fromkeys([(), *(k for _, k in near), *absent])
         if np.isfinite(costs.cost(keys))
     ]  # fmt: skip
-    sets = _share(costs, named, given, seed)
-    effects, drops = _by_effect(sets), _losses(sets)
+    sets = _compute_probabilities(costs, named, given, seed)
+    effects, drops = _sum_by_effect(sets), _find_evidence_losses(sets)
     effects |= {e: 0.0 for e in own if by_noise.size_of_own(e) < criteria.size}
-    by_name = dict(effects)
-    unknown = np.zeros(len(costs.p.y))
+    if_all_known = dict(effects)
+    unknown = np.zeros(len(costs.problem.y))
     functions: list[Unknown | None] = []
     for axis in range(len(unknown)):
-        splines = lay_splines(by_noise, axis)
+        splines = build_splines(by_noise, axis)
         if splines is None:
             functions.append(None)
             continue
@@ -115,58 +112,58 @@ def weigh_sets(
         if by_all.size < criteria.size:
             continue
         more = by_noise.cost(()) - by_all.cost - (none - here.cost) + costs.log_prior
-        if none - here.cost + more < costs.log_prior - _NEAR:
+        if none - here.cost + more < costs.log_prior - _MARGIN:
             continue
         acting = [e for e in own if axis in acting_axes(bare, e)]
-        more_by_block = _by_block(by_noise, (), by_all) - _by_block(costs, (), here)
+        more_by_block = _split_evidence(by_noise, (), by_all) - _split_evidence(costs, (), here)
         beside = [
-            _Listed(
+            _SetEvidence(
                 keys, axis, none - found.cost + more,
-                _by_block(costs, keys, found) + more_by_block,
+                _split_evidence(costs, keys, found) + more_by_block,
             )
             for keys, found in _beside_unknown(costs, splines, here, acting)
         ]  # fmt: skip
-        # What one axis lacks is independent of what another one does.
-        with_unknown = _share(costs, [*named, *beside], given, seed)
-        here_too = _by_effect(with_unknown)
+        # The axes are independent in what they lack.
+        with_unknown = _compute_probabilities(costs, [*named, *beside], given, seed)
+        here_too = _sum_by_effect(with_unknown)
         unknown[axis] = sum(s.probability for s in with_unknown if s.unknown is not None)
         for effect in acting:
             effects[effect] = min(effects[effect], here_too.get(effect, 0.0))
             if unknown[axis] >= criteria.probability:
-                drops[effect] = _losses(with_unknown).get(effect, 0.0)
+                drops[effect] = _find_evidence_losses(with_unknown).get(effect, 0.0)
         if unknown[axis] == unknown.max():
             sets = with_unknown
-    far = np.sqrt(_squares(costs, ()) / np.maximum(costs.p.count, 1)) > criteria.doubt
+    far = np.sqrt(_sum_squares(costs, ()) / np.maximum(costs.problem.count, 1)) > criteria.doubt
     unknown[far] = 1.0
     doubtful = (unknown >= criteria.probability) & fit.is_above_floor
     for effect in own if doubtful.any() else ():
-        # In doubt is not absent: the model keeps it, and the report mentions it.
+        # A doubtful effect is not absent: the model keeps it, and the report mentions it.
         most = max(_share_explained(costs, effect, doubtful), 1.0 - criteria.probability)
         effects[effect] = min(effects[effect], most)
-    return Weighed(sets, effects, by_name, unknown, tuple(functions), drops)
+    return Probabilities(sets, effects, if_all_known, unknown, tuple(functions), drops)
 
 
-def _squares(costs: SetCosts, keys: tuple[Key, ...]) -> Array:
-    """Sum of squares that a set leaves, in units of the noise, (n_q,)."""
+def _sum_squares(costs: SetCosts, keys: tuple[Key, ...]) -> Array:
+    """Return the sum of squares of the residual of a set in units of the noise, (n_q,)."""
     return np.array([max(float(rows @ rows), 1e-300) for rows in costs.residual_rows(keys)])
 
 
 def _share_explained(costs: SetCosts, effect: str, far: Flags) -> float:
-    """Of the error without an effect, what it takes on axes that are ``far``; the largest.
+    """Return the largest share of the error without an effect that it explains on ``far`` axes.
 
-    What is missing there may resemble an effect that takes less than that leaves. 1 of an effect
-    that the other axes show, or show more than these.
+    Something unknown there may resemble an effect that leaves a large error. The share is 1 if the
+    other axes support the effect by `_MARGIN`, or more than these.
     """
-    now, without = _squares(costs, ()), _squares(costs, ((f"-{effect}", ()),))
-    gain = 0.5 * costs.p.independent * np.log(without / now)
-    if gain[~far].sum() >= min(gain[far].sum(), _NEAR):
+    now, without = _sum_squares(costs, ()), _sum_squares(costs, ((f"-{effect}", ()),))
+    gain = 0.5 * costs.problem.independent * np.log(without / now)
+    if gain[~far].sum() >= min(gain[far].sum(), _MARGIN):
         return 1.0
     return float(np.max(1.0 - np.sqrt(now[far] / without[far])))
 
 
 @dataclass(frozen=True)
-class _Listed:
-    """A set with its log evidence over that of the most probable one, by block of time, too."""
+class _SetEvidence:
+    """A set with its gain in log evidence over the most probable model, in all and by block."""
 
     keys: tuple[Key, ...]
     unknown: int | None
@@ -174,53 +171,50 @@ class _Listed:
     by_block: Array
 
 
-def _share(
-    costs: SetCosts, listed: Sequence[_Listed], given: Sequence[str], seed: int
-) -> tuple[WeighedSet, ...]:
-    """Probabilities of sets, the most probable first."""
+def _compute_probabilities(
+    costs: SetCosts, listed: Sequence[_SetEvidence], given: Sequence[str], seed: int
+) -> tuple[SetProbability, ...]:
+    """Return the sets with their probabilities, most probable first."""
     total, blocks = np.array([s.gain for s in listed]), np.array([s.by_block for s in listed])
     count = blocks.shape[1]
     rng = np.random.default_rng([seed, count])
     drawn = rng.multinomial(count, np.full(count, 1.0 / count), _DRAWS)
     shares = softmax((drawn - 1.0) @ blocks.T + total, axis=1).mean(axis=0)
     sets = [
-        WeighedSet(s.keys, _effects(costs, s.keys, given), s.unknown, s.gain, float(share))
+        SetProbability(s.keys, _list_effects(costs, s.keys, given), s.unknown, s.gain, float(share))
         for s, share in zip(listed, shares, strict=True)
     ]
     return tuple(sorted(sets, key=lambda s: -s.probability))
 
 
-def _losses(sets: Sequence[WeighedSet]) -> dict[str, float]:
-    """For each effect, what the best set with it loses if nothing takes its place, nats."""
+def _find_evidence_losses(sets: Sequence[SetProbability]) -> dict[str, float]:
+    """Return the log evidence that the best set with each effect loses without it, nats."""
     found = {}
     for effect in dict.fromkeys(e for one in sets for e in one.effects):
         held = [one for one in sets if effect in one.effects]
         best = max(held, key=lambda one: one.log_evidence)
         rest = {*best.effects} - {effect}
         less = [s.log_evidence for s in sets if s.unknown == best.unknown and {*s.effects} <= rest]
-        found[effect] = best.log_evidence - max(less, default=best.log_evidence - _NEAR)
+        found[effect] = best.log_evidence - max(less, default=best.log_evidence - _MARGIN)
     return found
 
 
-def _by_effect(sets: Sequence[WeighedSet]) -> dict[str, float]:
-    found: dict[str, float] = {}
-    for one in sets:
-        for effect in one.effects:
-            found[effect] = found.get(effect, 0.0) + one.probability
-    return found
+def _sum_by_effect(sets: Sequence[SetProbability]) -> dict[str, float]:
+    names = dict.fromkeys(e for one in sets for e in one.effects)
+    return {e: sum(one.probability for one in sets if e in one.effects) for e in names}
 
 
 def _beside_unknown(
     costs: SetCosts, splines: Splines, here: Unknown, acting: Sequence[str]
 ) -> list[tuple[tuple[Key, ...], Unknown]]:
-    """Sets beside an unknown function: the whole one, and less each effect whose place it takes.
+    """Return sets beside an unknown function, by backward elimination of the ``acting`` effects.
 
-    An effect of the model may be a mere resemblance of what is missing.
+    An effect of the model may merely resemble the missing one.
     """
     keys: tuple[Key, ...] = ()
     found = [(keys, here)]
     while True:
-        away = gone(keys)
+        away = removed_effects(keys)
         fewer = [tuple(sorted((*keys, (f"-{e}", ())))) for e in acting if e not in away]
         tried = [(less, weigh_unknown(costs, splines, less)) for less in fewer]
         best = min(tried, key=lambda one: one[1].cost, default=None)
@@ -230,24 +224,24 @@ def _beside_unknown(
         keys = best[0]
 
 
-def _effects(costs: SetCosts, keys: Sequence[Key], given: Sequence[str]) -> tuple[str, ...]:
-    away = gone(keys)
-    kept = [e for e in costs.p.absence if e not in away and e not in given]
-    return (*kept, *(name for name, _ in added(keys)))
+def _list_effects(costs: SetCosts, keys: Sequence[Key], given: Sequence[str]) -> tuple[str, ...]:
+    away = removed_effects(keys)
+    kept = [e for e in costs.problem.absence if e not in away and e not in given]
+    return (*kept, *(name for name, _ in added_effects(keys)))
 
 
-def _by_block(
-    costs: SetCosts, keys: tuple[Key, ...], unknown: Unknown | None, short: float = 0.0
+def _split_evidence(
+    costs: SetCosts, keys: tuple[Key, ...], unknown: Unknown | None, shortfall: float = 0.0
 ) -> Array:
-    """Log likelihood of a set over that of none, less ``short``, nats, by block of time, (n,)."""
-    p = costs.p
+    """Return the log evidence of a set over that of none, less ``shortfall``, by block, (n,)."""
+    p = costs.problem
     before = costs.residual_rows(())
     after = list(unknown.residual) if unknown else costs.residual_rows(keys)
     w_before = costs.solve(()).weight
     w_after = unknown.weight if unknown else costs.solve(keys).weight
     volume = costs.volume_rows(keys)
     count = 1 + max((int(s.block.max()) for s in p.likelihood.samples if len(s.block)), default=0)
-    found = np.full(count, -short / count)
+    found = np.full(count, -shortfall / count)
     for axis, here in enumerate(p.likelihood.samples):
         if not len(here.rows):
             continue
@@ -260,38 +254,38 @@ def _by_block(
     return found
 
 
-def least_gain(criteria: Criteria, by_chance: Sequence[float] = ()) -> float:
-    """The log evidence from which on an effect alone is called missing, nats.
+def find_required_gain(criteria: Criteria, replicate_gains: Sequence[float] = ()) -> float:
+    """Return the log evidence from which a single effect is called missing, nats.
 
-    Its probability is what the criteria ask for, and chance gives as much rarely enough, see
-    `chance_of` (infinite where no replays can say so).
+    Both its probability and its p-value then meet the criteria. The gain is infinite if they ask
+    for less than `LEAST_P_VALUE`.
     """
     odds, p = float(logit(criteria.probability)), criteria.largest_p_value
-    if not len(by_chance):
+    if not len(replicate_gains):
         return odds
-    if p < LEAST_CHANCE:
+    if p < LEAST_P_VALUE:
         return float("inf")
-    middle, scale = _law_of_largest(by_chance)
+    middle, scale = _law_of_largest(replicate_gains)
     by_law = middle + scale * (np.log(np.log(2.0)) - np.log(-np.log1p(-p)))
-    by_count = np.sort(by_chance)[-1 - int(p * len(by_chance))]
+    by_count = np.sort(replicate_gains)[-1 - int(p * len(replicate_gains))]
     return max(odds, float(by_law), float(by_count))
 
 
-def chance_of(gain: float, by_chance: Sequence[float]) -> float:
-    """Probability that chance gives a largest gain of ``gain`` or more, from those of replays.
+def compute_p_value(gain: float, replicate_gains: Sequence[float]) -> float:
+    """Return the probability that chance gives a largest gain of at least ``gain``.
 
-    By the law of largest values (Gumbel 1935), with their median and quartiles, and no less than
-    the share of the replays that gave as much.
+    It follows from the Gumbel distribution with the median and quartiles of the largest gains on
+    replicates, and is at least the share of replicates with as large a gain.
     """
-    middle, scale = _law_of_largest(by_chance)
+    middle, scale = _law_of_largest(replicate_gains)
     beyond = (gain - middle) / scale - np.log(np.log(2.0))
     by_law = float(-np.expm1(-np.exp(-max(beyond, -50.0))))
-    return max(by_law, float(np.mean(np.asarray(by_chance) >= gain)), LEAST_CHANCE)
+    return max(by_law, float(np.mean(np.asarray(replicate_gains) >= gain)), LEAST_P_VALUE)
 
 
 def _law_of_largest(values: Sequence[float]) -> tuple[float, float]:
-    """Median and scale of the law of largest values."""
+    """Return the median and the scale of the Gumbel distribution of largest gains."""
     low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
-    # The evidence of one candidate alone scatters by half a nat a strength.
+    # The log evidence of a single candidate scatters by half a nat per strength.
     scale = max(float(high - low) / (np.log(np.log(4.0)) - np.log(np.log(4.0 / 3.0))), 1.0)
     return float(middle), scale

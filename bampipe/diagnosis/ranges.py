@@ -1,7 +1,7 @@
-"""Where a shape or a nonlinear strength is looked for, within the bounds that its effect states.
+"""Search ranges of shapes and nonlinear strengths, within the bounds of their effects.
 
-Lengths, speeds and times that matter differ by a thousand from machine to machine, so a range
-follows what the trials show: their travel, speeds, loads and sampling.
+Relevant lengths, speeds and times differ by a factor of a thousand between machines, so that the
+ranges follow the travel, speeds, loads and sampling of the trials.
 """
 
 from __future__ import annotations
@@ -16,113 +16,109 @@ from bampipe.physics.parameter import Parameter
 from bampipe.trials.evidence import Evidence
 
 _TRAVEL = (1e-4, 0.25)
-"""Of the travel: finer lengths are crossed within a sample or two."""
+"""Lengths, as shares of the travel; a shorter one is crossed within a sample or two."""
 _SPEED = (1e-3, 1.0)
-"""Of the highest speed."""
+"""Speeds, as shares of the highest speed."""
 _WAVES = (2.0, 30.0)
-"""Waves on the travel."""
+"""Wavenumbers, in waves on the travel."""
 _WAVES_APART = 0.6
-"""Waves on the travel between two values that are tried: two that differ by one have nothing in
-common."""
+"""Distance of two wavenumbers on a grid, in waves on the travel; at a distance of one they are
+uncorrelated."""
 _GIVE = (1e-4, 0.1)
-"""Of the travel, at the highest load: less cannot be distinguished from what happens between two
-samples where friction changes its sign."""
+"""Deflections at the highest load, as shares of the travel; a smaller one cannot be distinguished
+from a reversal of friction between two samples."""
 _LOSS = (1e-2, 3.0)
-"""Of the load, at the highest load."""
+"""Losses at the highest load, as shares of that load."""
 _GAP = (1e-3, 0.06)
-"""Of the travel: play that matters and that is not another machine."""
+"""Play, as shares of the travel."""
 _DRIVE = (0.05, 0.5)
-"""Of the inertia of an axis: what of it is a drive."""
+"""Inertia of a drive, as shares of that of its axis."""
 _GAPS, _DRIVES = 15, 4
-"""Values of these that are tried: of a gap half as wide again the impact comes too late to fit."""
+"""Grid values of play and of the inertia of a drive. In a gap half too wide, impacts come too late
+to fit."""
 _LIGHTEST = 6.0
-"""Inertia of an axis over that of the lightest part of it that matters."""
+"""Inertia of an axis over that of its lightest relevant part."""
 _TIME = (2.0, 3.0)
-"""In samples, in trials: the time in which something settles."""
+"""Settling times, from samples to durations of a trial."""
 _PARTS = {"travel": (0.02, 0.98), "upper half": (0.5, 0.98), "lower half": (0.02, 0.5)}
-"""Of the travel: where a position is looked for."""
+"""Positions, as shares of the travel."""
 _BEYOND = (0.52, 5.0)
-"""Of the travel, from its middle: where a position outside of it is looked for; what steepens
-towards one that lies farther is a straight line."""
+"""Distances of positions beyond the travel from its middle, as shares of the travel. A force that
+rises towards a more distant position is a straight line on the travel."""
 _RESONANCE = 3.0
-"""Of the highest frequency of the band: what rings beyond leaves a tenth of its force in the band,
-which a late sample or a filter leaves as well."""
+"""Highest resonance, over the highest frequency of the band. Above, only a tenth of its force lies
+in the band, as much as a late sample or a filter leaves."""
 _DELAY, _DELAY_OF_DRIVES = 0.2, 0.5
-"""In samples: both sides of the equation are filtered alike, so that less than one shows. Where
-there are several drives, friction that stops a joint looks late by less than half a sample, and how
-late all of them are within that, the timing that most of them share says already."""
+"""Shortest delays, in samples; both sides of the equation are filtered alike, so that less than a
+sample shows. With several drives, friction that stops a joint looks up to half a sample late, and a
+delay that most drives share is the input delay."""
 
 
 @dataclass(frozen=True)
 class SearchRange:
-    """Lower and upper end, and whether to step by ratios.
+    """The range of one searched parameter.
 
     Attributes:
-        around: middle of the travel for a position outside of it. Then ``low`` and ``high`` are
-            reciprocals of its distance from there, through 0 from one side to the other.
-        farthest: the farthest such distance.
-        least: of a grid, the fewest values.
-        apart: values may be no farther apart where they are tried one by one, in the unit; such a
-            range is even.
+        low, high: its ends.
+        by_ratio: whether grid values have equal ratios.
+        travel_middle: middle of the travel, for a position beyond it; ``low`` and ``high`` are then
+            reciprocals of the distance from there, negative on the lower side.
+        largest_distance: largest such distance.
+        largest_spacing: largest distance of two grid values, which are then evenly spaced.
+        least_count: smallest number of grid values.
     """
 
     low: float
     high: float
     by_ratio: bool
-    around: float | None = None
-    farthest: float = np.inf
-    apart: float = np.inf
-    least: int = 1
+    travel_middle: float | None = None
+    largest_distance: float = np.inf
+    largest_spacing: float = np.inf
+    least_count: int = 1
 
     @property
-    def fewest(self) -> int:
-        """Values of a grid that lie near enough."""
-        return max(self.least, 1 + int(np.ceil((self.high - self.low) / self.apart)))
+    def grid_size(self) -> int:
+        """Smallest number of values of a grid."""
+        count = 1 + int(np.ceil((self.high - self.low) / self.largest_spacing))
+        return max(self.least_count, count)
 
     @property
     def extent(self) -> float:
-        """Natural log of the ratio of its ends; a linear range counts as a ratio of 20."""
+        """Logarithm of the ratio of the ends; a linear range counts as a ratio of 20."""
         return float(np.log(self.high / self.low if self.by_ratio else 20.0))
 
     def value_at(self, searched: float) -> float:
-        """The value of the parameter for a number between ``low`` and ``high``."""
-        if self.around is None:
+        """Return the value of the parameter for a number between ``low`` and ``high``."""
+        if self.travel_middle is None:
             return searched
-        distance = min(1.0 / max(abs(searched), 1e-300), self.farthest)
-        return self.around + float(np.copysign(distance, searched))
+        distance = min(1.0 / max(abs(searched), 1e-300), self.largest_distance)
+        return self.travel_middle + float(np.copysign(distance, searched))
 
     def value_like(self, value: float) -> float:
-        """``value`` where it lies in the range, else one amid it; of a position beyond, above."""
-        if self.around is not None:
-            distance = abs(value - self.around)
-            holds = 1.0 / self.high <= distance <= self.farthest
-            return value if holds else self.value_at(self.within(0.75))
-        return value if self.low <= value <= self.high else self.within(0.5)
+        """Return ``value`` if it is in the range, else a value in its middle or upper part."""
+        if self.travel_middle is not None:
+            distance = abs(value - self.travel_middle)
+            holds = 1.0 / self.high <= distance <= self.largest_distance
+            return value if holds else self.value_at(self.interpolate(0.75))
+        return value if self.low <= value <= self.high else self.interpolate(0.5)
 
-    def within(self, share: float) -> float:
-        """The value that lies a share of the way from the lower to the upper end."""
-        if np.isfinite(self.apart):
-            return self.low + share * (self.high - self.low)
-        return between(self.low, self.high, share)
-
-
-def between(low: float, high: float, share: float = 0.5) -> float:
-    """The value a share of the way from ``low`` to ``high``, by ratios where both are positive."""
-    if low > 0.0 and high > 0.0:
-        return float(low ** (1.0 - share) * high**share)
-    return float(low + share * (high - low))
+    def interpolate(self, share: float) -> float:
+        """Return the number a share of the way between the ends, by ratios if both are positive."""
+        if self.low > 0.0 and self.high > 0.0 and not np.isfinite(self.largest_spacing):
+            return float(self.low ** (1.0 - share) * self.high**share)
+        return float(self.low + share * (self.high - self.low))
 
 
 @dataclass(frozen=True)
 class MachineScale:
-    """What sizes the trials of a session have.
+    """The range of motion and load in the trials of a session, by coordinate.
 
     Attributes:
-        lowest, highest: ends of the travel by coordinate, (n_q,), rad or m.
-        speed: the highest, (n_q,), rad/s or m/s.
-        load: the highest generalised force applied, (n_q,), N.m or N.
-        inertia: of each coordinate alone, by the model, amid the travel, (n_q,), kg.m2 or kg.
-        coordinates: names and units of these and of their forces.
+        lowest, highest: ends of the travel, (n_q,), rad or m.
+        speed: highest speed, (n_q,), rad/s or m/s.
+        load: largest applied generalised force, (n_q,), N.m or N.
+        inertia: diagonal of the model's mass matrix in mid-travel, (n_q,), kg.m2 or kg.
+        coordinates: units of each coordinate and its force, by name.
         interval, duration: time between samples, and of the longest trial, s.
         band_hz: highest frequency of the residual, (n_q,), Hz.
     """
@@ -139,7 +135,7 @@ class MachineScale:
 
     @classmethod
     def of_trials(cls, evidence: Evidence) -> MachineScale:
-        """The sizes of the trials of ``evidence``."""
+        """Return the scale of the trials of ``evidence``."""
         system, q, qd, load = evidence.system, [], [], []
         for trial, motion in enumerate(evidence.motions):
             applied = evidence.fitted[trial].applied
@@ -158,7 +154,7 @@ class MachineScale:
         )  # fmt: skip
 
     def range_of(self, item: BoundEffect, parameter: Parameter) -> SearchRange:
-        """Where to look for a parameter of an effect in which the residual is not linear."""
+        """Return the search range of a parameter in which the residual is not linear."""
         reach = 4.0 * (abs(parameter.typical) if parameter.typical else parameter.sd)
         lower, upper = parameter.lower, parameter.upper
         if parameter.strength and lower < 0.0:
@@ -185,13 +181,13 @@ class MachineScale:
         if item.axes and parameter.unit == f"1/{self.coordinates[item.axes[0]][0]}":
             i = list(self.coordinates).index(item.axes[0])
             travel = max(float(self.highest[i] - self.lowest[i]), 1e-300)
-            return SearchRange(low, high, True, apart=2.0 * np.pi * _WAVES_APART / travel)
+            return SearchRange(low, high, True, largest_spacing=2.0 * np.pi * _WAVES_APART / travel)
         is_length = item.axes and parameter.unit == self.coordinates[item.axes[0]][0]
         least = 1 if item.effect.ahead is None else _GAPS if is_length else _DRIVES
-        return SearchRange(low, high, True, least=least)
+        return SearchRange(low, high, True, least_count=least)
 
     def _sizes(self, item: BoundEffect, parameter: Parameter) -> dict[str, tuple[float, float]]:
-        """Ranges of lengths, speeds and the like at the target of an effect, by unit."""
+        """Return the range of sizes at the target of an effect, by unit."""
         found = {"s": (_TIME[0] * self.interval, _TIME[1] * self.duration)}
         if parameter.strength:
             of_drives = item.effect.scope == "force_component" or item.effect.drive
@@ -206,11 +202,11 @@ class MachineScale:
         speed, load = float(self.speed[i]), float(self.load[i])
         if not travel > 0.0 or not load > 0.0:
             return found
-        lightness = 1.0 / max(float(self.inertia[i]), 1e-300)
+        inertia = float(self.inertia[i])
+        lightness = 1.0 / max(inertia, 1e-300)
         highest = 2.0 * np.pi * _RESONANCE * self.band_hz[i]
         per_force = force.replace(".", "/")
         length = _GAP if item.effect.ahead else _TRAVEL
-        inertia = float(self.inertia[i])
         return found | {
             unit: (length[0] * travel, length[1] * travel),
             "kg.m2" if unit == "rad" else "kg": (_DRIVE[0] * inertia, _DRIVE[1] * inertia),

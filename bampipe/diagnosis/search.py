@@ -1,60 +1,64 @@
-"""The search over sets of effects, each weighed whole, its shapes refined, its bounds held."""
+"""The search over sets of effects, with shapes refined and strengths within their bounds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 
 import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Key
-from bampipe.diagnosis.set_cost import SetCosts, Solution, added, names
+from bampipe.diagnosis.set_cost import SetCosts, Solution, added_effects, effect_names
 from bampipe.trials.likelihood import solve_scaled
 
 _STEP = 0.02
-"""Of a shape's range: the step of its slope."""
-_FARTHEST = 0.2
+"""Step of the slope by a shape, as a share of the shape's range."""
+_STEP_LENGTHS = (1.0, 0.35, 0.1)
+_LONGEST_STEP = 0.2
+"""Longest step of a refinement, as a share of that range."""
 
-_BESIDE, _PROMISING, _SWAPPED = 12, 8, 5
-"""Candidates weighed exactly beside a set that grows, beside one that lost a member, and of those
-the ones whose shapes are refined."""
-_SWAPS, _POLISHED = 3, 4
+_ADDITIONS, _REPLACEMENTS, _SWAPS_REFINED = 12, 8, 5
+"""Candidates computed exactly as additions to a set and as replacements of a member, and number of
+the replacements whose shapes are refined."""
+_SWAP_ROUNDS, _SETS_REFINED = 3, 4
 _ROUNDS = 12
-"""Of the refinement of shapes, as long as each gains: an impact moves with the width of its gap,
-and one that comes too late looks like none."""
+"""Largest number of steps of a refinement. It may need many: an impact moves with the width of its
+gap, and an impact that comes too late gains nothing."""
 
 Pool = dict[tuple[str, ...], tuple[float, tuple[Key, ...]]]
-"""Sets by the names of their members, each with its cost and shapes."""
+"""Sets by the names of their effects, each with its cost and shapes."""
 
 
 class Search(SetCosts):
-    """Looks for the sets that cost least beside one model."""
+    """The search for the sets of least cost beside one model."""
 
     def largest_gain(self) -> tuple[float, str]:
-        """Log evidence of the candidate that gains most beside the model, nats, and its name.
-
-        Of whatever size: chance has no other.
-        """
+        """Return the largest log evidence of a candidate of any size, nats, and its name."""
         any_size = copy(self)
-        any_size.least_size, any_size._solved = 0.0, {}
-        beside = any_size.best_beside((), _PROMISING)
+        any_size.least_size, any_size._solutions = 0.0, {}
+        beside = any_size.rank_additions((), _REPLACEMENTS)
         return (any_size.cost(()) - beside[0][0], beside[0][1][0]) if beside else (0.0, "")
 
-    def best_beside(
+    def replicate_gains(self) -> tuple[float, ...]:
+        """Return `largest_gain` on each replicate of the model: the null distribution, nats."""
+        numbers = range(self.criteria.replicates)
+        return tuple(self.on_replicate(k).largest_gain()[0] for k in numbers)
+
+    def rank_additions(
         self, keys: Sequence[Key], most: int, shapes: int = 2
     ) -> list[tuple[float, Key]]:
-        """Cost of a set with each candidate added, best first, of those that promise most."""
+        """Return the cost of a set with each of the ``most`` promising candidates, best first."""
         none = self.cost(keys)
         if not np.isfinite(none):
             return []
-        # Close to those of this set: most weights are found in two passes from there.
+        # Most weights converge in two passes from those of this set.
         self._weight = self.solve(keys).weight
         gains, have = self.gains(keys), {name.removeprefix("-") for name, _ in keys}
         tried: dict[str, float] = {}
         best: dict[str, tuple[float, Key]] = {}
         for k in np.argsort(-gains):
-            key = self.places[k]
+            key = self.grid_keys[k]
             name = key[0]
             if not gains[k] > 0.0:
                 break
@@ -62,69 +66,62 @@ class Search(SetCosts):
             if name in have or tried.get(name, 0) >= shapes or is_one_too_many:
                 continue
             cost = self.cost((*keys, key))
-            # One that promised much beyond the bounds of others says little of the next.
+            # A promise that rests on parameters beyond their bounds says little of the next shape.
             tried[name] = tried.get(name, 0.0) + (1.0 if cost < none else 0.25)
             if np.isfinite(cost) and cost < best.get(name, (np.inf,))[0]:
                 best[name] = cost, key
         return sorted(best.values())
 
-    def refine(self, sets: Sequence[tuple[Key, ...]], rounds: int) -> list[tuple[Key, ...]]:
-        """Move the shapes of sets to where their cost is least: Gauss-Newton on all at once."""
-        current = [tuple(sorted(s)) for s in sets]
-        moving = [any(shape for _, shape in s) for s in current]
+    def refine(self, start: Sequence[tuple[Key, ...]], rounds: int) -> list[tuple[Key, ...]]:
+        """Minimise the cost of each set over its shapes by Gauss-Newton steps."""
+        current = [tuple(sorted(keys)) for keys in start]
+        moving = [i for i, keys in enumerate(current) if any(shape for _, shape in keys)]
         for _ in range(rounds):
-            wanted = [k for s, m in zip(current, moving, strict=True) if m for k in added(s)]
+            wanted = [key for i in moving for key in added_effects(current[i])]
             self.ensure(k for key in wanted for k in _neighbours(key))
-            proposed = [self._step(s) if m else None for s, m in zip(current, moving, strict=True)]
-            trials = [
-                list(_shares(s, to)) if to is not None else []
-                for s, to in zip(current, proposed, strict=True)
-            ]
-            self.ensure(key for each in trials for one in each[:1] for key in added(one))
-            for i, each in enumerate(trials):
-                before = self.cost(current[i]) if moving[i] else 0.0
-                moved = False
-                for one in each:
-                    self.ensure(added(one))
-                    cost = self.cost(one)
+            proposed = {i: self._propose_sets(current[i]) for i in moving}
+            first = [sets[0] for sets in proposed.values() if sets]
+            self.ensure(key for keys in first for key in added_effects(keys))
+            moving = []
+            for i, sets in proposed.items():
+                before = self.cost(current[i])
+                for keys in sets:
+                    self.ensure(added_effects(keys))
+                    cost = self.cost(keys)
                     if cost < before - 0.02:
-                        current[i], moved = tuple(sorted(one)), True
-                        moving[i] = cost < before - 0.3
+                        current[i] = tuple(sorted(keys))
+                        moving += [i] if cost < before - 0.3 else []
                         break
-                moving[i] &= moved
-            if not any(moving):
-                break
         return current
 
-    def _step(self, keys: tuple[Key, ...]) -> tuple[Key, ...] | None:
-        """Where a linear step in all shapes leads."""
-        found, all_keys = self.solve(keys), keys
-        keys = added(keys)
-        if not np.isfinite(found.cost):
-            return None
-        slopes = self.shape_slopes(keys, found.strengths)
+    def _propose_sets(self, all_keys: tuple[Key, ...]) -> list[tuple[Key, ...]]:
+        """Return a set after a linear step in all shapes, and after shorter steps."""
+        found, keys = self.solve(all_keys), added_effects(all_keys)
+        slopes = self.shape_slopes(keys, found.strengths) if np.isfinite(found.cost) else None
         if slopes is None:
-            return None
-        more = {a: c * self.p.likelihood.root[a][:, None] for a, c in slopes.items()}
+            return []
+        more = {a: c * self.problem.likelihood.root[a][:, None] for a, c in slopes.items()}
         solved = self._solve_with_shapes(all_keys, more, found)
-        steps = iter(np.clip(solved, -_FARTHEST, _FARTHEST))
-        moved = [
-            (name, tuple(float(np.clip(u + next(steps), 0.0, 1.0)) for u in shape))
-            for name, shape in keys
+        steps = iter(np.clip(solved, -_LONGEST_STEP, _LONGEST_STEP))
+        aims = [[float(np.clip(u + next(steps), 0.0, 1.0)) for u in s] for _, s in all_keys]
+        pairs = list(zip(all_keys, aims, strict=True))
+        return [
+            tuple(
+                (name, tuple(u + share * (v - u) for u, v in zip(shape, aim, strict=True)))
+                for (name, shape), aim in pairs
+            )
+            for share in _STEP_LENGTHS
         ]
-        return (*(key for key in all_keys if key[0][0] == "-"), *moved)
 
     def _solve_with_shapes(
         self, all_keys: tuple[Key, ...], more: Mapping[int, Array], known: Solution
     ) -> Array:
-        """Steps of the shapes, (d,), strengths and the model's own parameters moving along.
+        """Return the step of the shapes of a set, (d,), all other unknowns being free.
 
-        Args:
-            all_keys: the set; known: its solution.
-            more: weighted slopes by the shapes, by axis, each (n, d).
+        ``more`` are weighted slopes by the shapes, by axis, (n, d); ``known`` is the solution.
         """
-        keys, left = added(all_keys), self.residual_rows(all_keys)
-        p, nb, weight = self.p, self.bb.shape[1], known.weight
+        keys, left = added_effects(all_keys), self.residual_rows(all_keys)
+        p, nb, weight = self.problem, self.bb.shape[1], known.weight
         xx, xy, places = self._sums(keys)
         m, extra = xx.shape[1], next(iter(more.values())).shape[1]
         b = np.concatenate([known.base, *known.strengths])
@@ -135,7 +132,7 @@ class Search(SetCosts):
         normal[nb:m, nb:m] += (expected := self._expected(keys))
         right[:nb] += p.moment - p.precision @ known.base
         right[nb:m] -= expected @ b[nb:]
-        normal[m:, m:] = np.eye(extra) / _FARTHEST**2
+        normal[m:, m:] = np.eye(extra) / _LONGEST_STEP**2
         for axis, slopes in more.items():
             w = weight[axis]
             normal[:nb, m:] += w * (p.base[axis].T @ slopes)
@@ -152,7 +149,7 @@ class Search(SetCosts):
     def shape_slopes(
         self, keys: Sequence[Key], strengths: Sequence[Array]
     ) -> dict[int, Array] | None:
-        """Slopes of what a set adds by each of its shapes, by axis, (n, d), unweighted."""
+        """Return the unweighted slopes of the residual by the shapes of a set, by axis, (n, d)."""
         total = sum(len(shape) for _, shape in keys)
         found: dict[int, Array] = {}
         place = 0
@@ -164,85 +161,73 @@ class Search(SetCosts):
                     return None
                 step = other[1][j] - key[1][j]
                 for axis in {*here.columns, *there.columns}:
-                    x = (there.columns[axis] @ b if axis in there.columns else 0.0) - (
-                        here.columns[axis] @ b if axis in here.columns else 0.0
+                    block = found.setdefault(axis, np.zeros((len(self.problem.y[axis]), total)))
+                    after, before = (
+                        atom.columns[axis] @ b if axis in atom.columns else 0.0
+                        for atom in (there, here)
                     )
-                    block = found.setdefault(axis, np.zeros((len(self.p.y[axis]), total)))
-                    block[:, place + j] = x / step
+                    block[:, place + j] = (after - before) / step
             place += len(key[1])
         return found
 
-    def without_one(self, keys: tuple[Key, ...]) -> list[tuple[Key, ...]]:
-        """A set without each of its members, and without each effect of the model itself."""
+    def drop_each(self, keys: tuple[Key, ...]) -> list[tuple[Key, ...]]:
+        """Return a set without each of its members, and without each effect of the model."""
         less = [keys[:i] + keys[i + 1 :] for i, key in enumerate(keys) if key[0][0] != "-"]
         gone = {name for name, _ in keys}
         return less + [
             tuple(sorted((*keys, (f"-{name}", ()))))
-            for name in self.p.absence
+            for name in self.problem.absence
             if f"-{name}" not in gone
         ]
 
-    def keep(self, pool: Pool, keys: tuple[Key, ...]) -> None:
-        """Enter a set into a pool unless the same effects are there with better shapes."""
-        cost, known = self.cost(keys), pool.get(names(keys))
-        if np.isfinite(cost) and (known is None or cost < known[0]):
-            pool[names(keys)] = cost, tuple(sorted(keys))
+    def add_to_pool(self, pool: Pool, sets: Iterable[tuple[Key, ...]]) -> None:
+        """Add sets to a pool unless it has the same effects with better shapes."""
+        for keys in sets:
+            cost, known = self.cost(keys), pool.get(effect_names(keys))
+            if np.isfinite(cost) and (known is None or cost < known[0]):
+                pool[effect_names(keys)] = cost, tuple(sorted(keys))
 
-    def swaps(self, keys: tuple[Key, ...], pool: Pool) -> list[tuple[Key, ...]]:
-        """The best sets with another effect in the place of one, that are not in ``pool`` yet."""
+    def list_swaps(self, keys: tuple[Key, ...], pool: Pool) -> list[tuple[Key, ...]]:
+        """Return the best sets outside ``pool`` that have another effect in place of one."""
         found = [
             (cost, tuple(sorted((*rest, key))))
-            for rest in self.without_one(keys)
-            for cost, key in self.best_beside(rest, _PROMISING)[:_SWAPPED]
+            for rest in self.drop_each(keys)
+            for cost, key in self.rank_additions(rest, _REPLACEMENTS)[:_SWAPS_REFINED]
         ]
-        fresh = [swap for _, swap in sorted(found) if names(swap) not in pool]
+        fresh = [swap for _, swap in sorted(found) if effect_names(swap) not in pool]
         return fresh[: self.criteria.beam]
 
-    def beam(self, most: int) -> Iterator[list[tuple[float, tuple[Key, ...]]]]:
-        """Best sets of 1, 2, ... ``most`` effects: lists of cost and set, best first."""
+    def grow_sets(self, most: int) -> Iterator[list[tuple[float, tuple[Key, ...]]]]:
+        """Yield the best sets of 1, 2, ... ``most`` effects with their costs, best first."""
         wide, start = self.criteria.beam, tuple[Key, ...]()
         beam = [(self.cost(start), start)]
         for _ in range(most):
             grown: Pool = {}
             for _, keys in beam:
-                for _, key in self.best_beside(keys, _BESIDE):
-                    self.keep(grown, (*keys, key))
+                additions = self.rank_additions(keys, _ADDITIONS)
+                self.add_to_pool(grown, ((*keys, key) for _, key in additions))
             if not grown:
                 return
             pool: Pool = {}
-            for keys in self.refine([keys for _, keys in sorted(grown.values())[:wide]], 2):
-                self.keep(pool, keys)
-            for _ in range(_SWAPS):
+            best = [keys for _, keys in sorted(grown.values())[:wide]]
+            self.add_to_pool(pool, self.refine(best, 2))
+            for _ in range(_SWAP_ROUNDS):
                 lead = min(pool.values())[1]
-                for rest in self.without_one(lead):
-                    self.keep(pool, rest)
-                swaps = self.swaps(lead, pool)
-                for keys in self.refine(swaps, 2):
-                    self.keep(pool, keys)
+                self.add_to_pool(pool, self.drop_each(lead))
+                self.add_to_pool(pool, self.refine(self.list_swaps(lead, pool), 2))
                 if min(pool.values())[1] == lead:
                     break
-            best = [keys for _, keys in sorted(pool.values())[:_POLISHED]]
-            for keys in self.refine(best, _ROUNDS):
-                self.keep(pool, keys)
+            best = [keys for _, keys in sorted(pool.values())[:_SETS_REFINED]]
+            self.add_to_pool(pool, self.refine(best, _ROUNDS))
             beam = sorted(pool.values())[:wide]
             yield beam
 
 
 def _neighbours(key: Key) -> list[Key]:
-    """A candidate with each of its shapes a little on, towards the middle of its range."""
+    """Return a candidate with each of its shapes moved a little towards mid-range."""
     name, shape = key
     found = []
     for j, u in enumerate(shape):
         moved = u + (_STEP if u <= 0.5 else -_STEP)
         found.append((name, (*shape[:j], moved, *shape[j + 1 :])))
     return found
-
-
-def _shares(keys: tuple[Key, ...], to: tuple[Key, ...]) -> Iterator[tuple[Key, ...]]:
-    """The whole way to a proposed set, a third, and a tenth of it."""
-    aims = dict(to)
-    for share in (1.0, 0.35, 0.1):
-        yield tuple(
-            (name, tuple(u + share * (v - u) for u, v in zip(shape, aims[name], strict=True)))
-            for name, shape in keys
-        )

@@ -1,4 +1,4 @@
-"""The selection of effects: search, fit what was found, and search again from there."""
+"""The selection of effects: search, fit the best set, and search again from there."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -9,7 +9,7 @@ import numpy as np
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
-from bampipe.diagnosis.probability import Weighed, weigh_sets
+from bampipe.diagnosis.probability import Probabilities, weigh_sets
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import Pool, Search
 from bampipe.diagnosis.session import (
@@ -17,58 +17,56 @@ from bampipe.diagnosis.session import (
     Session,
     bounds_of,
     candidates_of,
-    shared,
+    change_effects,
     system_of,
-    without_members,
+    worker_state,
     workers,
 )
-from bampipe.diagnosis.set_cost import added, gone, names
+from bampipe.diagnosis.set_cost import added_effects, effect_names, removed_effects
 from bampipe.physics.recipe import Recipe
 from bampipe.results.compare import NOTICEABLE
 
 Progress = Callable[[float, str], None]
-"""Called with a fraction of the work done and what is being done."""
+"""Called with the fraction of the work done and a description of the current step."""
 
 _MOST_ROUNDS = 6
-PARTS = 8
-"""Tasks a process into which columns are divided: one candidate may take as long as ten others."""
-_MINOR = 0.05
-"""Share of the gain of a set that the next effect must bring to be added before the set is fitted:
-linearised far from the truth, a model leaves more than that."""
-_WORTH = 0.5
-"""Fall of the cost, nats, that makes another set worth fitting."""
-_TRIED = 2
-"""Sets fitted in a round before only smaller ones are: these keep more of what they promise."""
-_DEEP = 3
-"""Effects added at once beside a set that has been fitted."""
+TASKS_PER_PROCESS = 8
+"""Tasks per process into which columns are divided, as one candidate may take as long as ten."""
+_MINOR_SHARE = 0.05
+"""Smallest share of the gain of a set that a further effect must bring before the set is fitted: a
+model linearised far from the truth leaves a larger residual than that."""
+_LEAST_GAIN = 0.5
+"""Smallest fall of the cost, nats, for which another set is fitted."""
+_MOST_FITS = 2
+"""Failed fits of a round after which only smaller sets are fitted, which gain more reliably."""
+_MOST_ADDED = 3
+"""Largest number of effects added at once to a set that has been fitted."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What a search came to.
+    """The result of a selection.
 
     Attributes:
-        initial: the model as given, fitted; final: with the set that is most probable.
-        weighed: sets near it, effects and unknown functions with their probabilities.
-        chance: the largest gain of any candidate beside the final model on each replay, nats.
-        beside: the same on the measured trials, and of which candidate.
-        gains: log evidence of the model as given with each single effect, nats, by effect.
-        steps: the sets that were fitted, in order.
-        cut_short: whether more effects were wanted than may be added.
+        initial: the fit of the given model; final: the fit with the most probable set.
+        probabilities: probabilities of sets, effects and unknown functions beside the final model.
+        replicate_gains: largest gain of any candidate on each replicate of the final model, nats.
+        largest_gain: the same on the measured trials, and the candidate.
+        gains: log evidence of each single effect beside the given model, nats.
+        cut_short: whether the search ended at a limit on effects or rounds.
     """
 
     initial: Fit
     final: Fit
-    weighed: Weighed
-    chance: tuple[float, ...]
-    beside: tuple[float, str]
+    probabilities: Probabilities
+    replicate_gains: tuple[float, ...]
+    largest_gain: tuple[float, str]
     gains: dict[str, float]
-    steps: tuple[Fit, ...]
     cut_short: bool
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Of the most probable set, beyond those of the model as given."""
+        """Effects that the most probable set adds to the given model."""
         return tuple(e for e in self.final.recipe.effects if e not in self.initial.recipe.effects)
 
 
@@ -80,41 +78,42 @@ def open_search(
     known: Search | None = None,
     only: Sequence[str] = (),
 ) -> Iterator[Search]:
-    """A search over the candidates beside a fitted model, its columns made by several processes.
+    """Open a search over the candidates beside a fitted model, with columns from worker processes.
 
     Args:
-        session: the trials; fit: the model; without: effects that are not weighed.
-        known: a search beside another model, of which columns that are the same are taken.
-        only: effects that are weighed in place of all.
+        without: effects that are excluded; only: the only effects to consider, if any.
+        known: a search beside another model, whose equal columns are reused.
     """
     wanted = only or session.candidate_names(fit.recipe, without)
     candidates = {c.name: c for c in candidates_of(fit.recipe, wanted)}
-    # The shapes of a candidate are shares of its range, so that this must stay.
+    # The shapes of a candidate are shares of its range, which therefore must not change.
     scale = known.dictionary.scale if known else MachineScale.of_trials(fit.evidence)
     dictionary = Dictionary(fit.evidence, fit.likelihood.samples, candidates, scale)
     with workers(dictionary, session.jobs) as spread:
 
         def make(keys: Sequence[Key]) -> Iterable[tuple[Key, Atom | None]]:
-            parts = min(len(keys), PARTS * session.jobs)
+            parts = min(len(keys), TASKS_PER_PROCESS * session.jobs)
             if session.jobs <= 1 or parts < 2:
-                return dictionary.make_all(keys)
+                return make_columns(keys, dictionary)
             made = spread(make_columns, [keys[k::parts] for k in range(parts)])
             return [pair for part in made for pair in part]
 
         yield Search(fit.problem, dictionary, make, session.criteria, _reusable(known, dictionary))
 
 
-def make_columns(keys: Sequence[Key]) -> list[tuple[Key, Atom | None]]:
-    """Make columns by the dictionary that a worker process shares."""
-    dictionary: Dictionary = shared()
-    return dictionary.make_all(keys)
+def make_columns(
+    keys: Sequence[Key], dictionary: Dictionary | None = None
+) -> list[tuple[Key, Atom | None]]:
+    """Compute columns with a dictionary, by default that of this worker process."""
+    dictionary = dictionary or worker_state()
+    return [(key, dictionary.make(key)) for key in keys]
 
 
 def _reusable(known: Search | None, dictionary: Dictionary) -> dict[Key, Atom | None]:
-    """Columns that are the same beside another model: of effects that do not act on its effects."""
-    if known is None or known.dictionary.evidence.system.moves_sensors:
-        return {}
-    if dictionary.evidence.system.moves_sensors:
+    """Return the columns of a known search whose candidates do not interact with either model."""
+    if known is None or any(
+        d.evidence.system.moves_sensors for d in (known.dictionary, dictionary)
+    ):
         return {}
     same = {
         name
@@ -131,19 +130,18 @@ def select_effects(
     without: Collection[str] = (),
     progress: Progress = lambda fraction, message: None,
 ) -> Selection:
-    """Find the set of effects that is most probable beside a model.
+    """Find the most probable set of effects that a model lacks.
 
     Args:
-        session: the trials; recipe: the model; start: its parameters, (n_p,).
-        without: effects that are not weighed.
-        progress: called with a fraction and a message.
+        recipe: the model; start: its initial parameters, (n_p,).
+        without: effects that are excluded.
 
     Raises:
-        Runaway: the model as given cannot be replayed.
+        Runaway: the given model cannot be simulated.
     """
-    progress(0.0, "replaying the model")
+    progress(0.0, "simulating replicates of the model")
     initial = current = session.fit(recipe, start)
-    steps = [current]
+    earlier = [current]
     fits: dict[frozenset[str], Fit | None] = {frozenset(recipe.effects): current}
     gains: dict[str, float] = {}
     known: Search | None = None
@@ -154,47 +152,43 @@ def select_effects(
             known = search
             none = search.cost(())
             if not gains:
-                beside = search.best_beside((), len(search.dictionary.candidates))
+                beside = search.rank_additions((), len(search.dictionary.candidates))
                 gains = {key[0]: none - cost for cost, key in beside}
             room = session.criteria.most_effects - len(current.recipe.effects) + len(recipe.effects)
-            pool = _explore(search, room, deep=room if number == 0 else min(_DEEP, room))
+            pool = _explore(search, room, deep=room if number == 0 else min(_MOST_ADDED, room))
             moved, kept = None, dict[tuple[str, ...], float]()
             last |= number >= _MOST_ROUNDS - 1
             if not last:
-                better = [k for c, k in sorted(pool.values()) if c < none - _WORTH]
+                better = [k for c, k in sorted(pool.values()) if c < none - _LEAST_GAIN]
                 better += _without_weakest(search, recipe.effects)
                 tell = partial(progress, 0.15 + 0.1 * number)
                 moved, kept = _fit_better(session, search, current, better, fits, tell)
-                # By its own noise a set fitted before is not the better one: the last.
-                last |= any(moved is one for one in steps)
+                # Under the noise of its own replicates, an earlier set may seem better again.
+                last |= any(moved is one for one in earlier)
             if moved is None:
-                # What has been fitted counts by what it kept, not by its linear problem.
+                # The gain of a fitted set is that of its fit, not that of its linear problem.
                 pool = {
                     n: (none - kept[n] if n in kept else c, k)
                     for n, (c, k) in pool.items()
-                    if n in kept or c >= none - _WORTH
+                    if n in kept or c >= none - _LEAST_GAIN
                 }
-                progress(0.9, "holding the model against chance")
-                replays = range(session.criteria.replicates)
-                chance = tuple(search.of_replay(k).largest_gain()[0] for k in replays)
-                weighed = weigh_sets(
+                progress(0.9, "comparing the gains with those on replicates")
+                replicate_gains = search.replicate_gains()
+                probabilities = weigh_sets(
                     search, current, pool, recipe.effects, session.criteria, session.seed
                 )
-                moved = (
-                    None
-                    if number == _MOST_ROUNDS
-                    else _leave_out(session, search, current, weighed, recipe.effects)
-                )
+                if number < _MOST_ROUNDS:
+                    moved = _leave_out(session, search, current, probabilities, recipe.effects)
                 if moved is None:
                     return Selection(
-                        initial, current, weighed, chance, search.largest_gain(), gains,
-                        tuple(steps), number >= _MOST_ROUNDS - 1 or room <= 0,
+                        initial, current, probabilities, replicate_gains, search.largest_gain(),
+                        gains, number >= _MOST_ROUNDS - 1 or room <= 0,
                     )  # fmt: skip
-                # A second time, nothing more is added.
+                # After a second removal, nothing more is added.
                 last |= bool(left_out)
                 left_out |= {*current.recipe.effects} - {*moved.recipe.effects}
         current = moved
-        steps.append(current)
+        earlier.append(current)
     raise AssertionError("the last round returns")
 
 
@@ -206,29 +200,31 @@ def _fit_better(
     fits: dict[frozenset[str], Fit | None],
     tell: Callable[[str], None],
 ) -> tuple[Fit | None, dict[tuple[str, ...], float]]:
-    """Fit sets in turn until one is better than the current model when fitted, too.
+    """Fit the sets ``better`` in turn until the fit of one is better than the current model.
 
-    Of the sets ``better``, the most promising first; with what each kept when fitted, nats. One
-    whose error on unseen trials is larger is not better, whatever the bias of its replays explains.
+    A set with a larger held-out error is not better, even if its log evidence is.
+
+    Returns:
+        The better fit, if any, and the gains of the fits that are not better, nats, by effects.
     """
     broken: list[set[Key]] = []
     kept: dict[tuple[str, ...], float] = {}
     for keys in better:
-        if added(keys) and len(broken) >= _TRIED and len(keys) >= min(map(len, broken)):
+        if added_effects(keys) and len(broken) >= _MOST_FITS and len(keys) >= min(map(len, broken)):
             continue
-        # A larger set promises no more than the one in it whose fit fell short.
+        # A set that contains one whose fit failed is no better.
         if any(one <= {*keys} for one in broken):
             continue
         wider = change_set(current.recipe, keys)
         members = frozenset(wider.effects)
         if fresh := members not in fits:
-            tell(f"fitting {', '.join(names(keys))}")
+            tell(f"fitting {', '.join(effect_names(keys))}")
             fits[members] = session.try_fit(wider, start_of(search, keys, wider))
         moved = fits[members]
         if moved is not None:
             gain = gain_when_fitted(current, moved, search, keys)
-            if gain <= _WORTH:
-                kept[names(keys)] = gain
+            if gain <= _LEAST_GAIN:
+                kept[effect_names(keys)] = gain
             elif _held_out_error(moved) < _held_out_error(current) + NOTICEABLE:
                 return moved, kept
         broken.append({*keys})
@@ -238,31 +234,32 @@ def _fit_better(
 
 
 def _without_weakest(search: Search, given: Collection[str]) -> list[tuple[Key, ...]]:
-    """The set without the member that adds least, where shapes of others may take its place.
+    """Return the removal of the weakest effect if the shapes of others could replace it.
 
-    How far they do a linear problem at the shapes they have beside it does not say.
+    The linear problem at the present shapes does not show how well they could.
     """
-    own = [e for e in search.p.absence if e not in given]
+    own = [e for e in search.problem.absence if e not in given]
     weakest = min(own, key=lambda e: search.cost(((f"-{e}", ()),)), default=None)
-    shaped = any(search.p.shapes[e] for e in own if e != weakest)
+    shaped = any(search.problem.shapes[e] for e in own if e != weakest)
     return [((f"-{weakest}", ()),)] if shaped else []
 
 
 def _leave_out(
-    session: Session, search: Search, fit: Fit, weighed: Weighed, given: Collection[str]
+    session: Session, search: Search, fit: Fit, probabilities: Probabilities, given: Collection[str]
 ) -> Fit | None:
-    """The model without the effects that came out improbable; None where there are none.
+    """Fit the model without its improbable effects; None if it has none.
 
-    With what the most probable set has in their place. What an unknown function could replace
-    stays: it describes the machine until its effect has a name. It must predict, though.
+    The most probable set takes their place. An effect that an unknown function could replace stays
+    if it lowers the held-out error.
     """
     least = 1.0 - session.criteria.probability
     own = [e for e in fit.recipe.effects if e not in given]
-    out = {e for e in own if weighed.by_name.get(e, 0.0) < least} or _misleading(fit, weighed, own)
+    out = {e for e in own if probabilities.if_all_known.get(e, 0.0) < least}
+    out = out or _find_misleading(fit, probabilities, own)
     if not out:
         return None
-    best = next(one.keys for one in weighed.sets if one.unknown is None)
-    best = best if out & gone(best) else ()
+    best = next(one.keys for one in probabilities.sets if one.unknown is None)
+    best = best if out.intersection(removed_effects(best)) else ()
     keys = tuple(sorted({*best, *((f"-{e}", ()) for e in out)}))
     less = change_set(fit.recipe, keys)
     if np.isfinite(search.cost(keys)):
@@ -270,11 +267,10 @@ def _leave_out(
     return session.try_fit(less, start_at(search, np.zeros(search.bb.shape[1]), {}, less))
 
 
-def _misleading(fit: Fit, weighed: Weighed, own: Sequence[str]) -> set[str]:
-    """Effects that are rather not there, and make the error on trials not seen larger."""
-
+def _find_misleading(fit: Fit, probabilities: Probabilities, own: Sequence[str]) -> set[str]:
+    """Return the effects that are less probable than not and raise the held-out error."""
     out, least = set[str](), _held_out_error(fit)
-    while doubtful := [e for e in own if e not in out and weighed.effects.get(e, 0.0) < 0.5]:
+    while doubtful := [e for e in own if e not in out and probabilities.effects.get(e, 0.0) < 0.5]:
         left, worst = min((_held_out_error(fit, {*out, e}), e) for e in doubtful)
         if left >= least:
             break
@@ -283,16 +279,15 @@ def _misleading(fit: Fit, weighed: Weighed, own: Sequence[str]) -> set[str]:
 
 
 def _held_out_error(fit: Fit, without: Collection[str] = ()) -> float:
-    """Its logarithm, summed over the axes, with or without some of the model's effects."""
+    """Return the logarithm of the held-out error, summed over the axes."""
     errors = fit.held_out_without(without) if without else fit.held_out_rmse
     return float(np.sum(np.log(np.maximum(errors, 1e-300))))
 
 
 def gain_when_fitted(before: Fit, after: Fit, search: Search, keys: Sequence[Key]) -> float:
-    """Log evidence that a fitted set gains by the weights of the model without it, nats.
+    """Return the log evidence that a set gains by its fit, under the weights of ``before``, nats.
 
-    Args:
-        before, after: the model without and with it; search: beside the former; keys: the set.
+    ``before`` and ``after`` are fits without and with the set ``keys``.
     """
     if any(len(a) != len(b) for a, b in zip(before.problem.y, after.problem.y, strict=True)):
         return np.inf
@@ -310,27 +305,23 @@ def gain_when_fitted(before: Fit, after: Fit, search: Search, keys: Sequence[Key
 
 
 def _explore(search: Search, room: int, deep: int) -> Pool:
-    """Sets near the fitted one: without a member, with another in its place, and with more."""
+    """Return sets near the fitted one: with members removed, exchanged and added."""
     pool: Pool = {}
-    search.keep(pool, ())
+    search.add_to_pool(pool, [()])
     lead = search.cost(())
     rest: tuple[Key, ...] | None = ()
-    while rest is not None:  # backward elimination, as far as each member less is more probable
-        fewer, least = search.without_one(rest), search.cost(rest)
-        for keys in fewer:
-            search.keep(pool, keys)
-        rest = min(
-            (keys for keys in fewer if search.cost(keys) < least), key=search.cost, default=None
-        )
-    for keys in search.refine(search.swaps((), pool), 2):
-        search.keep(pool, keys)
-    for beam in search.beam(deep):
-        for _, keys in beam:
-            search.keep(pool, keys)
+    while rest is not None:  # backward elimination, as long as the probability rises
+        fewer, least = search.drop_each(rest), search.cost(rest)
+        search.add_to_pool(pool, fewer)
+        better = (keys for keys in fewer if search.cost(keys) < least)
+        rest = min(better, key=search.cost, default=None)
+    search.add_to_pool(pool, search.refine(search.list_swaps((), pool), 2))
+    for beam in search.grow_sets(deep):
+        search.add_to_pool(pool, (keys for _, keys in beam))
         best = min(cost for cost, _ in beam)
         gained, total = lead - best, search.cost(()) - best
-        if gained < _WORTH or gained < _MINOR * total:
-            # What is minor beside the rest is weighed once that has been fitted.
+        if gained < _LEAST_GAIN or gained < _MINOR_SHARE * total:
+            # Minor effects wait until the others have been fitted.
             if gained > 0.0 and gained < total:
                 largest = max(len(keys) for _, keys in beam)
                 for name in [n for n, (_, keys) in pool.items() if len(keys) >= largest]:
@@ -341,14 +332,14 @@ def _explore(search: Search, room: int, deep: int) -> Pool:
 
 
 def change_set(recipe: Recipe, keys: Sequence[Key]) -> Recipe:
-    """The model of ``recipe`` with the changes of a set."""
-    return without_members(recipe, gone(keys), [name for name, _ in added(keys)])
+    """Return the model of ``recipe`` with the changes of a set."""
+    return change_effects(recipe, removed_effects(keys), [name for name, _ in added_effects(keys)])
 
 
 def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
-    """Parameters of a changed model from the solution of its linear problem, (n_p,)."""
+    """Return the parameters of a changed model from the solution of its set, (n_p,)."""
     solution, known = search.solve(keys), dict[str, float]()
-    for key, strength in zip(added(tuple(sorted(keys))), solution.strengths, strict=True):
+    for key, strength in zip(added_effects(tuple(sorted(keys))), solution.strengths, strict=True):
         item = search.dictionary.candidates[key[0]]
         values = search.dictionary.values(key)
         share = 1.0 if item.linear_indices else float(strength[0])
@@ -364,13 +355,13 @@ def start_of(search: Search, keys: Sequence[Key], wider: Recipe) -> Array:
 
 
 def start_at(search: Search, base: Array, known: Mapping[str, float], wider: Recipe) -> Array:
-    """Parameters of a changed model, within bounds, (n_p,).
+    """Return the parameters of a changed model within their bounds, (n_p,).
 
-    Those of the model moved by ``base``, a solution of its linear problem, with ``known`` ones.
+    They are those of the model after the change ``base`` of its linear problem, and ``known`` ones.
     """
     evidence = search.dictionary.evidence
     found = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
-    change = search.p.to_parameters @ base
+    change = search.problem.to_parameters @ base
     for place, number in enumerate(evidence.free):
         found[evidence.system.parameters[number].name] += change[place]
     found |= known

@@ -1,9 +1,7 @@
-"""What a set of effects costs: its negative log evidence beside a model.
+"""The cost of a set of effects: its negative log evidence beside a model.
 
-Half of n log s^2 on each axis, with s^2 what the set leaves in units of the noise; the logarithm of
-what it takes off the measured quantity, so that nothing is explained by making both sides of the
-equation small; and by the priors of its parameters (Laplace) and of the set itself. Strengths are
-held within their bounds.
+The terms are those of docs/method_selection.md: misfit, change of variables, Occam factors, priors
+of the strengths and of the set. Strengths stay within their bounds.
 """
 
 from __future__ import annotations
@@ -32,24 +30,26 @@ from bampipe.trials.likelihood import (
 from bampipe.trials.scale import log_of_share
 
 _LEAST_SLOPE = 0.2
-"""Geometric mean of what a set leaves of the slope by the force; below, nothing has a scale."""
-_A_SHAPE = 2.5
-"""Half the logarithm of the information on a shape over its range, as it comes out on the whole."""
+"""Smallest geometric mean of dτ/df: below it, the equation of motion has no scale."""
+_SHAPE_COST = 2.5
+"""Occam factor of a shape, nats: a typical half logarithm of the information over its range."""
 
 Make = Callable[[Sequence[Key]], Iterable[tuple[Key, Atom | None]]]
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A set with its best strengths.
+    """A set with its most likely strengths.
 
     Attributes:
         cost: negative log evidence, nats.
-        strengths: of each effect, in the order of the set.
+        strengths: strengths of each effect, in the order of the set.
         base: change of the model's own reduced parameters.
-        scale: s^2 by axis, (n_q,).
-        volume: log of what is left of the measured quantity, summed over samples, by axis.
-        penalty: what the priors take off.
+        scale: s^2 of each axis, (n_q,).
+        volume: term of the change of variables, by axis, (n_q,).
+        penalty: Occam factors and priors, nats.
+        sizes: irreplaceable size of each effect, see `SetCosts._sizes`.
+        weight: weight of the squares of each axis, (n_q,).
     """
 
     cost: float
@@ -73,45 +73,43 @@ class SetCosts:
         criteria: Criteria,
         known: Mapping[Key, Atom | None],
     ) -> None:
-        self.p, self.dictionary, self.make, self.criteria = problem, dictionary, make, criteria
+        self.problem = p = problem
+        self.dictionary, self.make, self.criteria = dictionary, make, criteria
         self.log_prior = log_prior(criteria, len(dictionary.candidates))
-        p = problem
         self.n_q = len(p.y)
         self.bb, self.by, self.yy = p.sums()
         self.atoms: dict[Key, Atom | None] = dict(known)
-        self._with_base: dict[Key, dict[int, tuple[Array, Array, Array]]] = {}
-        self._solved: dict[tuple[Key, ...], Solution] = {}
+        self._products_by_key: dict[Key, dict[int, tuple[Array, Array, Array]]] = {}
+        self._solutions: dict[tuple[Key, ...], Solution] = {}
         self._own_penalties: dict[str, float] = {}
         self.least_size = criteria.size
         self._squares: dict[Key, dict[int, Array]] = {}
         self._scale_without: dict[str, tuple[dict[int, Array], Array]] = {}
         self.applied = [max(float(f @ f), 1e-300) for f in p.likelihood.applied]
         self._weight = p.independent / np.maximum(self.yy, 1e-300)
-        # Columns have the noise of the measured force: they scale or filter that in the residual.
+        # Columns that take part of the measured force scale or filter its noise, too.
         self._moves_noise = True
         grid = [key for name in dictionary.candidates for key in dictionary.grid(name)]
         self.ensure(grid)
         places = {key: atom for key in grid if (atom := self.atoms[key]) is not None}
-        self.places = list(places)
+        self.grid_keys = list(places)
         self._lay_out(places)
 
     def ensure(self, keys: Iterable[Key]) -> None:
-        """Make the columns of what has none yet."""
+        """Compute the columns that are missing."""
         missing = [key for key in dict.fromkeys(keys) if key not in self.atoms]
         if missing:
             self.atoms |= dict(self.make(missing))
 
     def _lay_out(self, places: Mapping[Key, Atom]) -> None:
-        """All columns of the grid side by side, axis by axis, and their products with the base."""
+        """Join the columns of the grid by axis, and compute their products with the base."""
         widths = [a.width for a in places.values()]
-        self.first = np.concatenate([[0], np.cumsum(widths)])[:-1].astype(int)
+        self.first_columns = np.concatenate([[0], np.cumsum(widths)])[:-1].astype(int)
         self.widths = np.array(widths, dtype=int)
-        m = int(sum(widths))
-        p = self.p
-        self.columns, self.at = [], []
-        self.own = np.zeros(
-            (self.n_q, len(places), int(max(widths, default=1)), int(max(widths, default=1)))
-        )
+        p = self.problem
+        self.columns, self.column_indices = [], []
+        widest = int(max(widths, default=1))
+        self.own_products = np.zeros((self.n_q, len(places), widest, widest))
         self.xb, self.xy = [], []
         for axis in range(self.n_q):
             blocks, at = [], []
@@ -119,86 +117,83 @@ class SetCosts:
                 if axis in atom.columns:
                     block = atom.columns[axis] * p.likelihood.root[axis][:, None]
                     w = block.shape[1]
-                    self.own[axis, k, :w, :w] = block.T @ block
+                    self.own_products[axis, k, :w, :w] = block.T @ block
                     blocks.append(block)
-                    at.append(np.arange(self.first[k], self.first[k] + w))
+                    at.append(np.arange(self.first_columns[k], self.first_columns[k] + w))
             x = np.concatenate(blocks, axis=1) if blocks else np.zeros((len(p.y[axis]), 0))
             self.columns.append(x)
-            self.at.append(np.concatenate(at) if at else np.zeros(0, dtype=int))
+            self.column_indices.append(np.concatenate(at) if at else np.zeros(0, dtype=int))
             self.xb.append(p.base[axis].T @ x)
             self.xy.append(x.T @ p.y[axis])
-        self.m = m
+        self.n_columns = int(sum(widths))
         bounds = [b for key in places for b in self.dictionary.bounds(key[0])]
-        self.low, self.high = np.array(bounds).reshape(-1, 2).T
-        self.spread = np.array([v for key in places for v in self.dictionary.spreads(key[0])])
+        self.lower, self.upper = np.array(bounds).reshape(-1, 2).T
+        self.prior_sd = np.array([v for key in places for v in self.dictionary.spreads(key[0])])
 
-    def of_replay(self, replay: int) -> Self:
-        """The same with the residual of a replay in place of the measured trials."""
+    def on_replicate(self, number: int) -> Self:
+        """Return the costs on the residual of a replicate instead of the measured one."""
         other = copy(self)
-        p, noise = self.p, self.p.likelihood.noise
+        p, noise = self.problem, self.problem.likelihood.noise
         rows = zip(noise.residuals, p.likelihood.root, strict=True)
-        other.p = replace(p, y=tuple(r[replay] * root for r, root in rows))
+        other.problem = replace(p, y=tuple(r[number] * root for r, root in rows))
         other._moves_noise = False
-        other.by = np.array([b.T @ y for b, y in zip(p.base, other.p.y, strict=True)])
-        other.yy = np.array([float(y @ y) for y in other.p.y])
-        other.xy = [x.T @ y for x, y in zip(self.columns, other.p.y, strict=True)]
-        other._with_base, other._solved = {}, {}
+        other.by = np.array([b.T @ y for b, y in zip(p.base, other.problem.y, strict=True)])
+        other.yy = np.array([float(y @ y) for y in other.problem.y])
+        other.xy = [x.T @ y for x, y in zip(self.columns, other.problem.y, strict=True)]
+        other._products_by_key, other._solutions = {}, {}
         other._weight = p.independent / np.maximum(other.yy, 1e-300)
         return other
 
     def with_independent(self, samples: tuple[Samples, ...]) -> Self:
-        """The same with other numbers of independent samples."""
+        """Return the costs with other numbers of independent samples."""
         other = copy(self)
-        other.p = replace(self.p, likelihood=replace(self.p.likelihood, samples=samples))
-        other._solved, other._own_penalties = {}, {}
-        other._weight = other.p.independent / np.maximum(self.yy, 1e-300)
+        other.problem = replace(
+            self.problem, likelihood=replace(self.problem.likelihood, samples=samples)
+        )
+        other._solutions, other._own_penalties = {}, {}
+        other._weight = other.problem.independent / np.maximum(self.yy, 1e-300)
         return other
 
     def _atom(self, key: Key) -> Atom:
-        """The columns of a candidate that does something in these trials."""
+        """Return the columns of a candidate that has an effect in these trials."""
         atom = self.atoms[key]
         assert atom is not None
         return atom
 
     def _products(self, key: Key) -> dict[int, tuple[Array, Array, Array]]:
-        """By axis: weighted columns of an atom, their products with the base and with y."""
-        if key not in self._with_base:
-            atom, p = self._atom(key), self.p
+        """Return weighted columns of a candidate and their products with base and y, by axis."""
+        if key not in self._products_by_key:
+            atom, p = self._atom(key), self.problem
             found = {}
             for axis, columns in atom.columns.items():
                 x = columns * p.likelihood.root[axis][:, None]
                 found[axis] = x, p.base[axis].T @ x, x.T @ p.y[axis]
-            self._with_base[key] = found
-        return self._with_base[key]
+            self._products_by_key[key] = found
+        return self._products_by_key[key]
 
     def solve(self, keys: Sequence[Key]) -> Solution:
-        """The best strengths of a set within their bounds, and its cost."""
+        """Return the most likely strengths of a set within their bounds, and its cost."""
         keys = tuple(sorted(keys))
-        if keys not in self._solved:
-            self._solved[keys] = self._solve(keys)
-        return self._solved[keys]
+        if keys not in self._solutions:
+            self._solutions[keys] = self._solve(keys)
+        return self._solutions[keys]
 
     def cost(self, keys: Sequence[Key]) -> float:
-        """Negative log evidence of a set, nats."""
+        """Return the negative log evidence of a set, nats."""
         return self.solve(keys).cost
 
     def _solve(self, all_keys: tuple[Key, ...]) -> Solution:
-        p, nb = self.p, self.bb.shape[1]
-        absent = {
-            place: change
-            for name, _ in all_keys
-            if name[0] == "-"
-            for place, change in p.absence[name[1:]].items()
-        }
-        keys = added(all_keys)
+        p, nb = self.problem, self.bb.shape[1]
+        removed = removed_effects(all_keys)
+        absent = {k: change for name in removed for k, change in p.absence[name].items()}
+        keys = added_effects(all_keys)
         if any(self.atoms.get(key) is None for key in keys):
             return Solution(np.inf)
         xx, xy, places = self._sums(keys)
-        bounds = np.array([x for key in keys for x in self.dictionary.bounds(key[0])]).reshape(
-            -1, 2
-        )
+        limits = [pair for key in keys for pair in self.dictionary.bounds(key[0])]
+        bounds = np.array(limits).reshape(-1, 2)
         spread = np.array([s for key in keys for s in self.dictionary.spreads(key[0])])
-        # What a strength of any size leaves as it is has none.
+        # A strength that changes nothing over its whole prior is zero.
         bounds[np.einsum("a,akk->k", self._weight, xx[:, nb:, nb:]) * spread**2 < NOTHING**2] = 0.0
         expected = self._expected(keys)
         solved = solve_bounded(
@@ -213,12 +208,12 @@ class SetCosts:
         volume = self._volume(self._log_slopes(all_keys, strengths, scale))
         if volume is None:
             return Solution(np.inf)
-        # The cost has what its own parameters leave of the scale in second order, absent ones, too.
+        # The cost contains the scale to second order in the model's parameters, absent ones too.
         places_of, change = list(absent), np.array([*absent.values()])
         first = self.dictionary.evidence.log_scale[1][:, places_of] @ change
         volume = volume - p.independent * (first - 0.5 * first**2)
         sizes: tuple[float, ...] = ()
-        # What an effect of the model costs is not in the cost of the model as it is.
+        # The cost of the model does not contain the priors of its own effects.
         penalty = self.penalty_of(all_keys) + 0.5 * float(b[nb:] @ expected @ b[nb:])
         if keys:
             products = np.tensordot(weight, xx, 1)
@@ -226,16 +221,20 @@ class SetCosts:
             normal[:nb, :nb] += p.precision
             normal[nb:, nb:] += expected
             used = np.flatnonzero(~solved.held)
-            # What a set takes away does not move along: its place can be taken by a twin of it.
+            # A removed effect stays removed, so that a twin can take its place.
             if absent:
                 free = p.hold(absent, n)[1]
                 normal = free.T @ normal @ free
-            inside = _schur(normal, nb - (n - len(normal)))[np.ix_(used, used)]
+            # The information on the strengths after the model's own parameters have adapted.
+            start = nb - (n - len(normal))
+            cross = normal[:start, start:]
+            inside = normal[start:, start:] - cross.T @ solve_scaled(normal[:start, :start], cross)
+            inside = inside[np.ix_(used, used)]
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
             member = np.repeat(np.arange(len(keys)), [h.stop - h.start for h in held])[used]
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)
             for k, size in enumerate(sizes):
-                # Nor can what others would take over beyond their bounds.
+                # Other parameters absorb an effect only within their bounds.
                 if (
                     size < self.least_size
                     and self._size_within_bounds(all_keys, k, strengths, b, products)
@@ -248,10 +247,9 @@ class SetCosts:
         return Solution(cost, strengths, b[:nb], scale, volume, penalty, sizes, weight)
 
     def _sums(self, keys: Sequence[Key]) -> tuple[Array, Array, list[slice]]:
-        """Products by axis of the base and the columns of a set, with each other and with y.
+        """Return products of base and columns with each other and with y, by axis.
 
-        Returns:
-            (n_q, n, n), (n_q, n), and the places of each member among the n.
+        They are (n_q, n, n) and (n_q, n); the slices of each member among the n come third.
         """
         nb, parts = self.bb.shape[1], [self._products(key) for key in keys]
         ends = nb + np.cumsum([0, *(self._atom(key).width for key in keys)], dtype=int)
@@ -276,9 +274,9 @@ class SetCosts:
         own: Array,
         place: Indices,
     ) -> tuple[float, ...]:
-        """What each effect adds as far as nothing else in the model takes its place.
+        """Return the size of each effect beyond what other parameters could absorb.
 
-        As a share of the applied force of the axis where that is largest.
+        It is a root mean square over that of the applied force, on the axis where it is largest.
         """
         spread, sizes = np.linalg.pinv(inside, hermitian=True), []
         for k, (key, strength) in enumerate(zip(keys, strengths, strict=True)):
@@ -300,13 +298,11 @@ class SetCosts:
         b: Array,
         products: Array,
     ) -> float:
-        """What an effect of a set adds as far as the best set without it, within bounds, does not.
+        """Return the size of one effect of a set beyond what the set without it could absorb.
 
-        Args:
-            all_keys: the set; number: of the effect; strengths: of each; b: all unknowns, (n,).
-            products: weighted, of all columns, (n, n).
+        ``b`` are all unknowns, (n,), and ``products`` the weighted products of all columns, (n, n).
         """
-        key = added(all_keys)[number]
+        key = added_effects(all_keys)[number]
         rest = self.solve(tuple(other for other in all_keys if other != key))
         if not np.isfinite(rest.cost):
             return 0.0
@@ -320,98 +316,95 @@ class SetCosts:
         return self._size(key, strengths[number]) * float(np.sqrt(max(share, 0.0)))
 
     def _size(self, key: Key, strength: Array) -> float:
-        """What an effect adds over the applied force of an axis, root mean square, the largest."""
+        """Return the root mean square of an effect over that of the applied force of an axis."""
         return max(
             float(np.sqrt(max(float(strength @ square @ strength), 0.0) / self.applied[axis]))
             for axis, square in self._squares_of(key).items()
         )
 
     def _squares_of(self, key: Key) -> dict[int, Array]:
-        """Products of the columns of a candidate with each other, by axis, (m, m), unweighted."""
+        """Return the unweighted products of a candidate's columns, by axis, (m, m)."""
         if key not in self._squares:
             self._squares[key] = {a: c.T @ c for a, c in self._atom(key).columns.items()}
         return self._squares[key]
 
     def _expected(self, keys: Sequence[Key]) -> Array:
-        """What is known of the strengths of a set beforehand, see `expect_strengths`, (m, m)."""
-        applied = self.p.likelihood.applied
+        """Return the prior precision of the strengths of a set, `expect_strengths`, (m, m)."""
+        applied = self.problem.likelihood.applied
         parts = [self._squares_of(key) for key in keys]
         blocks = [expect_strengths([*x.values()], [applied[a] for a in x]) for x in parts]
         return np.asarray(block_diag(*blocks)) if blocks else np.zeros((0, 0))
 
     def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
-        """`Solution.volume` of a set with the parameters of a model that was fitted with it."""
+        """Return `Solution.volume` of a set at the parameters of a model fitted with it."""
         known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
-        gains = [self.dictionary.gain_with(name, known) for name, _ in added(keys)]
-        gains += [self._without(name)[1] for name in gone(keys)]
+        gains = [self.dictionary.gain_with(name, known) for name, _ in added_effects(keys)]
+        gains += [self._without(name)[1] for name in removed_effects(keys)]
         filters: list[tuple[dict[int, Array], Array]] = [({}, gain) for gain in gains]
         scale = evidence.log_scale[0] - self.dictionary.evidence.log_scale[0]
         rows = self._log_of_slopes(filters, self.solve(keys).scale)
         return self._volume([r + here for r, here in zip(rows, scale, strict=True)])
 
     def _volume(self, rows: Sequence[Array]) -> Array | None:
-        """By axis, independent samples times the mean log of what is left of what was measured.
+        """Return the change of variables of each axis, or None if the equation has no scale.
 
-        None where so little is left of the force that the equation has no scale.
+        ``rows`` are the logarithms of the factors on the measured force at each sample, by axis.
         """
         means = np.array([float(r.mean()) if len(r) else 0.0 for r in rows])
         left = self.dictionary.evidence.log_scale[0] + means
         if (left < np.log(_LEAST_SLOPE)).any():
             return None
-        return np.asarray(self.p.independent * means * self._moves_noise)
+        return np.asarray(self.problem.independent * means * self._moves_noise)
 
     def _log_slopes(
         self, keys: Sequence[Key], strengths: Sequence[Array], scale: Array
     ) -> list[Array]:
-        """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
-        atoms = [self._atom(key) for key in added(keys)]
+        """Return the log of the factor of a set on the measured force, by axis, (n,)."""
+        atoms = [self._atom(key) for key in added_effects(keys)]
         each = [
             ({axis: slope @ b for axis, slope in atom.slopes.items()}, atom.gain)
             for atom, b in zip(atoms, strengths, strict=True)
         ]
-        return self._log_of_slopes([*each, *map(self._without, gone(keys))], scale)
+        return self._log_of_slopes([*each, *map(self._without, removed_effects(keys))], scale)
 
     def _without(self, name: str) -> tuple[dict[int, Array], Array]:
-        """Slopes and gain that it adds to take one of the model's own effects away."""
+        """Return the slopes and the gain of the removal of one of the model's effects."""
         if name not in self._scale_without:
-            absence = self.p.absence[name]
+            absence = self.problem.absence[name]
             self._scale_without[name] = self.dictionary.scale_without(name, absence)
         return self._scale_without[name]
 
     def _log_of_slopes(
         self, each: Sequence[tuple[Mapping[int, Array], Array]], scale: Array
     ) -> list[Array]:
-        """The same of slopes, by axis, (n, n_forces), and gains of each effect."""
-        found = [np.zeros(len(y)) for y in self.p.y]
+        """Return `_log_slopes` of effects with given slopes, by axis, (n, n_forces), and gains."""
+        found = [np.zeros(len(y)) for y in self.problem.y]
         moved: dict[int, Array] = {}
         gains = np.ones(self.n_q)
         for slopes, gain in each:
             for axis, slope in slopes.items():
                 moved[axis] = moved.get(axis, 0.0) + slope
             gains *= gain
-        # A filter takes off the noise of the forces, and what is beyond that of replays; that of
-        # the motion stays.
+        # A filter reduces the noise of the forces and any excess over the replicates, but not the
+        # noise of the motion.
         for axis in map(int, np.flatnonzero(gains != 1.0)):
-            kept = (1.0 - self.p.likelihood.force_share[axis]) / max(float(scale[axis]), 1.0)
+            kept = (1.0 - self.problem.likelihood.force_share[axis]) / max(float(scale[axis]), 1.0)
             found[axis] = found[axis] + 0.5 * np.log(kept + (1.0 - kept) * gains[axis])
         for axis, slope in moved.items():
-            found[axis] = found[axis] + log_of_share(self.p.likelihood.slopes[axis], slope)
+            found[axis] = found[axis] + log_of_share(self.problem.likelihood.slopes[axis], slope)
         return found
 
     def penalty_of(self, keys: Sequence[Key]) -> float:
-        """What the prior of a set costs, without that of the parameters it adds.
-
-        Of effects of the model, what is gained where they are taken away.
-        """
-        away = gone(keys)
+        """Return the cost of the prior of a set, less the priors of the effects it removes."""
+        away = removed_effects(keys)
         saved = sum(self._penalty_of_own(name) for name in away)
-        return self.log_prior * (len(away) - len(added(keys))) - saved
+        return self.log_prior * (len(away) - len(added_effects(keys))) - saved
 
     def _penalty_of_own(self, name: str) -> float:
-        """What the priors of the parameters of one of the model's effects cost."""
+        """Return the cost of the priors of the parameters of one of the model's effects."""
         if name not in self._own_penalties:
-            # Of a candidate, too, the information on its strengths is that at its shape.
-            p, shapes = self.p, self.p.shapes[name]
+            # As for a candidate, the information on the strengths is that at a given shape.
+            p, shapes = self.problem, self.problem.shapes[name]
             away = {k: change for k, change in p.absence[name].items() if k not in shapes}
             free = p.hold(dict.fromkeys(shapes, 0.0))[1]
             to = p.to_parameters[list(away)] @ free
@@ -424,79 +417,82 @@ class SetCosts:
         return self._own_penalties[name]
 
     def residual_rows(self, keys: Sequence[Key]) -> list[Array]:
-        """What a set leaves, in units of the noise, by axis, each (n,)."""
+        """Return the residual of a set in units of the noise, by axis, (n,)."""
         solution = self.solve(keys)
-        left = [y + b @ solution.base for y, b in zip(self.p.y, self.p.base, strict=True)]
-        for key, strength in zip(added(tuple(sorted(keys))), solution.strengths, strict=True):
+        left = [
+            y + b @ solution.base for y, b in zip(self.problem.y, self.problem.base, strict=True)
+        ]
+        for key, strength in zip(
+            added_effects(tuple(sorted(keys))), solution.strengths, strict=True
+        ):
             for axis, (x, _, _) in self._products(key).items():
                 left[axis] = left[axis] + x @ strength
         return left
 
     def size_of_own(self, name: str) -> float:
-        """What an effect of the model adds as far as the model without it does not.
+        """Return the size of an effect of the model beyond what the rest could absorb.
 
-        Root mean square over that of the applied force, of the axis where that is largest.
+        It is a root mean square over that of the applied force, on the axis where it is largest.
         """
         rows = zip(self.residual_rows(((f"-{name}", ()),)), self.residual_rows(()), strict=True)
-        moved = [(a - b) / r for (a, b), r in zip(rows, self.p.likelihood.root, strict=True)]
+        moved = [(a - b) / r for (a, b), r in zip(rows, self.problem.likelihood.root, strict=True)]
         return max(float(np.sqrt(x @ x / f)) for x, f in zip(moved, self.applied, strict=True))
 
     def volume_rows(self, keys: Sequence[Key]) -> list[Array]:
-        """Of each sample, the log of what a set leaves of the measured quantity, by axis."""
-        solved = self.solve(keys)
-        return self._log_slopes(tuple(sorted(keys)), solved.strengths, solved.scale)
+        """Return the log of the factor of a set on the measured force, by axis, (n,)."""
+        solution = self.solve(keys)
+        return self._log_slopes(tuple(sorted(keys)), solution.strengths, solution.scale)
 
     def _free_of(self, keys: Sequence[Key], n: int) -> Array:
-        """Directions in which n unknowns may move while effects that a set takes away stay away."""
-        away = [place for name in gone(keys) for place in self.p.absence[name]]
-        return self.p.hold(dict.fromkeys(away, 0.0), n)[1]
+        """Return the directions of n unknowns that keep the effects removed by a set at zero."""
+        away = [place for name in removed_effects(keys) for place in self.problem.absence[name]]
+        return self.problem.hold(dict.fromkeys(away, 0.0), n)[1]
 
     def gains(self, keys: Sequence[Key]) -> Array:
-        """What each place of the grid would take off the cost beside a set, at its weights."""
-        known, p, nb = self.solve(keys), self.p, self.bb.shape[1]
-        all_keys, keys = keys, added(tuple(sorted(keys)))
+        """Return the fall of the cost of a set by each key of the grid, at the set's weights."""
+        known, p, nb = self.solve(keys), self.problem, self.bb.shape[1]
+        all_keys, keys = keys, added_effects(tuple(sorted(keys)))
         weight = known.weight
         xx, _, places = self._sums(keys)
         n = xx.shape[1]
         normal = np.tensordot(weight, xx, 1)
         normal[:nb, :nb] += p.precision
-        cross, moment = np.zeros((n, self.m)), np.zeros(self.m)
+        cross, moment = np.zeros((n, self.n_columns)), np.zeros(self.n_columns)
         for axis in range(self.n_q):
-            w, cols = weight[axis], self.at[axis]
+            w, cols = weight[axis], self.column_indices[axis]
             cross[:nb, cols] += w * self.xb[axis]
             moment[cols] -= w * self.xy[axis]
             for i, key in zip(places, keys, strict=True):
                 if axis in (part := self._products(key)):
                     cross[i, cols] += w * (part[axis][0].T @ self.columns[axis])
-        # As the set has been solved within bounds, from there.
+        # The gains start from the solution of the set within its bounds.
         b = np.concatenate([known.base, *known.strengths])
         moment = moment - cross.T @ b
         free = self._free_of(all_keys, n)
         taken = free @ solve_scaled(free.T @ normal @ free, free.T @ cross)
-        widest = self.own.shape[2]
-        place = self.first[:, None] + np.minimum(np.arange(widest), self.widths[:, None] - 1)
-        valid = np.arange(widest) < self.widths[:, None]
-        block = np.tensordot(weight, self.own, 1)
+        widest = self.own_products.shape[2]
+        numbers, widths = np.arange(widest), self.widths[:, None]
+        place, valid = (
+            self.first_columns[:, None] + np.minimum(numbers, widths - 1),
+            numbers < widths,
+        )
+        block = np.tensordot(weight, self.own_products, 1)
         c, t = cross.T[place], taken.T[place]
         block = block - c @ t.transpose(0, 2, 1)
         mom = np.where(valid, moment[place], 0.0)
-        low, high = self.low[place], self.high[place]
-        own = np.einsum("kww->kw", np.tensordot(weight, self.own, 1))
-        least = np.maximum(1e-6 * own, (NOTHING / np.where(valid, self.spread[place], 1.0)) ** 2)
+        low, high = self.lower[place], self.upper[place]
+        own = np.einsum("kww->kw", np.tensordot(weight, self.own_products, 1))
+        least = np.maximum(1e-6 * own, (NOTHING / np.where(valid, self.prior_sd[place], 1.0)) ** 2)
         active = valid & (np.einsum("kww->kw", block) > least)
-        gain = np.zeros(len(self.places))
+        gain = np.zeros(len(self.grid_keys))
         for _ in range(widest + 1):
             masked = block * (active[:, :, None] & active[:, None, :])
             diagonal = np.einsum("kww->kw", masked)
             scale = np.where(active, 1.0 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
-            system = (
-                masked * scale[:, :, None] * scale[:, None, :]
-                + np.eye(widest) * np.where(active, 1e-9, 1.0)[:, :, None]
-            )
-            x = (
-                np.linalg.solve(system, (np.where(active, mom, 0.0) * scale)[:, :, None])[:, :, 0]
-                * scale
-            )
+            ridge = np.eye(widest) * np.where(active, 1e-9, 1.0)[:, :, None]
+            system = masked * scale[:, :, None] * scale[:, None, :] + ridge
+            right = (np.where(active, mom, 0.0) * scale)[:, :, None]
+            x = np.linalg.solve(system, right)[:, :, 0] * scale
             out = active & (
                 (x < np.minimum(low, 0.0) - 1e-12)
                 | (x > np.maximum(high, 0.0) + 1e-12)
@@ -507,7 +503,7 @@ class SetCosts:
             if not out.any():
                 break
             active &= ~out
-        # Of one strength that its bounds hold, at the bound: a delay's columns of shorter ones.
+        # A single strength may gain at its bound, as those of shorter delays than the true one do.
         only = np.flatnonzero(self.widths == 1)
         square, moment = block[only, 0, 0], mom[only, 0]
         x = np.clip(moment / np.maximum(square, 1e-300), low[only, 0], high[only, 0])
@@ -517,40 +513,34 @@ class SetCosts:
 
 
 def log_prior(criteria: Criteria, number: int) -> float:
-    """Log of the prior odds of each of so many candidates."""
+    """Return the log prior odds of each of a ``number`` of candidates."""
     return min(float(np.log(criteria.expected_effects / max(number, 1))), 0.0)
 
 
 def penalise(information: Array, spread: Array, strengths: Array, shapes: int) -> Array:
-    """What the priors of effects take off their log evidence (Laplace), nats, one or (...).
+    """Return the Occam factors of effects (Laplace), nats, (...).
 
     Args:
-        information: on their strengths, (m, m).
-        spread: of these before any data, (m,); strengths: (..., m).
-        shapes: how many parameters beside them are fitted.
+        information: information on the strengths, (m, m).
+        spread: their prior standard deviations, (m,); strengths: (..., m).
+        shapes: number of searched shapes.
     """
     wide = np.maximum(spread, np.abs(strengths))
     scaled = information * wide[..., :, None] * wide[..., None, :]
     found = 0.5 * np.linalg.slogdet(np.eye(len(information)) + scaled)[1]
-    return np.asarray(found + _A_SHAPE * shapes)
+    return np.asarray(found + _SHAPE_COST * shapes)
 
 
-def added(keys: Sequence[Key]) -> tuple[Key, ...]:
-    """The effects of a set that the model does not have; ``-name`` takes one of its own away."""
+def added_effects(keys: Sequence[Key]) -> tuple[Key, ...]:
+    """Return the effects that a set adds to the model; a key ``-name`` removes one."""
     return tuple(key for key in keys if key[0][0] != "-")
 
 
-def gone(keys: Sequence[Key]) -> set[str]:
-    """The effects of the model that a set takes away."""
-    return {name[1:] for name, _ in keys if name[0] == "-"}
+def removed_effects(keys: Sequence[Key]) -> tuple[str, ...]:
+    """Return the effects of the model that a set removes."""
+    return tuple(name[1:] for name, _ in keys if name[0] == "-")
 
 
-def names(keys: Sequence[Key]) -> tuple[str, ...]:
-    """The effects of a set, in order."""
+def effect_names(keys: Sequence[Key]) -> tuple[str, ...]:
+    """Return the names of the keys of a set in order."""
     return tuple(sorted(name for name, _ in keys))
-
-
-def _schur(normal: Array, nb: int) -> Array:
-    """Information on the strengths once the model's own parameters have moved along."""
-    cross = normal[:nb, nb:]
-    return np.asarray(normal[nb:, nb:] - cross.T @ solve_scaled(normal[:nb, :nb], cross))

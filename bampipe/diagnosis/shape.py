@@ -1,4 +1,4 @@
-"""The shape of a residual: maps of it, worst windows, explainable share."""
+"""Maps of a residual by the variables of the motion, and its worst windows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,14 +16,12 @@ from bampipe.trials.residuals import ModelOnTrial
 
 BINS = 16
 _LEAST = 12
+"""Smallest number of samples in a bin of a map."""
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One quantity that a residual may depend on, at the kept samples of every trial.
-
-    Its name is ``position``, ``velocity``, ..., its values are (K,) each.
-    """
+    """A quantity that a residual may depend on, at the thinned samples of each trial, (K,) each."""
 
     name: str
     unit: str
@@ -35,10 +33,11 @@ class Map:
     """Mean residual in bins of one variable, with 95 % confidence bands over independent samples.
 
     Attributes:
-        variable, unit: its name and its unit.
-        center, mean, low, high: by bin; the residual's are N.m or N.
+        variable, unit: name and unit of the variable.
+        center: mean of the variable in each bin.
+        mean, low, high: mean residual and its confidence band in each bin, N.m or N.
         count: samples in each bin.
-        share: share of the residual's variance that the bin means carry.
+        share: share of the residual's variance that the bin means explain.
     """
 
     variable: str
@@ -52,7 +51,7 @@ class Map:
 
 
 def variables(fitted: Sequence[ModelOnTrial], band: Band, axis: int) -> tuple[Variable, ...]:
-    """What the residual of one axis is mapped against, of a model on each trial."""
+    """Return the variables by which the residual of one axis is mapped."""
     system = fitted[0].system
     coordinate = system.model.device.coordinates[axis]
     unit = coordinate.unit
@@ -87,7 +86,7 @@ def variables(fitted: Sequence[ModelOnTrial], band: Band, axis: int) -> tuple[Va
 
 
 def since_reversal(motion: Motion, axis: int) -> tuple[Array, Array]:
-    """Time (s) and distance travelled since the velocity last changed sign, each (T,)."""
+    """Return the time (s) and the distance since the velocity last changed sign, each (T,)."""
     sign = motion.qd[:, axis] > 0.0
     last = np.zeros(len(sign), dtype=int)
     changes = np.flatnonzero(sign[1:] != sign[:-1]) + 1
@@ -97,14 +96,14 @@ def since_reversal(motion: Motion, axis: int) -> tuple[Array, Array]:
 
 
 def number_bins(values: Array, bins: int) -> Indices:
-    """Number of the bin of each value, (T,); bins hold equal counts."""
+    """Return the index of the bin of each value, (T,); bins hold equal counts."""
     edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, bins + 1)))
     found = np.searchsorted(edges, values, side="right") - 1
     return np.clip(found, 0, max(len(edges) - 2, 0)).astype(np.int64)
 
 
 def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = BINS) -> Map:
-    """Bin the residual of ``axis`` by ``variable`` into ``bins`` parts of equal count."""
+    """Average the residual of ``axis`` in ``bins`` parts of ``variable`` with equal counts."""
     use = np.concatenate([u[:, axis] for u in evidence.used]) > 0
     r = np.concatenate([x[:, axis] for x in evidence.residual])[use]
     v = np.concatenate(variable.values)[use]
@@ -126,9 +125,9 @@ def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = 
 
 
 def worst_windows(evidence: Evidence, count: int = 10, width_s: float = 0.5) -> list[WorstWindow]:
-    """The stretches with the largest residual relative to the axis' own, over all axes.
+    """Return the ``count`` windows with the largest error relative to that of their axis.
 
-    There are ``count``, and the worst of each axis that is not among them.
+    The worst window of each axis is always among them.
     """
     band, system = evidence.band, evidence.system
     length = max(2, int(width_s * band.rate_hz / band.step))
@@ -172,7 +171,7 @@ def _doing(motion: Motion, rows: Indices, axis: int, unit: str) -> str:
 
 
 def _size(value: float, unit: str) -> str:
-    """A position or a speed to two decimals, in mm where metres would show too few."""
+    """Return a position or speed with two decimals, in mm if metres would show too few."""
     if unit == "m" and abs(value) < 0.1:
         value, unit = 1e3 * value, "mm"
     return f"{round(float(value), 2) + 0.0:.2f} {unit}"

@@ -1,4 +1,4 @@
-"""What an effect leaves in the residual of a model that lacks it, along a standard motion."""
+"""The residual of a model that lacks one effect, along a standard motion."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ DURATION_S, RATE_HZ = 16.0, 250.0
 SMOOTHING_S = 0.3
 BINS = 24
 BRAKE_DAMPING = 10.0
-"""Damping that the brakes render where an effect shows only with brakes on, N.m.s/rad, N.s/m."""
+"""Damping of the brakes for an effect that shows only with brakes on, N.m.s/rad or N.s/m."""
 
 
 @dataclass(frozen=True)
 class Signature:
-    """The residual that one effect leaves on one axis.
+    """The residual of a device that lacks one effect.
 
     Attributes:
-        axis: the axis it is largest on, relative to the friction there.
+        axis: axis on which the residual is largest, relative to the force needed there.
         rms: root mean square of the residual by axis, N.m or N.
-        against: name of what explains most of the residual; abscissa: its values, (T,).
-        share: share of the residual's variance that a curve over that explains.
+        against: name of the quantity that explains most of it; abscissa: its values, (T,).
+        share: share of the residual's variance that a curve over the abscissa explains.
         residual: residual on ``axis``, (T,), in ``unit``.
         braked: whether the brakes were on.
     """
@@ -43,24 +43,16 @@ class Signature:
 
 
 def signature(device: Device, effect: Effect, target: str) -> Signature | None:
-    """Return what ``effect`` at its typical size leaves in the residual of the bare device.
+    """Return the residual of the bare device without ``effect`` of typical size, if there is any.
 
-    The motion is three sinusoids an axis, 0.1 to 1 Hz, over the middle of the axis' range, with
-    the hand force that the device needs for it, smoothed as a hand's is.
-
-    ``target`` is what it acts on, "" for a device-wide effect.
-
-    Returns:
-        None where the effect leaves nothing.
+    Each axis follows three sinusoids of 0.1 to 1 Hz over the middle of its range, driven by a force
+    as smooth as a hand's. ``target`` is empty for a device-wide effect.
     """
     name = f"{effect.name}:{target}" if target else effect.name
     bare = compile_model(Model(device))
     full = compile_model(Model(device, (name,), (effect,)))
-    for braked in (False, True):
-        found = _compute_signature(device, bare, full, braked)
-        if found is not None:
-            return found
-    return None
+    found = (_compute_signature(device, bare, full, braked) for braked in (False, True))
+    return next((one for one in found if one is not None), None)
 
 
 def _compute_signature(
@@ -141,7 +133,7 @@ def _motion(
     lower, upper = limits if limits is not None else (-0.5, 0.5)
     middle, size = (lower + upper) / 2.0, (upper - lower) / 4.0
     q, qd, qdd = np.full_like(t, middle), np.zeros_like(t), np.zeros_like(t)
-    # Frequencies that no two axes share, so that axes can be distinguished.
+    # No two axes share a frequency, so that axes can be distinguished.
     for order, frequency in enumerate((0.11, 0.37, 0.83)):
         w = 2.0 * np.pi * frequency * (1.0 + 0.13 * number)
         a, phase = size / (1.0 + 2.0 * order), 0.7 * number + order
@@ -152,7 +144,7 @@ def _motion(
 
 
 def _smooth(force: Array) -> Array:
-    """Return ``force`` without its jumps at reversals: a hand cannot follow them."""
+    """Return ``force`` without its jumps at reversals, which a hand cannot follow."""
     window = np.hanning(int(SMOOTHING_S * RATE_HZ) | 1)
     window /= window.sum()
     edge = len(window) // 2
@@ -165,7 +157,7 @@ def _inputs(system: System, channels: Mapping[str, Array], t: Array) -> Array:
 
 
 def _explained(abscissa: Array, residual: Array) -> float:
-    """Share of the variance of ``residual`` that its mean over bins of ``abscissa`` explains."""
+    """Return the share of the variance of ``residual`` that its means in bins explain."""
     edges = np.quantile(abscissa, np.linspace(0.0, 1.0, BINS + 1)[1:-1])
     bins = np.searchsorted(edges, abscissa)
     count = np.bincount(bins, minlength=BINS)

@@ -1,8 +1,7 @@
-"""Where an identification starts: the shapes of effects, and the width of a smoothed sign.
+"""Starting values of an identification: shapes of effects, and the width of the smoothed sign.
 
-A device file says over which speeds friction yields; a machine of its kind may truly stop. Where a
-test bench gives the motion nothing is integrated along the sign, and any width will do: the one
-with which trials that were left out are likeliest.
+A machine may yield over the speeds that its device file declares, or stop completely. On a test
+bench, nothing is integrated along the sign, so that held-out trials can choose the width.
 """
 
 from dataclasses import dataclass, replace
@@ -13,39 +12,35 @@ from bampipe.arrays import Array
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.select import open_search, start_of
 from bampipe.diagnosis.session import Fit, Session, system_of
-from bampipe.diagnosis.set_cost import gone, names
+from bampipe.diagnosis.set_cost import effect_names, removed_effects
 from bampipe.physics.recipe import Recipe
 from bampipe.trials.measured import MeasuredTrials
 
 _ANY_SIZE = 1e-9
 _REPLICATES = 6
-_STOPS = 0.125
-"""Width, times the device's, of a machine that is nearer to a true stop than to its device file.
-Friction that rises as the speed falls, where the model lacks it, can make a third of the width
-likelier on a machine that does yield over all of it, but not an eighth."""
-_NARROWER = (1.0 / 3.0, _STOPS, 1.0 / 32.0)
-WORTH = 0.03
-"""Least drop of the log error for a narrower width: `benchmarks/chosen_sign_width.py`."""
+_STOPPING_FACTOR = 0.125
+"""Factor on the width that reveals a machine that stops. If the model lacks friction that rises as
+the speed falls, a third of the width may be likelier on a machine that yields, an eighth is not."""
+_NARROW_FACTORS = (1.0 / 3.0, _STOPPING_FACTOR, 1.0 / 32.0)
+LEAST_DROP = 0.03
+"""Smallest drop of the log error for a narrower width: `benchmarks/chosen_sign_width.py`."""
 
 
 def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
-    """Starting values of every parameter of a model.
+    """Return starting values of the parameters of a model within their bounds, (n_p,).
 
-    The device's parameters start at their priors and are fitted; the shapes of the effects are
-    searched over their range as a diagnosis does, all of them together as far as each has a
-    strength beside the others: a descent from the prior would stay in the nearest valley.
-
-    Returns:
-        (n_p,), within the bounds.
+    The device's parameters are fitted from their priors. The shapes of effects are searched over
+    their ranges as in a diagnosis, since a descent from the prior would end in the nearest minimum.
     """
     session = Session(trials, Criteria(size=_ANY_SIZE, replicates=_REPLICATES))
     current, left = replace(recipe, effects=()), recipe.effects
     fit = _fit(session, current, session.fit_plainly(current, system_of(current).prior).evidence.p)
     while left:
         with open_search(session, fit, only=left) as search:
-            sets = [s for beam in search.beam(len(left)) for s in beam if not gone(s[1])]
+            every = (s for beam in search.grow_sets(len(left)) for s in beam)
+            sets = [s for s in every if not removed_effects(s[1])]
             keys = min(sets, key=lambda s: (-len(s[1]), s[0]))[1] if sets else ()
-            found = names(keys) or left[:1]
+            found = effect_names(keys) or left[:1]
             current = replace(current, effects=(*current.effects, *found))
             start = start_of(search, keys, current)
         fit, left = _fit(session, current, start), tuple(e for e in left if e not in found)
@@ -54,17 +49,17 @@ def search_start(trials: MeasuredTrials, recipe: Recipe) -> Array:
 
 
 def _fit(session: Session, recipe: Recipe, start: Array) -> Fit:
-    """A fit with the noise and the bias of its replays, without them where it runs away."""
+    """Fit a model with noise from replicates, or with equal noise if it cannot be simulated."""
     return session.try_fit(recipe, start) or session.fit_plainly(recipe, start)
 
 
 @dataclass(frozen=True)
 class SignWidth:
-    """The chosen width of the sign in Coulomb friction, and its held-out errors.
+    """The chosen width of the sign in Coulomb friction.
 
     Attributes:
-        factor: times the device's; 1 where nothing speaks for a narrower one.
-        declared, chosen: error on trials left out with either, by axis, (n_q,), N.m or N.
+        factor: its ratio to the declared width, at most 1.
+        declared, chosen: held-out errors with either width, (n_q,), N.m or N.
     """
 
     factor: float
@@ -73,12 +68,15 @@ class SignWidth:
 
 
 def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
-    """Choose the width for a model by least squares on trials left out.
+    """Choose the width for a model by the held-out error of least squares.
 
     Raises:
         ValueError: the trials are too short to be fitted.
     """
-    fits = {1.0: fit_width(trials, recipe, 1.0), _STOPS: fit_width(trials, recipe, _STOPS)}
+    fits = {
+        1.0: fit_width(trials, recipe, 1.0),
+        _STOPPING_FACTOR: fit_width(trials, recipe, _STOPPING_FACTOR),
+    }
     declared = fits[1.0].held_out_rmse
     count = fits[1.0].problem.independent
 
@@ -86,17 +84,15 @@ def choose_sign_width(trials: MeasuredTrials, recipe: Recipe) -> SignWidth:
         ratio = np.log(declared / np.maximum(fits[factor].held_out_rmse, 1e-300))
         return float(count @ ratio / max(count.sum(), 1.0))
 
-    if not drop(_STOPS) > WORTH:
+    if not drop(_STOPPING_FACTOR) > LEAST_DROP:
         return SignWidth(1.0, declared, declared)
-    for factor in _NARROWER:
-        if factor not in fits:
-            fits[factor] = fit_width(trials, recipe, factor)
-    best = max(_NARROWER, key=drop)
+    fits |= {f: fit_width(trials, recipe, f) for f in _NARROW_FACTORS if f not in fits}
+    best = max(_NARROW_FACTORS, key=drop)
     return SignWidth(best, declared, fits[best].held_out_rmse)
 
 
 def fit_width(trials: MeasuredTrials, recipe: Recipe, factor: float) -> Fit:
-    """Fit a model with its widths times ``factor``."""
+    """Fit a model with its sign widths multiplied by ``factor``."""
     narrowed = recipe.with_sign_widths(factor)
     session = Session(trials, Criteria())
     return session.fit_plainly(narrowed, search_start(trials, narrowed))

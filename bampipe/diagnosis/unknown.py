@@ -1,9 +1,7 @@
-"""Something that no effect of the library is: a smooth function of what an axis does.
+"""An unknown function as a candidate for what no effect of the library explains.
 
-A sum of linear splines, each of one quantity (position, speed, load, time since the last reversal,
-or the position of another axis), alike in both directions of motion or opposite, with a normal
-prior: Gaussian processes of few knots. Splines are added while the evidence, integrated over their
-strengths, grows.
+It is a sum of linear splines, see docs/method_selection.md. Splines are added while the evidence,
+integrated over their coefficients, grows.
 """
 
 from dataclasses import dataclass
@@ -13,31 +11,31 @@ import numpy as np
 
 from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.dictionary import Key
-from bampipe.diagnosis.set_cost import SetCosts, gone
+from bampipe.diagnosis.set_cost import SetCosts, removed_effects
 from bampipe.diagnosis.shape import since_reversal
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import solve_scaled, take_samples
 
 _KNOTS = (9, 33), (9,), (9,), (9,)
-"""Of splines of the position of the axis, of its speed, its load, and the time since a reversal."""
+"""Knots of splines of position, speed, load, and time since the last reversal."""
 _KNOTS_OF_OTHERS = (5,)
-"""Of splines of the position of another axis."""
+"""Knots of splines of the position of another axis."""
 _SIZES = (0.003, 0.01, 0.03, 0.1)
-"""Standard deviations of the function at a knot, over the applied force of the axis."""
+"""Prior standard deviations of the coefficients, over the applied force of the axis."""
 _REWEIGHTS = 2
-"""From the weights of the function with one spline less."""
+"""Reweighting steps, from the weights of the function with one spline less."""
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """The unknown function beside a set of effects.
+    """The unknown function of an axis beside a set of effects.
 
     Attributes:
-        cost: negative log evidence of the set with it, as `SetCosts.cost`.
-        residual: weighted rows that are left, by axis, each (n,).
-        weight: of the squares of each axis.
-        share: of the mean square of the axis' residual, what it takes.
-        size: of what it adds, root mean square, over the applied force.
+        cost: negative log evidence of the set with the function, as `SetCosts.cost`.
+        residual: residual in units of the noise, by axis, each (n,).
+        weight: weight of the squares of each axis, (n_q,).
+        share: share of the mean square of the axis' residual that the function explains.
+        size: root mean square of the function over that of the applied force.
     """
 
     axis: int
@@ -50,14 +48,13 @@ class Unknown:
 
 @dataclass(frozen=True)
 class Splines:
-    """Functions of what an axis does, one of which or a sum of some may be what is missing.
+    """The splines of which the unknown function of an axis is a sum.
 
     Attributes:
-        axis: whose equation they are part of.
-        columns: low-passed and weighted as the residual is, (n, m).
-        functions: places of the columns of each function.
-        products: of the columns with the model's own parameters, (nb, m), with each other, (m, m),
-            and with the residual, (m,).
+        columns: all columns, low-passed and weighted as the residual, (n, m).
+        functions: indices of the columns of each spline.
+        products: products of the columns with the columns of the model, (nb, m), with each other,
+            (m, m), and with the residual, (m,).
     """
 
     axis: int
@@ -66,9 +63,9 @@ class Splines:
     products: tuple[Array, Array, Array]
 
 
-def lay_splines(costs: SetCosts, axis: int) -> Splines | None:
-    """The functions that are weighed on an axis; None where the axis does not move."""
-    p, e = costs.p, costs.dictionary.evidence
+def build_splines(costs: SetCosts, axis: int) -> Splines | None:
+    """Return the splines of an axis; None if the axis does not move."""
+    p, e = costs.problem, costs.dictionary.evidence
     if len(p.y[axis]) <= costs.bb.shape[1]:
         return None
     width = e.system.model.device.coordinates[axis].sign_width
@@ -96,7 +93,7 @@ def _quantities(evidence: Evidence, trial: int, axis: int) -> list[Array]:
     motion, n_q = evidence.motions[trial], len(evidence.system.coordinates)
     since, _ = since_reversal(motion, axis)
     fitted = evidence.fitted[trial]
-    # The load by the model, not as measured: a function of that could take all of it away.
+    # The modelled load, since a function of the measured load could cancel it.
     load = (fitted.applied - fitted.residual)[:, axis]
     return [
         motion.q[:, axis],
@@ -108,13 +105,13 @@ def _quantities(evidence: Evidence, trial: int, axis: int) -> list[Array]:
 
 
 def _hats(values: Array, knots: Array) -> Array:
-    """Linear B-splines, (T, len(knots))."""
+    """Return linear B-splines, (T, len(knots))."""
     inside = np.clip(values, knots[0], knots[-1])
     return np.column_stack([np.interp(inside, knots, row) for row in np.eye(len(knots))])
 
 
 def weigh_unknown(costs: SetCosts, splines: Splines, keys: tuple[Key, ...] = ()) -> Unknown:
-    """The evidence of an unknown function beside a set, of effects of the model taken away."""
+    """Weigh an unknown function beside the model without the effects that ``keys`` remove."""
     model = _ModelWithout(costs, splines, keys)
     best = model.add_best({}, costs.solve(keys).weight)
     while len(best.sizes) < len(splines.functions):
@@ -127,7 +124,7 @@ def weigh_unknown(costs: SetCosts, splines: Splines, keys: tuple[Key, ...] = ())
 
 @dataclass(frozen=True)
 class _Solution:
-    """Functions of given sizes, by number, and unknowns of the model and of these at their best."""
+    """The most likely unknowns of the model and of splines, whose sizes are given by index."""
 
     sizes: dict[int, float]
     cost: float
@@ -137,12 +134,12 @@ class _Solution:
 
 
 class _ModelWithout:
-    """The linear problem of a model without some of its effects, to which functions are added."""
+    """The linear problem of a model without some of its effects, to which splines are added."""
 
     def __init__(self, costs: SetCosts, splines: Splines, keys: tuple[Key, ...]) -> None:
-        p = self.p = costs.p
+        p = self.p = costs.problem
         self.splines, axis = splines, splines.axis
-        absent = {k: v for name in gone(keys) for k, v in p.absence[name].items()}
+        absent = {k: v for name in removed_effects(keys) for k, v in p.absence[name].items()}
         self.fixed, self.free = p.hold(absent)
         self.base = [b @ self.free for b in p.base]
         self.y = [v + b @ self.fixed for v, b in zip(p.y, p.base, strict=True)]
@@ -157,7 +154,7 @@ class _ModelWithout:
         self.force = float(np.sqrt(np.mean(p.likelihood.applied[axis] ** 2)))
 
     def add_best(self, sizes: dict[int, float], weight: Array) -> _Solution:
-        """With the function and the size that take most off the cost beside those of ``sizes``."""
+        """Return the solution of least cost with one more spline than ``sizes``."""
         wider = [
             {**sizes, function: size}
             for function in range(len(self.splines.functions))
@@ -167,7 +164,7 @@ class _ModelWithout:
         return min((self.solve(one, weight) for one in wider), key=lambda one: one.cost)
 
     def solve(self, sizes: dict[int, float], weight: Array) -> _Solution:
-        """The best strengths of functions of given sizes, and the cost; from ``weight`` on."""
+        """Return the solution with splines of given sizes, from initial weights of the axes."""
         p, axis, functions = self.p, self.splines.axis, self.splines.functions
         at = np.concatenate([functions[k] for k in sizes])
         known = np.concatenate(
@@ -195,7 +192,7 @@ class _ModelWithout:
         return _Solution(sizes, cost, b, c, weight)
 
     def describe(self, one: _Solution) -> Unknown:
-        """What functions leave and add."""
+        """Describe the sum of the splines of a solution."""
         axis, root = self.splines.axis, self.p.likelihood.root[self.splines.axis]
         at = np.concatenate([self.splines.functions[k] for k in one.sizes])
         left = [v + z @ one.base for v, z in zip(self.y, self.base, strict=True)]

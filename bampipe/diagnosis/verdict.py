@@ -1,12 +1,12 @@
-"""The rule: what is said of each axis, from the probabilities, the sizes and the noise floor."""
+"""The verdict of each axis, from the probabilities of effects and the noise floor."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from bampipe.diagnosis.criteria import most_probable
-from bampipe.diagnosis.probability import chance_of
+from bampipe.diagnosis.criteria import cap_probability
+from bampipe.diagnosis.probability import compute_p_value
 from bampipe.diagnosis.select import Selection
 from bampipe.diagnosis.session import Session, acting_axes, rms
 from bampipe.results.diagnose import (
@@ -21,12 +21,12 @@ from bampipe.results.floor import compare_with_floor
 
 @dataclass(frozen=True)
 class Conclusion:
-    """What a diagnosis says.
+    """The conclusion of a diagnosis.
 
     Attributes:
-        axes: by coordinate, in order, without their sentences.
+        axes: verdict of each coordinate, in order, without its sentence.
         selected: effects to add; ranking: candidates, best first.
-        sets: by their probability; chance: the null distribution.
+        sets: sets, most probable first; chance: null distribution of the largest gain.
     """
 
     axes: tuple[AxisVerdict, ...]
@@ -37,44 +37,43 @@ class Conclusion:
 
 
 def conclude(session: Session, selection: Selection) -> Conclusion:
-    """Say of each axis what is missing there, how probable that is, and what remains."""
-    c, weighed = session.criteria, selection.weighed
+    """Conclude which effects each axis lacks, with their probabilities, and what remains."""
+    c, probabilities = session.criteria, selection.probabilities
     initial, final = selection.initial, selection.final
-    p_values = {e: chance_of(drop, selection.chance) for e, drop in weighed.drops.items()}
-    # Of what chance gives as well, nothing is sure.
+    p_values = {
+        e: compute_p_value(drop, selection.replicate_gains)
+        for e, drop in probabilities.drops.items()
+    }
+    # An effect whose gain chance can give is not certain.
     probability = {
-        e: min(share, most_probable(p_values.get(e, 0.0))) for e, share in weighed.effects.items()
+        e: min(share, cap_probability(p_values.get(e, 0.0)))
+        for e, share in probabilities.effects.items()
     }
     where = {e: acting_axes(initial.recipe, e) for e in probability}
     selected = tuple(e for e in selection.effects if probability.get(e, 0.0) >= 1.0 - c.probability)
     axes = []
-    for axis, name in enumerate(final.evidence.system.coordinates):
-        here = {e: p for e, p in probability.items() if axis in where[e]}
-        listed = {e: p for e, p in here.items() if p >= 1.0 - c.probability}
-        listed = dict(sorted(listed.items(), key=lambda pair: -pair[1]))
-        unknown = min(float(weighed.unknown[axis]), 1.0)
-        axes.append(_judge(session, selection, axis, name, listed, unknown))
+    for axis in range(len(final.evidence.system.coordinates)):
+        likely = [(e, p) for e, p in probability.items() if p >= 1.0 - c.probability]
+        here = [pair for pair in likely if axis in where[pair[0]]]
+        listed = dict(sorted(here, key=lambda pair: -pair[1]))
+        axes.append(_judge(session, selection, axis, listed))
     ranking = rank_effects(selection, probability, p_values, 1.0 - c.probability)
     return Conclusion(
-        tuple(axes), selected, tuple(ranking), _sets(selection),
+        tuple(axes), selected, tuple(ranking), _list_sets(selection),
         NullDistribution(
-            replicates=len(selection.chance),
-            largest=tuple(map(float, selection.chance)),
-            measured=selection.beside[0],
-            effect=selection.beside[1],
-            p_value=chance_of(selection.beside[0], selection.chance),
+            replicates=len(selection.replicate_gains),
+            largest=tuple(map(float, selection.replicate_gains)),
+            measured=selection.largest_gain[0],
+            effect=selection.largest_gain[1],
+            p_value=compute_p_value(selection.largest_gain[0], selection.replicate_gains),
         ),
     )  # fmt: skip
 
 
 def _judge(
-    session: Session,
-    selection: Selection,
-    axis: int,
-    name: str,
-    listed: Mapping[str, float],
-    unknown: float,
+    session: Session, selection: Selection, axis: int, listed: Mapping[str, float]
 ) -> AxisVerdict:
+    """Judge one axis, with the probabilities of the effects ``listed`` there."""
     c, final, initial = session.criteria, selection.final, selection.initial
     floor = final.noise_floor
     before, after = float(initial.held_out_rmse[axis]), float(final.held_out_rmse[axis])
@@ -83,7 +82,8 @@ def _judge(
     named = tuple(e for e in listed if e in selection.effects)
     sure = [e for e, p in listed.items() if p >= c.probability]
     open_question = [e for e, p in listed.items() if p < c.probability]
-    # At the floor, an unknown function follows what the bias is off, not the machine.
+    unknown = min(float(selection.probabilities.unknown[axis]), 1.0)
+    # At the floor, an unknown function follows errors of the bias, not the machine.
     asked = unknown if against_floor == "above_floor" else 0.0
     remains = asked >= c.probability
     verdict: Verdict
@@ -98,7 +98,7 @@ def _judge(
     force = rms(final.likelihood.applied[axis])
     excess = max(before**2 - level**2, 0.0)
     left = max(after**2 - level**2, 0.0)
-    function = selection.weighed.functions[axis]
+    function = selection.probabilities.functions[axis]
     share = min(max(function.share, 0.0), 1.0) if function else 0.0
     rest = after**2 * (1.0 - share) / max(before**2, 1e-300)
     return AxisVerdict(
@@ -129,24 +129,24 @@ def rank_effects(
     p_values: Mapping[str, float],
     mentioned: float,
 ) -> list[RankedEffect]:
-    """Effects of the most probable set, then the others by what each gains alone.
+    """Rank the effects of the most probable set, then the others by what each gains alone.
 
-    Sets that are ``mentioned`` have at least that probability.
-
-    The error with another effect alone follows from the log evidence by the independent samples of
-    the axis.
+    The error with one of the others follows from its log evidence and the independent samples of
+    the axis. Sets of at least the probability ``mentioned`` give the indistinguishable effects.
     """
     initial, final = selection.initial, selection.final
     values = final.effect_parameters
     own = {item.name: item.parameters for item in final.evidence.system.model.effects}
     unchosen = (e for e in selection.gains if e not in selection.effects)
     others = sorted(unchosen, key=lambda e: -selection.gains[e])
-    chosen = sorted(selection.effects, key=lambda e: -selection.weighed.drops.get(e, 0.0))
-    left, rows = initial.problem.independent * initial.solved.left, []
+    chosen = sorted(selection.effects, key=lambda e: -selection.probabilities.drops.get(e, 0.0))
+    left, rows = initial.problem.independent * initial.solution.left, []
     for effect in (*chosen, *others):
         is_chosen = effect in selection.effects
         fit = final if is_chosen else initial
-        gain = selection.weighed.drops.get(effect, 0.0) if is_chosen else selection.gains[effect]
+        gain = (
+            selection.probabilities.drops.get(effect, 0.0) if is_chosen else selection.gains[effect]
+        )
         axis = max(acting_axes(initial.recipe, effect), key=lambda a: float(left[a]))
         before = after = float(fit.held_out_rmse[axis])
         if is_chosen:
@@ -162,35 +162,33 @@ def rank_effects(
                 held_out_rmse_after=after,
                 unit=system.torque_units[axis],
                 probability=min(probability.get(effect, 0.0), 1.0),
-                p_value=p_values.get(effect, chance_of(gain, selection.chance)),
+                p_value=p_values.get(effect, compute_p_value(gain, selection.replicate_gains)),
                 score=gain,
                 parameters={q.name: values[q.name] for q in own.get(effect, ())},
-                indistinguishable_from=_alike(selection, effect, mentioned),
+                indistinguishable_from=_find_twins(selection, effect, mentioned),
             )
         )
     return rows
 
 
-def _alike(selection: Selection, effect: str, mentioned: float) -> tuple[str, ...]:
-    """Effects that take the place of one in a set which is as good as undecided against it."""
+def _find_twins(selection: Selection, effect: str, mentioned: float) -> tuple[str, ...]:
+    """Return the effects that replace one in another set of at least a given probability."""
     best = {*selection.effects}
     found = []
-    for one in selection.weighed.sets:
+    for one in selection.probabilities.sets:
         swapped = {*one.effects} ^ best
         if len(swapped) == 2 and effect in swapped and one.probability >= mentioned:
             found += [e for e in swapped if e != effect]
     return tuple(sorted({*found}))
 
 
-def _sets(selection: Selection) -> tuple[WeighedSet, ...]:
-    sets = selection.weighed.sets
+def _list_sets(selection: Selection) -> tuple[WeighedSet, ...]:
+    sets, axes = selection.probabilities.sets, selection.final.evidence.system.coordinates
     listed = [s for s in sets if s.probability >= 0.001] or sets[:1]
     return tuple(
         WeighedSet(
             effects=one.effects,
-            unknown=None
-            if one.unknown is None
-            else selection.final.evidence.system.coordinates[one.unknown],
+            unknown=None if one.unknown is None else axes[one.unknown],
             probability=min(one.probability, 1.0),
             log_evidence=one.log_evidence,
         )

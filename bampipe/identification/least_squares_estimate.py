@@ -94,7 +94,7 @@ class SquaresFit:
     def _left(self) -> Sequence[tuple[Array, float]]:
         """By axis: the residual, (n,), and its root mean square."""
         pairs = zip(self.fit.problem.y, self.fit.problem.base, strict=True)
-        every = (y + x @ self.fit.solved.base for y, x in pairs)
+        every = (y + x @ self.fit.solution.base for y, x in pairs)
         return KeptItems(
             (left, max(float(np.sqrt(np.mean(left**2))), 1e-300) if left.size else 1.0)
             for left in every
@@ -177,14 +177,14 @@ class SquaresFit:
         pose, count = self.fit.problem, self.free.size
         lower, upper = pose.lower.copy(), pose.upper.copy()
         if not self.problem.linear:
-            step = (pose.to_parameters @ self.fit.solved.base)[:count]
+            step = (pose.to_parameters @ self.fit.solution.base)[:count]
             reach = _FARTHEST * np.maximum(self.sd, 1e-300)
             lower[:count] = np.maximum(lower[:count], step - reach)
             upper[:count] = np.minimum(upper[:count], step + reach)
         bounded = replace(pose, lower=lower, upper=upper)
         yy = np.maximum(yy, 1e-300)
-        found = solve_bounded(bounded, xx, xy, yy, weight=self.fit.solved.weight)
-        moved = pose.to_parameters @ (found.base - self.fit.solved.base)
+        found = solve_bounded(bounded, xx, xy, yy, weight=self.fit.solution.weight)
+        moved = pose.to_parameters @ (found.base - self.fit.solution.base)
         p = self.p.copy()
         p[self.free] = np.clip(p[self.free] + moved[:count], self.problem.lower, self.problem.upper)
         return p
@@ -310,7 +310,7 @@ def fit_squares(
 
 def _with_values(fit: Fit, trials: MeasuredTrials, problem: Problem, block_s: float) -> SquaresFit:
     """Return the fit with its parameters, including the last step of its linear problem."""
-    change = (fit.problem.to_parameters @ fit.solved.base)[: problem.free.size]
+    change = (fit.problem.to_parameters @ fit.solution.base)[: problem.free.size]
     p = np.append(fit.evidence.p, 0.0)
     p[problem.free] = np.clip(p[problem.free] + change, problem.lower, problem.upper)
     return SquaresFit(fit, trials, problem, True, p, block_s)

@@ -13,7 +13,7 @@ from scipy.special import ndtr
 
 from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.candidates import Candidate
-from bampipe.diagnosis.columns import added_residual
+from bampipe.diagnosis.columns import compute_added_residual
 from bampipe.diagnosis.session import Fit, Session
 from bampipe.results.next import ExpectedConfusion, join_effects
 from bampipe.trials.evidence import Evidence, gather_evidence
@@ -130,7 +130,7 @@ class Comparison:
     @cached_property
     def scale(self) -> Array:
         """Mean square error of the better model, in variances of the noise, (n_q,)."""
-        return self.final.solved.left / self.final.problem.count
+        return self.final.solution.left / self.final.problem.count
 
     @cached_property
     def independent_share(self) -> Array:
@@ -223,7 +223,7 @@ class Comparison:
         def residual(number: int, values: Array) -> Array:
             item = alternative.items[number]
             count = len(item.system.parameters) - len(values)
-            return added_residual(item, np.append(base.p[:count], values), base)
+            return compute_added_residual(item, np.append(base.p[:count], values), base)
 
         here = [residual(k, values) for k, values in enumerate(alternative.values)]
         rows = [np.sum(here, axis=0) if here else np.zeros(base.motion.q.shape)]

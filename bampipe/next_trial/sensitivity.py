@@ -10,8 +10,8 @@ from scipy.stats import norm
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
-from bampipe.diagnosis.columns import added_residual
-from bampipe.diagnosis.probability import least_gain
+from bampipe.diagnosis.columns import compute_added_residual
+from bampipe.diagnosis.probability import find_required_gain
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.session import Fit, Session, candidates_of
 from bampipe.diagnosis.set_cost import log_prior, penalise
@@ -227,7 +227,9 @@ def find_detectability(
     typical = (make_typical_alternative(item, scale) for item in candidates_of(fit.recipe, names))
     alternatives = tuple(alternative for alternative in typical if alternative is not None)
     comparison = Comparison(session, fit, fit, alternatives)
-    needed = least_gain(session.criteria, by_chance) - log_prior(session.criteria, len(names))
+    needed = find_required_gain(session.criteria, by_chance) - log_prior(
+        session.criteria, len(names)
+    )
     limits = find_limits(comparison, comparison.sums_now, needed)
     limits = [
         replace(one, factor=_bound_factor(one, scale), growth=find_jump_growth(comparison, one))
@@ -293,5 +295,5 @@ def find_jump_growth(comparison: Comparison, found: DetectionLimit) -> float:
         sliding = replace(motion, qd=qd, qdd=np.zeros_like(qd))
         base = ModelOnTrial(e.system, e.p, [sliding])
         own += side * float(base.residual[:, axis].mean())
-        more += side * float(added_residual(item, p, base)[:, axis].mean())
+        more += side * float(compute_added_residual(item, p, base)[:, axis].mean())
     return max(more / own, 0.0) if own else 0.0

@@ -8,7 +8,7 @@ from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.select import open_search, start_of
-from bampipe.diagnosis.session import Fit, Session, system_of, without_members
+from bampipe.diagnosis.session import Fit, Session, change_effects, system_of
 from bampipe.next_trial.design_sentence import describe_design
 from bampipe.next_trial.discrimination import Alternative, Comparison
 from bampipe.next_trial.primitives import Envelope
@@ -52,7 +52,7 @@ def compare_alternatives(session: Session, final: Fit, odds: Odds) -> Comparison
     ``final`` is the model with its most probable set, fitted.
     """
     members = {name for one in odds for name in one}
-    recipe, e = without_members(final.recipe, members), final.evidence
+    recipe, e = change_effects(final.recipe, members), final.evidence
     known = {q.name: v for q, v in zip(e.system.parameters, e.p, strict=True)}
     start = np.array([known[q.name] for q in system_of(recipe).parameters])
     evidence = session.linearise(recipe, start)
@@ -70,14 +70,14 @@ def _fit_alternative(
     """Return a set of effects with its most probable parameters; None if it explains nothing."""
     keys: tuple[Key, ...] = ()
     for name in members:
-        places = [key for key in search.places if key[0] == name]
+        places = [key for key in search.grid_keys if key[0] == name]
         if not places:
             return None
         keys = (*keys, min(places, key=lambda key: search.cost((*keys, key))))
     (keys,) = search.refine([keys], _REFINEMENTS)
     if not np.isfinite(search.cost(keys)):
         return None
-    wider = without_members(recipe, (), members)
+    wider = change_effects(recipe, (), members)
     pairs = zip(system_of(wider).parameters, start_of(search, keys, wider), strict=True)
     start = {q.name: value for q, value in pairs}
     items = tuple(search.dictionary.candidates[name] for name in members)

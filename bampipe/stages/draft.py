@@ -103,7 +103,7 @@ def execute(run: RunFolder, out: Path, config: Config, progress: Progress) -> di
             for term in one.terms:
                 file = f"models/{config.model}/drafts/{term.form.name}.toml"
                 write_text(out / file, toml_text(declare(term, source)))
-                drafted[term.form.canonical] = _effect(term, file)
+                drafted[term.form.canonical_name] = _effect(term, file)
         rows = [row for row in diagnosis.ranking if row.axis == axis]
         entries[axis] = _axis(axis, one, drafted, named, rows)
         effects |= drafted
@@ -166,7 +166,7 @@ def _effect(term: Term, file: str) -> DraftedEffect:
             mean=mean,
             low=mean - NORMAL_95 * sd,
             high=mean + NORMAL_95 * sd,
-            beside={quantity.words: span.high for quantity, span in form.beside},
+            beside={quantity.words: span.high for quantity, span in form.other_quantities},
         ),
     )
 

@@ -18,7 +18,7 @@ from bampipe.data.run_folder import FILTERED, INGESTED, RunFolder
 from bampipe.declarations.model_file import IDENTIFIED_MODEL, load_model, read_estimate, read_recipe
 from bampipe.declarations.recording import DRAWING
 from bampipe.diagnosis.criteria import Criteria
-from bampipe.diagnosis.session import Session, system_of, without_members
+from bampipe.diagnosis.session import Session, change_effects, system_of
 from bampipe.errors import InputError, NothingToDoError, choose_from
 from bampipe.estimate.simulation import Runaway
 from bampipe.files import digest_content, write_json, write_text
@@ -382,7 +382,7 @@ def _compare_alternatives(case: _Case, diagnosed: DiagnoseResult) -> Comparison 
     asked = find_ambiguity(diagnosed, case.config)
     if asked is None:
         return None
-    final = without_members(case.recipe, (), diagnosed.selected)
+    final = change_effects(case.recipe, (), diagnosed.selected)
     known = {name: v for row in diagnosed.ranking for name, v in row.parameters.items()}
     known |= {q.name: value for q, value in zip(case.system.parameters, case.p, strict=True)}
     start = np.array([known.get(q.name, q.prior) for q in system_of(final).parameters])

@@ -509,7 +509,7 @@ class Problem:
         free[nb:, nb - rank :] = np.eye(n - nb)
         return fixed, free
 
-    def solve(self) -> Solved:
+    def solve(self) -> LinearSolution:
         """The most likely change of the model's own parameters."""
         return solve_bounded(self, *self.sums())
 
@@ -518,7 +518,7 @@ class Problem:
         roots = [float(np.mean(np.log(r))) if r.size else 0.0 for r in self.likelihood.root]
         return float(self.independent @ roots) - self.solve().cost
 
-    def solve_nuisance(self, count: int) -> Solved:
+    def solve_nuisance(self, count: int) -> LinearSolution:
         """The most likely nuisance parameters while the model's ``count`` parameters stay."""
         return solve_bounded(self, *self.sums(), absent=dict.fromkeys(range(count), 0.0))
 
@@ -594,7 +594,7 @@ def _absence(evidence: Evidence, item: BoundEffect) -> dict[int, float]:
 
 
 @dataclass(frozen=True)
-class Solved:
+class LinearSolution:
     """The most likely unknowns of a linear problem.
 
     Attributes:
@@ -626,7 +626,7 @@ def solve_bounded(
     absent: Mapping[int, float] | None = None,
     weight: Array | None = None,
     expected: Array | None = None,
-) -> Solved:
+) -> LinearSolution:
     """Minimise the negative log likelihood, alternating between axis weights and bounds.
 
     An unknown that leaves its bounds is held at the bound it crossed.
@@ -675,7 +675,7 @@ def solve_bounded(
     cost = float(independent @ (0.5 * np.log(left / p.count)))
     off = b[:nb]
     cost += p.fixed_cost + 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
-    return Solved(b, held & (bound == 0.0), left, weight, cost)
+    return LinearSolution(b, held & (bound == 0.0), left, weight, cost)
 
 
 def solve_scaled(normal: Array, right: Array) -> Array:

@@ -138,20 +138,20 @@ def draw_selection(found: Selection, search: Search) -> None:
     left.set(xlabel="gain of one effect beside the bare model, nats")
     left.tick_params(axis="y", labelsize=6.5)
     sizes, best = [0], [0.0]
-    for beam in search.beam(4):
+    for beam in search.grow_sets(4):
         sizes.append(len(sizes))
         best.append(search.cost(()) - beam[0][0])
     right.plot(sizes, best, "o-", color="C0", ms=3, label="best set of so many effects")
     level = best[len(found.effects)]
-    low, high = level + min(found.chance), level + max(found.chance)
+    low, high = level + min(found.replicate_gains), level + max(found.replicate_gains)
     right.axhspan(low, high, color="C1", alpha=0.4, lw=0,
                   label="one more effect, on replicates")  # fmt: skip
-    right.plot(len(found.effects) + 1, level + found.beside[0], "s", ms=4, color="C3",
+    right.plot(len(found.effects) + 1, level + found.largest_gain[0], "s", ms=4, color="C3",
                label="one more effect, measured")  # fmt: skip
     right.set(xlabel="effects in the set", ylabel="log evidence, nats", xticks=sizes)
     right.legend(frameon=False, fontsize=6.5)
     figure.savefig(HERE / "method_selection.svg", metadata={"Date": None})
-    print("largest gains of replicates, nats:", np.round(found.chance, 1))
+    print("largest gains of replicates, nats:", np.round(found.replicate_gains, 1))
 
 
 def main() -> None:

@@ -2,13 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from independent_runs import record_trials
 
 from bampipe.diagnosis.criteria import Criteria
+from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.select import Selection, select_effects
-from bampipe.diagnosis.session import Session, system_of
+from bampipe.diagnosis.session import Fit, Session, system_of
 from bampipe.diagnosis.verdict import Conclusion, conclude
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.low_pass import Band
@@ -44,6 +47,11 @@ KINEMATICS = Kinematics(
     25.0,
 )
 BAND = Band(RATE, (8.0, 8.0, 8.0))
+AXIS = MachineScale(
+    np.array([-0.05]), np.array([0.2]), np.array([0.3]), np.array([100.0]),
+    np.array([50.0]), {"carriage": ("m", "N")}, 1e-3, 20.0, (8.0,),
+)  # fmt: skip
+"""A positioning axis: 0.25 m, 0.3 m/s, 100 N, 1 kHz, a band up to 8 Hz."""
 
 
 def folds(count: int) -> Folds:
@@ -58,20 +66,33 @@ def bam(effects: Sequence[str] = (), extra: Sequence[Mapping[str, Any]] = ()) ->
 
 
 def fit_trials(trials: MeasuredTrials, recipe: Recipe) -> Evidence:
-    """Least squares of the model of ``recipe`` on the measured trials, from its priors on."""
+    """Least squares of the model of ``recipe`` on the trials, from its priors."""
     system = system_of(recipe)
-    return gather_evidence(
-        system, trials.motions, trials.band, system.prior, trials.folds, timing=trials.timing
-    )
+    return gather_evidence(system, trials.motions, trials.band, system.prior, trials.folds)
+
+
+def fit_from_priors(session: Session, recipe: Recipe) -> Fit:
+    """The plain fit of a model from its priors."""
+    return session.fit_plainly(recipe, system_of(recipe).prior)
 
 
 def take_timing_off(trials: MeasuredTrials, recipe: Recipe) -> MeasuredTrials:
     """The trials with the timing of their inputs as found by least squares, and open beside it."""
     half = 0.5 / trials.band.rate_hz
     timed = replace(trials, limit_s=half, timed=True)
-    fit = Session(timed, Criteria()).fit_plainly(recipe, system_of(recipe).prior)
-    change = fit.problem.to_parameters @ fit.solved.base
+    fit = fit_from_priors(Session(timed, Criteria()), recipe)
+    change = fit.problem.to_parameters @ fit.solution.base
     return timed.with_input_timing(float(change[len(fit.evidence.free)]))
+
+
+def fit_bare(
+    root: Path, machine: str, seed: int, *effects: str, replicates: int = 6
+) -> tuple[Session, Recipe, Fit]:
+    """A recorded session with hidden ``effects``, the bare device, and its fit."""
+    trials, recipe, _ = record_trials(root, machine, seed, *effects)
+    trials = replace(trials, motions=tuple(trials.motions))
+    session = Session(trials, Criteria(replicates=replicates))
+    return session, recipe, session.fit(recipe, system_of(recipe).prior)
 
 
 def diagnose_trials(
@@ -85,7 +106,7 @@ def diagnose_trials(
     """
     session = Session(trials, Criteria(**criteria))
     without = [n for n in session.candidate_names(recipe) if only and n not in only]
-    start = session.fit_plainly(recipe, system_of(recipe).prior).evidence.p
+    start = fit_from_priors(session, recipe).evidence.p
     selection = select_effects(session, recipe, start, without)
     return selection, conclude(session, selection)
 
@@ -93,7 +114,7 @@ def diagnose_trials(
 def made(
     recipe: Recipe, values: Mapping[str, float], trials: int = 4, seconds: float = 8.0
 ) -> MeasuredTrials:
-    """Replay designed motions with the model of ``recipe`` at TRUTH and ``values``."""
+    """Simulate designed motions with the model of ``recipe`` at TRUTH and ``values``."""
     system = system_of(recipe)
     known = TRUTH | {q.name: q.prior for q in system.parameters[len(TRUTH) :]} | dict(values)
     p = np.array([known[q.name] for q in system.parameters])

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from independent_runs import record_trials
+from sessions import fit_from_priors
 
 from bampipe.diagnosis.candidates import build_candidate_model, compile_candidate, list_candidates
-from bampipe.diagnosis.columns import added_residual
+from bampipe.diagnosis.columns import compute_added_residual
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.select import open_search, start_of
 from bampipe.diagnosis.session import Session, acting_axes, candidates_of, system_of
@@ -68,7 +69,8 @@ def test_what_a_candidate_adds_beside_others_is_what_the_whole_residual_changes_
     item = compile_candidate(build_candidate_model(DAMPER, second, (), recipe.effects))
     p = np.concatenate([base.p, 0.3 + np.array([q.prior for q in item.parameters])])
     whole = ModelOnTrial(item.system, p, [base.motion]).residual
-    np.testing.assert_allclose(added_residual(item, p, base), whole - base.residual, atol=1e-9)
+    added = compute_added_residual(item, p, base)
+    np.testing.assert_allclose(added, whole - base.residual, atol=1e-9)
 
 
 def test_only_effects_that_meet_are_taken_together():
@@ -104,10 +106,10 @@ def test_the_right_effect_explains_most_and_has_the_true_size(
 ):
     trials, recipe, truth = record_trials(tmp_path, machine, seed, effect)
     session = Session(trials, Criteria())
-    fit = session.fit_plainly(recipe, system_of(recipe).prior)
+    fit = fit_from_priors(session, recipe)
     wider = replace(recipe, effects=(effect,))
     with open_search(session, fit, only=(effect, *rivals)) as search:
-        best = search.refine([(key,) for _, key in search.best_beside((), 4)], 8)
+        best = search.refine([(key,) for _, key in search.rank_additions((), 4)], 8)
         gains = {keys[0][0]: search.cost(()) - search.cost(keys) for keys in best}
         (right,) = [keys for keys in best if keys[0][0] == effect]
         start = start_of(search, right, wider)

@@ -35,9 +35,8 @@ def test_a_damper_that_truly_stops_is_given_a_narrower_sign(stopped):
     assert f"`sign_width = {DECLARED * found.sign_width_factor:.2g}`" in said
     coulomb = found.parameters["coulomb.piston"]
     assert abs(coulomb.estimate - truth["coulomb.piston"]) < 3.0 * coulomb.sd
-    run, _ = stopped
-    factor = run.read(IdentifyResult, "base").sign_width_factor
-    assert width_of(load_model(run, "base")) == pytest.approx(DECLARED * factor)
+    width = DECLARED * found.sign_width_factor
+    assert width_of(load_model(run, "base")) == pytest.approx(width)
     assert width_of(load_model(run, "base", as_declared=True)) == DECLARED
 
 

@@ -1,23 +1,22 @@
 """What a diagnosis holds of candidates, axes, windows and doubt."""
 
 import copy
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sessions import BAND, KINEMATICS, SENSORS, folds, made
+from sessions import AXIS, KINEMATICS, SENSORS, fit_trials, made
 
 from bampipe.diagnosis.candidates import build_candidate_model, compile_candidate
 from bampipe.diagnosis.dictionary import Dictionary
 from bampipe.diagnosis.probability import _share_explained
-from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.session import candidates_of, system_of
+from bampipe.diagnosis.session import candidates_of
 from bampipe.diagnosis.shape import _size, worst_windows
 from bampipe.physics import registry
 from bampipe.physics.recipe import Recipe
 from bampipe.results.floor import compare_with_floor
 from bampipe.stages.diagnose import _map_variables
-from bampipe.trials.evidence import gather_evidence
 from bampipe.trials.measured import MeasuredTrials
 
 
@@ -31,15 +30,11 @@ def bam_with_force(factor: float) -> Recipe:
 
 def column_size(recipe: Recipe, trials: MeasuredTrials) -> float:
     """Size of what a wrong gain of the force along the extension adds to its equation."""
-    system = system_of(recipe)
-    evidence = gather_evidence(system, trials.motions, BAND, system.prior, trials.folds)
     (item,) = candidates_of(recipe, ["force_gain:z"])
-    u = trials.motions[0].inputs(item.system.inputs)
     motion = trials.motions[0]
-    p = np.append(evidence.p, 1.0)
-    z = item.system.memory(motion.q, motion.qd, motion.qdd, u, p, motion.t)
-    column = item.system.contribution(motion.q, motion.qd, motion.qdd, z, u, p)
-    return float(np.linalg.norm(column[:, 2]))
+    u, p = motion.inputs(item.system.inputs), np.append(fit_trials(trials, recipe).p, 1.0)
+    z = item.system.memory(*motion.kinematics, u, p, motion.t)
+    return float(np.linalg.norm(item.system.contribution(*motion.kinematics, z, u, p)[:, 2]))
 
 
 def test_two_devices_of_one_name_have_their_own_candidates():
@@ -68,10 +63,9 @@ def test_one_judgement_of_at_the_floor(error, floor, sd, expected):
 
 def test_every_axis_has_its_worst_window_and_filters_keep_their_order():
     trials = made(bam_with_force(1.0), {}, trials=2, seconds=4.0)
-    system = system_of(bam_with_force(1.0))
-    evidence = gather_evidence(system, trials.motions, BAND, system.prior, folds(2))
+    evidence = fit_trials(trials, bam_with_force(1.0))
     found = worst_windows(evidence, count=1)
-    assert sorted(window.axis for window in found) == sorted(system.coordinates)
+    assert sorted(window.axis for window in found) == sorted(evidence.system.coordinates)
     for window in found:
         alike = [w.rmse for w in worst_windows(evidence, count=1000) if w.axis == window.axis]
         assert window.rmse == max(alike) and len(alike) > 3
@@ -108,12 +102,6 @@ def test_blocks_of_one_trial_are_mapped_under_its_name() -> None:
     assert found["t"].tolist() == [0.0, 1.0, 2.0, 4.0, 5.0, 6.0]
 
 
-AXIS = MachineScale(
-    np.array([-0.05]), np.array([0.2]), np.array([0.3]), np.array([100.0]),
-    np.array([50.0]), {"carriage": ("m", "N")}, 1e-3, 20.0, (16.0,),
-)  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("without", "probability"),
     [
@@ -125,7 +113,7 @@ AXIS = MachineScale(
 def test_what_only_an_axis_far_above_the_noise_shows_is_as_sure_as_its_share(without, probability):
     rows = {(): (20.0, 1.0), (("-stribeck:yaw", ()),): without}
     search = SimpleNamespace(
-        p=SimpleNamespace(independent=np.array([100.0, 100.0])),
+        problem=SimpleNamespace(independent=np.array([100.0, 100.0])),
         residual_rows=lambda keys: [np.full(50, level) for level in rows[keys]],
     )
     found = _share_explained(search, "stribeck:yaw", np.array([True, False]))
@@ -135,7 +123,7 @@ def test_what_only_an_axis_far_above_the_noise_shows_is_as_sure_as_its_share(wit
 @pytest.mark.parametrize("name", ["loose_load:carriage", "loose_drive:carriage"])
 def test_a_grid_over_several_shapes_covers_each_of_their_ranges(name):
     item = compile_candidate(build_candidate_model(registry.device("slider"), name))
-    grid = Dictionary(None, (), {name: item}, AXIS).grid(name)
+    grid = Dictionary(None, (), {name: item}, replace(AXIS, band_hz=(16.0,))).grid(name)
     assert len(set(grid)) == len(grid) <= 300
     values = [sorted({shape[k] for _, shape in grid}) for k in range(len(grid[0][1]))]
     own = [item.parameters[i].name.rpartition(".")[2] for i in item.searched_indices]

@@ -3,10 +3,13 @@
 import json
 import tomllib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from independent_runs import record_trials
+from made_results import diagnosis, write_result
+from sessions import fit_bare
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.files import effect_faults
@@ -20,20 +23,18 @@ from bampipe.diagnosis.drafts.search import (
     draft_formulas,
     weigh_chance,
 )
-from bampipe.diagnosis.session import Session, candidates_of, system_of
+from bampipe.diagnosis.session import candidates_of
 from bampipe.errors import InputError, NothingToDoError
 from bampipe.files import toml_text
 from bampipe.physics import Model
 from bampipe.physics.effect import effect_from
 from bampipe.progress import silent
-from bampipe.results.diagnose import AxisVerdict, DiagnoseResult
+from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.draft import ChanceOfDraft, DraftResult
 from bampipe.run.models import ensure_base
 from bampipe.stages import draft as draft_stage
 from bampipe.stages import identify
 from bampipe.trials.likelihood import lay_out_samples
-
-FEW = Criteria(replicates=6)
 
 
 def open_forms(session, fit, axis, only=None):
@@ -44,20 +45,13 @@ def open_forms(session, fit, axis, only=None):
     return FormSearch(session, fit, forms)
 
 
-def unknown_on(axis, **changes):
-    """The diagnosis of an axis on which something is left without a name."""
+def write_diagnosis(root, axis, remains=True):
+    """Write the diagnosis of an axis that lacks something unknown."""
     entry = {
-        "verdict": "unknown_effect", "effects": (), "probabilities": {}, "unknown": 0.99,
-        "rmse_before": 1.0, "rmse_after": 1.0, "rmse_beyond_bias": 1.0, "noise_floor": 0.1,
-        "noise_floor_sd": 0.01, "standing": "above_floor", "unit": "N.m", "force_rms": 5.0,
-        "explained": 0.9, "explainable_share": 0.9, "explainable_after": 0.9,
-        "explained_by_effects": 0.0, "remains": True, "sentence": "Something is missing.",
+        "verdict": "unknown_effect", "unknown": 0.99, "noise_floor": 0.1, "unit": "N.m",
+        "standing": "above_floor", "remains": remains,
     }  # fmt: skip
-    return DiagnoseResult(
-        model="base", sentence="Something is missing.", next="bampipe draft RUN",
-        axes={axis: AxisVerdict(**entry | changes)}, ranking=(), selected=(), sets=(),
-        suggested_trial=None, maps={}, worst_windows=(),
-    )  # fmt: skip
+    write_result(root, DiagnoseResult, model="base", **diagnosis({axis: entry}))
 
 
 @pytest.fixture(scope="module")
@@ -68,25 +62,21 @@ def detent(tmp_path_factory):
     run = RunFolder(root / "run")
     ensure_base(run.root, "", ())
     identify.execute(run, run.root, identify.Config(method="least-squares"), silent)
-    unknown_on("joint").write(run.root)
+    write_diagnosis(run.root, "joint")
     draft_stage.execute(run, run.root, draft_stage.Config(replicates=6, jobs=1), silent)
     return run, run.read(DraftResult, "base")
 
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory):
-    """Trials of the arm that lack nothing, and the fit of the bare device."""
-    trials, recipe, _ = record_trials(tmp_path_factory.mktemp("clean"), "bam", 6)
-    session = Session(replace(trials, motions=tuple(trials.motions)), FEW)
-    return session, recipe, session.fit(recipe, system_of(recipe).prior)
+    """Trials of the arm that lack nothing."""
+    return fit_bare(tmp_path_factory.mktemp("clean"), "bam", 6)
 
 
 @pytest.fixture(scope="module")
 def damper(tmp_path_factory):
-    """The bare device and its fit to trials in which a coil is commanded."""
-    trials, recipe, _ = record_trials(tmp_path_factory.mktemp("damper"), "damper", 6)
-    session = Session(replace(trials, motions=tuple(trials.motions)), FEW)
-    return recipe, session.linearise(recipe, system_of(recipe).prior)
+    """Trials in which a coil is commanded."""
+    return fit_bare(tmp_path_factory.mktemp("damper"), "damper", 6)
 
 
 def test_the_draft_is_the_curve_that_was_hidden(detent):
@@ -108,16 +98,15 @@ def test_the_draft_is_the_curve_that_was_hidden(detent):
 
 
 def test_the_draft_is_the_most_probable_and_its_file_one_that_a_person_can_keep(detent):
-    _, found = detent
+    run, found = detent
     options = found.axes["joint"].options
     assert options[0].effects == () and options[0].constants == 0
     assert len(options) >= 3
     (best,) = (o for o in options if o.held_out_rmse == found.axes["joint"].rmse_after)
     assert best.log_evidence == max(o.log_evidence for o in options)
-    run, found = detent
     (effect,) = found.effects.values()
     declaration = tomllib.loads((run.root / effect.file).read_text(encoding="utf-8"))
-    device = registered_device(run)
+    device = draft_stage.load_model(run, "base").device
     tried, faults = effect_faults(declaration, effect.file, device)
     assert set(found.selected) <= set(tried)
     assert faults == []
@@ -127,10 +116,6 @@ def test_the_draft_is_the_most_probable_and_its_file_one_that_a_person_can_keep(
     for name, constant in effect.constants.items():
         assert typical[name] == pytest.approx(constant.value, rel=1e-5)
         assert constant.low < constant.value < constant.high
-
-
-def registered_device(run):
-    return draft_stage.load_model(run, "base").device
 
 
 @pytest.mark.long
@@ -152,11 +137,11 @@ def test_nothing_is_drafted_where_nothing_is_missing(clean):
 
 
 def test_a_formula_in_what_is_measured_is_told_from_chance(clean):
-    """What lacks nothing is as likely as the replays; five times its size in one form is not."""
+    """What lacks nothing is as likely as the replicates; five times its size in one form is not."""
     session, _, fit = clean
     search = open_forms(session, fit, 1, "bump_by_position")
     assert weigh_chance(search).p_value > session.criteria.largest_p_value
-    bump = search.atoms[search.places[0]].columns[1][:, 0] * fit.likelihood.root[1]
+    bump = search.atoms[search.grid_keys[0]].columns[1][:, 0] * fit.likelihood.root[1]
     y = list(fit.problem.y)
     y[1] = y[1] + 5.0 * bump / np.linalg.norm(bump) * np.linalg.norm(y[1])
     bumped = replace(fit, problem=replace(fit.problem, y=tuple(y)))
@@ -169,8 +154,9 @@ def test_a_formula_in_what_is_measured_is_told_from_chance(clean):
 def test_columns_of_forms_are_those_of_the_compiled_effects(clean, damper):
     """Every shape and factor once: the grammar's text and its columns must say the same."""
     seen = set()
-    for recipe, evidence in ((clean[1], clean[2].evidence), damper):
-        samples = lay_out_samples(evidence, FEW.block_s)
+    for _, recipe, fit in (clean, damper):
+        evidence = fit.evidence
+        samples = lay_out_samples(evidence, Criteria().block_s)
         forms = FormDictionary(evidence, samples, 0)
         forms.add_grammar()
         for name, form in forms.candidates.items():
@@ -187,9 +173,10 @@ def _hold_against_effect(recipe, evidence, samples, forms, name):
     }
     atom = forms.make(forms.key(name, searched))
     effect = replace(recipe, extra=(form.declaration("a test"),))
-    item = candidates_of(effect, (form.canonical,))[0]
+    item = candidates_of(effect, (form.canonical_name,))[0]
     short = [q.name.rpartition(".")[2] for q in item.parameters]
-    exact = Dictionary(evidence, samples, {name: item}, _NoRanges())
+    no_ranges = SimpleNamespace(range_of=lambda effect, parameter: None)
+    exact = Dictionary(evidence, samples, {name: item}, no_ranges)
     values = np.array([searched[short[i]] for i in item.searched_indices])
     exact.values = lambda key: values
     wanted = exact.make((name, ()))
@@ -198,16 +185,11 @@ def _hold_against_effect(recipe, evidence, samples, forms, name):
     for axis, found in atom.columns.items():
         off = np.linalg.norm(found[:, columns] - wanted.columns[axis], axis=0)
         # Made at a lower rate: a sharp edge at a reversal costs several per cent.
-        assert (off < 0.1 * np.linalg.norm(wanted.columns[axis], axis=0)).all(), form.canonical
+        assert (off < 0.1 * np.linalg.norm(wanted.columns[axis], axis=0)).all(), form.canonical_name
     for axis, slope in wanted.slopes.items():
         scale = np.abs(slope).max()
-        off = np.median(np.abs(atom.slopes[axis][:, :, columns[0]] - slope))
-        assert off < 0.05 * scale, form.canonical
-
-
-class _NoRanges:
-    def range_of(self, effect, parameter):
-        return None
+        off = np.median(np.abs(atom.slopes[axis][:, :, columns] - slope))
+        assert off < 0.05 * scale, form.canonical_name
 
 
 def _between(low, high):
@@ -219,7 +201,7 @@ def test_a_form_that_cancels_the_drive_gains_nothing(clean):
     session, _, fit = clean
     search = open_forms(session, fit, 0, "friction_rise_by_load")
     (name,) = search.forms.candidates
-    reach = search.forms.candidates[name].fixed()["reach"][0]
+    reach = search.forms.candidates[name].fixed_constants()["reach"][0]
     key = search.forms.key(name, {"place": 0.0})
     search.ensure([key])
 
@@ -227,20 +209,19 @@ def test_a_form_that_cancels_the_drive_gains_nothing(clean):
         return forms._volume(forms._log_slopes((place,), [strengths], np.ones(forms.n_q)))
 
     # A rise of this height from load zero is the load itself, against the motion.
-    assert volume(search, key, np.array([-0.2 * reach]))[0] < -0.05 * search.p.independent[0]
+    assert volume(search, key, np.array([-0.2 * reach]))[0] < -0.05 * search.problem.independent[0]
     assert volume(search, key, np.array([-reach])) is None
     own = open_forms(session, fit, 0, "slope_by_extension")
-    at = own.places[0]
+    at = own.grid_keys[0]
     assert volume(own, at, np.ones(own.atoms[at].width)) == pytest.approx(0.0)
 
 
 def test_hysteresis_of_a_force_sensor_is_found(tmp_path):
-    trials, recipe, _ = record_trials(tmp_path, "bam", 7, "sensor_hysteresis:x")
-    session = Session(replace(trials, motions=tuple(trials.motions)), FEW)
-    search = open_forms(session, session.fit(recipe, system_of(recipe).prior), 0)
+    session, _, fit = fit_bare(tmp_path, "bam", 7, "sensor_hysteresis:x")
+    search = open_forms(session, fit, 0)
     best, *others = search.best_forms(8, 1)
     form, gain = search.forms.candidates[best[0]], search.cost(()) - search.cost((best,))
-    assert form.canonical in ("hysteresis_of_reading:x", "two_hystereses_of_reading:x")
+    assert form.canonical_name in ("hysteresis_of_reading:x", "two_hystereses_of_reading:x")
     plain = next(k for k in (best, *others) if k[0] == "hysteresis_of_reading:x")
     assert search.cost(()) - search.cost((plain,)) > 0.95 * gain
     rest = [k for k in others if "hyst" not in k[0]]
@@ -262,7 +243,7 @@ def test_every_form_is_an_effect_file(clean):
         for form in forms.candidates.values():
             text = toml_text(form.declaration("a test"))
             tried, faults = effect_faults(tomllib.loads(text), form.name, device)
-            assert form.canonical in tried
+            assert form.canonical_name in tried
             assert faults == []
 
 
@@ -282,6 +263,6 @@ def test_what_is_missing_for_a_draft_is_said(tmp_path):
     run = RunFolder(tmp_path)
     with pytest.raises(InputError, match=r"diagnose\.json"):
         draft_stage.execute(run, tmp_path, draft_stage.Config(), silent)
-    unknown_on("joint", remains=False).write(tmp_path)
+    write_diagnosis(tmp_path, "joint", remains=False)
     with pytest.raises(NothingToDoError, match="explain all of the residual"):
         draft_stage.execute(run, tmp_path, draft_stage.Config(), silent)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from physics.small_arm import ARM
 from scipy.signal import butter, sosfiltfilt
-from sessions import BAND, KINEMATICS, RATE, bam, folds, made
+from sessions import BAND, KINEMATICS, RATE, bam, fit_trials, folds, made
 
 from bampipe.diagnosis.session import system_of
 from bampipe.estimate.least_squares import residual_and_slopes, stacked_residual
@@ -26,11 +26,10 @@ def test_thinning_is_that_of_the_library_with_a_cut_off_an_axis():
     expected = sosfiltfilt(sections, values, axis=0)[band.thinned_rows(3000)]
     inner = slice(8, -8)
     assert np.allclose(band.thin(values)[inner], expected[inner], atol=1e-6)
-    values = np.random.default_rng(1).normal(size=(3000, 2))
-    both = Band(RATE, (8.0, 20.0)).thin(values)
+    values, band = np.random.default_rng(1).normal(size=(3000, 2)), Band(RATE, (8.0, 20.0))
+    both, rows = band.thin(values), band.thinned_rows(3000)
     for column, cutoff in enumerate((8.0, 20.0)):
         alone = butter(2, cutoff, fs=RATE, output="sos")
-        rows = Band(RATE, (8.0, 20.0)).thinned_rows(3000)
         expected = sosfiltfilt(alone, values[:, column])[rows]
         assert np.allclose(both[60:-60, column], expected[60:-60], atol=1e-6)
 
@@ -39,8 +38,7 @@ def test_slopes_are_those_of_the_last_parameters_after_a_nonlinear_fit():
     """Slopes that no parameter changes are carried from one iteration to the next."""
     recipe = bam(["presliding:yaw"])
     session = made(recipe, {"presliding.yaw.force": 0.8, "presliding.yaw.distance": 0.03}, trials=2)
-    system = system_of(recipe)
-    found = gather_evidence(system, session.motions, BAND, system.prior, session.folds)
+    system, found = system_of(recipe), fit_trials(session, recipe)
     assert np.abs(found.p - system.prior).max() > 0.2
     anew = gather_evidence(system, session.motions, BAND, found.p, session.folds, most_iterations=0)
     for carried, fresh in zip(found.jacobian, anew.jacobian, strict=True):
@@ -67,14 +65,10 @@ def test_slopes_that_are_called_constant_are_the_same_at_other_parameters(timing
 def test_a_fit_that_takes_slopes_from_a_model_like_it_is_the_same(effects):
     session = made(bam(), {}, trials=2)
     narrow, wide = system_of(bam()), system_of(bam(effects))
-    given = session.motions, BAND
-    like = gather_evidence(narrow, *given, narrow.prior, session.folds)
-    for system, other in (
-        (wide, like),
-        (narrow, gather_evidence(wide, *given, wide.prior, session.folds)),
-    ):
-        alone = gather_evidence(system, *given, system.prior, session.folds)
-        found = gather_evidence(system, *given, system.prior, session.folds, like=other)
+    fits = [fit_trials(session, recipe) for recipe in (bam(effects), bam())]
+    for system, alone, like in zip((wide, narrow), fits, fits[::-1], strict=True):
+        given = system, session.motions, BAND, system.prior, session.folds
+        found = gather_evidence(*given, like=like)
         for one, two in zip(found.jacobian, alone.jacobian, strict=True):
             np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-7 * np.abs(two).max())
 

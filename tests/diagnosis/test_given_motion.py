@@ -9,6 +9,7 @@ import pytest
 from independent import prescribed
 from independent.sensors import Conditions
 from independent_runs import PIPELINE, record_trials
+from sessions import fit_from_priors
 
 import bampipe
 from bampipe.data.run_folder import RunFolder
@@ -40,10 +41,10 @@ def test_delays_shorter_than_the_true_one_promise_what_they_can_at_their_bounds(
     recipe = Recipe(device_from(tomllib.loads(prescribed.DEVICE)).declaration, (), ())
     trials = read_measured_trials(RunFolder(run.root), system_of(recipe), every_input=True)
     session = Session(trials, Criteria())
-    fit = session.fit_plainly(recipe, system_of(recipe).prior)
+    fit = fit_from_priors(session, recipe)
     with open_search(session, fit, only=("actuator_delay",)) as search:
         gains = search.gains(())
-        shorter = [search.dictionary.values(key)[0] < 8e-3 for key in search.places]
+        shorter = [search.dictionary.values(key)[0] < 8e-3 for key in search.grid_keys]
         assert sum(shorter) >= 3
         assert (np.diff(gains[shorter]) > 0.0).all() and (gains[shorter] > 0.0).all()
 
@@ -52,27 +53,22 @@ def test_a_drive_that_hardly_acts_any_more_explains_nothing(tmp_path: Path) -> N
     """Friction that falls with the speed left nearly one force, which a drive at its limit has."""
     trials, recipe, _ = record_trials(tmp_path, "joint", 3)
     session, weak = Session(trials, Criteria()), change_set(recipe, [("drive_sag:joint", ())])
-    before = session.fit_plainly(recipe, system_of(recipe).prior)
-    p = np.append(before.evidence.p, 0.0)
-    fits = []
-    for sag in (0.0, 1e3):
-        p[-1] = sag
-        evidence = session.linearise(weak, p)
-        fits.append(replace(before, recipe=weak, evidence=evidence))
-    same, weaker = fits
+    before = fit_from_priors(session, recipe)
+    p = before.evidence.p
+    same, weaker = (
+        replace(before, recipe=weak, evidence=session.linearise(weak, np.append(p, sag)))
+        for sag in (0.0, 1e3)
+    )
     keys = (("drive_sag:joint", (0.5,)),)
     small = replace(weaker, problem=before.likelihood.pose_problem(weaker.evidence))
     with open_search(session, before, only=("drive_sag:joint",)) as search:
         assert search.volume_where_fitted(keys, same.evidence) == pytest.approx([0.0])
         assert search.volume_where_fitted(keys, weaker.evidence) is None
         assert gain_when_fitted(before, small, search, keys) == -np.inf
-    ends = []
-    for sag in (0.0, 0.02, 1.0):
-        p[-1] = sag
-        ends.append(session.fit_plainly(weak, p))
+    ends = [session.fit_plainly(weak, np.append(p, sag)) for sag in (0.0, 0.02, 1.0)]
     for end in ends:
         assert end.evidence.p[-1] == pytest.approx(ends[0].evidence.p[-1], rel=1e-3, abs=1e-6)
-        assert end.solved.cost <= before.solved.cost + 0.01
+        assert end.solution.cost <= before.solution.cost + 0.01
 
 
 def test_a_sagging_drive_leaves_the_scale_that_its_curve_has(tmp_path: Path) -> None:
@@ -84,12 +80,9 @@ def test_a_sagging_drive_leaves_the_scale_that_its_curve_has(tmp_path: Path) -> 
     used = [u[trials.band.thinned_rows(len(u))] for u in used]
     added = [r[..., 0] for r in slopes_by_force(model, trials.motions, trials.band, [p])]
     scale, slopes = log_scale(model, trials.motions, trials.band, used, p, [0, len(p) - 1], added)
-    force = np.concatenate(
-        [
-            np.abs(r.applied[trials.band.thinned_rows(len(r.applied))][u])
-            for r, u in zip(plain_trials(trials, recipe), used, strict=True)
-        ]
-    )
+    applied = [np.abs(r.applied) for r in plain_trials(trials, recipe)]
+    thinned = [a[trials.band.thinned_rows(len(a))] for a in applied]
+    force = np.concatenate([a[u] for a, u in zip(thinned, used, strict=True)])
     assert scale == pytest.approx([np.mean(-2.0 * np.log(1.0 + 0.01 * force))], rel=1e-3)
     by_sag = np.mean(-2.0 * force / (1.0 + 0.01 * force))
     assert slopes == pytest.approx(np.array([[0.0, by_sag]]), rel=1e-2)

@@ -1,9 +1,10 @@
-"""The likelihood: weights, what replays share, stops, heavy tails, bounds."""
+"""The likelihood: weights, what replicates share, stops, heavy tails, bounds."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from sessions import fit_from_priors
 
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session, system_of
@@ -26,12 +27,11 @@ def fitted(record):
     """The arm, which lacks nothing, fitted under the likelihood."""
     trials, recipe = record("bam", 6)
     session = Session(trials, Criteria())
-    start = session.fit_plainly(recipe, system_of(recipe).prior).evidence.p
-    return session, session.fit(recipe, start)
+    return session, session.fit(recipe, fit_from_priors(session, recipe).evidence.p)
 
 
 def factors(fit, residual):
-    """Of the common bias, and of the replay that stops, by axis, each (n_q,)."""
+    """Of the common bias, and of the replicate that stops, by axis, each (n_q,)."""
     y = tuple(r * root for r, root in zip(residual, fit.likelihood.root, strict=True))
     problem = replace(fit.likelihood.pose_problem(fit.evidence), y=y)
     solved = problem.to_parameters @ problem.solve().base
@@ -39,18 +39,18 @@ def factors(fit, residual):
     return solved[-2 * n_q : -n_q], solved[-n_q:]
 
 
-def test_a_replay_has_unit_variance_in_units_of_its_noise(fitted):
-    """Fast or slow; by replays that the noise was not made of."""
+def test_a_replicate_has_unit_variance_in_units_of_its_noise(fitted):
+    """Fast or slow; by replicates that the noise was not made of."""
     session, fit = fitted
     e, samples = fit.evidence, fit.likelihood.samples
     nothing = [np.zeros_like(r) for r in e.residual]
-    noise = describe_noise(session.replay(e, e.p, 24), nothing, e, samples)
-    fresh = session.replay(e, e.p, 24, first=100)
+    noise = describe_noise(session.replicate(e, e.p, 24), nothing, e, samples)
+    fresh = session.replicate(e, e.p, 24, first=100)
     for axis, here in enumerate(samples):
         rows = take_samples(fresh, here, axis).T - noise.bias[axis]
         square = rows**2 / noise.variance[axis]
         speed = noise.speed[axis]
-        # A replay in which one reversal comes late is far from the others.
+        # A replicate in which one reversal comes late is far from the others.
         by_speed = [np.median(square[:, speed == k].mean(axis=1)) for k in np.unique(speed)]
         assert 0.6 < min(by_speed) and max(by_speed) < 1.7
         spread = np.sqrt(noise.variance[axis])
@@ -60,8 +60,8 @@ def test_a_replay_has_unit_variance_in_units_of_its_noise(fitted):
 def test_replicates_are_the_same_in_other_processes(fitted):
     session, fit = fitted
     e = fit.evidence
-    alone = session.replay(e, e.p, 3)
-    beside = replace(session, jobs=2).replay(e, e.p, 3)
+    alone = session.replicate(e, e.p, 3)
+    beside = replace(session, jobs=2).replicate(e, e.p, 3)
     assert len(alone) == len(e.motions)
     assert all(np.array_equal(a, b) for a, b in zip(alone, beside, strict=True))
     assert not np.array_equal(alone[0][:, :, 0], alone[0][:, :, 1])
@@ -70,25 +70,21 @@ def test_replicates_are_the_same_in_other_processes(fitted):
 def test_what_a_model_may_be_wrong_by_weighs_less_where_the_force_is_large(fitted):
     _, fit = fitted
     like = fit.likelihood
-    loose = Likelihood.of(
-        fit.evidence,
-        like.samples,
-        like.noise,
-        1e-9,
-        0.05,
-        np.zeros(len(fit.evidence.system.model.device.forces)),
-    )
+    force_sd = np.zeros(len(fit.evidence.system.model.device.forces))
+    loose = Likelihood.of(fit.evidence, like.samples, like.noise, 1e-9, 0.05, force_sd)
     for force, root in zip(loose.applied, loose.root, strict=True):
         large, small = np.abs(force) > np.quantile(np.abs(force), [[0.9], [0.1]])
         assert root[large].mean() < 0.6 * root[~small].mean()
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0, 1.4])
-def test_what_all_replays_share_goes_to_the_factor_of_the_bias(fitted, share):
+def test_what_all_replicates_share_goes_to_the_factor_of_the_bias(fitted, share):
     _, fit = fitted
     noise = fit.likelihood.noise
-    by_replay = [r[0] + (share - 1.0) * b for r, b in zip(noise.residuals, noise.bias, strict=True)]
-    of_bias, of_stops = factors(fit, by_replay)
+    by_replicate = [
+        r[0] + (share - 1.0) * b for r, b in zip(noise.residuals, noise.bias, strict=True)
+    ]
+    of_bias, of_stops = factors(fit, by_replicate)
     assert of_bias + of_stops == pytest.approx(np.full(3, share), abs=0.2)
 
 
@@ -168,7 +164,7 @@ def test_what_is_taken_away_changes_the_rest_unless_another_parameter_replaces_i
     assert free.shape == (2, 1) and free[1, 0] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_a_few_samples_that_no_replay_has_do_not_decide_under_heavy_tails(line):
+def test_a_few_samples_that_no_replicate_has_do_not_decide_under_heavy_tails(line):
     y, base = line
     y = y.copy()
     wild = np.arange(0, 400, 40)
@@ -198,11 +194,9 @@ def test_what_comes_back_with_the_motion_counts_as_few_independent_samples(fitte
         return np.array([s.independent for s in like.count_independent(problem, 100)])
 
     before = np.array([s.independent for s in like.samples])
-    replay = [
-        (r[0] - b) * root
-        for r, b, root in zip(like.noise.residuals, like.noise.bias, like.root, strict=True)
-    ]
-    assert np.all(counted(replay) > 0.8 * before)
+    rows = zip(like.noise.residuals, like.noise.bias, like.root, strict=True)
+    replicate = [(r[0] - b) * root for r, b, root in rows]
+    assert np.all(counted(replicate) > 0.8 * before)
     assert np.all(counted([np.cos(2.5 * s.rows) for s in like.samples]) > 0.8 * before)
     assert np.all(counted(forces) < 0.3 * before)
 

@@ -19,17 +19,17 @@ NUMERICAL = {
         "2": "effects in which two sets differ by an exchange",
     },
     "probability": {
-        "LEAST_CHANCE": "no chance is known to be smaller, so that nothing can be asked beyond it",
-        "_NEAR": "what is less probable by a factor of a million changes no probability",
+        "LEAST_P_VALUE": "no chance is known to be smaller, so that nothing can be asked beyond it",
+        "_MARGIN": "what is less probable by a factor of a million changes no probability",
     },
     "select": {
         "0.5": "more probable than not",
         "2": "tasks from which on processes share them",
         "NOTICEABLE": "a set is not proposed that the ladder would refuse",
         "_MOST_ROUNDS": "work, not a judgement",
-        "_TRIED": "work, not a judgement",
-        "_WORTH": "half a nat: a set that is no better is weighed, but not fitted",
-        "_MINOR": "what is put off until the rest is fitted, and weighed then",
+        "_MOST_FITS": "work, not a judgement",
+        "_LEAST_GAIN": "half a nat: a set that is no better is weighed, but not fitted",
+        "_MINOR_SHARE": "what is put off until the rest is fitted, and weighed then",
     },
     "search": {
         "0.02": "nats up to which a descent of shapes is not worth a step",

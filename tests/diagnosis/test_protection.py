@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sessions import bam, diagnose_trials, take_timing_off
+from sessions import bam, diagnose_trials, fit_from_priors, take_timing_off
 
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.select import open_search
-from bampipe.diagnosis.session import Session, system_of
+from bampipe.diagnosis.session import Session
 from bampipe.physics import registry
 
 pytest_plugins = ("recorded",)
@@ -95,7 +95,7 @@ def test_friction_by_load_beside_a_lag_does_not_halve_both_sides(record):
     trials, recipe = record("joint", 6, "actuator_lag:current", creep=True, rate_hz=100.0)
     session, name = Session(trials, Criteria()), "load_dependent_presliding:joint"
     lagging = replace(recipe, effects=("actuator_lag:current",))
-    fit = session.fit_plainly(lagging, system_of(lagging).prior)
+    fit = fit_from_priors(session, lagging)
     with open_search(session, fit, only=(name,)) as search:
         atom = search.make([(name, (0.0,))])[0][1]
     torque_by_current = 10.0
@@ -108,10 +108,9 @@ def test_a_trial_that_alone_holds_a_parameter_condemns_no_model(record):
     trials, recipe = record("joint", 7)
     joint = replace(recipe, effects=("return_spring:joint",))
     session = Session(trials, Criteria())
-    fit = session.fit(joint, session.fit_plainly(joint, system_of(joint).prior).evidence.p)
-    assert fit.held_out_rmse[0] < 1.3 * np.sqrt(
-        np.mean((fit.problem.y[0] / fit.likelihood.root[0]) ** 2)
-    )
+    fit = session.fit(joint, fit_from_priors(session, joint).evidence.p)
+    residual = fit.problem.y[0] / fit.likelihood.root[0]
+    assert fit.held_out_rmse[0] < 1.3 * np.sqrt(np.mean(residual**2))
 
 
 def test_inputs_that_are_read_half_a_sample_late_give_no_delay(record):
@@ -130,9 +129,9 @@ def test_a_delay_that_the_timing_takes_over_only_beyond_its_bounds_has_a_size(re
     late = [m.with_input_timing(-1.0 / trials.band.rate_hz) for m in trials.motions]
     criteria, name = Criteria(size=0.003), "actuator_delay"
     session = Session(replace(trials, motions=tuple(late)), criteria)
-    fit = session.fit_plainly(recipe, system_of(recipe).prior)
+    fit = fit_from_priors(session, recipe)
     with open_search(session, fit, only=(name,)) as search:
-        ((cost, key),) = search.best_beside((), 1)
+        ((cost, key),) = search.rank_additions((), 1)
         assert search.cost(()) - cost > 20.0
         # With a timing that knows no bounds little would be left of it.
         assert max(search.solve((key,)).sizes) < criteria.size
@@ -173,7 +172,7 @@ def test_what_no_effect_of_the_library_is_is_called_unknown(record, machine, eff
 
 
 def test_the_numbers_that_decide_are_those_that_are_given(record):
-    """A dozen replays make nobody surer than one in ten thousand; half the force nothing is.
+    """A dozen replicates make nobody surer than one in ten thousand; half the force nothing is.
 
     By the usual ones the effect is missing: `stages/test_diagnose.py`.
     """

@@ -4,18 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sessions import BAND, bam, made
+from sessions import AXIS, bam, fit_trials, made
 
 from bampipe.diagnosis.ranges import MachineScale
-from bampipe.diagnosis.session import system_of
 from bampipe.physics import Model, registry
-from bampipe.trials.evidence import gather_evidence
-
-AXIS = MachineScale(
-    np.array([-0.05]), np.array([0.2]), np.array([0.3]), np.array([100.0]),
-    np.array([50.0]), {"carriage": ("m", "N")}, 1e-3, 20.0, (8.0,),
-)  # fmt: skip
-"""A positioning axis: 0.25 m, 0.3 m/s, 100 N, 1 kHz, a band up to 8 Hz."""
 
 
 def range_of(effect, parameter, scale=AXIS):
@@ -55,7 +47,7 @@ def test_where_drives_are_late_and_stops_are_looked_for():
     assert (lower.low, lower.high) == pytest.approx((-0.045, 0.075))
     ends = range_of("gas_spring:carriage", "end")
     shares = np.linspace(0.0, 1.0, 21)
-    found = np.array([ends.value_at(ends.within(share)) for share in shares])
+    found = np.array([ends.value_at(ends.interpolate(share)) for share in shares])
     above, below = found[shares > 0.5], found[shares < 0.5]
     # The travel goes from -0.05 to 0.2 m: nearly at it, and where any gas is a straight line.
     assert above.min() == pytest.approx(0.205)
@@ -68,9 +60,7 @@ def test_where_drives_are_late_and_stops_are_looked_for():
 
 def test_the_scale_of_a_session_is_that_of_its_motion():
     session = made(bam(), {}, trials=2)
-    system = system_of(bam())
-    evidence = gather_evidence(system, session.motions, BAND, system.prior, session.folds)
-    scale = MachineScale.of_trials(evidence)
+    scale = MachineScale.of_trials(fit_trials(session, bam()))
     q = np.concatenate([m.q for m in session.motions])
     np.testing.assert_allclose(scale.highest - scale.lowest, np.ptp(q, axis=0))
     force = np.concatenate([m.channels["force_z"] for m in session.motions])
@@ -83,7 +73,7 @@ def test_the_scale_of_a_session_is_that_of_its_motion():
 def test_no_ripple_falls_between_two_values_that_are_tried():
     """Of two wavenumbers a wave on the travel apart neither tells of the other."""
     waves = range_of("torque_ripple:carriage", "wavenumber")
-    values = [waves.within(share) for share in np.linspace(0.0, 1.0, waves.fewest)]
+    values = [waves.interpolate(share) for share in np.linspace(0.0, 1.0, waves.grid_size)]
     on_travel = np.array(values) * 0.25 / (2.0 * np.pi)
     assert on_travel[-1] == pytest.approx(30.0)
     assert np.diff(on_travel).max() <= 0.6

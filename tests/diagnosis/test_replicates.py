@@ -1,4 +1,4 @@
-"""Replays of a fitted model: what they need, what they share, and the bias that they show."""
+"""Replicates of a fitted model: what they need, what they share, and the bias that they show."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -23,17 +23,12 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> tuple[MeasuredTrials, Ev
     root = tmp_path_factory.mktemp("joint")
     trials, recipe, _ = record_trials(root, "joint", 21, trials=12, seconds=5.0)
     # Every other trial: those between are moves with rests, whose errors are larger.
-    waves = range(0, 12, 2)
-    trials = replace(
-        trials,
-        motions=[trials.motions[number] for number in waves],
-        folds=trials.folds.subset(waves),
-    )
+    trials = trials.subset(range(0, 12, 2))
     system = system_of(recipe)
     return trials, gather_evidence(system, trials.motions, trials.band, system.prior, trials.folds)
 
 
-def test_a_replay_for_one_model_has_the_same_inputs(fitted) -> None:
+def test_a_replicate_for_one_model_has_the_same_inputs(fitted) -> None:
     trials, evidence = fitted
     system = evidence.system
     logged = {name: trials.motions[0].channels[name] for name in system.inputs}
@@ -64,16 +59,16 @@ def test_replicates_differ_by_noise_alone_and_share_what_was_simulated(
     monkeypatch.setattr(replicates, "follow_motion", counted)
     rate_hz, motions = trials.sensors.rate_hz, trials.motions
 
-    def replayed(simulated: SimulatedTrials, number: int) -> Any:
+    def replicate(simulated: SimulatedTrials, number: int) -> Any:
         rngs = (np.random.default_rng([7, number, k]) for k in range(len(motions)))
         filters = trials.sensors, trials.kinematics
         return [make_replicate(simulated, k, *filters, rng) for k, rng in enumerate(rngs)]
 
     one = SimulatedTrials(evidence.system, evidence.p, motions, rate_hz)
-    shared = [replayed(one, number) for number in range(2)]
+    shared = [replicate(one, number) for number in range(2)]
     assert simulated == [motion.trial_id for motion in motions]
     for number in range(2):
-        anew = replayed(SimulatedTrials(evidence.system, evidence.p, motions, rate_hz), number)
+        anew = replicate(SimulatedTrials(evidence.system, evidence.p, motions, rate_hz), number)
         for known, again in zip(shared[number], anew, strict=True):
             np.testing.assert_array_equal(known.q, again.q)
             np.testing.assert_array_equal(
@@ -82,7 +77,7 @@ def test_replicates_differ_by_noise_alone_and_share_what_was_simulated(
     assert not np.array_equal(shared[0][0].q, shared[1][0].q)
 
 
-def test_a_replay_leaves_out_the_moments_at_which_the_machine_stands_still(fitted) -> None:
+def test_a_replicate_leaves_out_the_moments_at_which_the_machine_stands_still(fitted) -> None:
     trials, evidence = fitted
     motion = trials.motions[0]
     rest = np.zeros(motion.q.shape, dtype=bool)
@@ -90,13 +85,13 @@ def test_a_replay_leaves_out_the_moments_at_which_the_machine_stands_still(fitte
     simulated = SimulatedTrials(
         evidence.system, evidence.p, [replace(motion, left_out=rest)], trials.sensors.rate_hz
     )
-    replayed = make_replicate(
+    replicate = make_replicate(
         simulated, 0, trials.sensors, trials.kinematics, np.random.default_rng(1)
     )
-    still = problem_of(evidence.system, [replayed], trials.band).standstill[0]
+    still = problem_of(evidence.system, [replicate], trials.band).standstill[0]
     assert still[rest].all() and 0.0 < still.mean() < 0.5
-    stored, _ = KeptItems([replayed, motion], most=1)
-    np.testing.assert_array_equal(stored.left_out, replayed.left_out)
+    stored, _ = KeptItems([replicate, motion], most=1)
+    np.testing.assert_array_equal(stored.left_out, replicate.left_out)
 
 
 @pytest.mark.parametrize("late", [0, 1.6, 3, -1.6, -3])
@@ -127,7 +122,7 @@ def test_the_jumps_of_a_drive_that_acts_or_is_read_late_are_seen(late: float) ->
 
 
 @pytest.mark.parametrize("machine", ["axis", "joint"])
-def test_a_replay_of_a_late_motor_leaves_what_the_measurement_leaves(machine, tmp_path) -> None:
+def test_a_replicate_of_a_late_motor_leaves_what_the_measurement_leaves(machine, tmp_path) -> None:
     """By another simulator; moved by time derivatives within the band, it was up to 27 % off."""
     trials, recipe, _ = record_trials(
         tmp_path, machine, 31, "actuator_delay", trials=2, seconds=5.0
@@ -140,10 +135,10 @@ def test_a_replay_of_a_late_motor_leaves_what_the_measurement_leaves(machine, tm
     simulated = SimulatedTrials(system, p, trials.motions, trials.sensors.rate_hz)
     for number, measured in enumerate(trials.motions):
         rng = np.random.default_rng(1)
-        replayed = make_replicate(simulated, number, trials.sensors, trials.kinematics, rng)
+        replicate = make_replicate(simulated, number, trials.sensors, trials.kinematics, rng)
         there, here = (
             np.sqrt(np.mean(trials.band.thin(ModelOnTrial(system, p, [m]).residual) ** 2))
-            for m in (measured, replayed)
+            for m in (measured, replicate)
         )
         assert 0.85 < here / there < 1.1
 
@@ -158,14 +153,12 @@ def test_a_replay_of_a_late_motor_leaves_what_the_measurement_leaves(machine, tm
     ],
 )
 def test_the_force_that_a_motion_needs_leaves_no_residual(fitted, effect, values) -> None:
-    """Whatever part of the force an effect takes: else the bias of replays holds the misfit."""
+    """Whatever part of the force an effect takes: else the bias of replicates holds the misfit."""
     trials, evidence = fitted
     system = compile_model(Model(evidence.system.model.device, [effect]))
     head = effect.replace(":", ".")
-    p = np.append(
-        evidence.p,
-        [values[q.name.removeprefix(f"{head}.")] for q in system.parameters[len(evidence.p) :]],
-    )
+    own = [values[q.name.removeprefix(f"{head}.")] for q in system.parameters[len(evidence.p) :]]
+    p = np.append(evidence.p, own)
     motion = replace(trials.motions[0], stamp_offset=None)
     measured = ModelOnTrial(system, p, [motion])
     force = replicates._required_force(measured, trials.sensors.rate_hz)

@@ -4,13 +4,13 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from sessions import TRUTH, bam, made
+from sessions import TRUTH, bam, fit_from_priors, made
 
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.select import open_search, select_effects, start_of
 from bampipe.diagnosis.session import Session, system_of
-from bampipe.diagnosis.set_cost import added, names
+from bampipe.diagnosis.set_cost import added_effects, effect_names
 
 HIDDEN = {
     "stribeck.yaw.force": 1.1,
@@ -35,8 +35,7 @@ def session() -> Session:
 @pytest.fixture(scope="module")
 def bare(session: Session):
     """The bare device, fitted."""
-    recipe = bam()
-    return session.fit(recipe, session.fit_plainly(recipe, system_of(recipe).prior).evidence.p)
+    return session.fit(bam(), fit_from_priors(session, bam()).evidence.p)
 
 
 @pytest.fixture(scope="module")
@@ -47,11 +46,13 @@ def search(session: Session, bare) -> Iterator[Search]:
 
 def best_set(search: Search, most: int):
     """The best set that a beam comes to."""
-    return min(pair for beam in search.beam(most) for pair in beam)[1]
+    return min(pair for beam in search.grow_sets(most) for pair in beam)[1]
 
 
 def test_a_set_of_three_is_found_whole_in_any_order_of_the_candidates(session, bare, search):
-    assert names(best_set(search, 4))[-3:] and {*EFFECTS} <= {*names(best_set(search, 3))}
+    assert effect_names(best_set(search, 4))[-3:] and {*EFFECTS} <= {
+        *effect_names(best_set(search, 3))
+    }
     with open_search(session, bare, only=(*OTHERS[::-1], *EFFECTS[::-1])) as turned:
         assert best_set(turned, 3) == best_set(search, 3)
     keys = best_set(search, 3)
@@ -59,9 +60,11 @@ def test_a_set_of_three_is_found_whole_in_any_order_of_the_candidates(session, b
 
 
 def test_strengths_stay_within_bounds_and_a_shape_moves_to_its_truth(search):
-    for beam in search.beam(2):
+    for beam in search.grow_sets(2):
         for _, keys in beam:
-            for key, strengths in zip(added(keys), search.solve(keys).strengths, strict=True):
+            for key, strengths in zip(
+                added_effects(keys), search.solve(keys).strengths, strict=True
+            ):
                 for value, (low, high) in zip(
                     strengths, search.dictionary.bounds(key[0]), strict=True
                 ):
@@ -81,18 +84,18 @@ def test_what_is_of_no_use_is_dropped_and_what_is_wrong_is_exchanged(search):
     right = best_set(search, 3)
     useless = ("force_bias:y", ())
     more = tuple(sorted((*right, useless)))
-    assert min(search.without_one(more), key=search.cost) == right or not np.isfinite(
+    assert min(search.drop_each(more), key=search.cost) == right or not np.isfinite(
         search.cost(more)
     )
     spring = next(key for key in right if key[0] == "return_spring:pitch")
     wrong = tuple(sorted((*(k for k in right if k != spring), useless)))
     search.least_size, kept = 0.0, search.least_size
     try:
-        exchanged = search.swaps(wrong, {})
+        exchanged = search.list_swaps(wrong, {})
     finally:
         search.least_size = kept
-        search._solved.clear()
-    assert {*names(right)} in [{*names(keys)} for keys in exchanged]
+        search._solutions.clear()
+    assert {*effect_names(right)} in [{*effect_names(keys)} for keys in exchanged]
 
 
 def test_what_makes_both_sides_of_the_equation_small_gains_nothing(search):
@@ -117,7 +120,7 @@ def test_the_fit_starts_where_the_linear_problem_ends_and_is_the_truth(session, 
 
 def test_an_effect_of_the_model_that_is_not_there_is_taken_away(session):
     recipe = bam(("quadratic_drag:yaw",))
-    start = session.fit_plainly(recipe, system_of(recipe).prior).evidence.p
+    start = fit_from_priors(session, recipe).evidence.p
     without = [n for n in session.candidate_names(recipe) if n not in (*EFFECTS, *OTHERS)]
     found = select_effects(session, recipe, start, without)
     assert {*found.final.recipe.effects} == {*EFFECTS}

@@ -5,15 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from independent_runs import record_trials
+from sessions import fit_bare
 
 from bampipe.declarations.files import effect_faults
-from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.drafts import symbolic
 from bampipe.diagnosis.drafts.columns import FormDictionary
 from bampipe.diagnosis.drafts.forms import list_quantities
 from bampipe.diagnosis.drafts.search import FormSearch
-from bampipe.diagnosis.session import Session, system_of
 from bampipe.estimate.low_pass import low_pass_at
 from bampipe.files import toml_text
 
@@ -21,10 +19,7 @@ from bampipe.files import toml_text
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
     """The arm's yaw, the model fitted to it, and the same with a force that two axes shape."""
-    trials, recipe, _ = record_trials(tmp_path_factory.mktemp("arm"), "bam", 7)
-    trials = replace(trials, motions=tuple(trials.motions))
-    session = Session(trials, Criteria(replicates=4))
-    fit = session.fit(recipe, system_of(recipe).prior)
+    session, recipe, fit = fit_bare(tmp_path_factory.mktemp("arm"), "bam", 7, replicates=4)
     force = []
     for motion, fitted in zip(fit.evidence.motions, fit.evidence.fitted, strict=True):
         q = fitted.mechanism.q
@@ -89,7 +84,7 @@ def test_what_two_axes_shape_is_found_by_symbolic_regression_alone(arm):
     form = forms.candidates[best[0]]
     text = toml_text(form.declaration("a test"))
     tried, faults = effect_faults(tomllib.loads(text), "formula", recipe.model().device)
-    assert form.canonical in tried
+    assert form.canonical_name in tried
     assert faults == []
     again = forms_of(fit)
     symbolic.breed(again, fit.problem)

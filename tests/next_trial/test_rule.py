@@ -1,17 +1,19 @@
 """Next and its table judge as the diagnosis does: by its search, its record and its criteria."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from diagnosis.sessions import TRUTH, bam, made
 
-from bampipe.diagnosis.criteria import Criteria, most_probable
+from bampipe.diagnosis.criteria import Criteria, cap_probability
 from bampipe.diagnosis.dictionary import Dictionary, Key
-from bampipe.diagnosis.probability import chance_of, least_gain
+from bampipe.diagnosis.probability import compute_p_value, find_required_gain
 from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.search import Search
+from bampipe.diagnosis.select import make_columns
 from bampipe.diagnosis.session import Fit, Session, candidates_of, system_of
 from bampipe.diagnosis.set_cost import log_prior
 from bampipe.next_trial.sensitivity import find_detectability
@@ -41,7 +43,9 @@ def search_beside(fit: Fit, residual, known: Search | None = None) -> Search:
     y = tuple(r * root for r, root in zip(residual, fit.likelihood.root, strict=True))
     problem = replace(fit.likelihood.pose_problem(fit.evidence), y=y)
     atoms = known.atoms if known is not None else {}
-    return Search(problem, dictionary, dictionary.make_all, CRITERIA, atoms)
+    return Search(
+        problem, dictionary, partial(make_columns, dictionary=dictionary), CRITERIA, atoms
+    )
 
 
 def key_of(dictionary: Dictionary, name: str, values) -> Key:
@@ -49,7 +53,7 @@ def key_of(dictionary: Dictionary, name: str, values) -> Key:
     item, shape = dictionary.candidates[name], []
     shares = np.linspace(0.0, 1.0, 401)
     for limits, place in zip(dictionary.ranges[name], item.searched_indices, strict=True):
-        at = np.array([limits.value_at(limits.within(share)) for share in shares])
+        at = np.array([limits.value_at(limits.interpolate(share)) for share in shares])
         shape.append(float(shares[np.argmin(np.abs(at - values[place]))]))
     return name, tuple(shape)
 
@@ -57,7 +61,7 @@ def key_of(dictionary: Dictionary, name: str, values) -> Key:
 def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_it(session, fit):
     detectability = find_detectability(session, fit)
     found = {one.alternative.name: one for one in detectability.limits}
-    assert detectability.needed == least_gain(CRITERIA, ()) - log_prior(
+    assert detectability.needed == find_required_gain(CRITERIA, ()) - log_prior(
         CRITERIA, len(session.candidate_names(fit.recipe))
     )
     noise, scale = fit.likelihood.noise, detectability.comparison.scale
@@ -74,10 +78,10 @@ def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_
         shares = []
         for share in (0.5, 1.3):
             is_found = []
-            for replay in range(CRITERIA.replicates):
+            for replicate in range(CRITERIA.replicates):
                 residual = [
                     bias
-                    + np.sqrt(scale[axis]) * (noise.residuals[axis][replay] - bias)
+                    + np.sqrt(scale[axis]) * (noise.residuals[axis][replicate] - bias)
                     - share * (atom.columns[axis] @ strength if axis in atom.columns else 0.0)
                     for axis, bias in enumerate(noise.bias)
                 ]
@@ -91,13 +95,13 @@ def test_the_search_finds_an_effect_at_the_smallest_strength_and_not_at_half_of_
 @pytest.mark.parametrize("count", [12, 400])
 def test_what_is_needed_is_what_the_rule_of_the_diagnosis_takes(count):
     by_chance = np.random.default_rng(0).gumbel(-3.0, 2.0, count)
-    least = least_gain(CRITERIA, by_chance)
+    least = find_required_gain(CRITERIA, by_chance)
     for gain, is_missing in ((least - 0.01, False), (least + 0.01, True)):
-        surely = most_probable(chance_of(gain, by_chance)) >= CRITERIA.probability
+        surely = cap_probability(compute_p_value(gain, by_chance)) >= CRITERIA.probability
         assert (surely and gain > np.log(9.0)) == is_missing
-    assert least_gain(CRITERIA) == pytest.approx(np.log(9.0))
-    # No dozen of replays makes anything that sure.
-    assert least_gain(Criteria(probability=0.9999), by_chance) == np.inf
+    assert find_required_gain(CRITERIA) == pytest.approx(np.log(9.0))
+    # No dozen of replicates makes anything that sure.
+    assert find_required_gain(Criteria(probability=0.9999), by_chance) == np.inf
 
 
 def made_diagnosis(sets, verdict="undecided") -> SimpleNamespace:

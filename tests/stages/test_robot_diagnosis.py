@@ -25,7 +25,7 @@ def run_arm(
 
 
 @pytest.mark.long
-def test_a_spring_that_the_model_lacks_carries_no_replay_away(tmp_path: Path) -> None:
+def test_a_spring_that_the_model_lacks_carries_no_replicate_away(tmp_path: Path) -> None:
     run = run_arm(tmp_path, 31, "ZY", {"return_spring:base_yaw": 4.0})
     axes = read_json(run.path("models/base/validate.json"))["axes"]
     for axis, entry in axes.items():
@@ -49,7 +49,7 @@ def test_a_drive_that_is_late_or_read_late_is_named(
     fitted = best["parameters"][f"{effect}.torque_shoulder.delay"]
     assert fitted == pytest.approx(abs(truth), rel=0.1)
     shoulder = found["axes"]["shoulder"]
-    # Friction jumps between other samples of the log than of the position, in replays, too.
+    # Friction jumps between other samples of the log than of the position, in replicates, too.
     assert 0.9 < shoulder["rmse_after"] / shoulder["noise_floor"] < 1.1
 
 
@@ -70,7 +70,7 @@ def test_beside_the_delay_of_one_drive_the_others_keep_their_timing(tmp_path: Pa
 
 
 @pytest.mark.long
-def test_joints_that_stick_are_held_against_replays_that_do(tmp_path: Path) -> None:
+def test_joints_that_stick_are_held_against_replicates_that_do(tmp_path: Path) -> None:
     run = run_arm(tmp_path, 33, "ZY", {}, soft_hz=4.0, noise=0.01, rate_hz=250.0)
     found = read_json(run.path("models/base/validate.json"))
     assert {entry["standing"] for entry in found["axes"].values()} == {"at_floor"}

@@ -1,1 +1,1 @@
-"""A formula for what no effect of the library explains: searched, held against chance, fitted."""
+"""Drafts of formulas for a residual that no effect of the library explains."""

@@ -1,7 +1,7 @@
-"""Forms as candidates: what each adds to the residual along the course of the trials.
+"""Forms as candidates, with the columns that they add to the residual.
 
-A `FormDictionary` stands where a `Dictionary` of compiled effects does. Nothing is compiled:
-columns are made at a few times the rate of the thinned residual, and pass the same low-pass.
+A `FormDictionary` has the interface of a `Dictionary` of compiled effects, but compiles nothing.
+Its columns are computed at a few times the rate of the thinned residual and low-passed like it.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,31 +30,31 @@ from bampipe.trials.evidence import Evidence
 from bampipe.trials.likelihood import Samples
 
 _FINER = 5
-"""Times the thinned rate at which columns are made, at least."""
+"""Smallest ratio of the rate at which columns are computed to the thinned rate."""
 _RANGE = (0.002, 0.998)
-"""Quantiles of a coordinate between which it is said to vary."""
+"""Quantiles that define the range of a quantity."""
 _LENGTHS = (0.02, 0.6, 6)
-"""Of the range, from, to, how many."""
+"""Grid of lengths, as shares of the range: smallest, largest, number."""
 _LAGS = 12
 _PLACES_APART = 0.05
-"""Of the range, for shapes without a length of their own."""
+"""Distance of neighbouring places of shapes without a length, as a share of the range."""
 _NEAREST = 1.3
-"""Distance of neighbouring places, in lengths of the shape."""
+"""Distance of neighbouring places of other shapes, in lengths of the shape."""
 _WAVES_APART = 0.4
-"""Between neighbouring wavenumbers, in waves on the range: they still resemble each other."""
+"""Distance of neighbouring wavenumbers, in waves on the range; they are still correlated."""
 _PARTS_OF_A_WAVE = (0.25, 0.4, 0.6, 0.8)
 _MOST_WAVES, _MOST_WAVES_IN_TIME = 30.0, 300.0
 _LOAD, _APPLIED = "load", "applied"
-"""Of the signals: what drives the axis, without and with its sign."""
+"""Names of the signals of the applied force, without and with its sign."""
 
 
 class FormDictionary:
     """The forms that may act on one axis, beside one fitted model.
 
     Attributes:
-        samples: of the evidence that count; axis: number of the coordinate.
+        samples: samples of the evidence that count; axis: index of the coordinate.
         candidates: forms by name.
-        starts: of candidates that have no grid, the searched constants to begin with.
+        starts: initial constants of candidates without a grid.
     """
 
     def __init__(self, evidence: Evidence, samples: Sequence[Samples], axis: int) -> None:
@@ -63,9 +63,9 @@ class FormDictionary:
         self.starts: dict[str, Mapping[str, float]] = {}
 
     def add_grammar(self, curves: bool = False, left: Array | None = None) -> None:
-        """Add every form of the grammar, or ``curves`` through points in place of formulas.
+        """Add every form of the grammar, or ``curves`` through points instead of formulas.
 
-        These belong where the residual ``left`` (n,) of the axis is.
+        The residual ``left`` (n,) of the axis limits the ranges of curves.
         """
         spans = self.spans
         if left is not None:
@@ -84,16 +84,16 @@ class FormDictionary:
                         device.coordinates[self.axis], self.axis, factor, SHAPES[shape], quantity,
                         spans[quantity.words], self.times, self.scales.get(factor, 1.0),
                     )  # fmt: skip
-                    self.candidates[form.canonical] = form
+                    self.candidates[form.canonical_name] = form
 
     def grid(self, name: str) -> list[Key]:
-        """The shapes of a form at which its columns are made to begin with."""
+        """Return the initial shapes of a form."""
         form = self.candidates[name]
         points = [self.starts[name]] if name in self.starts else self._points(form)
         return [self.key(name, point) for point in points]
 
     def key(self, name: str, searched: Mapping[str, float]) -> Key:
-        """A form at given values of its searched constants."""
+        """Return the key of a form at given values of its searched constants."""
         shape = []
         for constant, low, high, by_ratio in self._ranges(name):
             ends = [low, float(np.clip(searched[constant], low, high)), high]
@@ -102,34 +102,34 @@ class FormDictionary:
         return name, tuple(shape)
 
     def values(self, key: Key) -> dict[str, float]:
-        """The searched constants of a form at one shape."""
+        """Return the searched constants of a form at one shape."""
         return {
             constant: float(low * (high / low) ** u if by_ratio else low + u * (high - low))
             for u, (constant, low, high, by_ratio) in zip(key[1], self._ranges(key[0]), strict=True)
         }
 
     def _ranges(self, name: str) -> list[tuple[str, float, float, bool]]:
-        """Searched constants with the ends of their ranges, and whether to step by ratios."""
+        """Return searched constants, the ends of their ranges, and whether to step by ratios."""
         form = self.candidates[name]
         by_ratio = ("length", "time", "wavenumber")
         limits, kinds = form.limits().items(), form.shape.searched
         return [(n, low, high, kinds[n] in by_ratio) for n, (low, high, _) in limits]
 
     def bounds(self, name: str) -> list[tuple[float, float]]:
-        """Of each strength of a form: a file states none."""
+        """Return the bounds of each strength of a form, which are infinite."""
         return [(-np.inf, np.inf)] * len(self.candidates[name].shape.strengths)
 
     def spreads(self, name: str) -> list[float]:
-        """Standard deviation of each strength before any data: of what drives the axis."""
+        """Return the prior standard deviation of each strength, that of the applied force."""
         form = self.candidates[name]
         size = self._sizes[form.coordinate.words if form.factor == READING else _LOAD]
         return [max(size, 1e-300)] * len(form.shape.strengths)
 
     def make(self, key: Key) -> Atom | None:
-        """Columns of a form at one shape; None where it does nothing in these trials."""
+        """Compute a form at one shape; None if it has no effect in these trials."""
         form, searched = self.candidates[key[0]], self.values(key)
         constants = form.constants_at(searched, 1.0 / self._rate_hz)
-        # An error of a reading acts wherever the force does.
+        # An error of a reading acts on every axis that the force drives.
         axes = range(len(self.samples)) if form.factor == READING else [self.axis]
         rows: dict[int, list[Array]] = {axis: [] for axis in axes}
         slopes: dict[int, list[Array]] = {axis: [] for axis in axes}
@@ -141,7 +141,7 @@ class FormDictionary:
                 lever = self._lever(form, axis, i) / form.scale
                 acting = values * lever
                 if form.factor == INERTIA:
-                    # By Lagrange's equation of the kinetic energy.
+                    # Lagrange's equation for the kinetic energy.
                     turning = (
                         np.gradient(values, axis=0) * self._rate_hz * self._signals[DAMPING][i]
                     )
@@ -161,12 +161,8 @@ class FormDictionary:
         }
         return Atom(found, by_force, np.ones(len(self.samples)))
 
-    def make_all(self, keys: Iterable[Key]) -> list[tuple[Key, Atom | None]]:
-        """`make` each."""
-        return [(key, self.make(key)) for key in keys]
-
-    def thinned(self, words: str) -> Array:
-        """A coordinate where the residual is, low-passed as that is, (n,)."""
+    def thin(self, words: str) -> Array:
+        """Return a quantity, low-passed like the residual and at its samples, (n,)."""
         cutoff = float(self.evidence.band.cutoff_hz[self.axis])
         found = [
             low_pass_at(signal, cutoff, self._rate_hz, kept)[:, 0]
@@ -175,8 +171,8 @@ class FormDictionary:
         return np.asarray(np.concatenate(found)[self.samples[self.axis].rows])
 
     def _where_left(self, words: str, span: Span, left: Array) -> Span:
-        """The part of the range of a coordinate that holds nearly all of a residual."""
-        at = self.thinned(words)
+        """Return the part of the range of a quantity that contains nearly all of a residual."""
+        at = self.thin(words)
         order = np.argsort(at, kind="stable")
         mass = np.cumsum(left[order] ** 2)
         ends = np.searchsorted(mass, mass[-1] * np.array([0.005, 0.995]))
@@ -185,7 +181,7 @@ class FormDictionary:
 
     @cached_property
     def _sampling(self) -> list[tuple[slice, Indices]]:
-        """By trial: the samples at which columns are made, and which of these are kept."""
+        """Samples at which columns are computed, and which of them are kept, by trial."""
         band = self.evidence.band
         fits = [d for d in range(1, band.step + 1) if band.step % d == 0]
         every = max(d for d in fits if d * _FINER <= band.step or d == 1)
@@ -209,7 +205,7 @@ class FormDictionary:
 
     @cached_property
     def _signals(self) -> dict[str, list[Array]]:
-        """The coordinates by words, and velocity and acceleration of the axis, each (T, 1)."""
+        """Quantities by their words, and velocity and acceleration of the axis, each (T, 1)."""
         e, axis = self.evidence, self.axis
         system, device = e.system, e.system.model.device
         found: dict[str, list[Array]] = {}
@@ -247,14 +243,14 @@ class FormDictionary:
         return found
 
     def _lever(self, form: Form, axis: int, trial: int) -> Array:
-        """What the shape of a form is multiplied by on an axis, (T, 1)."""
+        """Return the factor on the shape of a form on an axis, (T, 1)."""
         if form.factor == READING:
             component = self.evidence.system.model.device.forces.index(form.coordinate.channel)
             return -self._pulls[trial][:, axis, [component]]
         return np.ones((1, 1)) if form.factor == FORCE else self._signals[form.factor][trial]
 
     def _by_forces(self, form: Form, trial: int, kept: Indices) -> Array:
-        """Slope of what a form follows by the measured forces, (K, n_forces, 1)."""
+        """Return the slope of a form's quantity by the measured forces, (K, n_forces, 1)."""
         forces = self.evidence.system.model.device.forces
         if form.factor == READING:
             return np.array([[[float(f == form.coordinate.channel)] for f in forces]])
@@ -263,7 +259,7 @@ class FormDictionary:
 
     @cached_property
     def spans(self) -> dict[str, Span]:
-        """The range of each coordinate that varies."""
+        """The range of each quantity that varies."""
         words = [c.words for c in list_quantities(self.evidence.system.model.device, self.axis)]
         ends = {n: np.quantile(np.concatenate(self._signals[n]), _RANGE) for n in words}
         return {n: Span(float(a), float(b)) for n, (a, b) in ends.items() if b - a > 1e-9}
@@ -284,38 +280,33 @@ class FormDictionary:
         return Span(float(np.median(np.diff(trials[0]))), max(float(np.ptp(t)) for t in trials))
 
     def _points(self, form: Form) -> list[dict[str, float]]:
-        """Values of the searched constants of a form to try."""
+        """Return the grid of the searched constants of a form."""
         span, names = form.span, tuple(form.shape.searched)
-        lengths = span.width * np.geomspace(*_LENGTHS)
-        points: Iterable[Sequence[float]] = [()]
-        if names == ("place", "width"):
-            points = [(at, width) for width in lengths for at in _places(span, width)]
-        elif names == ("place",):
-            points = product(_places(span, _PLACES_APART * span.width))
-        elif names == ("width",):
-            points = product(lengths)
-        elif names == ("width", "longer"):
-            points = combinations(lengths, 2)
-        elif names == ("lag",):
-            points = product(np.geomspace(4.0 * self.times.low, self.times.high, _LAGS))
-        elif names == ("wavenumber",):
-            most = _MOST_WAVES
-            if form.coordinate.quantity == "time":
-                cutoff = float(self.evidence.band.cutoff_hz[self.axis])
-                most = min(span.width * cutoff, _MOST_WAVES_IN_TIME)
-            waves = [*_PARTS_OF_A_WAVE, *np.arange(1.0, max(most, 2.0), _WAVES_APART)]
-            points = product(2.0 * np.pi * np.array(waves) / span.width)
-        return [dict(zip(names, map(float, point), strict=True)) for point in points]
+        lengths, most = span.width * np.geomspace(*_LENGTHS), _MOST_WAVES
+        if form.coordinate.quantity == "time":
+            cutoff = float(self.evidence.band.cutoff_hz[self.axis])
+            most = min(span.width * cutoff, _MOST_WAVES_IN_TIME)
+        waves = [*_PARTS_OF_A_WAVE, *np.arange(1.0, max(most, 2.0), _WAVES_APART)]
+        grids: dict[tuple[str, ...], Iterable[Sequence[float]]] = {
+            (): [()],
+            ("place",): product(_places(span, _PLACES_APART * span.width)),
+            ("place", "width"): [(at, w) for w in lengths for at in _places(span, w)],
+            ("width",): product(lengths),
+            ("width", "longer"): combinations(lengths, 2),
+            ("lag",): product(np.geomspace(4.0 * self.times.low, self.times.high, _LAGS)),
+            ("wavenumber",): product(2.0 * np.pi * np.array(waves) / span.width),
+        }
+        return [dict(zip(names, map(float, point), strict=True)) for point in grids[names]]
 
 
 def _places(span: Span, length: float) -> Array:
-    """Places along a span, near enough that none of that length is missed."""
+    """Return places along a span, close enough for a shape of the given length."""
     count = max(4, int(np.ceil(span.width / (_NEAREST * length))))
     return np.asarray(span.low + span.width * (np.arange(count) + 0.5) / count)
 
 
 def _slopes(values: Array, x: Array) -> Array:
-    """Slope along a trial of columns (T, m) by what they follow, (T,)."""
+    """Return the slopes of columns (T, m) along a trial by their quantity, (T,)."""
     rate = np.gradient(x)[:, None]
     moves = np.abs(rate) > 1e-9 * max(float(np.ptp(x)), 1e-300)
     return np.divide(np.gradient(values, axis=0), rate, out=np.zeros_like(values), where=moves)

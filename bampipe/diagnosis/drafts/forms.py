@@ -1,6 +1,6 @@
-"""What a draft may say: a factor times a shape of one coordinate, each constant with its unit.
+"""The grammar of drafts: a form is a factor times a shape of one quantity.
 
-A form is a few words of a grammar, and an effect file like any other once its numbers are found.
+With estimates of its constants, a form is an effect file like any other.
 """
 
 import re
@@ -29,8 +29,8 @@ FACTORS: Mapping[Factor, str] = {
     READING: "f - ({shape})",
 }
 
-# What each factor may follow, by the quantity and whose it is; what the library has is not
-# drafted again: springs and stops, rippling friction, drag, friction by load or by pose.
+# Shapes by quantity, by whether it belongs to the axis itself, and by factor. Effects of the
+# library are left out: springs and stops, rippling friction, drag, friction by load or by pose.
 _CURVES = ("parabola", "cubic", "bump", "snag", "step")
 _MEMORY = ("hysteresis", "two_hystereses")
 GRAMMAR: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
@@ -62,32 +62,31 @@ CURVED: Mapping[tuple[str, bool, Factor], tuple[str, ...]] = {
     for quantity, own in (("position", True), ("position", False), ("speed", True))
     for factor in (FORCE, FRICTION)
 }
-"""Where a curve may be put in place of a formula."""
+"""Curves through points instead of formulas."""
 _ACTS_AND_SHOWS = {
     FORCE: ("A force on the axis", "the same in both directions of motion"),
     FRICTION: ("Friction on the axis", "opposite in the two directions of motion"),
     DAMPING: ("Damping on the axis", "in proportion to velocity"),
     INERTIA: ("Inertia on the axis", "in proportion to acceleration"),
-    READING: ("An error of the sensor", "as an error of what the force is read to be"),
+    READING: ("An error of the sensor", "as an error of the measured force"),
 }
 
 
 _NEAR = 2
-"""Axes whose motion may matter, in the order of the coordinates; see `effect.pairs`."""
+"""Largest distance of another axis in the order of the coordinates; see `effect.pairs`."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity that a residual may follow.
+    """A quantity on which a residual may depend.
 
     Attributes:
-        words: name in a sentence, such as ``position``, ``extension speed``.
-        text: in an expression of an effect.
-        quantity: ``position``, ``speed``, ``velocity``, ``direction``, ``load``, ``time``,
-            ``command`` (of a brake or of an input that is no force), ``reading`` (of a force).
-        axis: number of the coordinate that it is of; of the axis itself where of no other.
-        unit: SI.
-        channel: of a command or a reading, where it is logged.
+        words: name in a sentence, such as ``position`` or ``extension speed``.
+        text: name in the expression of an effect.
+        quantity: kind: ``position``, ``speed``, ``velocity``, ``direction``, ``load``, ``time``,
+            ``command`` (to a brake or another input that is no force) or ``reading`` (of a force).
+        axis: index of its coordinate, by default the axis of the residual.
+        channel: logged channel of a command or a reading.
     """
 
     words: str
@@ -99,7 +98,7 @@ class Quantity:
 
     @property
     def name(self) -> str:
-        """Its words as part of a name."""
+        """Words as part of a name."""
         return self.words.removesuffix(" command").replace(" ", "_")
 
 
@@ -112,17 +111,17 @@ class Span:
 
     @property
     def width(self) -> float:
-        """From end to end."""
+        """Distance of the ends."""
         return self.high - self.low
 
     @property
     def middle(self) -> float:
-        """Half-way."""
+        """Middle of the range."""
         return 0.5 * (self.low + self.high)
 
 
 def list_quantities(device: Device, axis: int) -> tuple[Quantity, ...]:
-    """What the residual of ``axis`` may follow."""
+    """Return the quantities on which the residual of ``axis`` may depend."""
     own, brake = device.coordinates[axis], device.brakes.get(device.coordinates[axis].name)
     found = [
         Quantity("position", "q", "position", axis, own.unit),
@@ -152,15 +151,15 @@ def list_quantities(device: Device, axis: int) -> tuple[Quantity, ...]:
 
 @dataclass(frozen=True)
 class Form:
-    """A factor times a shape of a coordinate, acting on one axis.
+    """A factor times a shape of a quantity, acting on one axis.
 
     Attributes:
-        axis: that it acts on, and its number.
-        factor, shape, coordinate: its words.
-        span: of the coordinate in the trials; times: time between samples and of a trial, s.
-        scale: of the factor: the highest speed or acceleration of the axis; 1 for others.
-        beside: other quantities that it follows, ``x2``, ``x3`` in its shape, and their spans.
-        prefix: of its name, where a model has two terms of one form.
+        axis, number: axis that it acts on, and its index.
+        coordinate, span: quantity that it depends on, and its range in the trials.
+        times: time between samples, and duration of a trial, s.
+        scale: highest speed or acceleration of the axis if that is the factor, else 1.
+        other_quantities: further quantities, ``x2``, ``x3`` in the shape, and their ranges.
+        prefix: prefix of its name if a model has two terms of one form.
     """
 
     axis: Axis
@@ -171,13 +170,13 @@ class Form:
     span: Span
     times: Span
     scale: float
-    beside: tuple[tuple[Quantity, Span], ...] = ()
+    other_quantities: tuple[tuple[Quantity, Span], ...] = ()
     prefix: str = ""
 
     @property
     def quantities(self) -> tuple[tuple[Quantity, Span], ...]:
-        """Everything that it follows, with the spans."""
-        return ((self.coordinate, self.span), *self.beside)
+        """All quantities that it depends on, with their ranges."""
+        return ((self.coordinate, self.span), *self.other_quantities)
 
     @property
     def name(self) -> str:
@@ -186,41 +185,41 @@ class Form:
             return f"{self.prefix}{self.shape.name}_of_reading"
         head = self.prefix + ("" if self.factor == FORCE else f"{self.factor}_")
         tail = "" if self.is_own else f"_on_{self.axis.name}"
-        by = "" if self.beside else f"_by_{self.coordinate.name}"
+        by = "" if self.other_quantities else f"_by_{self.coordinate.name}"
         return f"{head}{self.shape.name}{by}{tail}"
 
     @property
     def is_own(self) -> bool:
-        """Whether it speaks of its own axis only, so that its file fits any axis."""
+        """Whether it involves one axis only, so that its file fits any axis."""
         own = all(quantity.axis == self.number for quantity, _ in self.quantities)
         return own and self.factor != READING
 
     @property
     def target(self) -> str:
-        """Axis or force component that its file is placed on; empty where it names its axes."""
+        """Axis or force component that its file applies to; empty if the file names its axes."""
         if self.factor == READING:
             return self.coordinate.words.removesuffix(" reading")
         return self.axis.name if self.is_own else ""
 
     @property
-    def canonical(self) -> str:
-        """Its name as a model has it."""
+    def canonical_name(self) -> str:
+        """Name in a model, ``name:target``."""
         return f"{self.name}:{self.target}" if self.target else self.name
 
     @property
     def unit(self) -> str:
-        """Of its strengths."""
+        """Unit of the strengths."""
         return self.coordinate.unit if self.factor == READING else self.axis.torque_unit
 
     @property
     def parameters(self) -> dict[str, str]:
-        """Names in a model of what is estimated, strengths first, by their short names."""
-        head = self.canonical.replace(":", ".")
+        """Names of the estimated parameters in a model, strengths first, by short name."""
+        head = self.canonical_name.replace(":", ".")
         return {n: f"{head}.{n}" for n in (*self.shape.strengths, *self.shape.searched)}
 
     @property
     def expression(self) -> str:
-        """The torque as an effect file writes it; the kinetic energy where it is an inertia."""
+        """Expression of an effect file: the torque, or the kinetic energy of an inertia."""
         rate = "qd" if self.is_own else f"qd_{self.axis.name}"
         shape = self._of_coordinate(self.shape.text)
         return FACTORS[self.factor].format(shape=shape, rate=rate)
@@ -229,7 +228,7 @@ class Form:
         def written(found: re.Match[str]) -> str:
             quantity, _ = self.quantities[_number_of(found[0])]
             if not self.is_own and quantity.axis == self.number:
-                # A file that names its axes has no axis of its own.
+                # In a file that names its axes, no quantity may omit its axis.
                 known = _OF_AXIS.get(quantity.text, quantity.channel or quantity.text)
                 return known.format(axis=self.axis.name)
             return quantity.text
@@ -243,17 +242,17 @@ class Form:
 
     @property
     def summary(self) -> str:
-        """What it is, in one sentence."""
+        """Description in one sentence."""
         return f"{_ACTS_AND_SHOWS[self.factor][0]} that {self._words}"
 
     @property
     def looks_like(self) -> str:
-        """How it shows in a residual."""
-        seen = "" if self.beside else f", {_ACTS_AND_SHOWS[self.factor][1]}"
+        """Appearance in a residual."""
+        seen = "" if self.other_quantities else f", {_ACTS_AND_SHOWS[self.factor][1]}"
         return f"residual that {self._words}{seen}"
 
-    def fixed(self) -> dict[str, tuple[float, str]]:
-        """Constants that are not estimated, with their units."""
+    def fixed_constants(self) -> dict[str, tuple[float, str]]:
+        """Return the constants that are not estimated, with their units."""
         found = {}
         for name in self.shape.fixed:
             quantity, span = self.quantities[_number_of(name)]
@@ -265,20 +264,20 @@ class Form:
                 "settling": (0.5 * self.times.low, "s"),
             }
             value, unit = known[name.rstrip("0123456789")]
-            found[name] = (rounded(value), unit)
+            found[name] = (round_constant(value), unit)
         if self.factor == DAMPING:
-            found["top_speed"] = (rounded(self.scale), f"{self.axis.unit}/s")
+            found["top_speed"] = (round_constant(self.scale), f"{self.axis.unit}/s")
         if self.factor == INERTIA:
-            found["top_acceleration"] = (rounded(self.scale), f"{self.axis.unit}/s2")
+            found["top_acceleration"] = (round_constant(self.scale), f"{self.axis.unit}/s2")
         return found
 
     def constants_at(self, searched: Mapping[str, float], interval: float) -> dict[str, float]:
-        """Searched and fixed constants of its shape, and the time between samples, s."""
-        fixed = {name: value for name, (value, _) in self.fixed().items()}
+        """Return all constants of the shape, and the time between samples, s."""
+        fixed = {name: value for name, (value, _) in self.fixed_constants().items()}
         return fixed | {"interval": interval} | dict(searched)
 
     def limits(self) -> dict[str, tuple[float, float, str]]:
-        """Lower and upper bound and unit of the searched constants."""
+        """Return lower and upper bound and unit of the searched constants."""
         low, width, unit = self.span.low, self.span.width, self.coordinate.unit
         by_kind = {
             "place": (low - 0.25 * width, low + 1.25 * width, unit),
@@ -290,21 +289,21 @@ class Form:
         return {name: by_kind[kind] for name, kind in self.shape.searched.items()}
 
     def entries(self) -> dict[str, dict[str, Any]]:
-        """The parameters of its effect file, the estimates still unknown."""
+        """Return the parameters of its effect file before any estimate."""
         found: dict[str, dict[str, Any]] = {}
         for name, words in self.shape.strengths.items():
             found[name] = {
                 "unit": self.unit, "prior": 0.0, "sd": 1.0, "strength": True, "description": words,
             }  # fmt: skip
         for name, (low, high, of) in self.limits().items():
-            low, high = rounded(low), rounded(high)
-            middle = rounded(0.5 * (low + high) if low <= 0.0 else float(np.sqrt(low * high)))
+            low, high = round_constant(low), round_constant(high)
+            middle = 0.5 * (low + high) if low <= 0.0 else float(np.sqrt(low * high))
             found[name] = {
-                "unit": of, "prior": middle, "sd": rounded(0.1 * (high - low)),
-                "lower": low, "upper": high,
+                "unit": of, "prior": round_constant(middle),
+                "sd": round_constant(0.1 * (high - low)), "lower": low, "upper": high,
                 "description": KINDS_IN_WORDS[self.shape.searched[name]],
             }  # fmt: skip
-        for name, (value, of) in self.fixed().items():
+        for name, (value, of) in self.fixed_constants().items():
             found[name] = {
                 "unit": of, "prior": value, "sd": 0.0, "fixed": True,
                 "description": "scales the formula",
@@ -314,11 +313,11 @@ class Form:
     def declaration(
         self, source: str, entries: Mapping[str, Mapping[str, Any]] | None = None
     ) -> dict[str, Any]:
-        """The effect file; source: where it comes from; entries: its parameters, else `entries`."""
+        """Return the content of its effect file, with parameters ``entries`` or else `entries`."""
         parameters: dict[str, Any] = {}
         for key, entry in (entries or self.entries()).items():
             numbers = {k: value for k, value in entry.items() if k != "description"}
-            # The unit of an axis' own motion is that of its kind.
+            # An axis has the units of its kind, rotational or linear.
             held = {self.axis.kind: numbers} if self.is_own else numbers
             parameters[key] = {"description": entry["description"], **held}
         scope = "axis" if self.is_own else "device"
@@ -354,24 +353,24 @@ class Form:
 
 _OF_AXIS = {"q": "{axis}", "qd": "qd_{axis}", "sgn(qd)": "sgn(qd_{axis})", "load": "load_{axis}"}
 _LARGEST = 50.0
-"""Pure number in a formula: its quantities are ratios."""
+"""Largest pure number in a formula, whose quantities are ratios."""
 
 
 def _number_of(name: str) -> int:
-    """Which quantity of a form a name such as ``x``, ``x2``, ``middle2`` is of, from 0."""
+    """Return the index of the quantity of a name such as ``x``, ``x2`` or ``middle2``."""
     digits = name[len(name.rstrip("0123456789")) :]
     return int(digits) - 1 if digits else 0
 
 
 KINDS_IN_WORDS = {
-    "place": "where it is",
-    "length": "how far it reaches",
-    "time": "time in which it follows",
-    "number": "number of the formula",
-    "wavenumber": "2 pi over the distance between two ripples",
+    "place": "position",
+    "length": "width",
+    "time": "time constant",
+    "number": "pure number of the formula",
+    "wavenumber": "2 pi over the distance of two ripples",
 }
 
 
-def rounded(value: float) -> float:
-    """Six digits: enough for any constant, and the same on every machine."""
+def round_constant(value: float) -> float:
+    """Round to six digits, so that a constant is the same on every machine."""
     return float(f"{value:.6g}")

@@ -1,14 +1,14 @@
-"""The search for a formula on one axis: forms weighed as effects are, held against chance, fitted.
+"""The search for a formula on one axis.
 
-A form is a candidate of a `Search` like an effect of the library: the same likelihood, the same
-penalties, the same log evidence in nats. Every form passes the grid of its shapes; the best are
-refined, and the best of these fitted with all parameters of the model.
+A form is a candidate of a `Search` like an effect of the library, with the same log evidence. Of
+all forms on grids, the best are refined, and the best of these fitted with the whole model.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -19,29 +19,26 @@ from bampipe.diagnosis.dictionary import Dictionary, Key
 from bampipe.diagnosis.drafts import symbolic
 from bampipe.diagnosis.drafts.columns import FormDictionary
 from bampipe.diagnosis.drafts.forms import Form
-from bampipe.diagnosis.probability import chance_of
+from bampipe.diagnosis.probability import compute_p_value
 from bampipe.diagnosis.search import Search
-from bampipe.diagnosis.select import PARTS, Progress, make_columns, start_at
-from bampipe.diagnosis.session import Fit, Session, shared, workers
+from bampipe.diagnosis.select import TASKS_PER_PROCESS, Progress, make_columns, start_at
+from bampipe.diagnosis.session import Fit, Session, worker_state, workers
 from bampipe.physics.recipe import Recipe
 from bampipe.results.draft import ChanceOfDraft
 
 MOST_TERMS = 2
-"""What is left beside two formulas is for a diagnosis of the model with them."""
+"""Largest number of formulas; any further residual is left to a diagnosis of the new model."""
 _REFINED, _FITTED = 12, 4
-"""Forms whose shapes are refined, and of those the ones that are fitted with the model."""
+"""Number of forms whose shapes are refined, and of those that are fitted with the model."""
 _TRIES = 90
-"""Evaluations in refining one."""
+"""Largest number of evaluations of a refinement."""
 _STEPS = {"place": 0.02, "length": 0.03, "time": 0.03, "wavenumber": 2e-4, "number": 0.003}
-"""Of its range: the first step in refining a shape, by kind."""
+"""First step of the refinement of a shape, as a share of its range, by kind."""
 
 
 @dataclass(frozen=True)
 class Term:
-    """A form with the values of its constants, by name, as fitted with the model.
-
-    Their covariance is in that order.
-    """
+    """A form with the fitted values of its constants, by name, and their covariance."""
 
     form: Form
     values: dict[str, float]
@@ -49,18 +46,18 @@ class Term:
 
     @property
     def sd(self) -> dict[str, float]:
-        """Standard deviations of the constants."""
+        """Standard deviations of the constants, by name."""
         spread = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         return dict(zip(self.values, map(float, spread), strict=True))
 
     def curve(self, count: int = 121) -> tuple[Array, Array, Array]:
-        """Coordinate, torque and its standard deviation along the range travelled, (count,) each.
+        """Return quantity, torque and its standard deviation along the range, (count,) each.
 
-        At full speed or acceleration where the term is in proportion to these, in the positive
-        direction of motion where it is friction, and at the upper end of what else it follows.
+        The motion is in the positive direction, at the highest speed and acceleration and at the
+        upper end of all other quantities.
         """
         x = np.linspace(self.form.span.low, self.form.span.high, count)[:, None]
-        others = [np.full((count, 1), span.high) for _, span in self.form.beside]
+        others = [np.full((count, 1), span.high) for _, span in self.form.other_quantities]
         x = np.hstack([x, *others])
         values = np.array(list(self.values.values()))
         middle, steps = self._at(x, values), np.diag(1e-4 * np.maximum(np.abs(values), 1e-9))
@@ -70,18 +67,17 @@ class Term:
 
     def _at(self, x: Array, values: Array) -> Array:
         known = dict(zip(self.values, values, strict=True))
-        columns = self.form.shape.columns(x, self.form.constants_at(known, 0.0), drawn=True)
+        columns = self.form.shape.columns(x, self.form.constants_at(known, 0.0), is_quick=True)
         return np.asarray(columns @ [known[n] for n in self.form.shape.strengths])
 
 
 @dataclass(frozen=True)
 class Option:
-    """A model with some terms, fitted.
+    """The fit of a model with some terms.
 
     Attributes:
-        terms: their forms.
-        held_out_rmse: on the axis, N.m or N.
-        log_evidence: over the model as given, nats.
+        held_out_rmse: held-out error of the axis, N.m or N.
+        log_evidence: log evidence over the given model, nats.
         recipe: the model; p: its parameters, (n_p,).
     """
 
@@ -93,21 +89,19 @@ class Option:
 
     @property
     def constants(self) -> int:
-        """How many numbers its terms have."""
+        """Number of constants of the terms."""
         return sum(len(form.parameters) for form in self.terms)
 
 
 @dataclass(frozen=True)
 class FoundDraft:
-    """What a search for a formula on one axis came to.
+    """The result of a search for a formula on one axis.
 
     Attributes:
-        terms: found, at most `MOST_TERMS`.
-        chance: of the first term, and of the next where one was looked for.
-        noise_floor: of the final model, N.m or N.
-        options: everything that was fitted, the model as given first.
-        chosen: the final model.
-        wants_formulas: whether the structured forms left much, and pyoperon is not installed.
+        chance: null distribution of each search for a term, in order.
+        noise_floor: noise floor of the final model, N.m or N.
+        options: all fits, that of the given model first; chosen: that of the final model.
+        wants_formulas: whether symbolic regression should follow, but pyoperon is not installed.
     """
 
     axis: int
@@ -124,24 +118,25 @@ class FormSearch(Search):
 
     def __init__(self, session: Session, fit: Fit, forms: FormDictionary) -> None:
         self.forms, self.fit = forms, fit
-        known = cast(Dictionary, forms)  # to a search they are alike
+        known = cast(Dictionary, forms)  # has the same interface
         keys = [key for name in forms.candidates for key in forms.grid(name)]
-        parts = PARTS * session.jobs
+        parts = TASKS_PER_PROCESS * session.jobs
         with workers(forms, session.jobs) as spread:
             made = spread(make_columns, [keys[k::parts] for k in range(parts)])
             atoms = {key: atom for part in made for key, atom in part}
-        super().__init__(fit.problem, known, forms.make_all, session.criteria, atoms)
+        make = partial(make_columns, dictionary=known)
+        super().__init__(fit.problem, known, make, session.criteria, atoms)
 
     def best_forms(self, count: int, jobs: int) -> list[Key]:
-        """The forms that gain most, their shapes refined, best first."""
+        """Return the forms that gain most, with refined shapes, best first."""
         with workers(self, jobs) as spread:
-            found = list(spread(_refine, [key for _, key in self.best_beside((), count)]))
+            found = list(spread(_refine, [key for _, key in self.rank_additions((), count)]))
         self.ensure(found)
         found = [key for key in found if self.cost((key,)) < self.cost(())]
         return sorted(found, key=lambda key: self.cost((key,)))
 
-    def refined(self, key: Key) -> Key:
-        """A form with its shape where the cost is least nearby."""
+    def refine_form(self, key: Key) -> Key:
+        """Minimise the cost of a form over its shape by the method of Nelder and Mead."""
         name, shape = key
         if not shape:
             return key
@@ -161,8 +156,8 @@ class FormSearch(Search):
 
 
 def _refine(key: Key) -> Key:
-    search: FormSearch = shared()
-    return search.refined(key)
+    search: FormSearch = worker_state()
+    return search.refine_form(key)
 
 
 def draft_formulas(
@@ -174,23 +169,22 @@ def draft_formulas(
     curves: bool = False,
     progress: Progress = lambda fraction, message: None,
 ) -> list[FoundDraft]:
-    """Search a formula for what a model leaves on each of some axes, one after the other.
+    """Search for formulas that explain the residual of a model, one axis after the other.
 
     Args:
-        start: of the model's parameters, (n_p,); axes: numbers of the coordinates.
-        source: that the effect files state.
-        curves: whether a curve through points will do, where prediction is all that is wanted.
-        progress: called with a fraction and a message.
+        start: initial parameters of the model, (n_p,); axes: indices of the coordinates.
+        source: source stated in the effect files.
+        curves: whether to draft curves through points instead, for prediction only.
 
     Raises:
-        Runaway: the model cannot be replayed.
+        Runaway: the model cannot be simulated.
     """
     found: list[FoundDraft] = []
     for k, axis in enumerate(axes):
         name = recipe.model().device.coordinates[axis].name
 
-        def tell(share: float, message: str, k: int = k, name: str = name) -> None:
-            progress((k + share) / len(axes), f"{name}: {message}")
+        def tell(fraction: float, message: str, k: int = k, name: str = name) -> None:
+            progress((k + fraction) / len(axes), f"{name}: {message}")
 
         found.append(_AxisSearch(session, axis, source, curves).run(recipe, start, tell))
         recipe, start = found[-1].chosen.recipe, found[-1].chosen.p
@@ -207,14 +201,14 @@ class _AxisSearch:
     curves: bool
 
     def run(self, recipe: Recipe, start: Array, progress: Progress) -> FoundDraft:
-        """Add terms to a model as long as one beats chance and lowers the held-out error."""
+        """Add terms to a model while one gains more than chance and lowers the held-out error."""
         bare, least = self.session.fit(recipe, start), self.session.criteria.largest_p_value
         given = Option((), self._error_of(bare), 0.0, recipe, bare.evidence.p)
         options, chances, stand = [given], [], (bare, given)
         for number in range(MOST_TERMS):
-            progress(0.05 + 0.4 * number, "holding every form against the residual")
+            progress(0.05 + 0.4 * number, "comparing every form with the residual")
             search, before = self._open(stand[0]), stand[1]
-            progress(0.15 + 0.4 * number, "searching replays for as good a formula")
+            progress(0.15 + 0.4 * number, "searching replicates for as good a formula")
             chances.append(weigh_chance(search))
             if chances[-1].p_value > least:
                 break
@@ -241,11 +235,11 @@ class _AxisSearch:
         )  # fmt: skip
 
     def _error_of(self, fit: Fit) -> float:
-        """Held-out error on the axis, N.m or N."""
+        """Return the held-out error of the axis, N.m or N."""
         return float(fit.held_out_rmse[self.axis])
 
     def _open(self, fit: Fit, bred: bool = False) -> FormSearch:
-        """A search over the forms of the grammar, or over formulas that are bred."""
+        """Open a search over the forms of the grammar, or over ``bred`` formulas."""
         forms = FormDictionary(fit.evidence, fit.likelihood.samples, self.axis)
         if bred:
             symbolic.breed(forms, fit.problem)
@@ -255,7 +249,7 @@ class _AxisSearch:
         return FormSearch(self.session, fit, forms)
 
     def _take(self, stand: tuple[Fit, Option], tried: Sequence[Option]) -> tuple[Fit, Option]:
-        """The most probable of models that lower the held-out error, fitted; else ``stand``."""
+        """Fit the most probable model that lowers the held-out error, or return ``stand``."""
         chosen = stand[1]
         lower = [o for o in tried if o.held_out_rmse < chosen.held_out_rmse]
         best = max((chosen, *lower), key=lambda option: option.log_evidence)
@@ -264,7 +258,7 @@ class _AxisSearch:
         return self.session.fit(best.recipe, best.p), best
 
     def _fit_forms(self, search: FormSearch, current: Option) -> list[Option]:
-        """The model with each of the best forms, all parameters fitted together."""
+        """Fit the model with each of the best forms, all parameters together."""
         keys = search.best_forms(_REFINED, self.session.jobs)[:_FITTED]
         terms, tasks = [], []
         for key in keys:
@@ -273,7 +267,7 @@ class _AxisSearch:
                 form = replace(form, prefix="other_")
             wider = replace(
                 current.recipe,
-                effects=(*current.recipe.effects, form.canonical),
+                effects=(*current.recipe.effects, form.canonical_name),
                 extra=(*current.recipe.extra, form.declaration(self.source)),
             )
             strengths = dict(zip(form.shape.strengths, solution.strengths[0], strict=True))
@@ -289,28 +283,26 @@ class _AxisSearch:
         for key, term, (wider, _), (cost, held_out, p) in zip(
             keys, terms, tasks, fits, strict=True
         ):
-            gain = search.fit.solved.cost - cost - search.solve((key,)).penalty
+            gain = search.fit.solution.cost - cost - search.solve((key,)).penalty
             found.append(Option(term, held_out, current.log_evidence + gain, wider, p))
         return found
 
 
 def _fit_form(task: tuple[Recipe, Array]) -> tuple[float, float, Array]:
-    """Cost and held-out error of a model with a form, and its parameters."""
-    search, noise = shared()
+    """Return cost, held-out error and parameters of the fit of a model with a form."""
+    search, noise = worker_state()
     fit = search.session.fit(*task, noise)
-    return fit.solved.cost, float(fit.held_out_rmse[search.axis]), fit.evidence.p
+    return fit.solution.cost, float(fit.held_out_rmse[search.axis]), fit.evidence.p
 
 
 def weigh_chance(search: FormSearch) -> ChanceOfDraft:
-    """Hold the gain of the best form against that on replays of the model, which lacks nothing."""
-    replays = range(search.criteria.replicates)
-    gains = tuple(search.of_replay(k).largest_gain()[0] for k in replays)
-    gain, _ = search.largest_gain()
-    return ChanceOfDraft(gain=gain, gains=gains, p_value=chance_of(gain, gains))
+    """Compare the gain of the best form with the gains on replicates of the model."""
+    gains, gain = search.replicate_gains(), search.largest_gain()[0]
+    return ChanceOfDraft(gain=gain, gains=gains, p_value=compute_p_value(gain, gains))
 
 
 def _terms(fit: Fit, option: Option) -> tuple[Term, ...]:
-    """The terms of a fitted model with values and covariance, all parameters free."""
+    """Return the terms of a fitted model with values and covariance, all parameters free."""
     e, p = fit.evidence, fit.problem
     solved = p.solve()
     normal = np.tensordot(solved.weight, p.sums()[0], 1) + p.precision

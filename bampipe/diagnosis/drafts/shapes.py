@@ -1,4 +1,4 @@
-"""Functions of one coordinate that a draft may use, with the constants that shape them.
+"""Shapes of drafts: functions of one quantity with their constants.
 
 Arguments of functions are ratios, so that every strength is a force or torque.
 """
@@ -21,32 +21,32 @@ Constants = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Memory:
-    """An internal state that follows the coordinate, in the unit of that.
+    """An internal state that follows the quantity, in the same unit.
 
     Attributes:
-        rate, initial: as an effect file writes them.
-        along: its course by that of the coordinate along a trial (T,) and the constants, (T,).
-        drawn: the same for motion that is quicker than what it remembers, upwards.
+        rate, initial: its expressions in an effect file.
+        course: its values (T,), from those of the quantity (T,) and the constants.
+        quick_course: the same for a quantity that rises too quickly for the state to relax.
     """
 
     rate: str
     initial: str
-    along: Callable[[Array, Constants], Array]
-    drawn: Callable[[Array, Constants], Array]
+    course: Callable[[Array, Constants], Array]
+    quick_course: Callable[[Array, Constants], Array]
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A function of one coordinate ``x``, linear in its strengths; or of ``x``, ``x2``, ...
+    """A function of quantities ``x``, ``x2``, ... that is linear in its strengths.
 
     Attributes:
-        name, text: as in names and in expressions, where ``x`` stands for the coordinate.
-        strengths: what it is linear in, each with what it means.
-        searched: constants that shape it, each with its kind: ``place``, ``length``,
-            ``wavenumber``, ``time``, ``number``.
-        fixed: constants that scale it and are not estimated: ``middle``, ``reach`` of the span.
-        words: what it does, of ``{x}``.
-        states: what it remembers, by name.
+        name, text: its name and its expression.
+        strengths: strengths with their descriptions.
+        searched: shape constants with their kinds: ``place``, ``length``, ``wavenumber``, ``time``
+            or ``number``.
+        fixed: constants that are not estimated, such as ``middle`` and ``reach`` of the span.
+        words: predicate about ``{x}`` in a sentence.
+        states: internal states by name.
     """
 
     name: str
@@ -57,17 +57,17 @@ class Shape:
     words: str
     states: Mapping[str, Memory] = field(default_factory=dict)
 
-    def columns(self, x: Array, constants: Constants, drawn: bool = False) -> Array:
-        """What each strength adds at one, (T, m).
+    def columns(self, x: Array, constants: Constants, is_quick: bool = False) -> Array:
+        """Return the function for each strength at one, (T, m).
 
         Args:
-            x: what it follows along a trial, (T, k).
-            constants: searched and fixed ones; with states, the ``interval`` of samples, s.
-            drawn: whether the motion is quicker than what it remembers.
+            x: quantities along a trial, (T, k).
+            constants: searched and fixed constants, and the ``interval`` of samples, s.
+            is_quick: whether the motion is too quick for the states to relax.
         """
         known = dict(constants) | {_x(k): column for k, column in enumerate(x.T)}
         for name, state in self.states.items():
-            known[name] = (state.drawn if drawn else state.along)(x[:, 0], known)
+            known[name] = (state.quick_course if is_quick else state.course)(x[:, 0], known)
         tree, nothing = _parsed(self.text), dict.fromkeys(self.strengths, 0.0)
         values = [_evaluate(tree, known | nothing | {name: 1.0}) for name in self.strengths]
         return np.column_stack([np.broadcast_to(value, len(x)) for value in values])
@@ -85,7 +85,7 @@ _FUNCTIONS: Mapping[str, Callable[..., Any]] = {
 
 
 def _evaluate(node: ast.AST, known: Constants) -> Any:
-    """The value of a checked expression."""
+    """Return the value of a checked expression."""
     match node:
         case ast.Constant(value=value):
             return float(value)  # type: ignore[arg-type]
@@ -101,28 +101,28 @@ def _evaluate(node: ast.AST, known: Constants) -> Any:
 
 
 def _x(k: int) -> str:
-    """Name of the quantity number ``k`` from 0: ``x``, ``x2``, ``x3``."""
+    """Return the name of the quantity with index ``k``: ``x``, ``x2``, ``x3``."""
     return f"x{k + 1}" if k else "x"
 
 
 def _lagged(x: Array, c: Constants, first: float) -> Array:
-    """x behind a first-order lag of ``c["lag"]``."""
+    """Apply a first-order lag of ``c["lag"]`` to ``x``."""
     keeps = np.exp(-c["interval"] / c["lag"])
     gain = 0.5 * (1.0 - keeps)
     return np.asarray(lfilter([gain, gain], [1.0, -keeps], x - first)) + first
 
 
 def _slip(name: str, play: str) -> dict[str, Memory]:
-    """The state that x drags along with a ``play``, within the time ``settling``."""
+    """Return the state that ``x`` drags along with a ``play``, within the time ``settling``."""
     rate = f"(x - {name} - clip(x - {name}, -{play}, {play}))/settling"
 
-    def along(x: Array, c: Constants) -> Array:
+    def course(x: Array, c: Constants) -> Array:
         return np.asarray(drag_along(np.ascontiguousarray(x), np.array([float(c[play])])))[:, 0]
 
-    def drawn(x: Array, c: Constants) -> Array:
+    def quick_course(x: Array, c: Constants) -> Array:
         return np.asarray(np.maximum(x - c[play], x.min() + c[play]))
 
-    return {name: Memory(rate, "x", along, drawn)}
+    return {name: Memory(rate, "x", course, quick_course)}
 
 
 _RELAXING = Memory(
@@ -131,10 +131,10 @@ _RELAXING = Memory(
 )  # fmt: skip
 _TRAILING = Memory("(x - trail)/lag", "0", lambda x, c: _lagged(x, c, 0.0), lambda x, c: x)
 KNOTS = 16
-"""Points of a curve in an effect file: an expression has no room for many more."""
-_AT_END = "what it comes to at the end of the range"
-_PER_REACH = "what it grows by over half the range"
-_LINEAR, _SQUARE = "its linear part at the end of the range", "its quadratic part there"
+"""Points of a curve; an expression of an effect file has no room for many more."""
+_AT_END = "value at the end of the range"
+_PER_REACH = "increase over half the range"
+_LINEAR, _SQUARE = "linear part at the end of the range", "quadratic part there"
 _U = "((x - middle)/reach)"
 _V = "((x - place)/width)"
 _PLACED = {"place": "place", "width": "length"}
@@ -151,19 +151,19 @@ SHAPES = {
         ),
         Shape(
             "cubic", f"slope*{_U} + bow*{_U}**2 + twist*{_U}**3",
-            {"slope": _LINEAR, "bow": _SQUARE, "twist": "its cubic part there"}, {},
+            {"slope": _LINEAR, "bow": _SQUARE, "twist": "cubic part there"}, {},
             ("middle", "reach"), "follows a cubic curve in {x}",
         ),
         Shape(
-            "bump", f"height*exp(-{_V}**2)", {"height": "at its top"}, _PLACED, (),
+            "bump", f"height*exp(-{_V}**2)", {"height": "peak value"}, _PLACED, (),
             "has a bump at one {x}",
         ),
         Shape(
-            "snag", f"height*{_V}*exp((1 - {_V}**2)/2)", {"height": "at either bump"}, _PLACED, (),
+            "snag", f"height*{_V}*exp((1 - {_V}**2)/2)", {"height": "peak value"}, _PLACED, (),
             "has opposite bumps on the two sides of one {x}",
         ),
         Shape(
-            "step", f"height*tanh{_V}", {"height": "half of the step"}, _PLACED, (),
+            "step", f"height*tanh{_V}", {"height": "half the height of the step"}, _PLACED, (),
             "changes from one level to another at one {x}",
         ),
         Shape(
@@ -177,20 +177,20 @@ SHAPES = {
         Shape(
             "dead_zone", "height*(x - clip(x, place - width, place + width))/reach",
             {"height": _PER_REACH}, _PLACED, ("reach",),
-            "is nothing within a range of {x} and grows in proportion beyond either end of it",
+            "is zero within a range of {x} and grows in proportion beyond its ends",
         ),
         Shape(
             "ripple", "sine*sin(wavenumber*x) + cosine*cos(wavenumber*x)",
-            {"sine": "in phase with the sine", "cosine": "in phase with the cosine"},
+            {"sine": "amplitude of the sine", "cosine": "amplitude of the cosine"},
             {"wavenumber": "wavenumber"}, (), "ripples with {x}",
         ),
         Shape(
-            "decay", "height*exp(-x/width)", {"height": "at zero"}, {"width": "length"}, (),
+            "decay", "height*exp(-x/width)", {"height": "value at zero"}, {"width": "length"}, (),
             "fades as {x} grows",
         ),
         Shape(
             "relaxing", "height*(x - rest)/reach",
-            {"height": "what a quick motion over half the range builds up"}, {"lag": "time"},
+            {"height": "increase by a quick motion over half the range"}, {"lag": "time"},
             ("reach",), "builds up with {x} and relaxes with time", {"rest": _RELAXING},
         ),
         Shape(
@@ -200,30 +200,30 @@ SHAPES = {
         Shape(
             "play", "height*(trail - middle)/reach", {"height": _AT_END}, {"width": "length"},
             ("middle", "reach", "settling"),
-            "follows {x} with play, up to its width behind it", _slip("trail", "width"),
+            "follows {x} with play, at most a width behind it", _slip("trail", "width"),
         ),
         Shape(
-            "hysteresis", "height*clip((x - trail)/width, -1, 1)", {"height": "what it comes to"},
+            "hysteresis", "height*clip((x - trail)/width, -1, 1)", {"height": "largest value"},
             {"width": "length"}, ("settling",),
-            "builds up as {x} turns round and stays once that has changed by twice its width",
+            "builds up after a reversal of {x} until that has changed by twice a width",
             _slip("trail", "width"),
         ),
         Shape(
             "two_hystereses",
             "short*clip((x - near)/width, -1, 1) + long*clip((x - far)/longer, -1, 1)",
-            {"short": "what the part of the shorter width comes to",
-             "long": "what the other part comes to"},
+            {"short": "largest value of the part of shorter width",
+             "long": "largest value of the other part"},
             {"width": "length", "longer": "length"}, ("settling",),
-            "builds up in two parts as {x} turns round, each of which stays once that has changed "
-            "by twice its width",
+            "builds up in two parts after a reversal of {x}, each until that has changed by twice "
+            "its width",
             _slip("near", "width") | _slip("far", "longer"),
         ),
         Shape(
             "curve",
             " + ".join(f"h{k}*max(1 - abs((x - start)/spacing - {k}), 0)" for k in range(KNOTS)),
-            {f"h{k}": f"at point {k + 1} of {KNOTS}" for k in range(KNOTS)}, {},
+            {f"h{k}": f"value at point {k + 1} of {KNOTS}" for k in range(KNOTS)}, {},
             ("start", "spacing"),
-            f"is a curve through {KNOTS} points along {{x}}; it is no formula",
+            f"is a curve through {KNOTS} points along {{x}}, not a formula",
         ),
     )
 }  # fmt: skip

@@ -1,8 +1,8 @@
-"""Symbolic regression of a residual: formulas in several quantities, of any form.
+"""Symbolic regression of a residual: formulas of any form in several quantities.
 
-pyoperon, an optional library, breeds expressions of ratios of the axis' quantities. Multiplied out,
-each is a sum of products whose leading factors are forces and whose other numbers are pure: a
-`Form` like any other, with itself less each of its parts beside it.
+The optional library pyoperon breeds expressions in ratios of the axis' quantities. After expansion,
+an expression is a sum of products whose coefficients are forces. It becomes a `Form`, and so do
+shorter sums of its products.
 """
 
 import importlib
@@ -22,12 +22,12 @@ from bampipe.physics.expression import build, parse
 from bampipe.trials.likelihood import Problem
 
 EXTRA = "formulas"
-"""The extra of bampipe that brings pyoperon."""
+"""Extra of bampipe that installs pyoperon."""
 _FOLLOWED = ("position", "velocity", "direction", "command")
-"""Quantities that a formula may hold: no force, for one that cancels the measured force explains
-anything; time has structured forms."""
+"""Quantities of formulas. A formula in a measured force could cancel that force, and time has
+structured forms."""
 _ROUNDS = 2
-"""Searches, each for what is left beside what the model's own parameters take of the last one."""
+"""Number of searches; the model's own parameters adapt to each formula before the next."""
 _MOST_SAMPLES = 1000
 _BREEDING = {
     "allowed_symbols": "add,sub,mul,constant,variable,sin,exp,tanh,abs,square",
@@ -37,16 +37,16 @@ _BREEDING = {
 _MOST_CONSTANTS = 8
 _DIGITS = 6
 _NEGLIGIBLE = 0.01
-"""Of the largest coefficient of a sum; below it a part is left out: its quantities are ratios."""
+"""Share of the largest coefficient of a sum below which a product is left out."""
 
 
 def is_available() -> bool:
-    """Whether pyoperon is installed."""
+    """Return whether pyoperon is installed."""
     return find_spec("pyoperon") is not None
 
 
 def breed(forms: FormDictionary, problem: Problem) -> None:
-    """Add formulas for what a model leaves on the axis of ``forms``, (n,) of ``problem``."""
+    """Add formulas for the residual of ``problem`` on the axis of ``forms``."""
     device, axis = forms.evidence.system.model.device, forms.axis
     known = [
         q
@@ -68,14 +68,14 @@ def breed(forms: FormDictionary, problem: Problem) -> None:
 
 
 def _ratios(forms: FormDictionary, quantity: Quantity) -> Array:
-    """A quantity over its reach where the residual is, (n,), low-passed as that is."""
+    """Return a quantity over its reach, low-passed like the residual, (n,)."""
     span = forms.spans[quantity.words]
     middle = span.middle if quantity.quantity == "position" else 0.0
-    return (forms.thinned(quantity.words) - middle) / (0.5 * span.width)
+    return (forms.thin(quantity.words) - middle) / (0.5 * span.width)
 
 
 def _breed_expressions(wanted: Array, base: Array, x: Array) -> list[str]:
-    """Expressions of ``x`` (n, k) for ``wanted`` (n,) beside ``base`` (n, P)."""
+    """Return expressions in ``x`` (n, k) for ``wanted`` (n,) beside ``base`` (n, P)."""
     breeder = importlib.import_module("pyoperon.sklearn").SymbolicRegressor
     some = slice(None, None, -(-len(x) // _MOST_SAMPLES))
     taken = base @ np.linalg.pinv(base)
@@ -86,15 +86,15 @@ def _breed_expressions(wanted: Array, base: Array, x: Array) -> list[str]:
         regressor.fit(x[some], sought[some])
         front = sorted(regressor.pareto_front_, key=lambda entry: entry["complexity"])
         found += [regressor.get_model_string(entry["tree"], _DIGITS) for entry in front]
-        # What the model's own parameters took of the formula belongs to it.
+        # The model's own parameters had absorbed part of the formula.
         sought = left + taken @ regressor.predict(x)
     return found
 
 
 def _read(text: str, count: int) -> dict[Any, float]:
-    """The products of a bred expression in ``X1``, ... with their coefficients; 1 for its constant.
+    """Return the products of a bred expression in ``X1``, ... with their coefficients.
 
-    Nothing where it holds numbers beyond any meaning.
+    The constant has the product 1. An expression with meaningless numbers has no products.
     """
     import sympy as sp
 
@@ -112,7 +112,7 @@ def _read(text: str, count: int) -> dict[Any, float]:
 
 
 def _choices(parts: Mapping[Any, float]) -> list[list[Any]]:
-    """The products of a formula, those that count most first, and shorter formulas of them."""
+    """Return the products of a formula, largest coefficients first, and those of shorter ones."""
     products = sorted((p for p in parts if p != 1), key=lambda p: -abs(parts[p]))
     whole = [*products, *(p for p in parts if p == 1)]
     shorter = [products[: k + 1] for k in range(len(products))]
@@ -123,7 +123,7 @@ def _choices(parts: Mapping[Any, float]) -> list[list[Any]]:
 def write_form(
     forms: FormDictionary, known: Sequence[Quantity], products: Sequence[Any]
 ) -> tuple[Form, dict[str, float]]:
-    """A sum of products of ``X1``, ... as a form, and the numbers in it."""
+    """Return a sum of products of ``X1``, ... as a form, and its numbers by name."""
     import sympy as sp
 
     numbers = sorted({n for p in products for n in p.atoms(sp.Float)}, key=float)
@@ -148,14 +148,12 @@ def write_form(
         text = re.sub(r"\bX(\d+)\b", ratio, str(p.xreplace(names)).replace("Abs(", "abs("))
         part = f"({text})" if p.is_Add else text
         texts.append(f"h{k + 1}" if p == 1 else f"h{k + 1}*{part}")
-    strengths = {f"h{k + 1}": f"of part {k + 1} of the formula" for k in range(len(products))}
+    strengths = {f"h{k + 1}": f"factor of part {k + 1}" for k in range(len(products))}
     shape = Shape(
         "formula", " + ".join(texts), strengths, {str(c): "number" for c in names.values()},
         tuple(fixed), "follows a formula in {x}",
     )  # fmt: skip
     (first, span), *beside = ((q, forms.spans[q.words]) for q in chosen)
     axis = forms.evidence.system.model.device.coordinates[forms.axis]
-    form = Form(
-        axis, forms.axis, FORCE, shape, first, span, forms.times, 1.0, tuple(beside)
-    )  # fmt: skip
+    form = Form(axis, forms.axis, FORCE, shape, first, span, forms.times, 1.0, tuple(beside))
     return form, {str(name): float(n) for n, name in names.items()}
