@@ -30,7 +30,8 @@ class Scores:
         beside: the same on the measured trials.
         unknown: probability of something unknown, by axis.
         over_floor: held-out error over the noise floor, by axis.
-        no_verdict: axes without a verdict; seconds: of the diagnosis; failure: why there is none.
+        no_verdict: axes without a verdict; failure: why there is no diagnosis.
+        seconds: processor time of the diagnosis.
     """
 
     id: str
@@ -72,7 +73,8 @@ def write_tables(scores: Sequence[Scores], criteria: Criteria) -> str:
             f" said to be missing in {sum(s.finds_unknown(criteria) for s in outside)}."
         )
     seconds = [s.seconds for s in done] or [np.nan]
-    facts.append(f"A diagnosis took {np.median(seconds):.1f} s, at most {max(seconds):.1f} s.")
+    took = f"{np.median(seconds):.1f} s of processor time, at most {max(seconds):.1f} s"
+    facts.append(f"A diagnosis took {took}.")
     return "\n".join(
         [
             f"{len(done)} sessions, {len(scores) - len(done)} refused; probability"
