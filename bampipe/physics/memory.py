@@ -62,11 +62,8 @@ class StateGroup:
     ) -> Array:
         """Return the states along a motion, (T, n); see `System.memory`.
 
-        Args:
-            module: the generated code; along: q, qd, qdd, u, p and t of the motion.
-            z0: the states at the start of each part, (parts, n); inputs: names of the columns of u.
-            parts: rows at which they restart; known: states along this very motion, to which these
-                are added.
+        The generated ``module`` follows them ``along`` q, qd, qdd, u, p and t, in each of ``parts``
+        from ``z0``, (parts, n). ``inputs`` names the columns of u; ``known`` keeps the result.
         """
         q, qd, qdd, u, p, t = along
         uses, p = self.uses, p[self.uses["p"]]

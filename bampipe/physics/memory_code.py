@@ -30,8 +30,7 @@ def between(q, qd, qdd, u, i, h, share, x, v, w):
         w[j] = u[i, j] + share * (u[i + 1, j] - u[i, j])
 '''
 
-# Coupled states take more steps between samples where a contact opens or closes or where they are
-# stiff.
+# Coupled states take more steps between samples where a contact opens or closes, or they are stiff.
 MEMORY_LOOP = '''
 
 @njit(types.float64(M, M, M, M, V, V, V, M), cache=True, error_model='numpy')

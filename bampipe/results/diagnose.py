@@ -188,17 +188,6 @@ class DiagnoseResult(Result):
         return {k: v for one in found for k, v in one.items()} if all(found) else {}
 
     @property
-    def alternatives(self) -> dict[str, Names]:
-        """By effect of the most probable set, those that replace it in other sets."""
-        found = {}
-        for effect in self.selected:
-            rest = {*self.selected} - {effect}
-            others = [s.effects for s in self.sets if effect not in s.effects]
-            swapped = [{*o} - rest for o in others if rest <= {*o} and len({*o} - rest) == 1]
-            found[effect] = tuple(dict.fromkeys(name for one in swapped for name in one))
-        return found
-
-    @property
     def unnamed_axes(self) -> Names:
         """Axes with a residual that no effect of the library explains."""
         return tuple(a for a, e in self.axes.items() if e.remains and e.verdict != "no_verdict")

@@ -97,7 +97,13 @@ def inspect_setup(
         robot = drawn_robot(system)
         warnings.append(robot.describe_mass(search.heavier.place, search.heavier.factor))
     if held is not None and search.over_position is not None:
-        warnings += describe_lack(system, held, search.over_position)
+        warnings += [
+            f"a torque that follows the position of {axis}, as by gravity or a spring, lowers its"
+            f" error from {_fall(i, held, search.over_position)}, but the device has none: add it"
+            " to [energy] potential of the device file, or let the diagnosis name it"
+            for i, axis in enumerate(system.coordinates)
+            if search.over_position.error[i] < held.error[i] / 1.5
+        ]
     named = " ".join(mistake.sentence for mistake in mistakes)
     warnings += [
         f"{sentence}: the scale of all estimates depends on it"
@@ -289,17 +295,6 @@ def describe_evidence(
     if not drawn:
         return said
     return f"with bodies as drawn, {said or 'all drives differ by one factor'}"
-
-
-def describe_lack(system: System, before: Plausibility, after: Plausibility) -> list[str]:
-    """Report, without a full stop, each axis on which a torque over position is missing."""
-    return [
-        f"a torque that follows the position of {axis}, as by gravity or a spring, lowers its error"
-        f" from {_fall(i, before, after)}, but the device has none: add it to [energy] potential of"
-        " the device file, or let the diagnosis name it"
-        for i, axis in enumerate(system.coordinates)
-        if after.error[i] < before.error[i] / 1.5
-    ]
 
 
 def _fall(axis: int, before: Plausibility, after: Plausibility) -> str:

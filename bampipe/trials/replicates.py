@@ -245,8 +245,8 @@ def _required_force(fitted: ModelOnTrial, rate_hz: float) -> Array:
         stamps, order = np.round(motion.t + late_by, 9), np.argsort(np.abs(late_by), kind="stable")
         stamps, first = np.unique(stamps[order], return_index=True)
         force = _required_force(ModelOnTrial(system, fitted.p, [logged]), rate_hz)[order[first]]
-        inside = np.clip(motion.t, stamps[0], stamps[-1])
-        return np.asarray(Akima1DInterpolator(stamps, force, method="makima")(inside))
+        curve = Akima1DInterpolator(stamps, force, method="makima")
+        return np.asarray(curve(np.clip(motion.t, stamps[0], stamps[-1])))
     found, late = fitted.inputs[:, force_columns(system)].copy(), _lateness(fitted) * rate_hz
     for samples in np.unique(late):
         at = fitted

@@ -47,16 +47,11 @@ def test_what_machines_do_is_not_wild(values: np.ndarray, rule: tuple[float, flo
 
 
 def test_friction_that_turns_with_an_axis_for_two_samples_is_not_wild() -> None:
-    position = np.sin(2.0 * T)
-    force = FORCE + 3.0 * np.sign(np.gradient(position))
     at = int(np.argmax(T > 0.2))  # the axis moves upwards, and down for two samples
-    turned = position.copy()
-    turned[at:] -= 0.02
-    turned[at + 1 :] -= 0.02
-    pulse = force.copy()
-    pulse[at : at + 2] -= 6.0
+    turned = COUNTS - 60.0 * (np.arange(T.size) >= at) - 60.0 * (np.arange(T.size) > at)
+    pulse = FORCE + 3.0 * np.sign(np.cos(2.0 * T)) - 6.0 * np.isin(np.arange(T.size), (at, at + 1))
     assert not find_wild_inputs(pulse, [turned]).any()
-    assert np.flatnonzero(find_wild_inputs(pulse, [position])).tolist() == [at, at + 1]
+    assert np.flatnonzero(find_wild_inputs(pulse, [COUNTS])).tolist() == [at, at + 1]
     pulse[at : at + 2] -= 60.0
     assert np.flatnonzero(find_wild_inputs(pulse, [turned])).tolist() == [at, at + 1]
 

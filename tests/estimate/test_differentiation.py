@@ -165,8 +165,8 @@ class TestUniformGrid:
         np.testing.assert_allclose(np.diff(grid.t), 1.0 / RATE)
         assert grid.t[0] == t[0]
         assert 37 <= grid.bridged.sum() <= 40
-        nearest = grid.t + grid.stamp_offset
-        assert np.abs(nearest[~grid.bridged, None] - t).min(axis=1).max() < 1e-12
+        nearest = (grid.t + grid.stamp_offset)[~grid.bridged, None]
+        assert np.abs(nearest - t).min(axis=1).max() < 1e-12
         assert np.all(grid.stamp_offset[grid.bridged] == 0.0)
         assert np.max(np.abs(grid.stamp_offset)) < 1.0 / RATE
         signal = np.sin(2 * np.pi * 2.0 * t)

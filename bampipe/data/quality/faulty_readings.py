@@ -100,14 +100,11 @@ def interpolate_spikes(table: TrialTable) -> None:
     """Take wild readings of positions and inputs out and interpolate them, where they are few."""
     positions = {e.column: table.columns[e.column] for e in table.session.encoders}
     wild_of = {column: find_spikes(values, POSITION) for column, values in positions.items()}
-    for column in table.inputs:
-        wild_of[column] = find_wild_inputs(table.columns[column], [*positions.values()])
-    some = False
-    for column, wild in wild_of.items():
-        if 0 < wild.sum() <= table.limits.nan_share * len(wild):
-            some = True
-            take_out(table, column, wild)
-    if some:
+    wild_of |= {c: find_wild_inputs(table.columns[c], [*positions.values()]) for c in table.inputs}
+    few = {c: w for c, w in wild_of.items() if 0 < w.sum() <= table.limits.nan_share * len(w)}
+    for column, wild in few.items():
+        take_out(table, column, wild)
+    if few:
         fill_missing(table)
 
 

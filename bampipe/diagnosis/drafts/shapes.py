@@ -65,7 +65,7 @@ class Shape:
             constants: searched and fixed constants, and the ``interval`` of samples, s.
             is_quick: whether the motion is too quick for the states to relax.
         """
-        known = dict(constants) | {_x(k): column for k, column in enumerate(x.T)}
+        known = dict(constants) | {f"x{k + 1}" if k else "x": c for k, c in enumerate(x.T)}
         for name, state in self.states.items():
             known[name] = (state.quick_course if is_quick else state.course)(x[:, 0], known)
         tree, nothing = _parsed(self.text), dict.fromkeys(self.strengths, 0.0)
@@ -98,11 +98,6 @@ def _evaluate(node: ast.AST, known: Constants) -> Any:
         case ast.Call(func=ast.Name(id=name), args=args):
             return _FUNCTIONS[name](*(_evaluate(argument, known) for argument in args))
     raise AssertionError(f"unchecked node {type(node).__name__}")
-
-
-def _x(k: int) -> str:
-    """Return the name of the quantity with index ``k``: ``x``, ``x2``, ``x3``."""
-    return f"x{k + 1}" if k else "x"
 
 
 def _lagged(x: Array, c: Constants, first: float) -> Array:

@@ -225,7 +225,8 @@ def _tell_alternatives(results: Results, effect: str) -> str:
         if effect not in diagnosis.selected:
             continue
         known = {n: p for one in diagnosis.axes.values() for n, p in one.probabilities.items()}
-        others = diagnosis.alternatives[effect][:_ALTERNATIVES]
+        row = next(row for row in diagnosis.ranking if row.effect == effect)
+        others = row.indistinguishable_from[:_ALTERNATIVES]
         named = (f"`{n}` ({phrases.probability(known.get(n, 0.0))})" for n in others)
         place = f"Alternatives: {join_names(named)}" if others else "It has no alternative"
         return f"Its probability is {phrases.probability(known[effect])}. {place}."
