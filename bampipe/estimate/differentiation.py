@@ -83,8 +83,8 @@ class UniformGrid:
         monotone = PchipInterpolator(t, values)
         if len(t) < 4:
             return np.asarray(monotone(inside), dtype=np.float64)
-        curve = Akima1DInterpolator(t, values, method="makima") if jumps else CubicSpline(t, values)
-        on_grid = np.asarray(curve(inside), dtype=np.float64)
+        akima = Akima1DInterpolator(t, values, method="makima", extrapolate=True) if jumps else None
+        on_grid = np.asarray((akima or CubicSpline(t, values))(inside), dtype=np.float64)
         on_grid[self.bridged] = monotone(inside[self.bridged])
         return on_grid
 
