@@ -21,6 +21,8 @@ TIMING_ORDERS = 3
 highest frequency of a residual. The first order alone errs by 20 %, which looks like a lag."""
 _MOST_JOINED = 100_000
 """Largest number of samples, over all axes, up to which a session's trials are joined."""
+STAMP_OFFSET = "stamp_offset"
+"""Channel with the time of the nearest logged sample less ``t``, s; all zero on a uniform grid."""
 SAMPLED = ("t", "q", "qd", "qdd", "qd_sd")
 """Fields of a motion with one row a sample."""
 
@@ -60,7 +62,6 @@ class Motion:
             samples that its trial leaves out. None if there are none.
         filters: filters that produced q, qd and qdd; None if they do not stem from encoders.
         parts: rows of each trial, if several have been joined.
-        stamp_offset: time of the nearest logged sample less ``t``, (T,), s; None if all are zero.
     """
 
     trial_id: str
@@ -73,7 +74,6 @@ class Motion:
     left_out: Flags | None = None
     filters: EncoderFilters | None = None
     parts: Sequence[slice] = (slice(None),)
-    stamp_offset: Array | None = None
     _states: dict[Any, Array] = field(default_factory=dict, init=False, repr=False, compare=False)
     _kept: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 

@@ -17,7 +17,7 @@ from bampipe.results.filter import Disturbance, FilterResult
 from bampipe.results.ingest import IngestResult
 from bampipe.trials.kept import MOST_OF_TRIALS, KeptItems
 from bampipe.trials.kinematics import Kinematics
-from bampipe.trials.motion import TIMING_ORDERS, Motion, input_derivatives
+from bampipe.trials.motion import STAMP_OFFSET, TIMING_ORDERS, Motion, input_derivatives
 from bampipe.trials.sensors import Sensors
 
 KINEMATICS = "filter/kinematics.parquet"
@@ -103,15 +103,14 @@ def read_motion(
     else:
         for name in [name for name in needed if name in smooth]:
             wanted += input_derivatives(name)[:TIMING_ORDERS]
-    column_of = {name: brakes.get(name, name) for name in dict.fromkeys(wanted)}
+    column_of = {name: brakes.get(name, name) for name in dict.fromkeys((*wanted, STAMP_OFFSET))}
     motion = {key: [f"{key}_{axis}" for axis in axes] for key in ("q", "qd", "qdd", "qd_sd")}
     required = [column for columns in motion.values() for column in columns]
     required += [column_of[name] for name in needed if name not in brakes]
     for column in required:
         if column not in stored:
             raise _no_column(column, str(path))
-    optional = ("stamp_offset", *column_of.values())
-    read = dict.fromkeys(["t", *required, *(c for c in optional if c in stored)])
+    read = dict.fromkeys(["t", *required, *(c for c in column_of.values() if c in stored)])
     columns = read_arrays(path, list(read), trial_id)
     t = columns["t"]
     channels = {
@@ -127,11 +126,7 @@ def read_motion(
     if disturbances:
         inside = np.any([(t >= one.start_s) & (t <= one.end_s) for one in disturbances], axis=0)
         left_out = np.tile(inside[:, None], (1, len(axes)))
-    offset = columns.get("stamp_offset", np.zeros(0))
-    return Motion(
-        trial_id, t, **kinematics, channels=channels, left_out=left_out, filters=filters,
-        stamp_offset=offset if offset.any() else None,
-    )  # fmt: skip
+    return Motion(trial_id, t, **kinematics, channels=channels, left_out=left_out, filters=filters)
 
 
 def read_motions(

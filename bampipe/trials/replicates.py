@@ -15,16 +15,17 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import Akima1DInterpolator, CubicSpline
+from scipy.interpolate import CubicSpline
 
 from bampipe.arrays import Array, Flags
 from bampipe.estimate.butterworth import zero_phase
+from bampipe.estimate.differentiation import UniformGrid
 from bampipe.estimate.simulation import Runaway, count_steps, simulate_tracking
 from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.kinematics import Kinematics
-from bampipe.trials.motion import Motion, Recording, force_columns, input_derivatives
+from bampipe.trials.motion import STAMP_OFFSET, Motion, Recording, force_columns, input_derivatives
 from bampipe.trials.residuals import ModelOnTrial, standstill_of
 from bampipe.trials.sensors import Sensors
 
@@ -237,16 +238,17 @@ def _required_force(fitted: ModelOnTrial, rate_hz: float) -> Array:
     those of the grid see a jump of friction earlier or later, and are resampled as the log was.
     """
     system, motion = fitted.system, fitted.motion
-    if (late_by := motion.stamp_offset) is not None:
-        by = late_by[:, None]
+    offset = motion.channels.get(STAMP_OFFSET, np.zeros(0))
+    if offset.any():
+        by = offset[:, None]
         q, qd = motion.q + by * motion.qd + 0.5 * by**2 * motion.qdd, motion.qd + by * motion.qdd
-        logged = replace(motion, q=q, qd=qd, stamp_offset=None)
-        # Of points of the grid that share a sample, the nearest.
-        stamps, order = np.round(motion.t + late_by, 9), np.argsort(np.abs(late_by), kind="stable")
-        stamps, first = np.unique(stamps[order], return_index=True)
-        force = _required_force(ModelOnTrial(system, fitted.p, [logged]), rate_hz)[order[first]]
-        curve = Akima1DInterpolator(stamps, force, method="makima")
-        return np.asarray(curve(np.clip(motion.t, stamps[0], stamps[-1])))
+        at_samples = replace(motion, q=q, qd=qd).with_channels({STAMP_OFFSET: 0.0 * offset})
+        force = _required_force(ModelOnTrial(system, fitted.p, [at_samples]), rate_hz)
+        # Of points of the grid that share a sample, the nearest counts.
+        order = np.argsort(np.abs(offset), kind="stable")
+        stamps, first = np.unique(np.round(motion.t + offset, 9)[order], return_index=True)
+        grid = UniformGrid(motion.t, np.zeros(len(offset), dtype=bool), False, stamps)
+        return np.column_stack([grid.resample(f, jumps=True) for f in force[order[first]].T])
     found, late = fitted.inputs[:, force_columns(system)].copy(), _lateness(fitted) * rate_hz
     for samples in np.unique(late):
         at = fitted

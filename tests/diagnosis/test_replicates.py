@@ -159,7 +159,7 @@ def test_the_force_that_a_motion_needs_leaves_no_residual(fitted, effect, values
     head = effect.replace(":", ".")
     own = [values[q.name.removeprefix(f"{head}.")] for q in system.parameters[len(evidence.p) :]]
     p = np.append(evidence.p, own)
-    motion = replace(trials.motions[0], stamp_offset=None)
+    motion = trials.motions[0].with_channels({"stamp_offset": np.zeros(trials.motions[0].t.size)})
     measured = ModelOnTrial(system, p, [motion])
     force = replicates._required_force(measured, trials.sensors.rate_hz)
     named = dict(zip(system.model.device.forces, force.T, strict=True))
