@@ -9,6 +9,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -142,9 +143,9 @@ def _contents(path: Path, wanted: Sequence[str] = ()) -> tuple[dict[str, Stored]
     samples = content if isinstance(content, list) else next(iter(lists.values()))
     if not samples:
         raise InputError("a header but no samples")
-    for count, sample in enumerate(samples, 1):
+    for number, sample in enumerate(samples, 1):
         if not isinstance(sample, dict):
-            raise InputError("not an object with named values", where=f"sample {count}")
+            raise InputError("not an object with named values", where=f"sample {number}")
     named = [x for x, cell in leaves(samples[0]) if reads_as_number(cell) or _is_moment(cell)]
     named += [name for name in wanted if find(samples[0], name) is not MISSING]
     found = {name: _column(samples, name, units) for name in dict.fromkeys(named)}
@@ -152,14 +153,21 @@ def _contents(path: Path, wanted: Sequence[str] = ()) -> tuple[dict[str, Stored]
 
 
 def _column(samples: Sequence[object], name: str, units: Mapping[str, str]) -> Stored:
-    """What stands at ``name`` in the samples, or these themselves; null where nothing does."""
+    """The column ``name`` of the samples, or these themselves, read when it is loaded."""
+    shape, first = (len(samples),), (x for x in _cells(samples, name) if x is not None)
+    if _is_moment(next(first, None)):
+        return Stored(shape, "M", lambda: np.array([*_cells(samples, name)], dtype=object))
+    return Stored(shape, "f", partial(_read_numbers, samples, name), units.get(name, ""))
+
+
+def _cells(samples: Sequence[object], name: str) -> Iterator[object]:
     found = (find(sample, name) if name else sample for sample in samples)
-    cells = [None if cell is MISSING else cell for cell in found]
-    if any(map(_is_moment, cells)):
-        return stored(np.array(cells, dtype=object), kind="M")
-    places = (f"sample {n}, '{name}'" for n, _ in enumerate(cells, 1))
-    load = partial(np.fromiter, map(as_number, cells, places), float, len(cells))
-    return Stored((len(cells),), "f", load, units.get(name, ""))
+    return (None if cell is MISSING else cell for cell in found)
+
+
+def _read_numbers(samples: Sequence[object], name: str) -> np.ndarray:
+    places = (f"sample {n}, '{name}'" for n in count(1))
+    return np.fromiter(map(as_number, _cells(samples, name), places), float, len(samples))
 
 
 def _is_moment(cell: object) -> bool:
