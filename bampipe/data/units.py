@@ -58,7 +58,7 @@ _SPELLINGS = {
 _CELSIUS = frozenset(["degc", "°c", "c", "celsius"])
 _NAME_WITH_UNIT = re.compile(r"(?P<name>.*?)\s*[\[(]\s*(?P<unit>[^\[\]()]{1,16}?)\s*[\])]\s*\Z")
 _BESIDE = re.compile(r"(?i)(?:\A|(?<=[./]))units?[./]|(?:\A|[ _./])units?\Z")
-"""What makes the name of a text that gives a unit of that of what it is of."""
+"""Affix that marks a metadata field as the unit of a quantity: the rest names the quantity."""
 _TOKEN = re.compile(
     r"(?P<number>(?<![^\W_])\d+(?:\.\d+)?(?:[eE]-?\d+)?|\.\d+)"
     r"|(?P<over>\s*(?:/|\bper\b)\s*)"
@@ -93,19 +93,16 @@ def units_in(names: Iterable[str]) -> dict[str, str]:
     matches = {n: match for n, said in plain.items() if (match := _NAME_WITH_UNIT.match(said))}
     numbered = Counter(m["name"] for m in matches.values() if m["unit"].isdigit())
     others = any(not match["unit"].isdigit() for match in matches.values())
-    return {
-        name: match["unit"]
-        for name, match in matches.items()
-        if match["name"]
-        and not (
-            match["unit"].isdigit()
-            and (match["unit"] != "1" or not others or numbered[match["name"]] > 1)
-        )
-    }
+
+    def is_index(match: re.Match[str]) -> bool:
+        alone = match["unit"] == "1" and others and numbered[match["name"]] == 1
+        return match["unit"].isdigit() and not alone
+
+    return {n: m["unit"] for n, m in matches.items() if m["name"] and not is_index(m)}
 
 
 def units_beside(texts: Mapping[str, str]) -> dict[str, str]:
-    """Units by what they are of, from texts in a file: ``q_unit``, ``q.unit``, ``units.q``."""
+    """Units by quantity, from metadata fields such as ``q_unit``, ``q.unit`` and ``units.q``."""
     found = ((_BESIDE.sub("", name, count=1), name) for name in texts)
     return {of: texts[name] for of, name in found if of != name}
 

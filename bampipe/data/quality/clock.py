@@ -144,7 +144,7 @@ def keep_fresh_rows(table: TrialTable) -> None:
     twice = np.logical_and.reduce([np.diff(values) == 0.0 for values in table.columns.values()])
     if twice.any() and twice.sum() == np.sum(np.diff(table.t) == 0.0):
         table.keep(np.concatenate([[True], ~twice]))
-        table.repairs.append(f"{count_noun(int(twice.sum()), 'row')} that stand twice left out")
+        table.repairs.append(f"{count_noun(int(twice.sum()), 'duplicate row')} left out")
     encoders = table.session.encoders
     kept = find_fresh_rows([table.columns[encoder.column] for encoder in encoders])
     if kept is not None:

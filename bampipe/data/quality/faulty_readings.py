@@ -86,11 +86,13 @@ def find_wild_inputs(values: Array, positions: Sequence[Array]) -> Flags:
     ``positions``: of each axis, (T,).
     """
     wild = find_spikes(values, INPUT)
-    runs = list(zip(*find_runs(wild), strict=True))
-    low, high = np.quantile(values[~wild], (0.01, 0.99)) if runs else (0.0, 0.0)
-    for start, stop in runs:
+    if not wild.any():
+        return wild
+    low, high = np.quantile(values[~wild], (0.01, 0.99))
+    changes = [np.diff(q) for q in positions]
+    for start, stop in zip(*find_runs(wild), strict=True):
         usual = np.all((low < values[start:stop]) & (values[start:stop] < high))
-        steps = [np.diff(q)[[start - 2, start - 1, stop - 2, stop]] for q in positions]
+        steps = [each[[start - 2, start - 1, stop - 2, stop]] for each in changes]
         turns = any(x[0] * (x[1] + x[2]) < 0.0 and x[3] * (x[1] + x[2]) < 0.0 for x in steps)
         wild[start:stop] = not (usual and turns)
     return wild

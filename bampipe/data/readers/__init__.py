@@ -126,9 +126,9 @@ def columns_of(path: Path, *, name: str = "", dialect: Dialect | None = None) ->
 
 
 def _units_in_names(reader: ModuleType, names: Iterable[str]) -> dict[str, str]:
-    """Units that stand in the names of columns; a text has told those of its header itself.
+    """Units parsed from column names; the reader of text tables parses those of its header itself.
 
-    What is in brackets may be an index or a joint as well, as it is in all names of a bag.
+    Brackets may also hold an index or a joint name; in a bag they always do.
     """
     said = {} if reader in (text, bag) else units_in(names)
     return {name: u for name, u in said.items() if not u.isdigit() and unit(u) is not None}

@@ -70,8 +70,8 @@ def _is_level_5(path: Path) -> bool:
 def _arrays(path: Path) -> tuple[dict[str, Stored], str]:
     """Arrays of a file, each struct followed by what is in it; and what is left out of the names.
 
-    A struct that is all of the file and has
-    a number in its name, as recorders count their files, is left out of the names.
+    A struct that is all of the file and has a number in its name, as recorders count their files,
+    is left out of the names.
 
     scipy.io reads the same files, but past its buffers where a damaged one lies about a length,
     which ends the process without a word. Source: MathWorks, MAT-File Format, level 5.

@@ -314,8 +314,8 @@ def _at_joint(
     if worth is None:
         return position, position
     if not in_counts(position):
-        named = [replace(position, unit=name) for name in ("rad", "deg", "rev")]
-        named = [position] if far else named
+        units = (position.unit,) if far else ("rad", "deg", "rev")
+        named = [replace(position, unit=name) for name in units]
         fitting = [p for p in named if abs(p.scale * worth.size - 1.0) < _NEAR]
         if fitting or not far:
             return ((fitting or [position])[0],) * 2

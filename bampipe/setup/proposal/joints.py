@@ -61,11 +61,7 @@ def pair_joints(
 
 def chain_logged(chains: Mapping[str, Sequence[tuple[str, str]]], found: Survey) -> str:
     """The link at which the chain ends whose joints the columns name most; "" if they name none."""
-    said = [
-        _tokens(column.name, column.unit)
-        for column in found.of("position")
-        if not column.is_constant
-    ]
+    said = [_tokens(c.name, c.unit) for c in found.of("position") if not c.is_constant]
     logged = [
         [end for end in chain if any(_without(own, _tokens(end[0])) is not None for own in said)]
         for chain in chains.values()
@@ -78,9 +74,7 @@ def _incomplete(
     names: Sequence[str], columns: Sequence[SurveyedColumn], positions: Group
 ) -> Iterator[Mapping[str, SurveyedColumn]]:
     """Groups with columns for some of ``names``: by their names, or numbered as ``positions``."""
-    split = {
-        column.name: _tokens(column.name, column.unit) for column in (*columns, *positions.columns)
-    }
+    split = {c.name: _tokens(c.name, c.unit) for c in (*columns, *positions.columns)}
     said = {name: _tokens(name) for name in names}
     yield from _named_alike(said, columns, split).values()
     for numbered in _numbered_alike(positions.columns, split).values():
