@@ -62,7 +62,7 @@ def move(m, law, goal, goal_rate, kick, log_at):
             )
             command += m.moment * np.sin(goal[k]) + m.moment_across * np.cos(goal[k])
             command = min(max(command, -m.limit), m.limit)
-        asked = command + kick[k]
+        asked = command + kick[k - k % hold]
         if k_log < len(log_at) and log_at[k_log] == k:
             out[k_log, 0], out[k_log, 1] = q, asked
             k_log += 1
