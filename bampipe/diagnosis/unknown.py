@@ -1,13 +1,14 @@
 """An unknown function as a candidate for what no effect of the library explains.
 
-It is a sum of linear splines, see docs/method_selection.md. Splines are added while the evidence,
-integrated over their coefficients, grows.
+It is a sum of linear splines and of a vibration, see docs/method_selection.md. They are added while
+the evidence, integrated over their coefficients, grows.
 """
 
 from dataclasses import dataclass
 from itertools import chain, pairwise, repeat
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.dictionary import Key
@@ -22,6 +23,8 @@ _KNOTS_OF_OTHERS = (5,)
 """Knots of splines of the position of another axis."""
 _SIZES = (0.003, 0.01, 0.03, 0.1)
 """Prior standard deviations of the coefficients, over the applied force of the axis."""
+_FEWEST_PERIODS = 2
+"""Of a vibration, in the longest trial."""
 _REWEIGHTS = 2
 """Reweighting steps, from the weights of the function with one spline less."""
 
@@ -48,11 +51,12 @@ class Unknown:
 
 @dataclass(frozen=True)
 class Splines:
-    """The splines of which the unknown function of an axis is a sum.
+    """The splines, and the vibration, of which the unknown function of an axis is a sum.
 
     Attributes:
         columns: all columns, low-passed and weighted as the residual, (n, m).
-        functions: indices of the columns of each spline.
+        functions: indices of the columns of each spline, and of the vibration.
+        log_choices: log number of the functions among which each was chosen.
         products: products of the columns with the columns of the model, (nb, m), with each other,
             (m, m), and with the residual, (m,).
     """
@@ -60,6 +64,7 @@ class Splines:
     axis: int
     columns: Array
     functions: tuple[Indices, ...]
+    log_choices: Array
     products: tuple[Array, Array, Array]
 
 
@@ -83,10 +88,37 @@ def build_splines(costs: SetCosts, axis: int) -> Splines | None:
                 blocks.append(take_samples(thin, p.likelihood.samples[axis], 0))
     if not blocks:
         return None
+    choices = [len(_SIZES) * (len(blocks) + 1)] * len(blocks)
+    vibration, frequencies = _find_vibration(costs, axis)
+    blocks.append(vibration)
+    choices.append(choices[0] * frequencies)
     ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
     x = np.concatenate(blocks, axis=1) * p.likelihood.root[axis][:, None]
     functions = tuple(np.arange(*pair) for pair in pairwise(ends))
-    return Splines(axis, x, functions, (p.base[axis].T @ x, x.T @ x, x.T @ p.y[axis]))
+    products = p.base[axis].T @ x, x.T @ x, x.T @ p.y[axis]
+    return Splines(axis, x, functions, np.log(choices), products)
+
+
+def _find_vibration(costs: SetCosts, axis: int) -> tuple[Array, int]:
+    """Return the vibration that explains most of the residual of an axis, and the number tried.
+
+    It has one frequency, and in each trial an amplitude and a phase: (n, 2 n_trials).
+    """
+    p, e = costs.problem, costs.dictionary.evidence
+    samples = p.likelihood.samples[axis]
+    counts = [len(used) for used in e.used]
+    left = np.zeros(sum(counts))
+    left[samples.rows] = costs.residual_rows(())[axis]
+    padded = 2 * max(counts)
+    power = np.zeros(padded // 2 + 1)
+    for part in np.split(left, np.cumsum(counts)[:-1]):
+        power += np.abs(np.fft.rfft(part, padded)) ** 2
+    # Fewer periods in the longest trial look like a drift.
+    first = min(2 * _FEWEST_PERIODS, len(power) - 1)
+    angle = 2.0 * np.pi * (first + int(np.argmax(power[first:]))) / padded
+    turns = [angle * np.arange(count) for count in counts]
+    columns = block_diag(*(np.column_stack([np.cos(turn), np.sin(turn)]) for turn in turns))
+    return columns[samples.rows], len(power) - first
 
 
 def _quantities(evidence: Evidence, trial: int, axis: int) -> list[Array]:
@@ -188,7 +220,7 @@ class _ModelWithout:
         cost += 0.5 * float(moved @ p.precision @ moved) - float(p.moment @ moved)
         cost += 0.5 * float(c @ (known * c))
         cost += 0.5 * float(np.linalg.slogdet(np.eye(len(at)) + inside / known)[1])
-        cost += len(sizes) * np.log(len(_SIZES) * len(functions)) + self.penalty
+        cost += float(self.splines.log_choices[list(sizes)].sum()) + self.penalty
         return _Solution(sizes, cost, b, c, weight)
 
     def describe(self, one: _Solution) -> Unknown:

@@ -171,6 +171,19 @@ def test_what_no_effect_of_the_library_is_is_called_unknown(record, machine, eff
     assert {v for k, v in enumerate(verdicts(found)) if k != axis} <= {"nothing_missing"}
 
 
+def test_a_vibration_that_depends_on_time_alone_is_called_unknown(record):
+    """Half a per cent of the force, in no state of the machine, with another phase in each trial."""
+    trials, recipe = record("axis", 41)
+    motions = [
+        replace(m, channels={**m.channels, "force_motor": m.channels["force_motor"] + shake})
+        for k, m in enumerate(trials.motions)
+        for shake in [0.35 * np.sin(2.0 * np.pi * 3.1 * m.t + k)]
+    ]
+    _, found = diagnose_trials(replace(trials, motions=tuple(motions)), recipe)
+    (axis,) = found.axes
+    assert axis.verdict == "unknown_effect" and axis.unknown > 0.9 and not found.selected
+
+
 def test_the_numbers_that_decide_are_those_that_are_given(record):
     """A dozen replicates make nobody surer than one in ten thousand; half the force nothing is.
 
