@@ -45,6 +45,7 @@ from measured import (
 from scipy.io import loadmat, savemat
 from scipy.optimize import least_squares
 
+from bampipe import open_run
 from bampipe.errors import InputError
 from bampipe.physics import System
 from bampipe.trials.motion import Motion
@@ -243,11 +244,12 @@ def climb(
     """The three tasks effect by effect, with the authors' filters and least squares."""
     runs, run = ("--runs", work / "authors"), work / "authors" / session.name
     bampipe("run", session, *runs, "--pipeline", SAMPLE / "published.toml")
-    model, rungs = "base", []
+    model, rungs, known = "base", [], {"base"}
     for effect in ("", *effects):
         if effect:
             bampipe("extend", run, effect, "--model", model)
-            model = f"{model}+{effect.replace(':', '.')}"
+            (model,) = {*open_run(run).models} - known  # a long name is shortened
+            known.add(model)
         rungs.append(
             {"added": effect, **score(run, model, positions), "closed": closed_loop(run, model)}
         )
