@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import minimize_scalar
 
 from bampipe.arrays import Array
@@ -17,7 +18,7 @@ from bampipe.data.angle_torque import (
     least_squares,
 )
 from bampipe.data.quality.clock import rate_of
-from bampipe.data.session import SECONDS
+from bampipe.data.session import SECONDS, Register
 from bampipe.data.units import spelled
 
 RATES_HZ = (4.0, 30_000.0)
@@ -216,38 +217,6 @@ def find_turning(t: np.ndarray, q: np.ndarray, drive: np.ndarray) -> Turning | N
     return Turning(size, sd * size, middle + size * float(hangs))
 
 
-@dataclass(frozen=True)
-class Register:
-    """How an unsigned register holds signed numbers.
-
-    Attributes:
-        bits: of its width, of two's complement; 0 where it has a sign bit.
-        sign_bit: number of the bit that stands for minus, the lower ones being the magnitude.
-    """
-
-    bits: int = 0
-    sign_bit: int = 0
-
-    @property
-    def fields(self) -> str:
-        """What the session file says of it, after a comma."""
-        if self.bits:
-            return f", wrap_bits = {self.bits}, signed = true"
-        return f", sign_bit = {self.sign_bit}"
-
-    @property
-    def words(self) -> str:
-        if self.bits:
-            return f"a signed register of {self.bits} bits"
-        return f"sign and magnitude: bit {self.sign_bit} stands for minus"
-
-    def signed(self, values: np.ndarray) -> np.ndarray:
-        """What readings (T,) stand for."""
-        half = 2.0 ** (self.bits - 1 if self.bits else self.sign_bit)
-        negative = values - 2.0 * half if self.bits else half - values
-        return np.where(values >= half, negative, values)
-
-
 def find_register(values: np.ndarray) -> Register | None:
     """How an unsigned register holds its sign, None where it holds none.
 
@@ -315,9 +284,9 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
                 found[names[derivative[rate]]] = "acceleration"
     positions = [k for k in derivative if k not in rates]
     left = [k for k, name in enumerate(names) if name not in found]
+    seconds = (t - t[0]) * SECONDS.get(time_unit(t, ""), 1.0)
     if len(positions) == 1:
-        q, unit = matrix[:, positions[0]], time_unit(t, "")
-        seconds = (t - t[0]) * SECONDS.get(unit, 1.0)
+        q = matrix[:, positions[0]]
         share = {
             k: driven(seconds, q, matrix[:, k]).share
             for k in left
@@ -329,7 +298,6 @@ def find_roles(values: Mapping[str, Array], t: Array | None) -> dict[str, str]:
     elif positions and len(left) == len(positions):
         found |= {names[k]: "force" for k in left}
     elif not positions and len(left) == 2:
-        seconds = (t - t[0]) * SECONDS.get(time_unit(t, ""), 1.0)
         explained = [driven(seconds, matrix[:, k], matrix[:, 1 - k]).share for k in left]
         moved = int(explained[1] > explained[0])
         least, most = sorted(explained)
@@ -359,8 +327,7 @@ def _derivatives(matrix: Array, t: Array) -> dict[int, int]:
     A column is held against the integrals of the others: noise spoils derivatives.
     """
     since = t - t[0]
-    middle = 0.5 * (matrix[1:] + matrix[:-1]) * np.diff(since)[:, None]
-    integrals = np.concatenate([np.zeros((1, matrix.shape[1])), np.cumsum(middle, axis=0)])
+    integrals = cumulative_trapezoid(matrix, since, axis=0, initial=0.0)
     base, _ = np.linalg.qr(np.column_stack([np.ones_like(since), since]))
     p, i = (each - base @ (base.T @ each) for each in (matrix, integrals))
     size = np.outer(np.linalg.norm(p, axis=0), np.linalg.norm(i, axis=0))

@@ -255,12 +255,9 @@ class _Reader:
             return np.column_stack([first, second, np.cross(first, second)])
         if element.get("zaxis"):
             up = _unit(np.array(numbers(element, "zaxis", "", 3)))
-            about = np.cross([0.0, 0.0, 1.0], up)
-            size = float(np.linalg.norm(about))
-            if size == 0.0:
-                return np.diag([1.0, 1.0, 1.0]) if up[2] > 0.0 else np.diag([1.0, -1.0, -1.0])
-            turned = about / size * np.arctan2(size, up[2])
-            return np.asarray(Rotation.from_rotvec(turned).as_matrix())
+            if up[2] == -1.0:
+                return np.diag([1.0, -1.0, -1.0])
+            return np.asarray(Rotation.align_vectors(up, (0.0, 0.0, 1.0))[0].as_matrix())
         return np.eye(3)
 
     def body(self, body: ElementTree.Element, moves: bool) -> Body:

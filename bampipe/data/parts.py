@@ -32,14 +32,6 @@ _SAME_LENGTH = 0.2
 
 
 @dataclass(frozen=True)
-class _Kind:
-    """Files alike: with the same columns, and the same quantities or axes in their names."""
-
-    columns: frozenset[str]
-    said: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class FileClock:
     """The time of one file.
 
@@ -70,7 +62,9 @@ def join_parts(
     """
     if len(found) < 2:
         return [], []
-    kinds = {name: _kind(name, columns, role) for name, columns in found.items()}
+    said = {name: _quantities_in(name, role) for name in found}
+    # Files of a kind have the same columns, and the same quantities or axes in their names.
+    kinds = {name: (frozenset(columns), said[name]) for name, columns in found.items()}
     # Words that all files of a kind have; numbers, if there are several, tell trials apart.
     own = {
         kind: frozenset.intersection(*(frozenset(_words(n)) for n in found if kinds[n] == kind))
@@ -79,7 +73,7 @@ def join_parts(
     shared = frozenset.intersection(*own.values())
     groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
     for name, kind in kinds.items():
-        words = (w for w in _words(name) if w not in kind.said and w not in own[kind])
+        words = (w for w in _words(name) if w not in said[name] and w not in own[kind])
         groups[tuple(words)].append(name)
     trials, reasons = [], []
 
@@ -92,7 +86,7 @@ def join_parts(
             continue
         called: dict[str, str] = {}
         for n in names:
-            name = _called(_words(n), own[kinds[n]] - shared, kinds[n].said)
+            name = _called(_words(n), own[kinds[n]] - shared, said[n])
             called[n] = f"{name}_{len(called)}" if name in called.values() else name
         roles = {n: {role(f"{called[n]}:{c}", u) for c, u in found[n].items()} for n in names}
         main = max(names, key=lambda n: ("position" in roles[n], -names.index(n)))
@@ -119,10 +113,9 @@ def axes_of(names: Sequence[str]) -> dict[str, str]:
     return found if len(bare) < len(names) == len(found) else {}
 
 
-def _kind(name: str, columns: Columns, role: Callable[[str, str], str]) -> _Kind:
+def _quantities_in(name: str, role: Callable[[str, str], str]) -> tuple[str, ...]:
     words = _words(Path(name).name)
-    said = tuple(w for w in words if _AXIS.fullmatch(w) or role(w, "") not in ("", "time"))
-    return _Kind(frozenset(columns), said)
+    return tuple(w for w in words if _AXIS.fullmatch(w) or role(w, "") not in ("", "time"))
 
 
 def _words(name: str) -> list[str]:

@@ -446,12 +446,11 @@ class _Logs:
             self.remarks += raw.remarks
         # Times of one name, beside the readings that each is of.
         times = [c for c in times if c in raw.columns]
-        ends = [re.sub(r" \(\d+\)$", "", c).rpartition(".")[2] for c in times]
+        end = {c: re.sub(r" \(\d+\)$", "", c).rpartition(".")[2] for c in times}
         for one, other in combinations(times if times and times[0][:1] != "/" else (), 2):
             here, there = (raw.columns[c][sound] for c in (one, other))
-            alike = ends[times.index(one)] == ends[times.index(other)]
             step = abs(np.nanmedian(np.diff(here))) if len(here) > 1 else 0.0
-            if alike and step and np.nanmax(np.abs(here - there)) > step:
+            if end[one] == end[other] and step and np.nanmax(np.abs(here - there)) > step:
                 raise InputError(
                     f"columns have times of their own, which differ, as {one} and {other} do",
                     where=trial.file,

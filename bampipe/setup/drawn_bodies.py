@@ -173,10 +173,10 @@ class Comparison:
     def by_body(self, mounting: Mounting) -> list[Array]:
         """By joint, the drive that each drawn body requires, less the losses, (K, bodies)."""
 
-        def forces(q: Array, qd: Array, qdd: Array) -> list[Array]:
+        def forces(q: Array, qd: Array, qdd: Array) -> Array:
             bodies, down = range(len(self.robot.joints)), mounting.gravity
             each = [self.robot.drawn_forces(q, qd, qdd, down, only=b) for b in bodies]
-            return [np.column_stack([one[:, k] for one in each]) for k, _ in enumerate(self.ratio)]
+            return np.stack(each, axis=2)
 
         return self._left_of(mounting, forces)
 
@@ -184,25 +184,23 @@ class Comparison:
         """By joint, the drive per unit of each inertial number of a body, less losses, (K, 10)."""
         under = self.robot.model_copy(update={"gravity": tuple(mounting.gravity)})
 
-        def numbers(q: Array, qd: Array, qdd: Array) -> list[Array]:
+        def numbers(q: Array, qd: Array, qdd: Array) -> Array:
             rows = (row[place] for row in under.columns(q, qd, qdd))
-            return [np.column_stack([np.broadcast_to(c, len(q)) for c in row]) for row in rows]
+            each = [np.column_stack([np.broadcast_to(c, len(q)) for c in row]) for row in rows]
+            return np.stack(each, axis=1)
 
         return self._left_of(mounting, numbers)
 
     def _left_of(
-        self, mounting: Mounting, columns: Callable[[Array, Array, Array], list[Array]]
+        self, mounting: Mounting, columns: Callable[[Array, Array, Array], Array]
     ) -> list[Array]:
-        """By joint, columns (K, m) less the losses, from forces (T, m) along each motion."""
-        found: list[list[Array]] = [[] for _ in self.ratio]
-        for motion in self.motions:
-            moved = motion.scaled(mounting.direction)
-            by_joint = columns(moved.position + mounting.zero, moved.rate, moved.change)
-            for parts, one, ratio in zip(found, by_joint, self.ratio, strict=True):
-                parts.append(one / ratio)
+        """By joint, columns (K, m) less the losses, from forces (T, n, m) along each motion."""
+        moved = [motion.scaled(mounting.direction) for motion in self.motions]
+        found = [columns(m.position + mounting.zero, m.rate, m.change) for m in moved]
+        parts = [one / self.ratio[:, None] for one in found]
         return [
-            loss.without(self._thinned(parts, k).T).T
-            for k, (parts, loss) in enumerate(zip(found, self.losses, strict=True))
+            loss.without(self._thinned([part[:, k] for part in parts], k).T).T
+            for k, loss in enumerate(self.losses)
         ]
 
     @cached_property

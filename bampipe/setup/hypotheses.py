@@ -8,19 +8,19 @@ from itertools import combinations, permutations
 
 import numpy as np
 
+from bampipe.data import units
 from bampipe.results.setup import Kind
 from bampipe.trials.signals import Change, Signals
 
-DEGREE = math.pi / 180.0
-FACTORS: dict[str, tuple[tuple[str, float], ...]] = {
-    "rad": (("deg", DEGREE), ("rev", 2.0 * math.pi), ("mrad", 1e-3)),
-    "m": (("mm", 1e-3), ("cm", 1e-2), ("um", 1e-6), ("in", 0.0254)),
-    "N": (("mN", 1e-3), ("kN", 1e3), ("kgf", 9.80665), ("gf", 9.80665e-3), ("lbf", 4.44822)),
-    "N.m": (("mN.m", 1e-3), ("kN.m", 1e3), ("N.mm", 1e-3), ("N.cm", 1e-2)),
-    "A": (("mA", 1e-3),),
-    "V": (("mV", 1e-3),),
+CONFUSED = {
+    "rad": ("deg", "rev", "mrad"),
+    "m": ("mm", "cm", "um", "in"),
+    "N": ("mN", "kN", "kgf", "gf", "lbf"),
+    "N.m": ("mN.m", "kN.m", "N.mm", "N.cm"),
+    "A": ("mA",),
+    "V": ("mV",),
 }
-"""By SI unit, units that are mistaken for it or it for them, with their factors."""
+"""By SI unit, units that are mistaken for it or it for them."""
 PLAIN = (10.0, 100.0, 1000.0, 2.0, 4.0)
 """Factors of amplifier gains and of encoder edges that are forgotten or applied twice."""
 MOST_TRAVEL = 4.0 * math.pi
@@ -101,23 +101,28 @@ def nearest_scale_correction(signals: Signals, names: Sequence[str], factor: flo
 
     The factor of a unit or of a usual gain is taken if one is near.
     """
-    place = signals.places(names)[0]
-    known = [*_units_taken(signals.units[place], signals.stated[place])]
-    known += [(gain, 2.0, ("", "")) for plain in PLAIN for gain in (plain, 1.0 / plain)]
-    nearest = min(known, key=lambda one: abs(math.log(one[0] / factor)))
+    nearest = min(_usual_scales(signals, names), key=lambda one: abs(math.log(one[0] / factor)))
     if abs(math.log(nearest[0] / factor)) > _ALIKE:
         return scale_correction(signals, names, float(factor), 2.0)
     return scale_correction(signals, names, *nearest)
 
 
-def _units_taken(si: str, stated: str) -> Iterator[tuple[float, float, tuple[str, str]]]:
-    """Yield factor, cost, and (meant, stated) for units that are mistaken for each other."""
-    for unit, factor in FACTORS.get(si, ()):
-        cost = 0.5 if unit in USUAL else 2.0
-        if stated == si:
-            yield factor, cost, (unit, si)
-        elif stated == unit:
-            yield 1.0 / factor, cost, (si, unit)
+def _usual_scales(
+    signals: Signals, names: Sequence[str]
+) -> Iterator[tuple[float, float, tuple[str, str]]]:
+    """Yield factor, cost, and (meant, stated) of units that are mistaken for others, and gains."""
+    place = signals.places(names)[0]
+    si, stated = signals.units[place], signals.stated[place]
+    for name in CONFUSED.get(si, ()):
+        known = units.unit(name)
+        cost = 0.5 if name in USUAL else 2.0
+        if known is not None and stated == si:
+            yield known.scale, cost, (name, si)
+        elif known is not None and stated == name:
+            yield 1.0 / known.scale, cost, (si, name)
+    for gain in PLAIN:
+        yield gain, 2.0, ("", "")
+        yield 1.0 / gain, 2.0, ("", "")
 
 
 def group_signals(signals: Signals) -> tuple[tuple[str, ...], ...]:
@@ -132,14 +137,10 @@ def group_signals(signals: Signals) -> tuple[tuple[str, ...], ...]:
 
 def sign_corrections(signals: Signals) -> Iterator[Correction]:
     """Signs of encoders, forces, channels and brake commands."""
-    groups: list[tuple[str, ...]] = [
-        (name,) for name in (*signals.axes, *signals.forces, *signals.channels)
-    ]
-    for many in (signals.forces, signals.brakes):
-        groups += [many] if len(many) > 1 else []
-    groups += [(name,) for name in signals.brakes]
-    for names in groups:
-        yield sign_correction(signals, names, 0.0 if len(names) == 1 else 1.0)
+    yield from (sign_correction(signals, [name]) for name in signals.names)
+    for names in (signals.forces, signals.brakes):
+        if len(names) > 1:
+            yield sign_correction(signals, names, 1.0)
 
 
 def exchange_corrections(signals: Signals) -> Iterator[Correction]:
@@ -173,12 +174,7 @@ def clock_corrections(signals: Signals) -> Iterator[Correction]:
 def unit_corrections(signals: Signals) -> Iterator[Correction]:
     """Units that are mistaken for others, and factors of gains and counters."""
     for names in group_signals(signals):
-        place = signals.places(names)[0]
-        for taken in _units_taken(signals.units[place], signals.stated[place]):
-            yield scale_correction(signals, names, *taken)
-        for factor in PLAIN:
-            yield scale_correction(signals, names, factor, 2.0)
-            yield scale_correction(signals, names, 1.0 / factor, 2.0)
+        yield from (scale_correction(signals, names, *one) for one in _usual_scales(signals, names))
 
 
 def quarter_turns(signals: Signals) -> Iterator[Correction]:

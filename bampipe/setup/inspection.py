@@ -174,7 +174,7 @@ def _record(
         gravity=correction.change.gravity,
         axes=tuple(system.coordinates[i] for i in axes),
         sentence=sentence,
-        evidence=describe_evidence(system, axes, found.before, found.after, found.drawn),
+        evidence=describe_evidence(system, axes, found.before, found.after),
         error_before=errors(found.before),
         error_after=errors(found.after),
         alternatives=tuple(
@@ -261,23 +261,20 @@ def _find_placeholders(system: System, session: IngestResult) -> dict[str, tuple
 
 def describe_correction(correction: Correction, session: IngestResult) -> str:
     """Describe a mistake without a full stop: the fault, a colon, the remedy in session.toml."""
-    if correction.kind == "clock":
-        return _clock(correction, session)
+    if correction.kind == "exchange":
+        return f"{join_names(correction.signals)} are exchanged: exchange their columns"
     if correction.change.gravity is not None:
         shown = ", ".join(f"{v:.4g}" for v in correction.change.gravity)
         return (
             "gravity has another direction in the frame of the base: if the robot is mounted so,"
             f" write gravity = [{shown}] into [robot] of the device file"
         )
-    if correction.kind == "zero":
-        return _zero(correction, session)
-    if correction.kind == "exchange":
-        return f"{join_names(correction.signals)} are exchanged: exchange their columns"
-    return _sign(correction, session) if correction.kind == "sign" else _scale(correction, session)
+    describe = {"clock": _clock, "zero": _zero, "sign": _sign, "scale": _scale}[correction.kind]
+    return describe(correction, session)
 
 
 def describe_evidence(
-    system: System, axes: list[int], before: Plausibility, after: Plausibility, drawn: bool
+    system: System, axes: list[int], before: Plausibility, after: Plausibility
 ) -> str:
     """Describe the effect of a correction: errors of ``axes``, and implausible parameters."""
     parts = [
@@ -292,7 +289,7 @@ def describe_evidence(
         if abs(distance_from_prior(item, old)) > abs(distance_from_prior(item, new)) + 1.0
     ]
     said = "; ".join(parts or back[:3])
-    if not drawn:
+    if after.unexplained is not None:
         return said
     return f"with bodies as drawn, {said or 'all drives differ by one factor'}"
 

@@ -29,7 +29,6 @@ _LEAST_TILT = np.radians(10.0)
 """Angle below which a gravity that explains more is attributed to errors of the drawn bodies."""
 _FIRST_TILT = 0.2
 """Initial angle of the search for a gravity along no axis, rad."""
-"""Angle by which the search for one along no axis begins, rad."""
 _MOST_ROUNDS = 6
 _ROUNDING = 1e-9
 
@@ -119,12 +118,6 @@ def find_mounting(
     return best
 
 
-def _alike(one: Mounting, other: Mounting) -> float:
-    """Cosine of the angle between two gravities."""
-    size = np.linalg.norm(one.gravity) * np.linalg.norm(other.gravity)
-    return float(one.gravity @ other.gravity / size) if size > 0.0 else 1.0
-
-
 def _tilted(mounting: Mounting, judge: Judge) -> Mounting:
     """Return the mounting with the best direction of gravity near its own.
 
@@ -140,7 +133,9 @@ def _tilted(mounting: Mounting, judge: Judge) -> Mounting:
     options = {"initial_simplex": start, "maxfev": 50, "xatol": 0.01, "fatol": 0.01}
     found = minimize(left, start[0], method="Nelder-Mead", options=options)
     tilted = mounting.under(down + found.x @ aside)
-    return tilted if _alike(tilted, mounting) < np.cos(_LEAST_TILT) else mounting
+    size = float(np.linalg.norm(tilted.gravity) * np.linalg.norm(mounting.gravity))
+    far = tilted.gravity @ mounting.gravity < np.cos(_LEAST_TILT) * size
+    return tilted if far else mounting
 
 
 def _neighbours(

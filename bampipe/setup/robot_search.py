@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import ClassVar
 
 import numpy as np
 
@@ -73,7 +72,6 @@ class DrawnSearch(Search):
     its own, and one factor for its bodies.
     """
 
-    is_drawn: ClassVar[bool] = True
     _reread: dict[bytes, Comparison] = field(default_factory=dict, init=False)
 
     @cached_property

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import ClassVar
 
 import numpy as np
 
@@ -75,7 +74,6 @@ class Finding:
     Attributes:
         rivals: other corrections that work as well; gain: of the score.
         before, after: plausibility of the set-ups, with all other mistakes corrected.
-        drawn: whether both were compared with drawn bodies.
     """
 
     correction: Correction
@@ -83,7 +81,6 @@ class Finding:
     before: Plausibility
     after: Plausibility
     gain: float
-    drawn: bool = False
 
 
 def confirm_mistakes(
@@ -91,7 +88,6 @@ def confirm_mistakes(
     chosen: tuple[Correction, ...],
     others: Sequence[Correction],
     placeholders: Sequence[str] = (),
-    drawn: bool = False,
 ) -> tuple[Finding, ...]:
     """Return the mistakes among corrections ``chosen`` together, the largest gain first.
 
@@ -100,7 +96,7 @@ def confirm_mistakes(
 
     Args:
         others: corrections that may replace a chosen one.
-        placeholders: signals whose scale is exactly 1; drawn: whether bodies are as drawn.
+        placeholders: signals whose scale is exactly 1.
     """
     found: list[Finding] = []
     while chosen:
@@ -110,7 +106,7 @@ def confirm_mistakes(
         found = []
         for one in chosen:
             before = judge(drop_correction(chosen, one)) or after.with_nothing_explained()
-            found.append(Finding(one, (), before, after, gain_of(before, after, one.cost), drawn))
+            found.append(Finding(one, (), before, after, gain_of(before, after, one.cost)))
         idle = min(found, key=lambda f: f.gain - least_gain(f.correction, placeholders))
         if idle.gain >= least_gain(idle.correction, placeholders):
             break
@@ -194,7 +190,6 @@ class Search:
     _judged: dict[tuple[int, ...], tuple[Plausibility | None, Corrections]] = field(
         default_factory=dict, init=False
     )
-    is_drawn: ClassVar[bool] = False
 
     def together(self, chosen: Corrections) -> Corrections:
         """Return corrections that explain more only together; none by default."""
@@ -224,7 +219,7 @@ class Search:
                 break
             tried += singles
             chosen = (*chosen, *self._with_refined_factor(chosen, best))
-        return confirm_mistakes(self.judge, chosen, self.rivals(tried), placeholders, self.is_drawn)
+        return confirm_mistakes(self.judge, chosen, self.rivals(tried), placeholders)
 
     def _best(
         self, chosen: Corrections, options: Sequence[Corrections], placeholders: Sequence[str]

@@ -1,7 +1,7 @@
 """Trials in which a signal has the opposite sign to the other trials, so no set-up suits all."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,8 +46,12 @@ def find_turned_trials(
     if len(fitted) < 2:
         return []
     if len(system.coordinates) > MOST_AXES:
-        drawn = is_drawn(system)
-        return _by_drawn_bodies(system, motions, fitted, band, folds, signals) if drawn else []
+        if not is_drawn(system):
+            return []
+        short = {k: shorten([motions[k]], DRAWN_SAMPLES) for k in fitted}
+        return _find_by_drawn_bodies(
+            {k: DrawnSearch(system, m, band, folds.subset([k]), signals) for k, m in short.items()}
+        )
 
     def gain(own: Plausibility, other: Plausibility) -> float:
         found = gain_of(own, other, 0.0)
@@ -88,27 +92,14 @@ def find_turned_trials(
     return result
 
 
-def _by_drawn_bodies(
-    system: System,
-    motions: Sequence[Motion],
-    fitted: Sequence[int],
-    band: Band,
-    folds: Folds,
-    signals: Signals,
-) -> list[TurnedTrial]:
-    """Find the few trials in which a drive opposes its drawn bodies and friction."""
-    alone = {
-        k: DrawnSearch(
-            system, shorten([motions[k]], DRAWN_SAMPLES), band, folds.subset([k]), signals
-        )
-        for k in fitted
-    }
+def _find_by_drawn_bodies(alone: Mapping[int, DrawnSearch]) -> list[TurnedTrial]:
+    """Find the few trials, each searched alone, in which a drive opposes bodies and friction."""
     against = {k: search.drives_against_bodies() for k, search in alone.items()}
     often = Counter(name for names in against.values() for name in names)
     found = []
     for k, search in alone.items():
-        if names := [name for name in against[k] if 2 * often[name] < len(fitted)]:
-            one = sign_correction(signals, names)
+        if names := [name for name in against[k] if 2 * often[name] < len(alone)]:
+            one = sign_correction(search.signals, names)
             before, after = search.judge(()), search.judge((one,))
             if before and after and gain_of(before, after, 0.0) > LEAST_GAIN:
                 found.append(TurnedTrial(k, (one,), before, after))

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bampipe.data.quality.table import TrialTable, find_runs, longest_run
-from bampipe.data.session import SECONDS, Channel, Encoder, Session
+from bampipe.data.session import SECONDS, Channel, Encoder, Register, Session
 from bampipe.data.session.channels import LARGEST_CONDITION
 from bampipe.data.units import unit
 from bampipe.errors import InputError
@@ -187,25 +187,19 @@ def part_readings(session: Session, si: dict[str, np.ndarray]) -> None:
         si[f"q_{axis}"] = values
 
 
-def to_signed(table: TrialTable, register: Channel | Encoder) -> None:
+def to_signed(table: TrialTable, source: Channel | Encoder) -> None:
     """Read the unsigned register of a signed number as what it stands for."""
-    two, bit = getattr(register, "wrap_bits", None), register.sign_bit
-    if bit is not None:
-        period = 2.0 ** (bit + 1)
-    elif two is not None:
-        period = 2.0**two
-    else:
+    register = Register(getattr(source, "wrap_bits", None) or 0, source.sign_bit or 0)
+    if not any(register):
         return
-    values = table.columns[register.column]
-    beyond = (values < 0.0) | (values >= period)
+    values = table.columns[source.column]
     table.refuse(
-        beyond,
-        lambda at: f"found {values[at]:g}, expected 0 to {period - 1.0:.0f}",
-        column=register.column,
+        (values < 0.0) | (values >= register.period),
+        lambda at: f"found {values[at]:g}, expected 0 to {register.period - 1.0:.0f}",
+        column=source.column,
         remedy="a column that is signed already needs no wrap_bits and no sign_bit",
     )
-    negative = values >= 0.5 * period
-    values[negative] = values[negative] - period if bit is None else 0.5 * period - values[negative]
+    table.columns[source.column] = register.signed(values)
 
 
 def _refuse_wild(table: TrialTable, values: np.ndarray, words: str, column: str) -> None:

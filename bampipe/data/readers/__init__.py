@@ -56,6 +56,7 @@ _KINDS = (
     (b"PK\x03\x04", ("", ".npz", *SHEETS), "a zip archive or spreadsheet"),
     (b"\x93NUMPY", (".npy",), "an array of NumPy"),
     (b"\x1f\x8b", ("",), "a gzip archive"),
+    (b"MATLAB", (".mat",), "a MATLAB file"),
     (hdf5.SIGNATURE, (".h5", ".hdf5", ".hdf", ".mat"), "an HDF5 file"),
 )
 
@@ -76,10 +77,7 @@ def read_trial(
         columns: names of the columns, the time first; see each format's module for how they are
             called there.
         name: what to call the file in messages (default: its path).
-        largest_bytes: refuse a trial that takes more than this in memory.
-        datetimes: ``strptime`` format of each column that holds dates and times, "" for ISO 8601;
-            returned as s since the first.
-        dialect: what is known about the layout of a text file.
+        largest_bytes, datetimes, dialect: see `Wanted`.
 
     Raises:
         InputError: empty, of another kind, cut off, too large, a column missing or twice, a
@@ -193,11 +191,10 @@ def _reader(path: Path) -> ModuleType:
         )
     if state.st_size == 0:
         raise InputError("the file is empty")
-    matlab = head.startswith(b"MATLAB") or head[512:520] == hdf5.SIGNATURE
-    kinds = [(magic, right, words) for magic, right, words in _KINDS if head.startswith(magic)]
-    kinds += [(b"", (".mat",), "a MATLAB file")] if matlab else []
-    for _, right, words in kinds:
-        if extension not in right:
+    if head[512:520] == hdf5.SIGNATURE:  # behind a user block of MATLAB
+        head = b"MATLAB"
+    for magic, right, words in _KINDS:
+        if head.startswith(magic) and extension not in right:
             remedy = f"name it *{right[0]}" if right[0] else "unpack it, or export it as CSV"
             raise InputError(f"this is {words}, not *{extension}", remedy=remedy)
     return _READERS.get(extension, text)

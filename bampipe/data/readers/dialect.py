@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import islice, zip_longest
 
 from bampipe.data.readers.moments import is_moment
 from bampipe.data.readers.trial import NUMBER, Dialect, check_columns
@@ -167,26 +167,16 @@ def readable_columns(head: bytes, layout: TableLayout) -> dict[str, bool]:
     Returns:
         Their names, and whether it is dates and times.
     """
-    numbers: Counter[int] = Counter()
-    moments: Counter[int] = Counter()
-    filled: Counter[int] = Counter()
-    rows = 0
-    for line in _lines(head)[: layout.first_line + _TRIED]:
-        if line.number < layout.first_line or not line.text.strip():
-            continue
-        rows += 1
-        row = layout.cells(line.text)
-        numbers.update(n for n, cell in enumerate(row) if _is_number(cell, layout.decimal))
-        moments.update(n for n, cell in enumerate(row) if is_moment(cell))
-        filled.update(n for n, cell in enumerate(row) if cell not in NULLS)
-    return {
-        name: moments[n] > numbers[n]
-        for n, name in enumerate(layout.header)
-        if name
-        and rows
-        and max(numbers[n], moments[n]) > max(0.5 * filled[n], _LEAST_FILLED * rows)
-        and layout.header.count(name) == 1
-    }
+    lines = _lines(head)[layout.first_line - 1 : layout.first_line + _TRIED]
+    rows = [layout.cells(line.text) for line in lines if line.text.strip()]
+    found = {}
+    for name, column in zip(layout.header, zip_longest(*rows, fillvalue=""), strict=False):
+        numbers = sum(_is_number(cell, layout.decimal) for cell in column)
+        moments, filled = sum(map(is_moment, column)), sum(cell not in NULLS for cell in column)
+        enough = max(numbers, moments) > max(0.5 * filled, _LEAST_FILLED * len(rows))
+        if name and enough and layout.header.count(name) == 1:
+            found[name] = moments > numbers
+    return found
 
 
 def share_of_rows(head: bytes) -> float:
@@ -448,18 +438,16 @@ def _padded(header: list[str], body: list[Line], delimiter: str) -> list[str]:
 
 def _decimal(body: list[Line], header: list[str], columns: Sequence[str], delimiter: str) -> str:
     """Decimal sign of the first lines; InputError where there are both, or digits in thousands."""
-    indices = [n for n, column in enumerate(header) if column in columns or not columns]
     seen: dict[str, tuple[str, int]] = {}
     plain = False
     for line in body[:_TRIED]:
-        row = cells(line.text, delimiter)
-        for index in indices:
-            cell = row[index] if index < len(row) else ""
-            at = f"row {line.number}, column '{header[index]}'"
+        for column, cell in zip(header, cells(line.text, delimiter), strict=False):
+            if columns and column not in columns:
+                continue
             if _GROUPED.match(cell):
                 raise InputError(
                     f"'{cell}' groups its digits in thousands",
-                    where=at,
+                    where=f"row {line.number}, column '{column}'",
                     remedy="export without thousands separators",
                 )
             if _COMMA.match(cell):

@@ -22,7 +22,6 @@ _STAMPED = re.compile(
     r"\s*\[?((?:\d{4}-\d\d-\d\d[ T])?\d{1,2}:\d\d:\d\d[.,]\d+)"
     r"(?:\]|\s*->|\s+(?:DEBUG|INFO|WARN\w*|ERROR)\b)\s*(.*)"
 )
-_QUOTED = re.compile(r'\A\s*"[^"]*\d[,;\t][^"]*"\s*\Z')
 _LINE_PROTOCOL = re.compile(r"[^\s,=]+(?:,\S+)? (\w[^\s=]*=\S+) (\d{10,19})\s*")
 _ELEMENT = re.compile(r"<(\w+)((?:\s+\w+=\"[^\"]*\")+)\s*/?>|<(\w+)>([^<>]*)</")
 _WITH_UNIT = re.compile(rf"({NUMBER})[ \u00a0]?([^\W\d_]\S*|[%°]\S*)")
@@ -77,6 +76,16 @@ class Form:
     names: tuple[str, ...] = ()
 
 
+_ALIKE = {
+    re.compile(r'\A\s*"[^"]*\d[,;\t][^"]*"\s*\Z'): Form(
+        "quotes around whole lines left out", lambda line: line.strip().strip('"')
+    ),
+    _HEX: Form("hexadecimal numbers", lambda line: _HEX.sub(lambda n: str(int(n[0], 16)), line)),
+    _FORTRAN: Form("exponents of Fortran", lambda line: _FORTRAN.sub(r"\1E\2", line)),
+}
+"""Forms of lines that are each written in one way."""
+
+
 def find_form(head: str) -> Form | None:
     """The form of a text that begins with ``head`` (whole lines); None of a table as it is.
 
@@ -98,16 +107,11 @@ def find_form(head: str) -> Form | None:
     ended = [line for line in lines if line.endswith(";") and line.count(";") == 1]
     if 2 * len(ended) > len(lines) and all(re.search(r"[,\t |]", line) for line in ended):
         return Form("", lambda line: line.removesuffix(";"))
-    if _are(_QUOTED, lines):
-        return Form("quotes around whole lines left out", lambda line: line.strip().strip('"'))
     if _are(_STAMPED, lines):
         return _stamped(lines)
-    if _are(_HEX, lines):
-        return Form(
-            "hexadecimal numbers", lambda line: _HEX.sub(lambda n: str(int(n[0], 16)), line)
-        )
-    if _are(_FORTRAN, lines):
-        return Form("exponents of Fortran", lambda line: _FORTRAN.sub(r"\1E\2", line))
+    for kind, form in _ALIKE.items():
+        if _are(kind, lines):
+            return form
     for find in (_protocol_fields, _elements, _PAIR.findall):
         if pairs := _pairs(lines, find):
             return pairs

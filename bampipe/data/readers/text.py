@@ -346,20 +346,15 @@ def _sound_end(stream: BinaryIO, layout: TableLayout) -> tuple[int, tuple[str, .
     last = content[cut + 1 :]
     if not last or layout.is_remark(last.decode("utf-8", "replace")):
         return size, ()
-    row = _split(last, layout)
-    short = len(row) < len(layout.header)
+    above = re.split(rb"[\r\n]+", content[: max(cut, 0)].rstrip(b"\r\n"))[-1]
+    rows = [layout.cells(line.decode("utf-8", "replace")) for line in (last, above)]
+    short = len(rows[0]) < len(layout.header)
     if not short and not ended and cut >= 0:
-        above = _split(re.split(rb"[\r\n]+", content[:cut].rstrip(b"\r\n"))[-1], layout)
-        sign = layout.decimal.encode()
-        decimals = [cells[-1].strip().partition(sign) for cells in (row, above)]
+        decimals = ["".join(row[-1:]).partition(layout.decimal) for row in rows]
         short = not (decimals[0][1] and len(decimals[0][2]) == len(decimals[1][2]))
     if not short:
         return size, ()
     return start + cut + 1, ("last line is cut off: 1 row dropped",)
-
-
-def _split(line: bytes, layout: TableLayout) -> list[bytes]:
-    return line.split() if layout.delimiter == " " else line.split(layout.delimiter.encode())
 
 
 _NO_READING = re.compile(r"[^\d\s\"\\][^\d\"\\]{0,19}|[-+]?1\.#\w+|#[A-Z]+[/\d!?]*")

@@ -5,7 +5,7 @@ Everything that can be known from the session file alone is checked here, and a 
 is wrong with one trial's file is the reader's and the quality rules' business.
 """
 
-from bampipe.data.session.channels import SECONDS, Channel, Clock, Encoder
+from bampipe.data.session.channels import SECONDS, Channel, Clock, Encoder, Register
 from bampipe.data.session.file import Part, Session, TrialEntry, inside, read_session, session_from
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "Clock",
     "Encoder",
     "Part",
+    "Register",
     "Session",
     "TrialEntry",
     "inside",

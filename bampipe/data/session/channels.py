@@ -458,6 +458,42 @@ class BrakeTable(Declaration):
         return tuple(map(Brake, named, self.columns, stated))
 
 
+class Register(NamedTuple):
+    """How an unsigned register holds signed numbers.
+
+    Attributes:
+        bits: of its width, of two's complement; 0 where it has a sign bit.
+        sign_bit: number of the bit that stands for minus, the lower ones being the magnitude.
+    """
+
+    bits: int = 0
+    sign_bit: int = 0
+
+    @property
+    def fields(self) -> str:
+        """What the session file says of it, after a comma."""
+        if self.bits:
+            return f", wrap_bits = {self.bits}, signed = true"
+        return f", sign_bit = {self.sign_bit}"
+
+    @property
+    def words(self) -> str:
+        if self.bits:
+            return f"a signed register of {self.bits} bits"
+        return f"sign and magnitude: bit {self.sign_bit} stands for minus"
+
+    @property
+    def period(self) -> float:
+        """Number of its readings, 0 to one less."""
+        return 2.0 ** (self.bits or self.sign_bit + 1)
+
+    def signed(self, values: np.ndarray) -> np.ndarray:
+        """What readings (T,) stand for."""
+        half = 0.5 * self.period
+        negative = values - self.period if self.bits else half - values
+        return np.where(values >= half, negative, values)
+
+
 class Channel(NamedDeclaration):
     """Any other recorded input: scale * raw + offset, in the unit given, which becomes SI."""
 

@@ -100,8 +100,8 @@ def propose(
         columns = find_robot_columns(folder, chosen.device, robot, found, clock.t, notes)
         match.robot = columns
         chosen = _with_guessed_motors(folder, chosen, match)
-        if columns.mounting is not None:
-            chosen = _hung(folder, chosen, columns.mounting, notes)
+        if columns.mounting is not None and columns.mounting.hangs:
+            chosen = _hang(folder, chosen, columns.mounting, notes)
         chosen = _check_robot(chosen, robot, columns, notes)
     encoders, axes = encoders_table(chosen.device, match, notes)
     inputs = input_tables(chosen, axes, match, notes)
@@ -199,10 +199,8 @@ def _with_guessed_motors(folder: Path, chosen: ChosenDevice, match: Matcher) -> 
     return chosen
 
 
-def _hung(folder: Path, chosen: ChosenDevice, mounting: Mounting, notes: Notes) -> ChosenDevice:
-    """The robot under the gravity that the drawn bodies ask for, where that is not as stated."""
-    if not mounting.hangs:
-        return chosen
+def _hang(folder: Path, chosen: ChosenDevice, mounting: Mounting, notes: Notes) -> ChosenDevice:
+    """The robot under the gravity that the drawn bodies ask for in place of the stated one."""
     gravity = np.where(np.abs(mounting.gravity) < 1e-9, 0.0, mounting.gravity)
     said = f"gravity = [{', '.join(f'{v:.4g}' for v in gravity)}]"
     put = "" if chosen.text else f" put that into [robot] of {chosen.name}"
@@ -262,9 +260,8 @@ def _trials_tables(
         for start_s, end_s in pairwise([None, *cuts, None]):
             lines += ["[[trials]]", f"file = {quoted(trial.file)}"]
             lines += _trial_kind(trial.file, device, notes)
-            lines += [f"recording = {trial.recording}"] if trial.recording else []
-            lines += [f"start_s = {start_s}"] if start_s is not None else []
-            lines += [f"end_s = {end_s}"] if end_s is not None else []
+            stretch = {"recording": trial.recording, "start_s": start_s, "end_s": end_s}
+            lines += [f"{key} = {value}" for key, value in stretch.items() if value is not None]
             lines += [f"part = {quoted(trial.part)}"] if trial.part else []
             for part in trial.parts:
                 if not any(name.startswith(f"{part.name}:") for name in match.used):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bampipe.data import guesses
+from bampipe.data.session import Register
 from bampipe.data.survey import DRIVERS, REFERENCE_WORDS, Survey, SurveyedColumn, words
 from bampipe.setup.proposal.notes import Notes
 from bampipe.setup.proposal.positions import travelled
@@ -42,7 +43,7 @@ class Matcher:
     found: Survey
     t: np.ndarray
     used: set[str]
-    registers: Mapping[str, guesses.Register]
+    registers: Mapping[str, Register]
     robot: RobotColumns = field(default_factory=RobotColumns)
     turning: Mapping[str, guesses.Turning] = field(default_factory=dict)
     given: Mapping[str, SurveyedColumn] = field(default_factory=dict)
@@ -158,16 +159,18 @@ class Matcher:
             share[column.name] = guesses.driven(self.t, travelled(position, self.t), values).share
         roles = {column.name: column.role for column in self.found.columns}
         fitting = [name for name in share if share[name] >= guesses.DRIVEN]
+        number, at_motor = _numbers(position.name), "motor" in words(position.name)
         # A velocity of an unknown name fits itself. Of several joints without a drawing, a drive
         # has the number of its position.
-        fitting = [name for name in fitting if roles[name] in DRIVERS] or fitting
-        fitting = [name for name in fitting if not _SUPPLIED & set(words(name))] or fitting
-        number = _numbers(position.name)
-        fitting = [name for name in fitting if number and _numbers(name) == number] or fitting
+        for is_likelier in (
+            lambda name: roles[name] in DRIVERS,
+            lambda name: not _SUPPLIED & set(words(name)),
+            lambda name: number and _numbers(name) == number,
+            lambda name: at_motor or "motor" not in words(name) or roles[name] != "force",
+        ):
+            fitting = [*filter(is_likelier, fitting)] or fitting
         if not fitting:
             return None
-        at_axis = [name for name in fitting if "motor" not in words(name) or roles[name] != "force"]
-        fitting = at_axis if "motor" not in words(position.name) and at_axis else fitting
         # A torque needs no constant where a current tells the same.
         best = max(fitting, key=lambda name: share[name] + _NO_LESS * (roles[name] == "force"))
         return next(c for c in self.found.columns if c.name == best)

@@ -8,6 +8,7 @@ from bampipe.data import guesses
 from bampipe.data.quality.clock import find_fresh_rows
 from bampipe.data.quality.encoders import integral, unwrapped
 from bampipe.data.quality.faulty_readings import INPUT, POSITION, find_spikes
+from bampipe.data.session import Register
 from bampipe.data.survey import DRIVERS, Survey, SurveyedColumn, words
 from bampipe.data.units import unit
 from bampipe.setup.proposal.notes import Notes
@@ -88,7 +89,7 @@ def fresh_readings(found: Survey, notes: Notes) -> Survey:
     return replace(found, columns=columns)
 
 
-def signed_readings(found: Survey) -> tuple[Survey, dict[str, guesses.Register]]:
+def signed_readings(found: Survey) -> tuple[Survey, dict[str, Register]]:
     """The log with its registers as signed numbers, and how each of them holds its sign.
 
     A position that counts on where a counter starts anew is no register: like ingest, it is

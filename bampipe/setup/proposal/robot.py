@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -223,14 +224,14 @@ def find_robot_columns(
             notes.check.append(f"of several {what}, {groups[0]} are taken, not {listed}")
     positions, drives = next(iter(by_position), None), next(iter(by_drive), None)
     turns, logged, joints = _turns(device, robot), Logged(device, robot, t), _joints(device)
-    if positions is None or drives is None or any(map(in_counts, positions.columns)):
-        columns = dict(zip(joints, positions.columns, strict=True)) if positions else {}
-        columns |= dict(zip(device.forces, drives.columns, strict=True)) if drives else {}
-        return RobotColumns(joints, {**columns, **some_drives})
 
-    def pair(positions: Group, drives: Group) -> dict[str, SurveyedColumn]:
-        found = (*positions.columns, *drives.columns)
-        return dict(zip((*joints, *device.forces), found, strict=True))
+    def pair(positions: Group | None, drives: Group | None) -> dict[str, SurveyedColumn]:
+        groups = (joints, positions), (device.forces, drives)
+        pairs = (zip(names, group.columns, strict=True) for names, group in groups if group)
+        return dict(chain.from_iterable(pairs))
+
+    if positions is None or drives is None or any(map(in_counts, positions.columns)):
+        return RobotColumns(joints, pair(positions, drives) | some_drives)
 
     def explain(positions: Group, drives: Group) -> Gears | None:
         """How the drawing explains the drives; None where they cannot be compared."""
@@ -275,10 +276,10 @@ def find_robot_columns(
     if not (positions.named or drives.named or sound):
         # ROS publishes joints so: the first column is the first name of the alphabet.
         order = [sorted(joints).index(name) for name in joints]
-        ordered = (
-            replace(positions, columns=tuple(positions.columns[k] for k in order)),
-            replace(drives, columns=tuple(drives.columns[k] for k in order)),
-        )
+        ordered = [
+            replace(group, columns=tuple(group.columns[k] for k in order))
+            for group in (positions, drives)
+        ]
         other = explain(*ordered)
         if other is not None and mean_left(other.drives) < _BETTER * left:
             notes.check.append(
@@ -395,10 +396,15 @@ def _sentences(
     for c, (name, drive) in zip(device.coordinates, drives.items(), strict=True):
         column = columns[name].name
         if not drive.is_sure:
+            by_friction = "; by its friction it is right" if drive.is_dissipative else ""
+            if drive.is_turned:
+                by_friction = (
+                    f"; by its friction it is turned, or that of {c.name} is the wrong one"
+                )
             if not together:
                 lines.append(
                     f"{column}: too little weight and inertia act on {c.name} to tell its sign"
-                    + _by_friction(drive, c.name)
+                    f"{by_friction}"
                 )
             continue
         size, share = abs(drive.share), -drive.share if together else drive.share
@@ -434,10 +440,3 @@ def _sentences(
     explained = max(0.0, 1.0 - mean_left(list(drives.values())))
     lines.append(f"drawing, drives' inertia and friction explain {explained:.1%} of the drives")
     return lines
-
-
-def _by_friction(drive: Drive, joint: str) -> str:
-    """What friction says of a drive's sign, as the end of a sentence."""
-    if drive.is_turned:
-        return f"; by its friction it is turned, or that of {joint} is the wrong one"
-    return "; by its friction it is right" if drive.is_dissipative else ""

@@ -8,7 +8,7 @@ import numpy as np
 
 from bampipe.data import guesses
 from bampipe.data.quality.clock import spread_stamps, unroll
-from bampipe.data.session import SECONDS
+from bampipe.data.session import SECONDS, Register
 from bampipe.data.survey import Survey, SurveyedColumn, words
 from bampipe.data.units import bare, spelled, unit
 from bampipe.errors import InputError
@@ -218,8 +218,7 @@ def encoders_table(
         match.used.add(column.name)
         alone = len(device.coordinates) == 1
         table = _encoder(axis, alone, column, match, notes)
-        register = match.registers.get(column.name)
-        if register is not None:
+        if register := match.registers.get(column.name):
             table = table.replace(" }", f"{register.fields} }}", 1)
             notes.check.append(f"{column.name} is {register.words}")
         lines.append(f"{axis.name} = {table}")
@@ -288,11 +287,10 @@ def _counting(axis: Coordinate, said: str, match: Matcher, turns: float = 1.0) -
 def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
     si = f"{axis.unit}/s"
     if column.is_foreign:
-        note = notes.ask(
+        return entry(column.name, UNKNOWN) + notes.ask(
             f"the unit of {column.name}, stated as '{column.stated}', which is integrated",
             "ask who wrote the logger; rad/s, rev/min and mm/s are usual",
         )
-        return entry(column.name, UNKNOWN) + note
     said = (spelled(column.unit, _SPEED_UNITS) if column.si == si else "") or si
     integral = f"that of {axis.name} is the integral of {column.name}, in {said}"
     return entry(column.name, said) + notes.guess(f"no position was recorded: {integral}")
@@ -300,23 +298,25 @@ def _integrated(axis: Coordinate, column: SurveyedColumn, notes: Notes) -> str:
 
 def _counted(axis: Coordinate, column: SurveyedColumn, match: Matcher, notes: Notes) -> str:
     """The entry of an encoder that counts; the weight of a joint may show what a count is worth."""
+
+    def count(size: str, zero: float, scale_sd: str = "") -> str:
+        counting = f"counts_per_unit = {size}, zero_counts = {zero:.0f}{scale_sd}"
+        return f'{{ column = {quoted(column.name)}, {counting}, unit = "{axis.unit}" }}'
+
     worth = match.turning.get(column.name)
-    zero = worth.zero if worth is not None else float(np.median(column.values))
-    turn, sd = (2.0 * np.pi * x for x in ((worth.size, worth.sd) if worth is not None else (0, 0)))
-    power = 2.0 ** round(np.log2(turn)) if turn > 0.0 else 0.0
-    is_power = abs(turn - power) < max(_SURE * sd, _NEAR * power)
-    size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}" if turn > 0.0 else "0.0"
-    counting = f"counts_per_unit = {size}, zero_counts = {zero:.0f}"
-    counting += f", scale_sd = {_rounded(sd / turn)}" if turn > 0.0 and not is_power else ""
-    table = f'{{ column = {quoted(column.name)}, {counting}, unit = "{axis.unit}" }}'
     if worth is not None:
+        turn, sd = 2.0 * np.pi * worth.size, 2.0 * np.pi * worth.sd
+        power = 2.0 ** round(np.log2(turn))
+        is_power = abs(turn - power) < max(_SURE * sd, _NEAR * power)
+        size = f"{(power if is_power else turn) / (2.0 * np.pi):.6g}"
+        scale_sd = "" if is_power else f", scale_sd = {_rounded(sd / turn)}"
         taken = f" ({power:.0f}, a power of two, is taken)" if is_power else ""
-        return table + notes.guess(
+        return count(size, worth.zero, scale_sd) + notes.guess(
             f"{column.name} counts {turn:.5g} ± {_rounded(sd)} a turn of {axis.name}{taken}, and"
-            f" {zero:.0f} where it hangs, by its weight, which goes with the sine of the angle; put"
-            " in the encoder's counts a turn, times the gear, by 2 pi"
+            f" {worth.zero:.0f} where it hangs, by its weight, which goes with the sine of the"
+            " angle; put in the encoder's counts a turn, times the gear, by 2 pi"
         )
-    return table + notes.ask(
+    return count("0.0", float(np.median(column.values))) + notes.ask(
         f"counts_per_unit of {{}}, the counts in one {axis.unit}; zero_counts is a guess"
         + (" of what is read where the drawing has 0" if match.robot.joints else ""),
         "counts a turn in the encoder's data sheet, times the gear, by 2 pi"
@@ -385,19 +385,21 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
     common = units.pop() if len(units) == 1 else ""
     known = unit(common)
     names = ", ".join(quoted(column.name) for column in columns)
+
+    def ask_unit(question: str, where: str) -> list[str]:
+        return [f'unit = "{UNKNOWN}"{notes.ask(question, where)}']
+
     if known is not None and known.si == device.force_unit and common:
         stated = all(column.stated for column in columns)
-        return [
-            f'unit = "{common}"'
-            + ("" if stated else notes.guess(f"{names} is a {_QUANTITY[known.si]} in {common}"))
-        ]
+        guess = f"{names} is a {_QUANTITY[known.si]} in {common}"
+        return [f'unit = "{common}"' + ("" if stated else notes.guess(guess))]
     if len({unit(column.unit) for column in columns if column.unit}) > 1:
-        note = notes.ask(
-            f"one unit of {names}, which are logged in {join_names([c.unit for c in columns])}",
+        listed = join_names([column.unit for column in columns])
+        return ask_unit(
+            f"one unit of {names}, which are logged in {listed}",
             "export them in one, as a force has one unit; it goes here",
         )
-        return [f'unit = "{UNKNOWN}"{note}']
-    counted = any(needs_gain(column) for column in columns)
+    counted = any(map(needs_gain, columns))
     if common == "V" or counted:
         row = f"[{', '.join(['0.0'] * len(columns))}]"
         rows = f"[{', '.join([row] * len(columns))}]"
@@ -416,24 +418,22 @@ def _force_unit(device: Device, columns: list[SurveyedColumn], why: str, notes: 
     odd = next((column for column in columns if column.is_foreign), None)
     if odd is not None or any(c.by_looks or not (c.role or c.unit or why) for c in columns):
         looks = "which looks like what drives the motion"
-        note = notes.ask(
+        return ask_unit(
             f"the unit of {names}, " + (f"stated as '{odd.stated}'" if odd is not None else looks),
             'ask who wrote the logger; "N.m" and "N" are usual, and volts or counts are "V" with'
             " a calibration_n_per_v",
         )
-        return [f'unit = "{UNKNOWN}"{note}']
     other = next((c for c in columns if c.si not in (None, "", "V", "kg", "N", "N.m")), None)
     if other is not None:
-        note = notes.ask(
+        return ask_unit(
             f"the force: {other.name} is in {bare(other.unit)} and follows the motion, but is none",
             "a channel of a force sensor; of a cylinder, log pressure times area in its place",
         )
-        return [f'unit = "{UNKNOWN}"{note}']
     note = ""
     if any(column.si == "kg" for column in columns):
         common = next(unit for unit in ("kgf", "gf") if columns[0].unit.startswith(unit[:-1]))
         note = notes.guess(f"{names} is the weight of a mass: a force in {common}")
-    if device.force_unit == "N.m" and any(is_force(column) for column in columns):
+    if device.force_unit == "N.m" and any(map(is_force, columns)):
         note = note or ("" if common else notes.guess(f"{names} is a force in N"))
         ask = notes.ask(
             f"lever_m, how far from the axis {names} acts, m",
@@ -494,30 +494,27 @@ def _channel(
             return table
         return table + notes.guess(f"{column.name} is {name}{why}{_unscaled(si, column, register)}")
     if column.is_foreign and si and not register:
-        note = notes.ask(f"the unit of {column.name}, stated as '{column.stated}'", _LOGGER)
-        return entry(column.name, UNKNOWN, fields) + note
+        question = f"the unit of {column.name}, stated as '{column.stated}'"
+        return entry(column.name, UNKNOWN, fields) + notes.ask(question, _LOGGER)
     if register and si and not column.unit:
-        note = notes.ask(
+        return entry(column.name, UNKNOWN, fields) + notes.ask(
             f"the unit of {column.name}, what one count is, such as 2.69mA; {register.words}",
             "the drive's table of registers",
         )
-        return entry(column.name, UNKNOWN, fields) + note
     if column.conversion is not None and column.si != si:
-        note = notes.ask(
+        return entry(column.name, si, f"{fields}, scale = 0.0") + notes.ask(
             f"the scale of {{}}, {si} for one {bare(column.unit)}, in which its column is",
             "of a share, what is rated, in the drive's data sheet",
             name,
         )
-        return entry(column.name, si, f"{fields}, scale = 0.0") + note
     likely = si if register else guesses.likely_unit(si, column.values) or si
     if name == "supply" and column.is_integer and float(np.nanmedian(column.values)) > _MOST_VOLTS:
         likely = "0.1V"
     if name == "duty" and not column.unit:
         most = float(np.nanmax(np.abs(column.values)))
         if most > 100.0:
-            table = entry(column.name, "", f"{fields}, scale = 0.0")
             said = f", {register.words}" if register else ""
-            return table + notes.ask(
+            return entry(column.name, "", f"{fields}, scale = 0.0") + notes.ask(
                 f"the scale of {name}, 1 over the reading of {column.name} at full duty{said}",
                 "the servo's table of registers: in steps of 0.1 % it is 0.001",
             )
@@ -530,7 +527,7 @@ def _channel(
     )
 
 
-def _unscaled(si: str, column: SurveyedColumn, register: guesses.Register | None) -> str:
+def _unscaled(si: str, column: SurveyedColumn, register: Register | None) -> str:
     """What to add of a column that may be in counts, or is a register."""
     if register:
         return f", {register.words}: give its scale"
