@@ -14,7 +14,7 @@ from bampipe.declarations.model import read_model_file
 from bampipe.errors import MissingResultError
 from bampipe.files import read_toml
 from bampipe.lists import join_names
-from bampipe.report.document import Paragraph, Section
+from bampipe.report.document import Paragraph
 from bampipe.results.compare import CompareResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.record import Result
@@ -146,10 +146,6 @@ class Results:
             return self.require_model(self.detail_model)
         compared = self.read(CompareResult)
         return compared.best if compared and compared.best in self.models else "base"
-
-    def make_section(self, title: str, said: str, stage: str) -> Section:
-        """Return the section of a stage that has not run, with the command that runs it."""
-        return Section(title, (self.state_undone(said, stage),))
 
     def state_undone(self, said: str, stage: str) -> Paragraph:
         """Return the paragraph on a stage that has not run, with the command that runs it."""
