@@ -193,14 +193,10 @@ def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Fig
     names = sorted(maps, key=lambda name: -maps[name].variance_share)[:_MOST_MAPS]
     figure, panels = style.make_grid(len(names), 3, 1.65, column_width=1.9)
     for number, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        draw_map(panel, name, maps[name], style.VERMILLION, "the model")
-        shown = [maps[name]]
+        shown = [(maps[name], style.VERMILLION, "the model")]
         if name in later:
-            draw_map(panel, name, later[name], style.BLUE, "with the effects found")
-            shown.append(later[name])
-        panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
-        bands = [np.array(values) for one in shown for values in (one.low, one.high)]
-        style.set_limits(panel, bands, zero=True)
+            shown.append((later[name], style.BLUE, "with the effects found"))
+        draw_maps(panel, name, shown)
         if number % 3 == 0:
             panel.set_ylabel(style.label_axis("mean residual", unit))
     caption = (
@@ -211,7 +207,16 @@ def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Fig
     return style.finish(figure, f"residual-maps-{model}-{axis}", caption, panels[:1])
 
 
-def draw_map(panel: Any, name: str, shown: ResidualMap, colour: str, title: str) -> None:
+def draw_maps(panel: Any, name: str, shown: Sequence[tuple[ResidualMap, str, str]]) -> None:
+    """Draw maps of one variable into a panel, each with its colour and its title."""
+    for one in shown:
+        _draw_map(panel, name, *one)
+    panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
+    bands = [np.array(values) for one, _, _ in shown for values in (one.low, one.high)]
+    style.set_limits(panel, bands, zero=True)
+
+
+def _draw_map(panel: Any, name: str, shown: ResidualMap, colour: str, title: str) -> None:
     """Draw the mean residual with its band over one variable of a map."""
     mean, low, high = (np.array(values) for values in (shown.mean, shown.low, shown.high))
     values = None if shown.unit else _name_values(name, shown.center)
