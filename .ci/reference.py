@@ -12,6 +12,7 @@ import runpy
 import textwrap
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,6 @@ from bampipe.declarations.pipeline import Pipeline
 from bampipe.physics import registry
 from bampipe.physics.device import Device
 from bampipe.physics.effect import Effect
-from bampipe.run.settings import plain
 from bampipe.schema import json_schema
 from bampipe.stages import base
 
@@ -125,7 +125,7 @@ def settings() -> str:
         words = described(stage.Config)
         rows = [
             (code(key), code(json.dumps(value)), words[key])
-            for key, value in plain(stage.Config()).items()
+            for key, value in asdict(stage.Config()).items()
             if key not in ("session", "model")
         ]
         text.append(table(("setting", "default", "meaning"), rows) if rows else "None.\n")

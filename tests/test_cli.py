@@ -531,7 +531,7 @@ def test_a_diagnosis_that_is_older_than_its_inputs_is_said(
         ]
 
     for reason in ("", "settings changed", "models/base/identify.json changed"):
-        monkeypatch.setattr(one_stage, "status", lambda *_, reason=reason: stands(reason))
+        monkeypatch.setattr("bampipe.run.status.status", lambda *_, reason=reason: stands(reason))
         one_stage._say_if_outdated(Path("runs/s01"), load("default"), "base")
         said = capsys.readouterr().out
         assert ("bampipe diagnose runs/s01" in said) == ("identify.json" in said)

@@ -10,7 +10,7 @@ from bampipe.declarations.model import ModelFile
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.run import RunResult
-from bampipe.run import models, pipeline, record
+from bampipe.run import models, pipeline
 from bampipe.run.events import ignore_event
 
 
@@ -34,7 +34,7 @@ def test_a_child_is_identified_as_its_parent_was(tmp_path: Path) -> None:
         "diagnose:base": made({"model": "base", "seed": 2, "without": ["quadratic_drag:carriage"]}),
         f"validate:{child}": made({"model": child, "seed": 4}),
     }
-    write_result(tmp_path, RunResult, schema=record.SCHEMA, stages=stages)
+    write_result(tmp_path, RunResult, schema="bampipe.run/1", stages=stages)
     given = loop.settings_of(tmp_path, "base")
     assert given == {
         "identify": {"method": "least-squares"},

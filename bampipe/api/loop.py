@@ -1,28 +1,28 @@
 """The loop: diagnose a model, extend it by the missing effects, and confirm the result."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 from bampipe.data.run_folder import RunFolder
+from bampipe.declarations.model import ModelFile
+from bampipe.declarations.pipeline import Pipeline
 from bampipe.errors import InputError
 from bampipe.files import is_normal, write_text
 from bampipe.lists import join_names
+from bampipe.phrases import diagnosis as phrases
+from bampipe.results.compare import CompareResult
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.draft import DraftResult
+from bampipe.results.identify import IdentifyResult
 from bampipe.run import models, record
 from bampipe.run.events import Listener
 from bampipe.run.request import Request
 from bampipe.run.runner import run_session
 from bampipe.stages import base
-
-if TYPE_CHECKING:
-    from bampipe.declarations.pipeline import Pipeline
-    from bampipe.results.diagnose import DiagnoseResult
 
 MOST_ROUNDS = 4
 
@@ -89,8 +89,6 @@ def settings_of(root: Path, model: str) -> dict[str, dict[str, object]]:
 
 def list_drafts(root: Path, model: str) -> dict[str, Path]:
     """Return the files of the effects that were drafted for ``model``, by ``name[:target]``."""
-    from bampipe.results.draft import DraftResult
-
     run = RunFolder(root)
     found = run.find(DraftResult, model)
     effects = found.effects.items() if found is not None else ()
@@ -176,9 +174,7 @@ def _remove(options: LoopOptions, model: str) -> None:
 
 def _write_child(root: Path, parent: str, named: Mapping[str, Path | None]) -> None:
     """Write the child of ``parent`` with the effects ``named``, its ``model.toml`` last."""
-    from bampipe.declarations.model import ModelFile
     from bampipe.declarations.model_file import load_model
-    from bampipe.results.diagnose import DiagnoseResult
 
     before = models.read(root, parent)
     for effect in named:
@@ -218,10 +214,6 @@ def follow(
     Returns:
         The name of the last model that is better than its parent.
     """
-    from bampipe.phrases.diagnosis import verdict
-    from bampipe.results.diagnose import DiagnoseResult
-    from bampipe.results.draft import DraftResult
-
     run, given = RunFolder(options.root), model
     options.run("identify", "validate", model)  # the ladder compares each child with it
     left_out: dict[str, dict[str, object]] = {}
@@ -229,7 +221,7 @@ def follow(
         options.run("diagnose", "diagnose", model, left_out)
         diagnosis = run.read(DiagnoseResult, model)
         for axis in sorted(diagnosis.axes):
-            tell(f"{model}, {axis}: {verdict(diagnosis, axis)}")
+            tell(f"{model}, {axis}: {phrases.verdict(diagnosis, axis)}")
         for line in dict.fromkeys(_list_open_questions(diagnosis)):
             tell(line)
         found = () if model != given and diagnosis.remainder_unknown else diagnosis.selected
@@ -256,8 +248,6 @@ def follow(
 
 def _list_open_questions(diagnosis: DiagnoseResult) -> Iterator[str]:
     """Yield a line on each undecided axis: the effect added, and the trial that would decide."""
-    from bampipe.phrases import diagnosis as phrases
-
     trial, open_effects = diagnosis.suggested_trial, phrases.find_open_effects(diagnosis)
     for axis, entry in diagnosis.axes.items():
         if entry.verdict != "undecided":
@@ -275,9 +265,6 @@ def _add(
     options: LoopOptions, model: str, effects: tuple[str, ...], tell: Callable[[str], None]
 ) -> str:
     """Extend ``model`` by the effects with a strength; return "" if it does not improve."""
-    from bampipe.results.compare import CompareResult
-    from bampipe.results.identify import IdentifyResult
-
     tell(f"adding {', '.join(effects)}")
     child = extend(options, model, effects)
     found = RunFolder(options.root).read(IdentifyResult, child).effects

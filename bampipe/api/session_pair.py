@@ -141,10 +141,12 @@ def _require_one_device(a: _Side, b: _Side) -> list[str]:
     for what, here in facts[0].items():
         there = facts[1][what]
         if here != there:
-            only = (join_names(sorted(x - y)) or "none" for x, y in ((here, there), (there, here)))
+            only_here, only_there = (
+                join_names(sorted(names)) or "none" for names in (here - there, there - here)
+            )
             raise InputError(
-                f"the sessions differ in {what}: {' only in '.join([next(only), a.name])},"
-                f" {' only in '.join([next(only), b.name])}",
+                f"the sessions differ in {what}: {only_here} only in {a.name},"
+                f" {only_there} only in {b.name}",
                 where=str(b.run.root),
                 remedy="compare sessions of one device",
             )

@@ -8,7 +8,6 @@ import typer
 from bampipe.cli import places, show
 from bampipe.cli.options import RUNS, BestModelOption, QuietOption, RunArgument, RunsOption
 from bampipe.data.run_folder import RunFolder
-from bampipe.run import accepted, models
 
 
 def accept(
@@ -26,6 +25,8 @@ def accept(
 
     Example: bampipe accept 2026-10-03_s01
     """
+    from bampipe.run import accepted, models
+
     root = places.find_run(run, runs)
     chosen = models.choose_model(root, model)
     path = accepted.accept(root, chosen, folder or accepted.accepted_folder(root.parent), force)

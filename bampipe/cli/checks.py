@@ -4,9 +4,6 @@ import typer
 
 from bampipe.cli import places, show
 from bampipe.cli.options import RUNS, JsonOption, RunArgument, RunsOption
-from bampipe.run import pipeline as pipelines
-from bampipe.run.status import status
-from bampipe.run.verify import verify
 
 
 def status_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption = False) -> None:
@@ -14,6 +11,9 @@ def status_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption =
 
     Example: bampipe status 2026-10-03_s01
     """
+    from bampipe.run import pipeline as pipelines
+    from bampipe.run.status import status
+
     root = places.find_run(run, runs)
     found = status(root, pipelines.recorded(root))
     if json:
@@ -31,6 +31,8 @@ def verify_(run: RunArgument = None, runs: RunsOption = RUNS, json: JsonOption =
 
     Example: bampipe verify 2026-10-03_s01
     """
+    from bampipe.run.verify import verify
+
     root = places.find_run(run, runs)
     found = verify(root)
     if json:

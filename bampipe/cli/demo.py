@@ -3,30 +3,25 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import bampipe
 from bampipe.api.loop import LoopOptions, follow
 from bampipe.cli import places
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
+from bampipe.results.compare import CompareResult
+from bampipe.results.truth import TruthResult
+from bampipe.results.validate import ValidateResult
 from bampipe.run import models, pipeline
 from bampipe.run.events import Listener
 from bampipe.run.request import Request
 from bampipe.run.runner import run_session
 from bampipe.run.session_name import session_id
 
-_PACKAGE = Path(bampipe.__file__).parent
-_SAMPLES = (_PACKAGE / "_sample_runs", _PACKAGE.parent / "sample_runs")
-
 
 def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str], None]) -> None:
     """Run the whole loop on the session that ships for it; ``tell``: called with each line."""
-    from bampipe.results.compare import CompareResult
-    from bampipe.results.truth import TruthResult
-    from bampipe.results.validate import ValidateResult
-
-    samples = next((folder for folder in _SAMPLES if folder.is_dir()), None)
-    if samples is None:
-        raise InputError("this installation has no sample sessions", where=str(_SAMPLES[0]))
+    samples = pipeline.find_shipped("sample_runs")
+    if not samples.is_dir():
+        raise InputError("this installation has no sample sessions", where=str(samples))
     session = samples / "demo"
     root = runs / session_id(session)
     chosen = pipeline.load()

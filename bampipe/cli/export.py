@@ -8,7 +8,6 @@ import typer
 from bampipe.cli import places, show
 from bampipe.cli.options import RUNS, BestModelOption, RunArgument, RunsOption
 from bampipe.errors import InputError, did_you_mean, located
-from bampipe.run import models
 
 
 def export(
@@ -40,6 +39,7 @@ def export(
     from bampipe.declarations.export import FORMS, export_model
     from bampipe.declarations.recording import gather_recording
     from bampipe.files import atomic_writer, write_text
+    from bampipe.run import models
 
     recordings = {"mcap": mcap_file.pack_recording, "rrd": rerun_file.pack_recording}
     if pack := recordings.get(form):

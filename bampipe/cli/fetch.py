@@ -7,7 +7,6 @@ import typer
 from bampipe.cli import show
 from bampipe.cli.options import RUNS, QuietOption, RunsOption
 from bampipe.errors import InputError, choose_from
-from bampipe.run import publish
 
 
 def fetch(
@@ -26,6 +25,8 @@ def fetch(
 
     Example: bampipe fetch file:///mnt/lab/runs 2026-10-03_s01
     """
+    from bampipe.run import publish
+
     known = publish.published(url)
     if not known:
         raise InputError("nothing is published here", where=url)

@@ -5,7 +5,6 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.next_step import after_loop, print_forecasts
 from bampipe.cli.one_stage import advise, run_stage, stage_command
 from bampipe.cli.options import (
     DEFAULTS,
@@ -21,8 +20,6 @@ from bampipe.cli.options import (
 )
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError
-from bampipe.run import batch, models
-from bampipe.run import pipeline as pipelines
 
 
 @stage_command("diagnose")
@@ -33,7 +30,9 @@ def diagnose(
 
     Example: bampipe diagnose 2026-10-03_s01
     """
+    from bampipe.cli.next_step import print_forecasts
     from bampipe.results.diagnose import DiagnoseResult
+    from bampipe.run import models
 
     root = places.find_run(run, options.runs)
     chosen = models.choose_model(root, model)
@@ -58,6 +57,7 @@ def draft(
     Example: bampipe draft 2026-10-03_s01
     """
     from bampipe.results.draft import DraftResult
+    from bampipe.run import models
 
     root = places.find_run(run, options.runs)
     chosen = models.choose_model(root, model)
@@ -101,8 +101,11 @@ def extend(
     Example: bampipe extend 2026-10-03_s01 --auto --draft
     """
     from bampipe.api import loop
+    from bampipe.cli.next_step import after_loop
     from bampipe.results.compare import CompareResult
     from bampipe.results.identify import IdentifyResult
+    from bampipe.run import batch, models
+    from bampipe.run import pipeline as pipelines
 
     batch.limit_threads(1)
     effects = others or []
@@ -151,6 +154,7 @@ def demo(runs: RunsOption = RUNS, force: ForceOption = False, quiet: QuietOption
     Example: bampipe demo
     """
     from bampipe.cli.demo import demonstrate
+    from bampipe.run import batch
 
     batch.limit_threads(1)
     with show.Watcher(quiet) as watcher:

@@ -16,7 +16,6 @@ import typer
 from bampipe.cli import places, show
 from bampipe.cli.options import RUNS, BestModelOption, RunsOption
 from bampipe.errors import InputError
-from bampipe.run import models
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -79,6 +78,7 @@ def monitor(
     from bampipe.data.run_folder import RunFolder
     from bampipe.monitor import monitor as monitoring
     from bampipe.monitor import start as monitor_start
+    from bampipe.run import models
 
     options = monitor_start.MonitorOptions(window_s, false_alarms, memory_s)
     options.check()

@@ -4,14 +4,17 @@ from pathlib import Path
 
 from bampipe.cli import show
 from bampipe.data.run_folder import RunFolder
+from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts
+from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.draft import DraftResult
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.next import NextResult
+from bampipe.results.setup import SetupResult
+from bampipe.results.validate import ValidateResult
 
 
 def after_run(root: Path, model: str) -> str:
     """Return the next step after a run; ``model``: that counts."""
-    from bampipe.results.diagnose import DiagnoseResult
-    from bampipe.results.identify import IdentifyResult
-    from bampipe.results.setup import SetupResult
-
     run = RunFolder(root)
     setup, found = run.find(SetupResult), run.find(DiagnoseResult, model)
     if setup is not None and setup.mistakes:
@@ -30,8 +33,6 @@ def after_run(root: Path, model: str) -> str:
 
 def _is_above_floor(run: RunFolder, model: str) -> bool:
     """Whether an axis is known to have an error above its noise floor."""
-    from bampipe.results.validate import ValidateResult
-
     validated = run.find(ValidateResult, model)
     axes = validated.axes.values() if validated is not None else ()
     return any(error.standing == "above_floor" for error in axes)
@@ -39,8 +40,6 @@ def _is_above_floor(run: RunFolder, model: str) -> bool:
 
 def after_loop(root: Path, model: str) -> str:
     """Return the next step after the loop ended with ``model``."""
-    from bampipe.results.diagnose import DiagnoseResult
-
     run = RunFolder(root)
     found = run.find(DiagnoseResult, model)
     if found is None:  # stopped after many rounds
@@ -56,9 +55,6 @@ def after_proposal(root: Path, model: str) -> str:
 
     Effects that a diagnosis has found come first, unless the trial is to decide about them.
     """
-    from bampipe.results.diagnose import DiagnoseResult
-    from bampipe.results.next import NextResult
-
     run = RunFolder(root)
     proposed = run.read(NextResult, model)
     if proposed.purpose != "decision":
@@ -74,18 +70,12 @@ def after_proposal(root: Path, model: str) -> str:
 
 def _after_diagnosis(run: RunFolder, model: str, said: str) -> str:
     """Return the advice of a diagnosis, or that of the draft that it asked for."""
-    from bampipe.results.draft import DraftResult
-
     draft = run.find(DraftResult, model) if said.startswith("bampipe draft ") else None
     return said if draft is None else draft.next
 
 
 def print_forecasts(root: Path, model: str) -> None:
     """Print forecasts beside their outcome, if there are trials that the proposals did not have."""
-    from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts
-    from bampipe.results.diagnose import DiagnoseResult
-    from bampipe.results.identify import IdentifyResult
-
     run, forecasts = RunFolder(root), read_forecasts(root, model)
     identified = run.find(IdentifyResult, model) if forecasts else None
     if identified is not None:

@@ -11,16 +11,11 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 
 from bampipe.cli import places, show
 from bampipe.cli.options import StageOptions
-from bampipe.run import batch
-from bampipe.run import pipeline as pipelines
-from bampipe.run.request import Outcome, Request
-from bampipe.run.runner import run_session
-from bampipe.run.settings import parse_assignment
-from bampipe.run.status import status
 from bampipe.stages import base
 
 if TYPE_CHECKING:
     from bampipe.declarations.pipeline import Pipeline
+    from bampipe.run.request import Outcome
 
 _OF_DIAGNOSIS = ("draft", "next")
 """Stages that use a diagnosis."""
@@ -67,6 +62,8 @@ def stage_command(stage: str) -> Callable[[Callable[..., None]], Callable[..., N
 
 def parse_settings(given: Sequence[str] | None) -> dict[str, object]:
     """Return the settings ``NAME=VALUE`` by name."""
+    from bampipe.run.settings import parse_assignment
+
     return dict(parse_assignment(text) for text in given or ())
 
 
@@ -86,6 +83,11 @@ def run_stage(
         model: the only model to run; all that the pipeline names, if empty.
         more: settings from options that only this stage has; empty ones were not given.
     """
+    from bampipe.run import batch
+    from bampipe.run import pipeline as pipelines
+    from bampipe.run.request import Request
+    from bampipe.run.runner import run_session
+
     batch.limit_threads(1)
     settings = parse_settings(options.settings)
     settings |= {name: value for name, value in (more or {}).items() if value}
@@ -117,6 +119,8 @@ def run_stage(
 
 def _say_if_outdated(root: Path, pipeline: Pipeline, model: str) -> None:
     """Print a note if a diagnosis that has just been used was made from other results."""
+    from bampipe.run.status import status
+
     for step in status(root, pipeline):
         # Settings that differ from the pipeline's do not make it wrong; other inputs do.
         if step.step == f"diagnose:{model}" and step.state == "stale" and "/" in step.reason:

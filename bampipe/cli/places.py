@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bampipe.errors import InputError, choose_from
-from bampipe.run import record
 from bampipe.run.session_name import session_folder, session_id
 
 
 def run_folder_of(argument: str, runs: Path) -> Path | None:
     """Return the run folder: a bare name is first of all one in ``runs``, anything else a path."""
+    from bampipe.run import record
+
     is_name = argument == Path(argument).name
     places = (runs / argument, Path(argument)) if is_name else (Path(argument), runs / argument)
     return next((path for path in places if (path / record.FILE).is_file()), None)
@@ -28,26 +29,29 @@ def find_run(argument: str | None, runs: Path) -> Path:
     Raises:
         InputError: there is no such run.
     """
+    from bampipe.run import record
+
     files = sorted(runs.glob(f"*/{record.FILE}"), key=lambda file: -file.stat().st_mtime_ns)
     known = [file.parent for file in files]
-    if argument is None and not known:
-        raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
-    root = known[0] if argument is None else run_folder_of(argument, runs)
-    if argument is not None and root is None:
-        folder = session_folder(argument)
-        if not (folder / "session.toml").is_file():
-            remedy = choose_from(argument, [root.name for root in known])
-            raise InputError(
-                f"no run {argument!r}",
-                where=str(runs),
-                remedy=remedy or "start with `bampipe run SESSION`",
-            )
-        root = runs / session_id(folder)
-        if not (root / record.FILE).is_file():
-            raise InputError(
-                "this session has not been run", where=str(folder), remedy=f"`bampipe run {folder}`"
-            )
-    assert root is not None
+    if argument is None:
+        if not known:
+            raise InputError(f"no run yet in {runs}", remedy="start with `bampipe run SESSION`")
+        return known[0]
+    if root := run_folder_of(argument, runs):
+        return root
+    folder = session_folder(argument)
+    if not (folder / "session.toml").is_file():
+        remedy = choose_from(argument, [root.name for root in known])
+        raise InputError(
+            f"no run {argument!r}",
+            where=str(runs),
+            remedy=remedy or "start with `bampipe run SESSION`",
+        )
+    root = runs / session_id(folder)
+    if not (root / record.FILE).is_file():
+        raise InputError(
+            "this session has not been run", where=str(folder), remedy=f"`bampipe run {folder}`"
+        )
     return root
 
 

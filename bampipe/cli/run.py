@@ -1,15 +1,16 @@
 """``bampipe run``: sessions from raw log to report."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from bampipe.cli import places, show
 from bampipe.cli.lab import refresh
-from bampipe.cli.next_step import after_run, print_forecasts
 from bampipe.cli.one_stage import parse_settings
 from bampipe.cli.options import (
     RUNS,
@@ -21,12 +22,11 @@ from bampipe.cli.options import (
     RunsOption,
 )
 from bampipe.errors import InputError
-from bampipe.run import batch
-from bampipe.run import junit as junit_xml
-from bampipe.run import pipeline as pipelines
-from bampipe.run.request import Outcome, Request
 from bampipe.run.session_name import session_id
 from bampipe.stages import base
+
+if TYPE_CHECKING:
+    from bampipe.run.request import Outcome, Request
 
 STATES = {0: "done", 1: "gate failed", 2: "bad input", 3: "crashed"}
 
@@ -84,6 +84,11 @@ def run(
 
     Example: bampipe run 'sessions/*' --jobs 2 --junit gates.xml
     """
+    from bampipe.cli.next_step import after_run, print_forecasts
+    from bampipe.run import batch
+    from bampipe.run import pipeline as pipelines
+    from bampipe.run.request import Request
+
     if engine not in ("local", "dask"):
         raise InputError(f"no engine {engine!r}", remedy="choose local or dask")
     if scheduler and engine != "dask":
@@ -139,6 +144,8 @@ def _make_requests(common: Request, folders: Sequence[Path]) -> tuple[list[Reque
     Raises:
         InputError: the only session is refused.
     """
+    from bampipe.run.request import Outcome
+
     requests: dict[Path, Request] = {}
     refused: list[Outcome] = []
     for folder in folders:
@@ -174,6 +181,7 @@ def _write_summaries(
     outcomes: Sequence[Outcome], junit: Path | None, markdown: Path | None
 ) -> None:
     """Write the verdicts of the gates as JUnit XML, and add a summary in Markdown, where asked."""
+    from bampipe.run import junit as junit_xml
     from bampipe.run.markdown import summary
 
     for path, mode in ((junit, "wb"), (markdown, "ab")):

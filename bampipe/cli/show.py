@@ -16,11 +16,11 @@ from bampipe.progress import Progress
 from bampipe.report.document import Table, strip_marks
 from bampipe.report.wording import break_lines
 from bampipe.run.events import Event
-from bampipe.run.request import Outcome
 
 if TYPE_CHECKING:
     from bampipe.results.compare import Rung
     from bampipe.results.identify import EffectEstimate
+    from bampipe.run.request import Outcome
 
 LARGEST_TABLE = 40
 WIDEST_CELL = 60

@@ -9,7 +9,6 @@ from bampipe.cli import show
 from bampipe.cli.one_stage import parse_settings
 from bampipe.cli.options import JsonOption, QuietOption
 from bampipe.errors import InputError
-from bampipe.run import batch
 
 
 def simulate(
@@ -47,6 +46,8 @@ def simulate(
 
     Example: bampipe simulate sessions/trial --effect stribeck:yaw --seed 1
     """
+    from bampipe.run import batch
+
     batch.limit_threads(1)
     from bampipe.simulator.simulated_session import Config, simulate_session
 

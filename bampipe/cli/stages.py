@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from bampipe.cli import places, show
-from bampipe.cli.next_step import after_proposal, print_forecasts
 from bampipe.cli.one_stage import advise, run_stage, run_stage_of, stage_command
 from bampipe.cli.options import (
     DEFAULTS,
@@ -20,7 +19,6 @@ from bampipe.cli.options import (
 )
 from bampipe.errors import InputError
 from bampipe.files import write_text
-from bampipe.run import models
 from bampipe.run.session_name import session_id
 
 
@@ -140,6 +138,9 @@ def next_(
 
     Example: bampipe next robot_arm --as trajectory --out motion.yaml
     """
+    from bampipe.cli.next_step import after_proposal, print_forecasts
+    from bampipe.run import models
+
     suffix = _choose_trajectory(form, out, plan)
     if sd and not plan:
         raise InputError("--sd needs --plan", remedy="give --plan with it")

@@ -1,8 +1,9 @@
-"""The place of a lab's folder, and whether it is up to date; imports nothing slow."""
+"""The place of a lab's folder, and whether it is up to date."""
 
 from pathlib import Path
 
 from bampipe.errors import InputError
+from bampipe.results.lab import LabResult
 from bampipe.run import record
 
 FILE = "lab.json"
@@ -33,8 +34,6 @@ def is_current(runs: Path, folder: Path) -> bool:
     roots = run_folders(runs)
     if any((root / record.FILE).stat().st_mtime_ns > written for root in roots):
         return False
-    from bampipe.results.lab import LabResult
-
     try:
         lab = LabResult.read(about)
     except InputError:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import datetime
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from bampipe.report import page, style, typeset
-from bampipe.report.document import Block, Callout, Document, Figure, Section
+from bampipe.report.document import Document, Figure, Section
 from bampipe.report.explorer.page import explorer_page
 from bampipe.report.run_results import Results
 from bampipe.report.sections import SECTIONS
-from bampipe.results.setup import SetupResult
 
 
 @dataclass(frozen=True)
@@ -53,10 +52,9 @@ def build_run_report(results: Results, progress: Callable[[float, str], None]) -
         progress(0.7 * number / len(SECTIONS), name)
         module = importlib.import_module(f"bampipe.report.sections.{name}")
         with style.use_style():
-            section: Section | None = module.section(results)
-        if section is not None:
-            sections.append(section)
-    sections[0] = replace(sections[0], blocks=(*_list_warnings(results), *sections[0].blocks))
+            blocks = tuple(module.list_blocks(results))
+        if blocks:
+            sections.append(Section(module.TITLE, blocks))
     title = f"Session {results.session.session_id}"
     document = Document(title, _make_subtitle(results), tuple(sections))
     progress(0.7, "page for exploring")
@@ -66,28 +64,6 @@ def build_run_report(results: Results, progress: Callable[[float, str], None]) -
     if when is not None and when.tzinfo is None:
         when = when.replace(tzinfo=datetime.UTC)
     return Report.from_document(document, max(0, int(when.timestamp())) if when else 0, explorer)
-
-
-def _list_warnings(results: Results) -> tuple[Block, ...]:
-    """Return the mistakes in the set-up, and the outdated results."""
-    blocks: list[Block] = []
-    setup = results.read(SetupResult)
-    for mistake in setup.mistakes if setup else ():
-        text = f"Once this is corrected, {mistake.evidence}."
-        if mistake.alternatives:
-            others = "; ".join(other.sentence for other in mistake.alternatives)
-            text += f" The trials cannot distinguish it from: {others}."
-        text += " No result below is valid before the session file is corrected."
-        blocks.append(Callout("attention", f"Set-up: {mistake.sentence}", text))
-    if setup and setup.warnings:
-        text = " ".join(f"{line}." for line in setup.warnings)
-        blocks.append(Callout("note", "Doubtful set-up", text))
-    if results.outdated:
-        steps = ", ".join(f"`{step}`" for step in results.outdated)
-        text = f"Run these again before relying on their results: {steps}."
-        title = "Some results are older than their inputs"
-        blocks.append(Callout("attention", title, text))
-    return tuple(blocks)
 
 
 def _make_subtitle(results: Results) -> str:

@@ -1,6 +1,6 @@
 """The report over all sessions of a lab: verdicts, control charts, errors, trials."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -111,8 +111,7 @@ def _show_session(one: SessionVerdict) -> Callout:
     return Callout(tone, f"{one.session}: {one.verdict}", f"{sentence}.{remedy}")
 
 
-def _show_charts(trends: TrendsResult) -> list[Section]:
-    sections = []
+def _show_charts(trends: TrendsResult) -> Iterator[Section]:
     devices = sorted({one.device for one in trends.series})
     for place, device in enumerate(devices, start=1):
         charts = [one for one in trends.series if one.device == device]
@@ -120,7 +119,7 @@ def _show_charts(trends: TrendsResult) -> list[Section]:
         if all(len(chart.points) == 1 for chart in charts):
             name = charts[0].points[0].session
             text = f"This device has one session, {name}: there is nothing to compare."
-            sections.append(Section(title, (Paragraph(text),)))
+            yield Section(title, (Paragraph(text),))
             continue
         text = (
             "Each point is the estimate of a session with two standard deviations, for the base "
@@ -142,8 +141,7 @@ def _show_charts(trends: TrendsResult) -> list[Section]:
                 _draw_chart(panel, chart)
             caption = "Parameters of the base model and stiffnesses, session by session."
             blocks.append(style.finish(figure, f"charts-{place}{number}", caption))
-        sections.append(Section(title, tuple(blocks)))
-    return sections
+        yield Section(title, tuple(blocks))
 
 
 def _draw_chart(panel: Axes, chart: ControlChart) -> None:
@@ -221,11 +219,11 @@ def _tabulate_charts(charts: list[ControlChart]) -> Table:
     )
 
 
-def _show_errors(folder: Path, trends: TrendsResult) -> list[Section]:
+def _show_errors(folder: Path, trends: TrendsResult) -> Iterator[Section]:
     frame = pd.read_parquet(folder / "errors")
     frame = frame[frame["error_over_floor"].notna()]
     if frame.empty:
-        return []
+        return
     model_of = {one.session: one.model for one in trends.sessions}
     with_error = set(frame["session_id"])
     sessions = [one.session for one in trends.sessions if one.session in with_error]
@@ -257,13 +255,13 @@ def _show_errors(folder: Path, trends: TrendsResult) -> list[Section]:
         f"right. In the green band, below {AT_FLOOR:g}, only a diagnosis can find a further effect."
     )
     picture = style.finish(figure, "errors", caption, panels[:1])
-    return [Section("Prediction", (Paragraph(text), picture))]
+    yield Section("Prediction", (Paragraph(text), picture))
 
 
-def _show_trials(folder: Path) -> list[Section]:
+def _show_trials(folder: Path) -> Iterator[Section]:
     frame = pd.read_parquet(folder / "quality")
     if frame.empty:
-        return []
+        return
     odd = frame[frame["status"] != "ok"]
     sessions = count_noun(frame["session_id"].nunique(), "session")
     text = (
@@ -286,4 +284,4 @@ def _show_trials(folder: Path) -> list[Section]:
         note = f"{more} more in the table `quality`." if more > 0 else ""
         title = "Trials that were not sound as recorded"
         blocks.append(Table(title, "Session | Trial | Status | Reason ~1", rows, note))
-    return [Section("Trials", tuple(blocks))]
+    yield Section("Trials", tuple(blocks))

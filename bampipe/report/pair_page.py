@@ -1,12 +1,10 @@
 """Two sessions of one device: tables for page and terminal, and the residual by state."""
 
-import numpy as np
-
 from bampipe.lists import count_noun
 from bampipe.report import style
 from bampipe.report.document import Block, Bullets, Callout, Document, Figure, Section, Table, Tone
 from bampipe.report.page import render_page
-from bampipe.report.sections.diagnosis import draw_map
+from bampipe.report.sections.diagnosis import draw_maps
 from bampipe.report.wording import format_digits, format_p_value, format_unit
 from bampipe.results.pair import PairResult
 
@@ -82,15 +80,9 @@ def _draw_states(pair: PairResult, axis: str) -> Figure:
     states = [one for one in pair.states if one.axis == axis and one.p_values]
     figure, panels = style.make_grid(max(len(states), 1), 3, 1.8)
     for panel, one in zip(panels, states, strict=False):
-        for shown, colour, side in (
-            (one.first, style.BLUE, pair.first),
-            (one.second, style.VERMILLION, pair.second),
-        ):
-            draw_map(panel, one.variable, shown, colour, side.session)
-        panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
+        first = (one.first, style.BLUE, pair.first.session)
+        draw_maps(panel, one.variable, [first, (one.second, style.VERMILLION, pair.second.session)])
         panel.set_title(f"{count_noun(one.changed, 'bin')} of {len(one.p_values)} changed")
-        bands = [np.array(v) for m in (one.first, one.second) for v in (m.low, m.high)]
-        style.set_limits(panel, bands, zero=True)
     panels[0].set_ylabel(style.label_axis("mean residual", pair.journeys[0].axes[axis].unit))
     caption = f"Residual of the model of {pair.first.session} on {axis}, trials of both sessions."
     return style.finish(figure, f"states-{axis}", caption, panels[:1])

@@ -14,7 +14,7 @@ from bampipe.declarations.model import read_model_file
 from bampipe.errors import MissingResultError
 from bampipe.files import read_toml
 from bampipe.lists import join_names
-from bampipe.report.document import Paragraph, Section
+from bampipe.report.document import Paragraph
 from bampipe.results.compare import CompareResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.record import Result
@@ -64,23 +64,18 @@ class Results:
         run = self.read(RunResult)
         stages = run.stages if run else {}
         makers = {name: step for step, made in stages.items() for name in made.outputs}
-        found: set[str] = set()
-        while True:
-            more = {
-                step
-                for step, made in stages.items()
-                if step not in found
-                for name, digest in made.inputs.items()
-                if name in makers
-                # TOML inputs are hashed by content, outputs by bytes: they cannot be compared.
-                and (
-                    makers[name] in found
-                    or (not name.endswith(".toml") and stages[makers[name]].outputs[name] != digest)
-                )
-            } - {"report"}
-            if not more:
-                return tuple(sorted(found))
-            found |= more
+        # TOML inputs are hashed by content, outputs by bytes: they cannot be compared.
+        found = {
+            step
+            for step, made in stages.items()
+            for name, digest in made.inputs.items()
+            if name in makers and not name.endswith(".toml")
+            if stages[makers[name]].outputs[name] != digest
+        }
+        for _ in stages:  # no chain of steps is longer
+            inputs = {name for name, step in makers.items() if step in found}
+            found |= {step for step, made in stages.items() if inputs & made.inputs.keys()}
+        return tuple(sorted(found - {"report"}))
 
     @cached_property
     def session(self) -> IngestResult:
@@ -146,10 +141,6 @@ class Results:
             return self.require_model(self.detail_model)
         compared = self.read(CompareResult)
         return compared.best if compared and compared.best in self.models else "base"
-
-    def make_section(self, title: str, said: str, stage: str) -> Section:
-        """Return the section of a stage that has not run, with the command that runs it."""
-        return Section(title, (self.state_undone(said, stage),))
 
     def state_undone(self, said: str, stage: str) -> Paragraph:
         """Return the paragraph on a stage that has not run, with the command that runs it."""

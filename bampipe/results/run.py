@@ -8,13 +8,15 @@ from bampipe.files import is_normal
 from bampipe.results.record import Names, Record, Result, Size
 from bampipe.schema import Declaration, Text, fault
 
-_PRIVATE, _OF_SESSION = ".bampipe", "session:"
-"""As in `bampipe.run.record`, which imports nothing heavy."""
+PRIVATE = ".bampipe"
+"""Folder of the runner's own files in a run folder."""
+SESSION = "session:"
+"""Prefix of a session's files among the inputs of a step."""
 
 
 def is_result(name: object) -> bool:
     """Whether ``name`` can be a result: a normal path, and none of the runner's own files."""
-    own = str(name).partition("/")[0].casefold() == _PRIVATE
+    own = str(name).partition("/")[0].casefold() == PRIVATE
     return is_normal(name) and name != RunResult.FILE and not own
 
 
@@ -25,7 +27,7 @@ def _check_result(name: str) -> str:
 
 
 def _check_input(name: str) -> str:
-    if not name.startswith(_OF_SESSION) and not is_normal(name):
+    if not name.startswith(SESSION) and not is_normal(name):
         raise fault(f"the name {name!r} leads out of the run folder")
     return name
 

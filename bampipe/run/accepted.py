@@ -4,19 +4,20 @@ They lie in ``accepted/<device>.json`` beside the runs, one small file to keep u
 control. `bampipe accept RUN` writes it; gates with ``against = "accepted"`` read it.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from bampipe.data.run_folder import RunFolder
+from bampipe.declarations.accepted import Accepted
 from bampipe.errors import InputError
 from bampipe.files import read_json, write_json
+from bampipe.phrases.results import STANDINGS
+from bampipe.results.identify import IdentifyResult
+from bampipe.results.ingest import IngestResult
+from bampipe.results.stiffness import StiffnessResult
+from bampipe.results.validate import ValidateResult
 from bampipe.run import record
-
-if TYPE_CHECKING:
-    from bampipe.declarations.accepted import Accepted
+from bampipe.schema import read as check
 
 ACCEPTED = "accepted"
 """Name of the folder, and value of a gate's ``against``."""
@@ -37,9 +38,6 @@ def read(folder: Path, device: str) -> Accepted | None:
     path = file_of(folder, device)
     if not path.is_file():
         return None
-    from bampipe.declarations.accepted import Accepted
-    from bampipe.schema import read as check
-
     try:
         return check(Accepted, read_json(path), str(path))
     except InputError as error:
@@ -55,11 +53,6 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
     Raises:
         InputError: the model is not identified, a gate failed, or a result was changed by hand.
     """
-    from bampipe.declarations.accepted import Accepted
-    from bampipe.results.identify import IdentifyResult
-    from bampipe.results.ingest import IngestResult
-    from bampipe.results.stiffness import StiffnessResult
-
     run = RunFolder(root)
     names = (IdentifyResult.file(model), StiffnessResult.FILE, IngestResult.FILE)
     record.require_untouched(root, names)
@@ -105,9 +98,6 @@ def accept(root: Path, model: str, folder: Path, force: bool = False) -> Path:
 
 def doubts(run: RunFolder, model: str) -> list[str]:
     """Return reasons, one line each, not to use ``model`` as the reference for later sessions."""
-    from bampipe.phrases.results import STANDINGS
-    from bampipe.results.validate import ValidateResult
-
     found = run.find(ValidateResult, model)
     if found is None:
         return [f"model {model} has not been validated: `bampipe validate {run.root}`"]

@@ -1,19 +1,16 @@
 """Quality gates: results compared with the limits of a pipeline."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bampipe.data.run_folder import RunFolder
+from bampipe.declarations.pipeline import Gate
 from bampipe.files import read_json_table
+from bampipe.results.ingest import IngestResult
+from bampipe.results.run import GateState, GateVerdict
 from bampipe.run import accepted
-
-if TYPE_CHECKING:
-    from bampipe.declarations.pipeline import Gate
-    from bampipe.results.run import GateState, GateVerdict
 
 
 def _pick(content: object, dotted: str) -> dict[str, object]:
@@ -45,8 +42,6 @@ def _found(
 
     The advice is that for ``word``, if the gate has one.
     """
-    from bampipe.results.run import GateVerdict
-
     state: GateState = "passed" if passed else "failed" if gate.level == "fail" else "warned"
     advice = gate.advice_on.get(word, gate.advice)
     parts = [*parts, advice] if advice and not passed else parts
@@ -54,8 +49,6 @@ def _found(
 
 
 def _missing(gate: Gate, key: str, what: str) -> GateVerdict:
-    from bampipe.results.run import GateVerdict
-
     state: GateState = "absent" if gate.optional else "failed" if gate.level == "fail" else "warned"
     return GateVerdict(gate=gate.name, key=key, state=state, value=None, message=what)
 
@@ -125,8 +118,6 @@ def _judge_change(
 
     A change beyond the limit but within two standard deviations neither passes nor fails: it warns.
     """
-    from bampipe.results.ingest import IngestResult
-
     reference = accepted.read(baseline, RunFolder(root).read(IngestResult).device)
     if reference is None:
         what = f"nothing accepted yet in {baseline}: run `bampipe accept`"

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 import bampipe
 from bampipe.errors import InputError
 from bampipe.files import digest_content, digest_file, digest_input, is_inside, read_toml
-from bampipe.run.record import SESSION
+from bampipe.results.run import SESSION
 from bampipe.stages import base
 
 PACKAGES = (

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, printable
+from bampipe.results.validate import ValidateResult
 from bampipe.run.request import Outcome
 
 STATES = {0: "passed", 1: "**gate failed**", 2: "**bad input**", 3: "**crashed**"}
@@ -63,8 +64,6 @@ def _session(outcome: Outcome) -> tuple[str, ...]:
 
 def _errors(run: RunFolder, model: str) -> str:
     """Return the ratio of held-out error to noise floor of each axis."""
-    from bampipe.results.validate import ValidateResult
-
     try:
         found = run.find(ValidateResult, model) if model else None
     except InputError:

@@ -3,18 +3,15 @@
 A missing or damaged model raises `InputError`, which names the existing ones.
 """
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from bampipe.data.run_folder import RunFolder
+from bampipe.declarations.model import ModelFile, read_model_file
 from bampipe.errors import InputError, choose_from
 from bampipe.files import digest_bytes, read_toml, write_text
-
-if TYPE_CHECKING:
-    from bampipe.declarations.model import ModelFile
+from bampipe.results.compare import CompareResult
+from bampipe.results.ingest import IngestResult
 
 BASE = "base"
 _LONGEST = 160
@@ -31,8 +28,6 @@ def names(root: Path) -> tuple[str, ...]:
 
 def read(root: Path, name: str) -> ModelFile:
     """Read ``models/<name>/model.toml``."""
-    from bampipe.declarations.model import read_model_file
-
     if name not in names(root):
         known = names(root) or (BASE,)
         raise InputError(f"no model {name!r}", where=str(root), remedy=choose_from(name, known))
@@ -51,8 +46,6 @@ def default_model(root: Path) -> str:
 
     The stage compare stores it; without a comparison it is the base model.
     """
-    from bampipe.results.compare import CompareResult
-
     try:
         best = RunFolder(root).read(CompareResult).best
     except InputError:  # it is missing or damaged, and compare will make it again
@@ -80,9 +73,6 @@ def ensure_base(root: Path, device: str, effects: tuple[str, ...]) -> None:
         device: the pipeline's device; "" for that of ``ingest/session.json``.
         effects: the pipeline's effects; if there are none, those of the device file.
     """
-    from bampipe.declarations.model import ModelFile
-    from bampipe.results.ingest import IngestResult
-
     if not device:
         session = RunFolder(root).read(IngestResult)
         device = session.device

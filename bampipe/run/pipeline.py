@@ -3,27 +3,20 @@
 A missing or invalid pipeline raises `InputError`.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bampipe
+from bampipe.declarations.pipeline import Pipeline
 from bampipe.errors import InputError, choose_from
 from bampipe.files import read_toml
 from bampipe.run import record
-
-if TYPE_CHECKING:
-    from bampipe.declarations.pipeline import Pipeline
+from bampipe.schema import read
 
 SCHEMA = "bampipe.pipeline/1"
 
 
 def recorded(root: Path) -> Pipeline:
     """Return the pipeline, without its gates, that ``run.json`` keeps; else the default one."""
-    from bampipe.declarations.pipeline import Pipeline
-    from bampipe.schema import read
-
     used = record.read(root).pipeline
     if used is None:
         return load()
@@ -37,18 +30,16 @@ def whole(root: Path, name: str = "") -> Pipeline:
     return (load(name) if name else recorded(root)).with_every_stage()
 
 
-_PACKAGE = Path(bampipe.__file__).parent
-# A wheel has the folder inside the package, a working copy beside it.
-_FOLDERS = (_PACKAGE / "_pipelines", _PACKAGE.parent / "pipelines")
-
-
-def _shipped() -> Path:
-    return next((folder for folder in _FOLDERS if folder.is_dir()), _FOLDERS[0])
+def find_shipped(name: str) -> Path:
+    """Return a folder that ships: a wheel has it inside the package, a working copy beside it."""
+    package = Path(bampipe.__file__).parent
+    inside = package / f"_{name}"
+    return inside if inside.is_dir() else package.parent / name
 
 
 def names() -> tuple[str, ...]:
     """Return the names of the pipelines that ship, sorted."""
-    return tuple(sorted(path.stem for path in _shipped().glob("*.toml")))
+    return tuple(sorted(path.stem for path in find_shipped("pipelines").glob("*.toml")))
 
 
 def find(name: str) -> Path:
@@ -59,15 +50,12 @@ def find(name: str) -> Path:
             return path
         raise InputError("no such pipeline file", where=name)
     if name in names():
-        return _shipped() / f"{name}.toml"
+        return find_shipped("pipelines") / f"{name}.toml"
     raise InputError(f"no pipeline {name!r}", remedy=choose_from(name, names()))
 
 
 def load(name: str = "default") -> Pipeline:
     """Read and check the pipeline ``name`` (see :func:`find`)."""
-    from bampipe.declarations.pipeline import Pipeline
-    from bampipe.schema import read
-
     path = find(name)
     pipeline = read(Pipeline, read_toml(path), str(path))
     pipeline._where = str(path)

@@ -12,22 +12,18 @@ versions are kept, because somebody may be reading them. Any refusal by fsspec, 
 file system or by the place itself is an `InputError`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bampipe.errors import InputError
 from bampipe.files import digest_content, digest_file, json_text, parse_json
-from bampipe.run import record
+from bampipe.results.run import PRIVATE, Published
 from bampipe.run.session_name import is_name
-
-if TYPE_CHECKING:
-    from bampipe.results.run import Published
+from bampipe.schema import read
 
 SCHEMA = "bampipe.published/1"
 CURRENT = "current.json"
@@ -44,7 +40,7 @@ def publish(root: Path, url: str) -> str:
     files = {
         path.relative_to(root).as_posix(): path
         for path in sorted(root.rglob("*"))
-        if path.is_file() and path.relative_to(root).parts[0] != record.PRIVATE
+        if path.is_file() and path.relative_to(root).parts[0] != PRIVATE
     }
     hashes = {name: digest_file(path) for name, path in files.items()}
     version = digest_content(hashes)[:16]
@@ -149,9 +145,6 @@ def _driver(what: str, url: str) -> Iterator[None]:
 
 
 def _current(system: Any, here: str) -> Published | None:
-    from bampipe.results.run import Published
-    from bampipe.schema import read
-
     place = f"{here}/{CURRENT}"
     try:
         system.invalidate_cache(here)

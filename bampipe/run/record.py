@@ -1,26 +1,17 @@
 """``run.json``, the record of inputs, settings and results of every step; and the run's lock."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
 
 from bampipe.errors import InputError
 from bampipe.files import STORAGE_FAULTS, digest_file, write_json
+from bampipe.results.run import PRIVATE, RunResult
 from bampipe.run.events import Event, Listener, ignore_event
 from bampipe.run.lock import hold
 
-if TYPE_CHECKING:
-    from bampipe.results.run import RunResult
-
-SCHEMA: Final = "bampipe.run/1"
-FILE = "run.json"
-PRIVATE = ".bampipe"
-SESSION = "session:"
-"""Prefix of a session's files among the inputs of a step."""
+FILE = RunResult.FILE
 
 
 def read(root: Path) -> RunResult:
@@ -28,9 +19,7 @@ def read(root: Path) -> RunResult:
 
     A damaged file counts as missing: all stages run again, and the file is rebuilt.
     """
-    from bampipe.results.run import RunResult
-
-    return _sound(root) or RunResult(schema=SCHEMA, stages={})
+    return _sound(root) or RunResult(schema="bampipe.run/1", stages={})
 
 
 def is_damaged(root: Path) -> bool:
@@ -39,8 +28,6 @@ def is_damaged(root: Path) -> bool:
 
 
 def _sound(root: Path) -> RunResult | None:
-    from bampipe.results.run import RunResult
-
     try:
         return RunResult.read(root / FILE)
     except InputError:

@@ -1,18 +1,13 @@
 """Requests to the runner, and its outcomes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from bampipe.declarations.pipeline import Pipeline
 from bampipe.errors import InputError
+from bampipe.results.run import GateVerdict
 from bampipe.stages import base
-
-if TYPE_CHECKING:
-    from bampipe.declarations.pipeline import Pipeline
-    from bampipe.results.run import GateVerdict
 
 
 @dataclass(frozen=True)

@@ -4,19 +4,18 @@ import json
 import shutil
 import time
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
 
 from bampipe.compile_ahead import compiling_ahead
 from bampipe.errors import InputError, MissingResultError, NothingToDoError
+from bampipe.files import write_json
+from bampipe.results.run import Commit, GateVerdict, StepRecord, Timing
 from bampipe.run import accepted, hashing, models, record, staging
 from bampipe.run.events import Event, Listener, ignore_event
 from bampipe.run.gates import judge_gates
 from bampipe.run.request import Outcome, Request, Step, StepResult, select_stages
-from bampipe.run.state import FIRST_TIME, RunState, lasting
+from bampipe.run.settings import list_lasting
+from bampipe.run.state import FIRST_TIME, RunState
 from bampipe.stages import base
-
-if TYPE_CHECKING:
-    from bampipe.results.run import GateVerdict
 
 
 class _Runner:
@@ -29,8 +28,6 @@ class _Runner:
         self.root = request.root
 
     def execute(self, step: Step, reason: str) -> StepResult:
-        from bampipe.results.run import Commit, StepRecord, Timing
-
         name = self.root.name
         self.listen(Event(name, step.name, "start", 0.0, "" if reason == FIRST_TIME else reason))
         started = datetime.now(UTC)
@@ -41,14 +38,14 @@ class _Runner:
         declared = base.paths_of(step.model, module.INPUTS)
         inputs = state.inputs(step, declared)
         outputs = base.paths_of(step.model, module.OUTPUTS)
-        out = staging.prepare(self.root, step, outputs)
+        out = staging.prepare(self.root, step.name, outputs)
 
         def progress(fraction: float, message: str) -> None:
             self.listen(Event(name, step.name, "progress", fraction, message))
 
         summary = module.execute(state.folder, out, config, progress)
-        written = staging.digest_outputs(out, outputs, step)
-        settings = lasting(config)
+        written = staging.digest_outputs(out, outputs, step.name)
+        settings = list_lasting(config)
         previous = state.records[step.name].outputs if step.name in state.records else {}
         made = StepRecord(
             key=state.key(step, settings, inputs),
@@ -65,7 +62,8 @@ class _Runner:
         timing = Timing(started_at=started.isoformat(timespec="seconds"), seconds=round(seconds, 3))
         remove = tuple(sorted(previous.keys() - written.keys()))
         sealed = Commit(step=step.name, record=made, timing=timing, remove=remove)
-        staging.seal(out, sealed)
+        # From here on, the step counts as done.
+        write_json(out / staging.COMMIT, sealed.model_dump(mode="json"))
         staging.commit(state, out, sealed)
         self.listen(Event(name, step.name, "done", 1.0))
         return StepResult(step.name, "done", reason, seconds, made.summary)
@@ -75,7 +73,7 @@ class _Runner:
 
         Results of its last success stay, and stay recorded.
         """
-        shutil.rmtree(staging.folder(self.root, step), ignore_errors=True)
+        shutil.rmtree(staging.folder(self.root, step.name), ignore_errors=True)
         if noted:
             self.state.failures[step.name] = error
             self.state.save()

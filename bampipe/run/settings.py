@@ -6,7 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from bampipe.errors import InputError
+from bampipe.schema import refusal
 from bampipe.stages import base
+
+_NEUTRAL = ("session", "jobs")
+"""Fields of a configuration that affect no result: a place, and a number of processes."""
 
 
 def configure(stage: str, settings: Mapping[str, object], where: str = "") -> Any:
@@ -19,8 +23,6 @@ def configure(stage: str, settings: Mapping[str, object], where: str = "") -> An
     """
     from pydantic import ValidationError
 
-    from bampipe.schema import refusal
-
     kind = base.load_stage(stage).Config
     try:
         return kind(**settings)
@@ -29,12 +31,12 @@ def configure(stage: str, settings: Mapping[str, object], where: str = "") -> An
         raise refusal(error, kind, where, inside) from None
 
 
-def plain(config: object) -> dict[str, object]:
-    """Return a configuration as a table that JSON can hold, tuples as lists."""
-    assert dataclasses.is_dataclass(config) and not isinstance(config, type)
+def list_lasting(config: Any) -> dict[str, object]:
+    """Return the fields of a configuration that affect a result, as JSON can hold them."""
     return {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in dataclasses.asdict(config).items()
+        if name not in _NEUTRAL
     }
 
 

@@ -4,35 +4,25 @@ A step writes below ``.bampipe/staging/``. When it is done, a commit file lists 
 then on a kill loses nothing, since the next run repeats the moves of the commit file.
 """
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from bampipe.errors import InputError
-from bampipe.files import digest_file, is_inside, read_json_table, write_json
+from bampipe.files import digest_file, is_inside, read_json_table
+from bampipe.results.run import PRIVATE, Commit
 from bampipe.run import record
-from bampipe.run.request import Step
 from bampipe.run.state import RunState
-
-if TYPE_CHECKING:
-    from bampipe.results.run import Commit
+from bampipe.schema import read
 
 COMMIT = ".commit.json"
 
 
-def folder(root: Path, step: Step) -> Path:
-    """Return the staging folder of ``step`` in the run folder ``root``."""
-    return root / record.PRIVATE / "staging" / folder_name(step.name)
+def folder(root: Path, step: str) -> Path:
+    """Return the staging folder of ``step``, as in ``run.json``, in the run folder ``root``."""
+    return root / PRIVATE / "staging" / step.replace(":", "@")
 
 
-def folder_name(step: str) -> str:
-    """Return the name of the staging folder of ``step``."""
-    return step.replace(":", "@")
-
-
-def prepare(root: Path, step: Step, outputs: tuple[str, ...]) -> Path:
+def prepare(root: Path, step: str, outputs: tuple[str, ...]) -> Path:
     """Make an empty staging folder with the parents of all declared ``outputs``."""
     staging = folder(root, step)
     shutil.rmtree(staging, ignore_errors=True)
@@ -45,7 +35,7 @@ def prepare(root: Path, step: Step, outputs: tuple[str, ...]) -> Path:
     return staging
 
 
-def digest_outputs(staging: Path, declared: tuple[str, ...], step: Step) -> dict[str, str]:
+def digest_outputs(staging: Path, declared: tuple[str, ...], step: str) -> dict[str, str]:
     """Hash the outputs of a stage, and compare them with its declaration."""
     files = {
         path.relative_to(staging).as_posix(): path
@@ -55,17 +45,12 @@ def digest_outputs(staging: Path, declared: tuple[str, ...], step: Step) -> dict
     allowed: set[str] = set()
     for pattern in declared:
         if "*" not in pattern and pattern not in files:
-            raise RuntimeError(f"stage {step.name} did not write {pattern}, which it declares")
+            raise RuntimeError(f"stage {step} did not write {pattern}, which it declares")
         allowed |= {path.relative_to(staging).as_posix() for path in staging.glob(pattern)}
     undeclared = sorted(files.keys() - allowed)
     if undeclared:
-        raise RuntimeError(f"stage {step.name} wrote {undeclared[0]}, which it does not declare")
+        raise RuntimeError(f"stage {step} wrote {undeclared[0]}, which it does not declare")
     return {name: digest_file(path) for name, path in files.items()}
-
-
-def seal(staging: Path, sealed: Commit) -> None:
-    """Write the commit file, from which on the step counts as done."""
-    write_json(staging / COMMIT, sealed.model_dump(mode="json"))
 
 
 def commit(state: RunState, staging: Path, sealed: Commit) -> None:
@@ -89,7 +74,7 @@ def recover(state: RunState) -> None:
     for pattern in (f".{record.FILE}.*.partial", "models/*/.model.toml.*.partial"):
         for draft in state.root.glob(pattern):
             draft.unlink()
-    parent = state.root / record.PRIVATE / "staging"
+    parent = state.root / PRIVATE / "staging"
     for staging in sorted(parent.glob("*")):
         if not staging.is_dir():
             staging.unlink()
@@ -101,15 +86,12 @@ def recover(state: RunState) -> None:
 
 def _sealed(root: Path, staging: Path) -> Commit | None:
     """Return the commit file's content, if it and the remaining files that it names are intact."""
-    from bampipe.results.run import Commit
-    from bampipe.schema import read
-
     try:
         sealed = read(Commit, read_json_table(staging / COMMIT), COMMIT)
     except InputError:
         return None
     outputs = sealed.record.outputs
-    if folder_name(sealed.step) != staging.name:
+    if folder(root, sealed.step) != staging:
         return None
     for name in (*outputs, *sealed.remove):
         if not (is_inside(root, name) and is_inside(staging, name)) or (root / name).is_dir():

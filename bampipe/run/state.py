@@ -1,27 +1,21 @@
 """State of a run folder: its record, the dependencies of each step, and which must run again."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.errors import InputError, MissingResultError
 from bampipe.files import digest_content, digest_file, digest_input
+from bampipe.results.run import SESSION, GateVerdict, PipelineUsed, RunResult
 from bampipe.run import hashing, models, record
 from bampipe.run.request import Request, Step
-from bampipe.run.settings import configure, plain
+from bampipe.run.settings import configure, list_lasting
 from bampipe.stages import base
-
-if TYPE_CHECKING:
-    from bampipe.results.run import GateVerdict, RunResult
 
 FIRST_TIME = "never run"
 """Reason of a step without a result."""
-NEUTRAL = ("session", "jobs")
-"""Fields of a configuration that affect no result: a place, and a number of processes."""
 
 
 class RunState:
@@ -136,7 +130,7 @@ class RunState:
         if made is not None and made.settings == self.settings(step) and made.code == code:
             return made.config, made.declared_inputs
         config = self.configure(step, self.settings(step))
-        return lasting(config), base.paths_of(step.model, base.load_stage(step.stage).INPUTS)
+        return list_lasting(config), base.paths_of(step.model, base.load_stage(step.stage).INPUTS)
 
     def reason(self, step: Step) -> str:
         """Return the reason why the step must run, or ""."""
@@ -158,7 +152,7 @@ class RunState:
             return "settings changed"
         for name in sorted(inputs.keys() | made.inputs.keys()):
             if inputs.get(name) != made.inputs.get(name):
-                return f"{name.removeprefix(record.SESSION)} changed"
+                return f"{name.removeprefix(SESSION)} changed"
         if dict(hashing.versions()) != made.versions:
             return "versions changed"
         return "the code of the stage changed"
@@ -184,8 +178,6 @@ class RunState:
 
     def close(self, verdicts: Iterable[GateVerdict]) -> None:
         """Write ``run.json`` with the verdicts of the gates, unless it is unchanged."""
-        from bampipe.results.run import PipelineUsed
-
         noted = self._noted()
         if self.request.judge:
             used = PipelineUsed.model_validate(self.request.pipeline.content())
@@ -225,8 +217,3 @@ def _maker(name: str) -> str:
         if name in base.paths_of(model, base.load_stage(stage).OUTPUTS):
             return stage
     return ""
-
-
-def lasting(config: object) -> dict[str, object]:
-    """Return the fields of a configuration that affect a result: all but `NEUTRAL`."""
-    return {name: value for name, value in plain(config).items() if name not in NEUTRAL}

@@ -1,18 +1,13 @@
 """The status of each step of a run, without running anything."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from bampipe.declarations.pipeline import Pipeline
 from bampipe.errors import InputError
 from bampipe.run.request import Request
 from bampipe.run.state import RunState
 from bampipe.stages import base
-
-if TYPE_CHECKING:
-    from bampipe.declarations.pipeline import Pipeline
 
 
 @dataclass(frozen=True)

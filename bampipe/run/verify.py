@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from bampipe.files import digest_file, digest_input
+from bampipe.results.run import PRIVATE, SESSION
 from bampipe.run import hashing, record
 from bampipe.stages import base
 
@@ -18,7 +19,7 @@ def verify(root: Path) -> list[tuple[str, str]]:
     found: dict[str, str] = {record.FILE: "damaged"} if record.is_damaged(root) else {}
     recorded: set[str] = {record.FILE}
     for made in content.stages.values():
-        inputs = {n: d for n, d in made.inputs.items() if not n.startswith(record.SESSION)}
+        inputs = {n: d for n, d in made.inputs.items() if not n.startswith(SESSION)}
         for names, digest in ((made.outputs, digest_file), (inputs, digest_input)):
             for name, written in names.items():
                 recorded.add(name)
@@ -39,12 +40,12 @@ def verify(root: Path) -> list[tuple[str, str]]:
             continue
         now = hashing.digest_session(Path(place))
         for name in sorted(noted.keys() | now.keys()):
-            if name.startswith(record.SESSION) and noted.get(name) != now.get(name):
+            if name.startswith(SESSION) and noted.get(name) != now.get(name):
                 gone = now.get(name) in (None, hashing.ABSENT)
                 found[name] = "gone" if gone else "changed"
     for path in sorted(root.rglob("*")):
         relative = path.relative_to(root)
-        private = relative.parts[0] == record.PRIVATE
+        private = relative.parts[0] == PRIVATE
         if path.is_file() and not private and relative.as_posix() not in recorded:
             found[relative.as_posix()] = "unknown"
     return sorted(found.items())

@@ -163,12 +163,8 @@ def _gears(
         if not parts:
             continue
         try:
-            windup = find_windup(
-                [difference for difference, _, _ in parts],
-                [load for _, load, _ in parts],
-                [rate for _, _, rate in parts],
-                rotor_known=axis in rotors,
-            )
+            differences, loads, rates = zip(*parts, strict=True)
+            windup = find_windup(differences, loads, rates, axis in rotors)
         except InputError as error:
             notes.append(f"{axis}: {error}")
             continue

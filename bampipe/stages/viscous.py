@@ -154,11 +154,10 @@ def _estimated(
     field_sd, blocks = _block_sd(found, model.n_states, field)
     spread = slope[field] * field_sd
     friction = _device_damping(system, motions, start)
-    directions = {}
-    for k, component in enumerate(system.model.device.components):
-        directions[component] = _direction(
-            estimate[field[k]], spread[k], friction[k], command, blocks
-        )
+    directions = {
+        component: _direction(estimate[field[k]], spread[k], friction[k], command, blocks)
+        for k, component in enumerate(system.model.device.components)
+    }
     frame = tabulate_trace(names, model, motions, found, config.trace_rows)
     kept = [c for c in frame if c in ("t_total", "trial_id") or str(c).startswith(f"{FIELD}.")]
     frame = frame[kept].rename(columns=lambda c: str(c).removeprefix(f"{FIELD}."))

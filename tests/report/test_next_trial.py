@@ -57,12 +57,12 @@ def results_with(found: NextResult | None) -> SimpleNamespace:
 
 
 def test_the_section_says_what_to_do_where_somebody_asked():
-    assert next_trial.section(results_with(None)) is None
-    section = next_trial.section(results_with(NextResult.model_validate(FOUND)))
-    first = section.blocks[0]
+    assert not [*next_trial.list_blocks(results_with(None))]
+    blocks = [*next_trial.list_blocks(results_with(NextResult.model_validate(FOUND)))]
+    first = blocks[0]
     assert isinstance(first, Callout)
     assert first.text == SENTENCE
-    sd, sensitivity = (block for block in section.blocks if isinstance(block, Table))
+    sd, sensitivity = (block for block in blocks if isinstance(block, Table))
     assert sd.rows == (("`coulomb.yaw`", "0.010", "0.0050", "N·m"),)
     assert not sd.note
     # What no trial shows stands first, with a dash.

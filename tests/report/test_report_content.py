@@ -275,7 +275,7 @@ def test_what_did_not_run_along_the_data_has_no_picture_of_its_convergence(own_r
     trace = pd.read_parquet(path)
     for rows, expected in ((trace, True), (trace.groupby("trial_id").tail(1), False)):
         write_parquet(path, rows.reset_index(drop=True))
-        blocks = identification.section(Results(own_run)).blocks
+        blocks = identification.list_blocks(Results(own_run))
         assert ("convergence" in [getattr(b, "name", "") for b in blocks]) is expected
 
 
@@ -289,7 +289,7 @@ def test_the_drift_of_a_model_is_a_table_and_its_absence_a_sentence(own_run: Pat
     content = validated.model_dump(mode="json") | {"free_run": {"drift": {"yaw": drift}}}
     path = own_run / "models" / results.model / "validate.json"
     path.write_text(json.dumps(content))
-    blocks = validation.section(Results(own_run)).blocks
+    blocks = [*validation.list_blocks(Results(own_run))]
     table = next(b for b in blocks if getattr(b, "caption", "").startswith("Drift"))
     assert list(table.rows) == [("yaw", "1.2", "3.4", "200", "mrad")]
     assert any(f"yaw: {why[:1].lower()}{why[1:]}" in getattr(b, "items", ()) for b in blocks)

@@ -1,4 +1,4 @@
-"""One file, one section. Each has ``section(results)``: a Section, or None where irrelevant."""
+"""One file, one section: its ``TITLE``, and ``list_blocks(results)``, no block where irrelevant."""
 
 SECTIONS: tuple[str, ...] = (
     "summary",

@@ -1,27 +1,26 @@
 """The device: numbers taken from drawings, with their sources, and what they do (Table II)."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
-from bampipe.report.document import Block, Section, Table
+from bampipe.report.document import Block, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_decimals, format_digits, format_stated, format_unit
 from bampipe.results.identify import Combined, DeviceNumber, IdentifyResult
 from bampipe.results.performance import DeviceConstant, PerformanceResult
 
+TITLE = "Device"
 _LEAST_PERCENT = 0.005
 
 
-def section(results: Results) -> Section | None:
-    """Return the section; None where no constants are stored."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the constants, and those on which the estimates depend, if they are stored."""
     performance, identified = results.read(PerformanceResult), results.read(IdentifyResult)
     known = identified.identifiability if identified else None
-    blocks: list[Block] = []
     if performance and performance.constants:
         together = known.together if known else ()
-        blocks.append(_tabulate_constants(results, performance.constants, together))
+        yield _tabulate_constants(results, performance.constants, together)
     if known and known.numbers:
-        blocks.append(_tabulate_numbers(known.numbers))
-    return Section("Device", tuple(blocks)) if blocks else None
+        yield _tabulate_numbers(known.numbers)
 
 
 def _tabulate_constants(

@@ -1,6 +1,6 @@
 """Diagnosis: verdict by axis, candidate effects, where the residual is, the trial to add."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,6 @@ from bampipe.report.document import (
     Callout,
     Figure,
     Paragraph,
-    Section,
     Subheading,
     Table,
 )
@@ -47,49 +46,43 @@ _MOST_MAPS = 6
 """Most maps shown of one axis: those that explain most, best first."""
 
 
-def section(results: Results) -> Section:
-    """Return the section."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the findings of each diagnosis."""
     found = [
         (model, content)
         for model in results.models
         if (content := results.read(DiagnoseResult, model)) is not None
     ]
     if not found:
-        text = f"No model has been diagnosed yet: run `{results.diagnose_command}`."
-        return Section(TITLE, (Paragraph(text),))
-    blocks: list[Block] = []
+        yield Paragraph(f"No model has been diagnosed yet: run `{results.diagnose_command}`.")
+        return
     last, after = found[-1]
     for model, content in found:
         if len(found) > 1:
-            blocks.append(Subheading(f"Model `{model}`"))
-        blocks += _show_model(results, model, content, {} if model == last else after.maps)
-    return Section(TITLE, tuple(blocks))
+            yield Subheading(f"Model `{model}`")
+        yield from _show_model(results, model, content, {} if model == last else after.maps)
 
 
 def _show_model(
     results: Results, model: str, found: DiagnoseResult, later: Mapping[str, Maps]
-) -> list[Block]:
+) -> Iterator[Block]:
     axes = results.order_axes(found.axes)
-    sentences = tuple(entry.sentence for entry in axes.values())
-    blocks: list[Block] = [Bullets(sentences), _tabulate_verdicts(found, axes)]
+    yield Bullets(tuple(entry.sentence for entry in axes.values()))
+    yield _tabulate_verdicts(found, axes)
     if limits := phrases.limits(found):
-        blocks.append(Paragraph(limits))
+        yield Paragraph(limits)
     lacking = [axis for axis in axes if axis in found.lacking]
     if found.ranking and lacking:
-        blocks += [_tabulate_ranking(found.ranking), *_tabulate_sets(found)]
-    blocks += _advise(results, model, found) if lacking else [_tell_sensitivity(results, model)]
+        yield _tabulate_ranking(found.ranking)
+        yield from _tabulate_sets(found)
+    yield _advise(results, model, found) if lacking else _tell_sensitivity(results, model)
     if found.suggested_trial is not None:
-        words = found.suggested_trial.sentence
-        blocks.append(Callout("note", "A trial that would tell more", words))
-    blocks += [
-        _draw_maps(model, axis, axes[axis].unit, found.maps[axis], later.get(axis, {}))
-        for axis in lacking
-        if found.maps.get(axis)
-    ]
-    windows = [window for window in found.worst_windows if window.axis in lacking]
-    if windows:
-        blocks.append(_tabulate_windows(results, windows))
-    return blocks
+        yield Callout("note", "A trial that would tell more", found.suggested_trial.sentence)
+    for axis in lacking:
+        if maps := found.maps.get(axis):
+            yield _draw_maps(model, axis, axes[axis].unit, maps, later.get(axis, {}))
+    if windows := [window for window in found.worst_windows if window.axis in lacking]:
+        yield _tabulate_windows(windows)
 
 
 def _tell_sensitivity(results: Results, model: str) -> Paragraph:
@@ -104,16 +97,16 @@ def _tell_sensitivity(results: Results, model: str) -> Paragraph:
     )
 
 
-def _advise(results: Results, model: str, found: DiagnoseResult) -> list[Block]:
+def _advise(results: Results, model: str, found: DiagnoseResult) -> Paragraph:
     """Return the next command, or its result if it has been run."""
     compared = results.read(CompareResult)
     wanted = set(found.selected)
     for rung in compared.ladder if compared else ():
         if wanted and rung.parent == model and wanted == set((rung.added or "").split(", ")):
-            return [Paragraph(f"Added since, as model `{rung.model}`.")]
+            return Paragraph(f"Added since, as model `{rung.model}`.")
     if found.next.startswith("bampipe draft ") and results.read(DraftResult, model):
-        return [Paragraph("Drafted since (under Drafts).")]
-    return [results.state_next(found.next)]
+        return Paragraph("Drafted since (under Drafts).")
+    return results.state_next(found.next)
 
 
 def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -> Table:
@@ -137,22 +130,21 @@ def _tabulate_verdicts(found: DiagnoseResult, axes: Mapping[str, AxisVerdict]) -
     )
 
 
-def _tabulate_sets(found: DiagnoseResult) -> list[Block]:
-    """Return the probable sets of effects, if there are several, and the null distribution."""
+def _tabulate_sets(found: DiagnoseResult) -> Iterator[Block]:
+    """Yield the probable sets of effects, if there are several, and the null distribution."""
     shown = [one for one in found.sets if phrases.probability(one.probability) != "< 0.01"]
-    null = Paragraph(phrases.null_distribution(found.chance))
-    if len(shown) < 2:
-        return [null]
-    rows = [
-        (
-            phrases.name_set(one, "`"),
-            phrases.probability(one.probability),
-            format_digits(one.log_evidence - shown[0].log_evidence),
-        )
-        for one in shown[:_MOST_RANKED]
-    ]
-    columns = "Effects | >Probability | >Log evidence over the first (nats)"
-    return [Table("Sets of effects, the most probable first", columns, rows), null]
+    if len(shown) > 1:
+        rows = [
+            (
+                phrases.name_set(one, "`"),
+                phrases.probability(one.probability),
+                format_digits(one.log_evidence - shown[0].log_evidence),
+            )
+            for one in shown[:_MOST_RANKED]
+        ]
+        columns = "Effects | >Probability | >Log evidence over the first (nats)"
+        yield Table("Sets of effects, the most probable first", columns, rows)
+    yield Paragraph(phrases.null_distribution(found.chance))
 
 
 def tabulate_candidates(
@@ -201,14 +193,10 @@ def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Fig
     names = sorted(maps, key=lambda name: -maps[name].variance_share)[:_MOST_MAPS]
     figure, panels = style.make_grid(len(names), 3, 1.65, column_width=1.9)
     for number, (panel, name) in enumerate(zip(panels, names, strict=True)):
-        draw_map(panel, name, maps[name], style.VERMILLION, "the model")
-        shown = [maps[name]]
+        shown = [(maps[name], style.VERMILLION, "the model")]
         if name in later:
-            draw_map(panel, name, later[name], style.BLUE, "with the effects found")
-            shown.append(later[name])
-        panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
-        bands = [np.array(values) for one in shown for values in (one.low, one.high)]
-        style.set_limits(panel, bands, zero=True)
+            shown.append((later[name], style.BLUE, "with the effects found"))
+        draw_maps(panel, name, shown)
         if number % 3 == 0:
             panel.set_ylabel(style.label_axis("mean residual", unit))
     caption = (
@@ -219,7 +207,16 @@ def _draw_maps(model: str, axis: str, unit: str, maps: Maps, later: Maps) -> Fig
     return style.finish(figure, f"residual-maps-{model}-{axis}", caption, panels[:1])
 
 
-def draw_map(panel: Any, name: str, shown: ResidualMap, colour: str, title: str) -> None:
+def draw_maps(panel: Any, name: str, shown: Sequence[tuple[ResidualMap, str, str]]) -> None:
+    """Draw maps of one variable into a panel, each with its colour and its title."""
+    for one in shown:
+        _draw_map(panel, name, *one)
+    panel.axhline(0.0, color=style.INK, lw=0.6, zorder=1)
+    bands = [np.array(values) for one, _, _ in shown for values in (one.low, one.high)]
+    style.set_limits(panel, bands, zero=True)
+
+
+def _draw_map(panel: Any, name: str, shown: ResidualMap, colour: str, title: str) -> None:
     """Draw the mean residual with its band over one variable of a map."""
     mean, low, high = (np.array(values) for values in (shown.mean, shown.low, shown.high))
     values = None if shown.unit else _name_values(name, shown.center)
@@ -246,7 +243,7 @@ def _name_values(name: str, centre: Sequence[float]) -> list[str] | None:
     return [signs.get(int(value), str(int(value) + first)) for value in centre]
 
 
-def _tabulate_windows(results: Results, windows: Sequence[WorstWindow]) -> Table:
+def _tabulate_windows(windows: Sequence[WorstWindow]) -> Table:
     rows = [
         (
             one.axis,

@@ -1,11 +1,13 @@
 """Drafts: formulas over residuals that no effect explains, and over the null distribution."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from matplotlib.axes import Axes
 
 from bampipe.lists import join_names
 from bampipe.report import style
-from bampipe.report.document import Block, Figure, Formulas, Paragraph, Section, Subheading, Table
+from bampipe.report.document import Block, Figure, Formulas, Paragraph, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits, format_unit, split_name
 from bampipe.results.diagnose import DiagnoseResult, ResidualMap
@@ -21,29 +23,27 @@ _DRAWN_AT = {
 }
 
 
-def section(results: Results) -> Section | None:
-    """Return the section; None if no formula was searched for."""
-    blocks: list[Block] = []
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the searches for formulas, model by model."""
     for model in results.models:
         found = results.read(DraftResult, model)
         if found is None:
             continue
         diagnosis = results.read(DiagnoseResult, model)
         for axis, one in found.axes.items():
-            heading = Subheading(f"{axis.capitalize()}, model `{model}`")
-            blocks += [heading, Paragraph(one.sentence)]
+            yield Subheading(f"{axis.capitalize()}, model `{model}`")
+            yield Paragraph(one.sentence)
             effects = {name: found.effects[name] for name in one.effects}
             if effects:
-                blocks.append(Formulas(tuple(f"{n}: {e.expression}" for n, e in effects.items())))
+                yield Formulas(tuple(f"{n}: {e.expression}" for n, e in effects.items()))
             maps = diagnosis.maps.get(axis, {}) if diagnosis else {}
-            blocks.append(_draw(f"draft-{model}-{axis}", axis, one, effects, maps))
+            yield _draw(f"draft-{model}-{axis}", axis, one, effects, maps)
             if one.nearest:
-                blocks.append(_tabulate_nearest(one))
+                yield _tabulate_nearest(one)
         drafted, own = set(found.selected), set(results.effects(model))
         later = (set(results.effects(name)) for name in results.models)
         if not drafted or not any(drafted <= effects - own for effects in later):
-            blocks.append(results.state_next(found.next))
-    return Section(TITLE, tuple(blocks)) if blocks else None
+            yield results.state_next(found.next)
 
 
 def _draw(

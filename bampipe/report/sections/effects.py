@@ -1,6 +1,6 @@
 """Effects: a description of each one found, its curve, errors before and after, alternatives."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from bampipe.lists import join_names
 from bampipe.phrases import diagnosis as phrases
 from bampipe.report import style
-from bampipe.report.document import Block, Figure, Formulas, Paragraph, Section, Subheading, Table
+from bampipe.report.document import Block, Figure, Formulas, Paragraph, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.sections.diagnosis import tabulate_candidates
 from bampipe.report.wording import format_digits, format_unit, format_with_sd, split_name
@@ -26,43 +26,38 @@ _LEAST_CURVE_SHARE = 0.2
 """Share of a term's variance that its curve has to carry to be drawn."""
 
 
-def section(results: Results) -> Section | None:
-    """Return the section; None where no model was validated."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield friction and effects of the model in detail, if it was validated."""
     terms = results.read(TermsResult)
     if terms is None:
-        return None
+        return
     friction = [term for term in terms.terms if term.name.startswith("friction:")]
     effects = [term for term in terms.terms if term not in friction]
-    blocks: list[Block] = []
     if not effects:
-        blocks.append(Paragraph(f"Model `{results.model}` is the device without effects."))
+        yield Paragraph(f"Model `{results.model}` is the device without effects.")
     if curves := [term.curves[0] for term in friction if term.curves]:
         caption = (
             "Identified friction of each axis with its 95 % band, over the motion of the trials."
         )
-        blocks.append(_draw_curves("friction", curves, caption))
+        yield _draw_curves("friction", curves, caption)
     shown: set[str] = set()
     for term in effects:
-        blocks += _show_effect(results, term, shown)
-    blocks += _tabulate_weighed(results, {term.name for term in effects})
-    return Section(TITLE, tuple(blocks))
+        yield from _show_effect(results, term, shown)
+    yield from _tabulate_weighed(results, {term.name for term in effects})
 
 
-def _show_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
-    """Return the blocks of one effect; ``shown``: versions whose worst window is already drawn."""
+def _show_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator[Block]:
+    """Yield the blocks of one effect; ``shown``: versions whose worst window is already drawn."""
     text = term.text
-    words = [f"**Diagnosis.** {_tell_alternatives(results, term.name)}"]
+    yield Subheading(f"`{term.name}`")
+    yield Paragraph(f"{text.summary}. {_list_estimates(results, term)}".rstrip())
+    yield Formulas(text.formulas)
+    yield from _draw_effect(results, term, shown)
     if text.on_the_machine:
-        words.insert(0, f"**On the machine.** {text.on_the_machine}.")
+        yield Paragraph(f"**On the machine.** {text.on_the_machine}.")
+    yield Paragraph(f"**Diagnosis.** {_tell_alternatives(results, term.name)}")
     if text.source:
-        words.append(f"**Source.** {text.source}.")
-    return [
-        Subheading(f"`{term.name}`"),
-        Paragraph(f"{text.summary}. {_list_estimates(results, term)}".rstrip()),
-        Formulas(text.formulas),
-        *_draw_effect(results, term, shown),
-        *map(Paragraph, words),
-    ]
+        yield Paragraph(f"**Source.** {text.source}.")
 
 
 def _list_estimates(results: Results, term: ModelTerm) -> str:
@@ -94,17 +89,16 @@ def _draw_curve(panel: Axes, curve: TermCurve) -> None:
     panel.set_ylabel(style.label_axis(f"{kind} taken", curve.unit))
 
 
-def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Block]:
+def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> Iterator[Block]:
     """Draw the curves of an effect and, once per version, its worst window without and with it."""
     name = f"effect-{term.name.replace(':', '-')}"
     curves = [curve for curve in term.curves if curve.variance_share >= _LEAST_CURVE_SHARE]
-    blocks: list[Block] = []
     if term.curves and not curves:
-        words = "No curve is drawn: no single variable accounts for a fifth of its force."
-        blocks.append(Paragraph(words))
+        yield Paragraph("No curve is drawn: no single variable accounts for a fifth of its force.")
     found = _find_window(results, term)
     if found is None or found.added in shown:
-        return [*blocks, *_draw_contribution(name, term, curves)]
+        yield from _draw_contribution(name, term, curves)
+        return
     shown.add(found.added)
     first = next((curve for curve in curves if curve.axis == found.window.axis), None)
     if first is None:
@@ -128,16 +122,15 @@ def _draw_effect(results: Results, term: ModelTerm, shown: set[str]) -> list[Blo
     beside = (
         f"Left: {_describe_curves(term, [first])} Right: t{caption}" if first else f"T{caption}"
     )
-    blocks.append(style.finish(figure, name, beside, [top]))
+    yield style.finish(figure, name, beside, [top])
     others = [curve for curve in curves if curve is not first]
-    return [*blocks, *_draw_contribution(f"{name}-more", term, others)]
+    yield from _draw_contribution(f"{name}-more", term, others)
 
 
-def _draw_contribution(name: str, term: ModelTerm, curves: Sequence[TermCurve]) -> list[Block]:
-    if not curves:
-        return []
-    words = _describe_curves(term, curves)
-    return [_draw_curves(name, curves, words[:1].upper() + words[1:])]
+def _draw_contribution(name: str, term: ModelTerm, curves: Sequence[TermCurve]) -> Iterator[Figure]:
+    if curves:
+        words = _describe_curves(term, curves)
+        yield _draw_curves(name, curves, words[:1].upper() + words[1:])
 
 
 def _describe_curves(term: ModelTerm, curves: Sequence[TermCurve]) -> str:
@@ -233,16 +226,15 @@ def _tell_alternatives(results: Results, effect: str) -> str:
     return "No diagnosis of this run has compared it with other effects."
 
 
-def _tabulate_weighed(results: Results, added: set[str]) -> list[Table]:
-    """Return the candidates that the latest diagnosis weighed and that were not added."""
+def _tabulate_weighed(results: Results, added: set[str]) -> Iterator[Table]:
+    """Tabulate the candidates that the latest diagnosis weighed and that were not added."""
     diagnosis = next((found for found in _read_diagnoses(results) if found.descriptions), None)
-    if diagnosis is None:
-        return []
-    texts = diagnosis.descriptions
+    texts = diagnosis.descriptions if diagnosis else {}
     rows = [
         (one, [f"{text.summary}. " + "; ".join(f"`{line}`" for line in text.formulas[:2])])
-        for one in diagnosis.ranking
+        for one in (diagnosis.ranking if diagnosis else ())
         if one.effect not in added and (text := texts.get(one.effect.partition(":")[0]))
     ][:_MOST_CANDIDATES]
-    title = f"Weighed on model `{diagnosis.model}`, best first"
-    return [tabulate_candidates(title, rows, "Description and formula ~2.6")] if rows else []
+    if diagnosis and rows:
+        title = f"Weighed on model `{diagnosis.model}`, best first"
+        yield tabulate_candidates(title, rows, "Description and formula ~2.6")

@@ -1,7 +1,7 @@
 """Identification: Table VII, Table VI, convergence (Fig. 7), torques and motion (Fig. 6)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import pandas as pd
 from bampipe.lists import join_names
 from bampipe.phrases.results import METHODS
 from bampipe.report import style
-from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
+from bampipe.report.document import Block, Bullets, Figure, Paragraph, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     find_digits,
@@ -34,28 +34,28 @@ _PANEL_COLUMNS, _MOST_PANEL_ROWS = (2, 3, 4), 7
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
 
-def section(results: Results) -> Section:
-    """Return the section."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the parameters, how they converged, and the motion."""
     identified = results.read(IdentifyResult)
     if identified is None:
-        return results.make_section(TITLE, "No parameters have been identified", "identify")
-    blocks: list[Block] = [_tabulate_parameters(results, identified)]
+        yield results.state_undone("No parameters have been identified", "identify")
+        return
+    yield _tabulate_parameters(results, identified)
     if identified.base_parameters:
-        blocks.append(_tabulate_combinations(identified.base_parameters))
+        yield _tabulate_combinations(identified.base_parameters)
     known = identified.identifiability.sentences if identified.identifiability else ()
     if notes := tuple(note for note in identified.notes if note not in known):
-        blocks.append(Bullets(notes))
+        yield Bullets(notes)
     if checks := _list_checks(identified):
-        blocks.append(Paragraph(checks))
+        yield Paragraph(checks)
     if identified.state_3sigma:
-        blocks.append(_tabulate_states(results, identified.state_3sigma))
+        yield _tabulate_states(results, identified.state_3sigma)
     trace = results.table(results.model_file("trace.parquet"))
     # Least squares stores at most one row per trial: nothing converges along the data.
     if trace is not None and len(trace) > trace["trial_id"].nunique():
-        blocks.append(_draw_convergence(results, identified, trace))
+        yield _draw_convergence(results, identified, trace)
     if motion := _draw_motion(results):
-        blocks.append(motion)
-    return Section(TITLE, tuple(blocks))
+        yield motion
 
 
 def _tabulate_parameters(results: Results, identified: IdentifyResult) -> Table:

@@ -1,12 +1,12 @@
 """The ladder: held-out error of each model version against the floor, and its parameters."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from bampipe.lists import join_names
 from bampipe.report import style
-from bampipe.report.document import Block, Bullets, Figure, Section, Table
+from bampipe.report.document import Block, Bullets, Figure, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
@@ -20,26 +20,27 @@ from bampipe.report.wording import (
 )
 from bampipe.results.compare import CompareResult, Rung, Value, horizons_of
 
+TITLE = "Model versions"
 _MOST_COLUMNS = 3
 _MOST_NUMBERS = 4
 """Most versions for which every number fits below a panel."""
 
 
-def section(results: Results) -> Section | None:
-    """Return the section; None where there is one model only."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the comparison of several models."""
     compared = results.read(CompareResult)
     if compared is None or len(compared.ladder) < 2:
-        return None
+        return
     rungs = compared.ladder
     known = {axis for rung in rungs for axis in rung.held_out_rmse}
     axes = [axis for axis in results.axes if axis in known]
-    blocks: list[Block] = [_tabulate_errors(results, rungs, axes), _draw(results, rungs, axes)]
-    blocks += tabulate_runs(rungs, axes)
+    yield _tabulate_errors(results, rungs, axes)
+    yield _draw(results, rungs, axes)
+    yield from tabulate_runs(rungs, axes)
     if compared.parameters:
-        blocks.append(_tabulate_parameters(results, rungs, compared.parameters))
+        yield _tabulate_parameters(results, rungs, compared.parameters)
     if compared.moved:
-        blocks.append(Bullets(tuple(one.sentence for one in compared.moved)))
-    return Section("Model versions", tuple(blocks))
+        yield Bullets(tuple(one.sentence for one in compared.moved))
 
 
 def _tabulate_errors(results: Results, rungs: Sequence[Rung], axes: Sequence[str]) -> Table:
@@ -56,10 +57,12 @@ def _tabulate_errors(results: Results, rungs: Sequence[Rung], axes: Sequence[str
     return Table(caption, " | ".join(("Version | Added", *heads)), rows)
 
 
-def tabulate_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> list[Table]:
-    """Return the errors of each version in free runs: whole trials, and short horizons."""
-    found = [_tabulate_free_runs(rungs, axes)] if any(rung.free_run for rung in rungs) else []
-    return [*found, _tabulate_drift(rungs, axes)] if horizons_of(rungs) else found
+def tabulate_runs(rungs: Sequence[Rung], axes: Sequence[str]) -> Iterator[Table]:
+    """Yield the errors of each version in free runs: whole trials, and short horizons."""
+    if any(rung.free_run for rung in rungs):
+        yield _tabulate_free_runs(rungs, axes)
+    if horizons_of(rungs):
+        yield _tabulate_drift(rungs, axes)
 
 
 def _choose_scales(

@@ -1,9 +1,9 @@
 """The trial to record next, its expected gain, and the limits of the present trials."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from bampipe.phrases.forecast_outcome import compare_forecasts, read_forecasts
-from bampipe.report.document import Block, Bullets, Callout, Paragraph, Section, Table
+from bampipe.report.document import Block, Bullets, Callout, Paragraph, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits, format_percent, format_unit
 from bampipe.results.diagnose import DiagnoseResult
@@ -13,31 +13,28 @@ from bampipe.results.next import Detectable, ExpectedSd, NextResult, PlannedConf
 TITLE = "What to record next"
 
 
-def section(results: Results) -> Section | None:
-    """Return the section; None where no trial was proposed."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the proposed trial and its expected gain, if there is one."""
     found = results.read(NextResult)
     if found is None:
-        return None
-    blocks: list[Block] = [
-        Callout("note", "The next trial", found.sentence),
-        Paragraph(f"{found.why} {found.expected}"),
-    ]
+        return
+    yield Callout("note", "The next trial", found.sentence)
+    yield Paragraph(f"{found.why} {found.expected}")
     if identified := results.read(IdentifyResult):
         forecasts = read_forecasts(results.root, results.model)
         lines = compare_forecasts(forecasts, identified, results.read(DiagnoseResult))
         if lines:
-            blocks.append(Bullets(tuple(one.replace("RUN", results.root.name) for one in lines)))
+            yield Bullets(tuple(one.replace("RUN", results.root.name) for one in lines))
     best = found.proposals[0]
     if best.confusion:
         title = "Probability of confusing two effects"
         heads = ">with the present trials | >with the next one"
-        blocks.append(tabulate_confusion(title, heads, best.confusion))
+        yield tabulate_confusion(title, heads, best.confusion)
     if best.sd:
         title = "Standard deviation of each parameter, now and with the next trial"
-        blocks.append(tabulate_sds(title, best.sd))
+        yield tabulate_sds(title, best.sd)
     if found.sensitivity:
-        blocks.append(_tabulate_sensitivity(found.sensitivity))
-    return Section(TITLE, tuple(blocks))
+        yield _tabulate_sensitivity(found.sensitivity)
 
 
 def tabulate_confusion(title: str, heads: str, pairs: Sequence[PlannedConfusion]) -> Table:

@@ -4,32 +4,33 @@ Nothing here depends on when or where the stages ran: equal results give equal r
 the machine are in ``run.json``, and ``bampipe status`` prints them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
-from bampipe.report.document import Block, Paragraph, Section, Subheading, Table
+from bampipe.report.document import Block, Paragraph, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.results.run import RunResult, StepRecord
 
+TITLE = "Provenance"
 _DIGITS = 12
 
 
-def section(results: Results) -> Section:
-    """Return the section."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield versions, files, stages and settings."""
     run = results.read(RunResult)
     if run is None:
-        text = "This run folder has no run.json, so its provenance is not known."
-        return Section("Provenance", (Paragraph(text),))
+        yield Paragraph("This run folder has no run.json, so its provenance is not known.")
+        return
     stages = {name: made for name, made in run.stages.items() if name != "report"}
-    blocks: list[Block] = [Paragraph(_list_versions(stages))]
+    yield Paragraph(_list_versions(stages))
     if "ingest" in stages:
         read = stages["ingest"].inputs
         rows = [(f"`{name}`", f"`{digest[:_DIGITS]}`") for name, digest in read.items()]
         title = f"Files that were read (first {_DIGITS} digits of their hash)"
-        blocks.append(Table(title, "File | Hash", rows))
-    blocks.append(_tabulate_stages(stages))
+        yield Table(title, "File | Hash", rows)
+    yield _tabulate_stages(stages)
     if settings := _tabulate_settings(stages):
-        blocks += [Subheading("Settings"), settings]
-    return Section("Provenance", tuple(blocks))
+        yield Subheading("Settings")
+        yield settings
 
 
 def _list_versions(stages: Mapping[str, StepRecord]) -> str:

@@ -1,13 +1,14 @@
 """The device's paper and this session, side by side."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from bampipe.files import read_json_table
-from bampipe.report.document import Block, Bullets, Callout, Section, Subheading, Table
+from bampipe.report.document import Block, Bullets, Callout, Subheading, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import NONE, format_digits, format_unit, format_with_sd
 
+TITLE = "Paper and this session"
 _SIMULATED = Callout(
     "note",
     "This session is simulated",
@@ -16,31 +17,30 @@ _SIMULATED = Callout(
 )
 
 
-def section(results: Results) -> Section | None:
-    """Return the section; None for a device without a paper."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the comparison with the device's paper, if it has one."""
     paper = results.paper
     if paper is None:
-        return None
+        return
     rows = []
     for row in paper["rows"]:
         value, sd = _read_number(results, row, "value"), _read_number(results, row, "sd")
         shown = format_digits(value) if sd is None else format_with_sd(value, sd)
         place = (row["quantity"], row["place"], row["published"])
         rows.append((*place, shown, format_unit(row["unit"])))
-    blocks: list[Block] = [_SIMULATED] if results.session.simulated else []
-    blocks.append(
-        Table(
-            f"{paper['title']}: published values and those of this session",
-            "Quantity | Place | >Paper | >This session | Unit",
-            rows,
-            f"Paper: digits as printed there.{_explain_dash(rows)}",
-        )
+    if results.session.simulated:
+        yield _SIMULATED
+    yield Table(
+        f"{paper['title']}: published values and those of this session",
+        "Quantity | Place | >Paper | >This session | Unit",
+        rows,
+        f"Paper: digits as printed there.{_explain_dash(rows)}",
     )
     if "comparison" in paper:
-        blocks.append(_tabulate_devices(results, paper["comparison"]))
+        yield _tabulate_devices(results, paper["comparison"])
     if notes := tuple(paper.get("notes", {}).get("text", ())):
-        blocks += [Subheading("Where this differs from the paper, and why"), Bullets(notes)]
-    return Section("Paper and this session", tuple(blocks))
+        yield Subheading("Where this differs from the paper, and why")
+        yield Bullets(notes)
 
 
 def _tabulate_devices(results: Results, comparison: dict[str, Any]) -> Table:

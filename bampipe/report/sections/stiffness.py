@@ -1,13 +1,13 @@
 """Stiffness: Table I, the hysteresis loops of Fig. 3, bandwidth in both units."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from bampipe.report import style
-from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
+from bampipe.report.document import Block, Bullets, Figure, Paragraph, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     choose_scale,
@@ -22,24 +22,26 @@ from bampipe.results.stiffness import AxisStiffness, GearStiffness, StiffnessRes
 TITLE = "Stiffness"
 
 
-def section(results: Results) -> Section | None:
-    """Return the section; None for a session without locked trials."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the stiffness of axes and gears; nothing for a session without locked trials."""
     found = results.read(StiffnessResult)
     if found is None:
-        if not (results.trials["kind"] == "locked").any():
-            return None
-        return results.make_section(TITLE, "The locked trials have not been used", "stiffness")
+        if (results.trials["kind"] == "locked").any():
+            yield results.state_undone("The locked trials have not been used", "stiffness")
+        return
     axes, notes = found.axes, found.notes
     if not axes and not found.gears:
-        return Section(TITLE, (Paragraph(" ".join(notes) or "There are no locked trials."),))
-    blocks: list[Block] = [_tabulate_axes(results, axes)] if axes else []
-    blocks += [_tabulate_gears(results, found.gears)] if found.gears else []
+        yield Paragraph(" ".join(notes) or "There are no locked trials.")
+        return
+    if axes:
+        yield _tabulate_axes(results, axes)
+    if found.gears:
+        yield _tabulate_gears(results, found.gears)
     loops = results.table("stiffness/loops.parquet")
     if loops is not None and len(loops):
-        blocks.append(_draw_loops(results, axes, loops))
+        yield _draw_loops(results, axes, loops)
     if notes:
-        blocks.append(Bullets(notes))
-    return Section(TITLE, tuple(blocks))
+        yield Bullets(notes)
 
 
 def _tabulate_axes(results: Results, axes: Mapping[str, AxisStiffness]) -> Table:

@@ -1,12 +1,12 @@
 """Summary: the verdict, the trials and the model, the key numbers."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from bampipe.lists import count_noun, join_names
 from bampipe.phrases.results import METHODS
 from bampipe.report import verdicts
-from bampipe.report.document import Block, Paragraph, Section, Table
+from bampipe.report.document import Block, Callout, Paragraph, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
@@ -24,6 +24,7 @@ from bampipe.results.setup import SetupResult
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import JudgedError, ValidateResult
 
+TITLE = "Summary"
 _MOST_OTHERS = 12
 """Most parameters other than friction that a note names."""
 _FRICTION = ("viscous.", "coulomb.")
@@ -34,17 +35,34 @@ _TERMS = (
 )
 
 
-def section(results: Results) -> Section:
-    """Return the section."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the warnings, the verdict unless the set-up is wrong, and the findings."""
     setup = results.read(SetupResult)
-    blocks: list[Block] = [Paragraph(_describe_session(results))]
-    if setup is None or not setup.mistakes:  # else no verdict on the model counts
-        blocks.insert(0, verdicts.judge_session(results))
+    yield from _list_warnings(results, setup)
+    if setup is None or not setup.mistakes:
+        yield verdicts.judge_session(results)
+    yield Paragraph(_describe_session(results))
     if ladder := _describe_ladder(results):
-        blocks.append(Paragraph(ladder))
+        yield Paragraph(ladder)
     if numbers := _tabulate_numbers(results):
-        blocks.append(numbers)
-    return Section("Summary", tuple(blocks))
+        yield numbers
+
+
+def _list_warnings(results: Results, setup: SetupResult | None) -> Iterator[Callout]:
+    """Yield the mistakes in the set-up, and the outdated results."""
+    for mistake in setup.mistakes if setup else ():
+        text = f"Once this is corrected, {mistake.evidence}."
+        if mistake.alternatives:
+            others = "; ".join(other.sentence for other in mistake.alternatives)
+            text += f" The trials cannot distinguish it from: {others}."
+        text += " No result below is valid before the session file is corrected."
+        yield Callout("attention", f"Set-up: {mistake.sentence}", text)
+    if setup and setup.warnings:
+        yield Callout("note", "Doubtful set-up", " ".join(f"{line}." for line in setup.warnings))
+    if results.outdated:
+        steps = ", ".join(f"`{step}`" for step in results.outdated)
+        text = f"Run these again before relying on their results: {steps}."
+        yield Callout("attention", "Some results are older than their inputs", text)
 
 
 def _describe_session(results: Results) -> str:

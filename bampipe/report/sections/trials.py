@@ -3,12 +3,12 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from bampipe.lists import join_names
 from bampipe.phrases import results as phrases
-from bampipe.report.document import Block, Paragraph, Section, Table
+from bampipe.report.document import Block, Paragraph, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
@@ -20,6 +20,7 @@ from bampipe.report.wording import (
 )
 from bampipe.results.filter import FilterResult
 
+TITLE = "Data"
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 _BLANK = "\0"
 """Placeholder of a number in a remark."""
@@ -29,19 +30,17 @@ _SAME_RATE = 0.02
 """Largest relative difference between a mean rate and the grid's for which they are the same."""
 
 
-def section(results: Results) -> Section:
-    """Return the section."""
-    session = results.session
-    blocks: list[Block] = [Paragraph(_describe_sampling(results))]
-    if session.notes:
-        blocks.append(Paragraph(f"Notes: {session.notes.rstrip('.')}."))
-    blocks.append(_tabulate_trials(results))
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield sampling, trials, and the differentiated motion."""
+    notes = results.session.notes.rstrip(".")
+    yield Paragraph(_describe_sampling(results))
+    if notes:
+        yield Paragraph(f"Notes: {notes}.")
+    yield _tabulate_trials(results)
     if filtered := results.read(FilterResult):
-        blocks += _describe_filter(results, filtered)
+        yield from _describe_filter(results, filtered)
     else:
-        said = "Velocities and accelerations have not been computed"
-        blocks.append(results.state_undone(said, "filter"))
-    return Section("Data", tuple(blocks))
+        yield results.state_undone("Velocities and accelerations have not been computed", "filter")
 
 
 def _describe_sampling(results: Results) -> str:
@@ -128,13 +127,12 @@ def _describe_kind(row: dict[Any, Any]) -> str:
     return kind
 
 
-def _describe_filter(results: Results, filtered: FilterResult) -> list[Block]:
+def _describe_filter(results: Results, filtered: FilterResult) -> Iterator[Block]:
     method = phrases.FILTERS.get(filtered.method, filtered.method)
-    text = f"Velocity and acceleration come from {method} ({filtered.method_reason})."
-    blocks: list[Block] = [Paragraph(text)]
+    yield Paragraph(f"Velocity and acceleration come from {method} ({filtered.method_reason}).")
     if filtered.skipped:
         skipped = "; ".join(f"{name}: {reason}" for name, reason in filtered.skipped.items())
-        blocks.append(Paragraph(f"Not differentiated: {skipped}."))
+        yield Paragraph(f"Not differentiated: {skipped}.")
     stretches = [
         (name, f"{one.start_s:.1f} to {one.end_s:.1f}", one.reason)
         for name, found in filtered.disturbances.items()
@@ -142,7 +140,7 @@ def _describe_filter(results: Results, filtered: FilterResult) -> list[Block]:
     ]
     if stretches:
         title = "Stretches that no estimate and no error uses"
-        blocks.append(Table(title, "Trial ~1 | Time (s) ~1 | Why ~6", stretches))
+        yield Table(title, "Trial ~1 | Time (s) ~1 | Why ~6", stretches)
     rows = [
         (
             axis,
@@ -160,5 +158,4 @@ def _describe_filter(results: Results, filtered: FilterResult) -> list[Block]:
             "Axis | >Resolution ~1 | >Bandwidth (Hz) ~1 | >Position ~1 | >Velocity ~1"
             " | >Acceleration ~1"
         )
-        blocks.append(Table(title, columns, rows))
-    return blocks
+        yield Table(title, columns, rows)

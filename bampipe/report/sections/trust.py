@@ -1,8 +1,8 @@
 """Trust in the estimates: weak directions, trials, tests of the innovations."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
-from bampipe.report.document import Block, Bullets, Paragraph, Section, Table
+from bampipe.report.document import Block, Bullets, Paragraph, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_decimals, format_digits, format_percent, format_unit
 from bampipe.results.identify import IdentifiabilityReport, IdentifyResult, InnovationTests
@@ -10,29 +10,26 @@ from bampipe.results.identify import IdentifiabilityReport, IdentifyResult, Inno
 TITLE = "Trust in the estimates"
 
 
-def section(results: Results) -> Section | None:
-    """Return the section; None if nothing is stored for it."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the limits of the estimates and the tests of the filter, if they are stored."""
     identified = results.read(IdentifyResult)
     if identified is None:
-        return None
-    known = identified.identifiability
-    blocks: list[Block] = []
-    if known:
-        blocks.append(Paragraph(_summarise(identified, known)))
+        return
+    if known := identified.identifiability:
+        yield Paragraph(_summarise(identified, known))
         if known.sentences:
-            blocks.append(Bullets(known.sentences))
-        blocks.append(_tabulate_bounds(results, identified, known))
+            yield Bullets(known.sentences)
+        yield _tabulate_bounds(results, identified, known)
         if len(known.trials) > 1:
             rows = [
                 (name, format_percent(one.growth), f"`{one.parameter}`")
                 for name, one in known.trials.items()
             ]
             caption = "Growth of a bound without each trial, for the parameter that needs it most"
-            blocks.append(Table(caption, "Trial | >Growth | Parameter", rows))
+            yield Table(caption, "Trial | >Growth | Parameter", rows)
     if identified.innovations:
         is_published = identified.method == "ukf"
-        blocks.append(_tabulate_innovations(results, identified.innovations, is_published))
-    return Section(TITLE, tuple(blocks)) if blocks else None
+        yield _tabulate_innovations(results, identified.innovations, is_published)
 
 
 def _summarise(identified: IdentifyResult, known: IdentifiabilityReport) -> str:

@@ -1,6 +1,6 @@
 """Validation: measured and predicted force (Fig. 9), error without friction (Fig. 4), tables."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,7 @@ import pandas as pd
 
 from bampipe.lists import join_names
 from bampipe.report import style, verdicts
-from bampipe.report.document import Block, Bullets, Figure, Paragraph, Section, Table
+from bampipe.report.document import Block, Bullets, Figure, Paragraph, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import (
     NONE,
@@ -25,33 +25,32 @@ _SHOWN_S = 12.0
 _SETTLE_S = 1.0
 
 
-def section(results: Results) -> Section:
-    """Return the section."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the errors of the predicted force, and its course over one trial."""
     validated = results.read(ValidateResult)
     if validated is None:
         said = "The predicted force has not been compared with the measured one"
-        return results.make_section(TITLE, said, "validate")
-    blocks: list[Block] = [_tabulate_axes(results, validated)]
+        yield results.state_undone(said, "validate")
+        return
+    yield _tabulate_axes(results, validated)
     if validated.trials:
-        blocks.append(_tabulate_trials(results, validated))
+        yield _tabulate_trials(results, validated)
     if validated.forces:
         shown = join_names(
             f"{split_name(name)} {format_digits(one.rmse)} {format_unit(one.unit)}"
             for name, one in validated.forces.items()
         )
         place = " at the handle" if results.pusher == "hand" else ""
-        blocks.append(Paragraph(f"Error of the predicted force{place} (RMSE): {shown}."))
+        yield Paragraph(f"Error of the predicted force{place} (RMSE): {shown}.")
     if validated.free_run is not None and validated.free_run.drift:
-        blocks += _tabulate_drift(results, validated, validated.free_run.drift)
+        yield from _tabulate_drift(results, validated, validated.free_run.drift)
     if validated.notes:
-        blocks.append(Bullets(validated.notes))
+        yield Bullets(validated.notes)
     residuals = _read_trial(results)
     if residuals is not None:
-        blocks.append(_draw_forces(results, residuals))
-        velocity = _read_velocity(results, residuals)
-        if velocity:
-            blocks.append(_draw_friction(results, residuals, velocity))
-    return Section(TITLE, tuple(blocks))
+        yield _draw_forces(results, residuals)
+        if velocity := _read_velocity(results, residuals):
+            yield _draw_friction(results, residuals, velocity)
 
 
 def _tabulate_axes(results: Results, validated: ValidateResult) -> Table:
@@ -90,14 +89,14 @@ def _tabulate_trials(results: Results, validated: ValidateResult) -> Table:
 
 def _tabulate_drift(
     results: Results, validated: ValidateResult, drift: Mapping[str, AxisDrift]
-) -> list[Block]:
-    """Return the drift of the model in short free runs, or the reasons why it is unknown."""
+) -> Iterator[Block]:
+    """Yield the drift of the model in short free runs, or the reasons why it is unknown."""
     axes = results.order_axes(drift)
     horizons = sorted({h.horizon_s for one in axes.values() for h in one.horizons})
     reasons = {axis: one.reason for axis, one in axes.items() if one.reason}
     if not horizons and len(reasons) == len(axes) and len(set(reasons.values())) == 1:
-        return [Paragraph(f"No short free runs of this model. {next(iter(reasons.values()))}")]
-    blocks: list[Block] = []
+        yield Paragraph(f"No short free runs of this model. {next(iter(reasons.values()))}")
+        return
     if horizons:
         rows = []
         for axis, one in axes.items():
@@ -119,11 +118,10 @@ def _tabulate_drift(
             "quantile, and the distance that the axis itself has moved by then."
         )
         columns = " | ".join(("Axis", *heads, "Unit"))
-        blocks.append(Table("Drift of the model in free runs", columns, rows, note))
+        yield Table("Drift of the model in free runs", columns, rows, note)
     if reasons:
         lines = (f"{axis}: {why[:1].lower()}{why[1:]}" for axis, why in reasons.items())
-        blocks.append(Bullets(tuple(lines)))
-    return blocks
+        yield Bullets(tuple(lines))
 
 
 def _read_trial(results: Results) -> pd.DataFrame | None:

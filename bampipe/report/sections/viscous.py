@@ -1,13 +1,13 @@
 """Viscous field: the damping that the brakes rendered, against the command (Fig. 8)."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pandas as pd
 
 from bampipe.lists import join_names
 from bampipe.report import style
-from bampipe.report.document import Block, Figure, Paragraph, Section, Table
+from bampipe.report.document import Block, Figure, Paragraph, Table
 from bampipe.report.run_results import Results
 from bampipe.report.wording import format_digits, format_p_value, format_with_sd
 from bampipe.results.intervals import NORMAL_95
@@ -16,21 +16,18 @@ from bampipe.results.viscous import Damping, ViscousResult
 TITLE = "Viscous field"
 
 
-def section(results: Results) -> Section | None:
-    """Return the section; None for a session without trials in a viscous field."""
+def list_blocks(results: Results) -> Iterator[Block]:
+    """Yield the rendered damping; nothing for a session without trials in a viscous field."""
     found = results.read(ViscousResult)
-    if found is None:
-        if not (results.trials["kind"] == "viscous").any():
-            return None
-        return results.make_section(TITLE, "The viscous trials have not been used", "viscous")
-    directions = found.directions
-    if not directions:
-        return None
-    blocks: list[Block] = [Paragraph(_compare(directions)), _tabulate(directions)]
+    if found is None and (results.trials["kind"] == "viscous").any():
+        yield results.state_undone("The viscous trials have not been used", "viscous")
+    if found is None or not found.directions:
+        return
+    yield Paragraph(_compare(found.directions))
+    yield _tabulate(found.directions)
     trace = results.table(results.model_file("viscous.parquet"))
     if trace is not None and len(trace):
-        blocks.append(_draw(results, directions, trace))
-    return Section(TITLE, tuple(blocks))
+        yield _draw(results, found.directions, trace)
 
 
 def _compare(directions: Mapping[str, Damping]) -> str:
