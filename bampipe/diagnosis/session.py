@@ -160,25 +160,19 @@ class Session:
         both = choosing, self.trials.folds.judged
         return [self.trials.subset(np.flatnonzero(counts).tolist()) for counts in both]
 
-    def replicate(
-        self, evidence: Evidence, p: Array, count: int, first: int = 0
-    ) -> Sequence[Array]:
-        """Return the residuals of replicates of a model, by trial, each (K, n_q, count).
-
-        Args:
-            evidence: the model on the measured trials; p: parameters of the replicates, (n_p,).
-            first: number of the first replicate, part of its seed.
+    def replicate(self, evidence: Evidence, count: int) -> Sequence[Array]:
+        """Return the residuals of replicates of a fitted model, by trial, each (K, n_q, count).
 
         Raises:
             Runaway: the simulated motion grows without bounds.
         """
-        seeds = [(self.seed, _SEED, k) for k in range(first, first + count)]
-        return self._replicate(evidence, evidence.system, p, self.trials.sensors, seeds)
+        seeds = [(self.seed, _SEED, k) for k in range(count)]
+        return self._replicate(evidence, evidence.system, self.trials.sensors, seeds)
 
     def _replicate(
-        self, e: Evidence, system: System, p: Array, sensors: Sensors, seeds: Sequence[Seed]
+        self, e: Evidence, system: System, sensors: Sensors, seeds: Sequence[Seed]
     ) -> Sequence[Array]:
-        simulated = SimulatedTrials(system, p, e.motions, sensors.rate_hz)
+        simulated = SimulatedTrials(system, e.p, e.motions, sensors.rate_hz)
         parts = [[seed] for seed in seeds] if self.jobs > 1 else [seeds]
         # Workers inherit the course of the machine, which all replicates share.
         trials = range(min(len(simulated.courses), len(simulated.rests)))
@@ -205,7 +199,7 @@ class Session:
         )
         narrow = system_of(recipe.with_sign_widths(_STOPPING_WIDTH))
         try:
-            found = self._replicate(evidence, narrow, evidence.p, exact, [(self.seed,)])
+            found = self._replicate(evidence, narrow, exact, [(self.seed,)])
         except Runaway:
             return nothing
         return [values[:, :, 0] for values in found]
@@ -225,7 +219,7 @@ class Session:
         c = self.criteria
         samples = lay_out_samples(evidence, c.block_s)
         if noise is None:
-            residuals = self.replicate(evidence, evidence.p, count or c.replicates)
+            residuals = self.replicate(evidence, count or c.replicates)
             stopping = self.replicate_stopping(recipe, evidence)
             noise = describe_noise(residuals, stopping, evidence, samples)
         force_sd = self.trials.sensors.force_sd

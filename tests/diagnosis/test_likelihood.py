@@ -38,8 +38,8 @@ def test_a_replicate_has_unit_variance_in_units_of_its_noise(fitted):
     session, fit = fitted
     e, samples = fit.evidence, fit.likelihood.samples
     nothing = [np.zeros_like(r) for r in e.residual]
-    noise = describe_noise(session.replicate(e, e.p, 24), nothing, e, samples)
-    fresh = session.replicate(e, e.p, 24, first=100)
+    noise = describe_noise(session.replicate(e, 24), nothing, e, samples)
+    fresh = replace(session, seed=1).replicate(e, 24)
     for axis, here in enumerate(samples):
         rows = take_samples(fresh, here, axis).T - noise.bias[axis]
         square = rows**2 / noise.variance[axis]
@@ -54,8 +54,8 @@ def test_a_replicate_has_unit_variance_in_units_of_its_noise(fitted):
 def test_replicates_are_the_same_in_other_processes(fitted):
     session, fit = fitted
     e = fit.evidence
-    alone = session.replicate(e, e.p, 3)
-    beside = replace(session, jobs=2).replicate(e, e.p, 3)
+    alone = session.replicate(e, 3)
+    beside = replace(session, jobs=2).replicate(e, 3)
     assert len(alone) == len(e.motions)
     assert all(np.array_equal(a, b) for a, b in zip(alone, beside, strict=True))
     assert not np.array_equal(alone[0][:, :, 0], alone[0][:, :, 1])
