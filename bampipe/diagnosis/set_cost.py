@@ -49,7 +49,6 @@ class Solution:
         base: change of the model's own reduced parameters.
         scale: s^2 of each axis, (n_q,).
         penalty: Occam factors and priors, nats.
-        sizes: irreplaceable size of each effect, see `SetCosts._sizes`.
         weight: weight of the squares of each axis, (n_q,).
     """
 
@@ -58,7 +57,6 @@ class Solution:
     base: Array = field(default_factory=lambda: np.zeros(0))
     scale: Array = field(default_factory=lambda: np.zeros(0))
     penalty: float = 0.0
-    sizes: tuple[float, ...] = ()
     weight: Array = field(default_factory=lambda: np.zeros(0))
 
 
@@ -207,7 +205,6 @@ class SetCosts:
         places_of, change = list(absent), np.array([*absent.values()])
         first = self.dictionary.evidence.log_scale[1][:, places_of] @ change
         volume = volume - p.independent * (first - 0.5 * first**2)
-        sizes: tuple[float, ...] = ()
         # The cost of the model does not contain the priors of its own effects.
         penalty = self.penalty_of(all_keys) + 0.5 * float(b[nb:] @ expected @ b[nb:])
         if keys:
@@ -228,18 +225,15 @@ class SetCosts:
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
             member = np.repeat(np.arange(len(keys)), [h.stop - h.start for h in held])[used]
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)
-            for k, size in enumerate(sizes):
-                # Other parameters absorb an effect only within their bounds.
-                if (
-                    size < self.least_size
-                    and self._size_within_bounds(all_keys, k, strengths, b, products)
-                    < self.least_size
-                ):
-                    return Solution(np.inf)
+            small = (k for k, size in enumerate(sizes) if size < self.least_size)
+            # Other parameters absorb an effect only within their bounds.
+            within = (self._size_within_bounds(all_keys, k, strengths, b, products) for k in small)
+            if any(size < self.least_size for size in within):
+                return Solution(np.inf)
             shapes = sum(len(key[1]) for key in keys)
             penalty += float(penalise(inside, spread[used], b[nb:][used], shapes))
         cost = solved.cost - float(volume.sum()) + penalty
-        return Solution(cost, strengths, b[:nb], scale, penalty, sizes, weight)
+        return Solution(cost, strengths, b[:nb], scale, penalty, weight)
 
     def _sums(
         self, keys: Sequence[Key], more: Sequence[Products] = ()
@@ -271,7 +265,7 @@ class SetCosts:
         inside: Array,
         own: Array,
         place: Indices,
-    ) -> tuple[float, ...]:
+    ) -> list[float]:
         """Return the size of each effect beyond what other parameters could absorb.
 
         It is a root mean square over that of the applied force, on the axis where it is largest.
@@ -286,7 +280,7 @@ class SetCosts:
                 alone = float(b[at] @ np.linalg.pinv(spread[here], hermitian=True) @ b[at])
             share = alone / max(float(b[at] @ own[here] @ b[at]), 1e-300)
             sizes.append(self._size(key, strength) * float(np.sqrt(max(share, 0.0))))
-        return tuple(sizes)
+        return sizes
 
     def _size_within_bounds(
         self,

@@ -39,7 +39,6 @@ class Unknown:
         size: root mean square of the function over that of the applied force.
     """
 
-    axis: int
     cost: float
     residual: tuple[Array, ...]
     weight: Array
@@ -200,4 +199,4 @@ class _ModelWithout:
         before, after = self.before / root, left[axis] / root
         share = 1.0 - float(after @ after) / max(float(before @ before), 1e-300)
         size = float(np.sqrt(np.mean((before - after) ** 2))) / max(self.force, 1e-300)
-        return Unknown(axis, one.cost, tuple(left), one.weight, share, size)
+        return Unknown(one.cost, tuple(left), one.weight, share, size)
