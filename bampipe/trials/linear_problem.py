@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from bampipe.arrays import Array, Flags, Indices
-from bampipe.physics.effect import BoundEffect
+from bampipe.physics.parameter import Parameter
 from bampipe.trials.evidence import Evidence
 from bampipe.trials.kept import KeptItems
 from bampipe.trials.likelihood import Likelihood
@@ -74,7 +74,8 @@ def pose_problem(likelihood: Likelihood, evidence: Evidence) -> LinearProblem:
     known_precision, moment = np.diag(precision), precision * known
     cost_of_known = 0.5 * float(precision @ known**2)
     effects, p = evidence.system.model.effects, evidence.p[list(evidence.free)]
-    strengths = [_places(evidence, item, strengths=True) for item in effects]
+    strengths = [_find_places(evidence, [q for q in e.parameters if q.strength]) for e in effects]
+    shapes = [_find_places(evidence, [q for q in e.parameters if q.shape]) for e in effects]
     if at := [place for places in strengths for place in places]:
         member = np.repeat(np.arange(len(effects)), [*map(len, strengths)])
         own = (take_samples(evidence.slopes, here, a)[:, at] for a, here in enumerate(samples))
@@ -99,26 +100,20 @@ def pose_problem(likelihood: Likelihood, evidence: Evidence) -> LinearProblem:
         likelihood, KeptItems(y), KeptItems(map(combined_columns, range(n_q))),
         to.T @ known_precision @ to, to.T @ moment, log_scale,
         by_parameters @ to, to, lower, upper,
-        {item.name: _absence(evidence, item) for item in effects},
-        {item.name: tuple(_places(evidence, item, strengths=False)) for item in effects},
+        {
+            # Without a strength the data say nothing of the shape: it does not move to its prior.
+            item.name: {k: -float(p[k]) for k in own} | dict.fromkeys(others, 0.0)
+            for item, own, others in zip(effects, strengths, shapes, strict=True)
+        },
+        {item.name: tuple(own) for item, own in zip(effects, shapes, strict=True)},
         cost_of_known, loose,
     )  # fmt: skip
 
 
-def _places(evidence: Evidence, item: BoundEffect, *, strengths: bool) -> list[int]:
-    """Indices, among the free parameters, of the strengths or of the shapes of an effect."""
-    names = {q.name for q in item.parameters if (q.strength if strengths else q.shape)}
-    parameters = evidence.system.parameters
-    return [k for k, number in enumerate(evidence.free) if parameters[number].name in names]
-
-
-def _absence(evidence: Evidence, item: BoundEffect) -> dict[int, float]:
-    away = {
-        place: -float(evidence.p[evidence.free[place]])
-        for place in _places(evidence, item, strengths=True)
-    }
-    # Without a strength the data say nothing of the shape: it stays, not moving to its prior.
-    return away | dict.fromkeys(_places(evidence, item, strengths=False), 0.0)
+def _find_places(evidence: Evidence, parameters: Sequence[Parameter]) -> list[int]:
+    """Indices, among the free parameters, of some parameters."""
+    names, every = {q.name for q in parameters}, evidence.system.parameters
+    return [k for k, number in enumerate(evidence.free) if every[number].name in names]
 
 
 def _stack_chunks(parts: Iterable[Array]) -> Iterator[tuple[slice, Array]]:
