@@ -49,6 +49,7 @@ class Solution:
         base: change of the model's own reduced parameters.
         scale: s^2 of each axis, (n_q,).
         penalty: Occam factors and priors, nats.
+        sizes: irreplaceable size of each effect, see `SetCosts._sizes`.
         weight: weight of the squares of each axis, (n_q,).
     """
 
@@ -57,6 +58,7 @@ class Solution:
     base: Array = field(default_factory=lambda: np.zeros(0))
     scale: Array = field(default_factory=lambda: np.zeros(0))
     penalty: float = 0.0
+    sizes: Sequence[float] = ()
     weight: Array = field(default_factory=lambda: np.zeros(0))
 
 
@@ -205,6 +207,7 @@ class SetCosts:
         places_of, change = list(absent), np.array([*absent.values()])
         first = self.dictionary.evidence.log_scale[1][:, places_of] @ change
         volume = volume - p.independent * (first - 0.5 * first**2)
+        sizes = list[float]()
         # The cost of the model does not contain the priors of its own effects.
         penalty = self.penalty_of(all_keys) + 0.5 * float(b[nb:] @ expected @ b[nb:])
         if keys:
@@ -233,7 +236,7 @@ class SetCosts:
             shapes = sum(len(key[1]) for key in keys)
             penalty += float(penalise(inside, spread[used], b[nb:][used], shapes))
         cost = solved.cost - float(volume.sum()) + penalty
-        return Solution(cost, strengths, b[:nb], scale, penalty, weight)
+        return Solution(cost, strengths, b[:nb], scale, penalty, sizes, weight)
 
     def _sums(
         self, keys: Sequence[Key], more: Sequence[Products] = ()
