@@ -7,7 +7,7 @@ import numpy as np
 from bampipe.arrays import Array
 from bampipe.diagnosis.candidates import Candidate
 from bampipe.trials.evidence import Evidence
-from bampipe.trials.likelihood import NOTHING
+from bampipe.trials.linear_problem import NOTHING
 from bampipe.trials.residuals import ModelOnTrial
 
 
@@ -72,13 +72,11 @@ def _compute_changes(item: Candidate, probes: Sequence[Array], base: ModelOnTria
         return [each - base.contribution for each in added] if item.is_joint else added
     added = []
     for p in probes:
-        moved = motion.of_mechanism(system, u, p)
-        at = moved.kinematics
         if item.replaces_motion:
+            at = motion.of_mechanism(system, u, p).kinematics
             left = base.system.residual(*at, base.memory, base.inputs, base.p)
         else:
-            z = moved.memory(system, p)
-            left = system.applied(*at, z, u, p) - system.required(*at, z, u, p)
+            left = ModelOnTrial(system, p, [motion]).residual_once
         added.append(left - base.residual)
     return added
 

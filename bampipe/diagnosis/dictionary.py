@@ -14,8 +14,8 @@ from bampipe.diagnosis.columns import compute_columns, make_parameters
 from bampipe.diagnosis.ranges import MachineScale, SearchRange
 from bampipe.physics.system import System
 from bampipe.trials.evidence import Evidence
-from bampipe.trials.likelihood import Samples, take_samples
 from bampipe.trials.residuals import ModelOnTrial
+from bampipe.trials.samples import Samples, take_samples
 from bampipe.trials.scale import NO_SLOPE, Spectra, find_spectra, gain_of_filter, slopes_by_force
 
 _ALONE, _SEVERAL = 7, 5

@@ -6,7 +6,7 @@ bootstrap: Yao, Vehtari, Simpson and Gelman 2018, Bayesian Analysis 13, 917).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logit, softmax
@@ -28,21 +28,23 @@ LEAST_P_VALUE = 1e-4
 
 
 @dataclass(frozen=True)
-class SetProbability:
-    """A set of effects with its probability.
+class SetEvidence:
+    """A set of effects with its log evidence and probability.
 
     Attributes:
         keys: its changes of the most probable model.
         effects: effects that it adds to the model diagnosed.
         unknown: index of the axis of an unknown function beside the effects, or None.
         log_evidence: log evidence over that of the most probable model, nats.
+        by_block: its share of each block, (n,).
     """
 
     keys: tuple[Key, ...]
     effects: tuple[str, ...]
     unknown: int | None
     log_evidence: float
-    probability: float
+    by_block: Array
+    probability: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class Probabilities:
         drops: log evidence lost without each effect if nothing replaces it, nats.
     """
 
-    sets: tuple[SetProbability, ...]
+    sets: tuple[SetEvidence, ...]
     effects: Mapping[str, float]
     if_all_known: Mapping[str, float]
     unknown: Array
@@ -88,15 +90,20 @@ def weigh_sets(
     bare = change_effects(fit.recipe, own)
     near = sorted((c, k) for c, k in pool.values() if c < none + _MARGIN and k)[:_MOST_SETS]
     absent = [((f"-{e}", ()),) for e in own]
+
+    def list_effects(keys: Sequence[Key]) -> tuple[str, ...]:
+        kept = [e for e in own if e not in removed_effects(keys)]
+        return (*kept, *(name for name, _ in added_effects(keys)))
+
     named = [
-        _SetEvidence(
-            keys, None, none - costs.cost(keys) - shortfall.get(keys, 0.0),
+        SetEvidence(
+            keys, list_effects(keys), None, none - costs.cost(keys) - shortfall.get(keys, 0.0),
             _split_evidence(costs, keys, None, shortfall.get(keys, 0.0)),
         )
         for keys in dict.fromkeys([(), *(k for _, k in near), *absent])
         if np.isfinite(costs.cost(keys))
     ]  # fmt: skip
-    sets = _compute_probabilities(costs, named, given, seed)
+    sets = _compute_probabilities(named, seed)
     effects, drops = _sum_by_effect(sets), _find_evidence_losses(sets)
     effects |= {e: 0.0 for e in own if by_noise.size_of_own(e) < criteria.size}
     if_all_known = dict(effects)
@@ -117,14 +124,14 @@ def weigh_sets(
         acting = [e for e in own if axis in acting_axes(bare, e)]
         more_by_block = _split_evidence(by_noise, (), by_all) - _split_evidence(costs, (), here)
         beside = [
-            _SetEvidence(
-                keys, axis, none - found.cost + more,
+            SetEvidence(
+                keys, list_effects(keys), axis, none - found.cost + more,
                 _split_evidence(costs, keys, found) + more_by_block,
             )
             for keys, found in _beside_unknown(costs, splines, here, acting)
         ]  # fmt: skip
         # The axes are independent in what they lack.
-        with_unknown = _compute_probabilities(costs, [*named, *beside], given, seed)
+        with_unknown = _compute_probabilities([*named, *beside], seed)
         here_too = _sum_by_effect(with_unknown)
         unknown[axis] = sum(s.probability for s in with_unknown if s.unknown is not None)
         for effect in acting:
@@ -161,33 +168,19 @@ def _share_explained(costs: SetCosts, effect: str, far: Flags) -> float:
     return float(np.max(1.0 - np.sqrt(now[far] / without[far])))
 
 
-@dataclass(frozen=True)
-class _SetEvidence:
-    """A set with its gain in log evidence over the most probable model, in all and by block."""
-
-    keys: tuple[Key, ...]
-    unknown: int | None
-    gain: float
-    by_block: Array
-
-
-def _compute_probabilities(
-    costs: SetCosts, listed: Sequence[_SetEvidence], given: Sequence[str], seed: int
-) -> tuple[SetProbability, ...]:
+def _compute_probabilities(listed: Sequence[SetEvidence], seed: int) -> tuple[SetEvidence, ...]:
     """Return the sets with their probabilities, most probable first."""
-    total, blocks = np.array([s.gain for s in listed]), np.array([s.by_block for s in listed])
+    total = np.array([s.log_evidence for s in listed])
+    blocks = np.array([s.by_block for s in listed])
     count = blocks.shape[1]
     rng = np.random.default_rng([seed, count])
     drawn = rng.multinomial(count, np.full(count, 1.0 / count), _DRAWS)
     shares = softmax((drawn - 1.0) @ blocks.T + total, axis=1).mean(axis=0)
-    sets = [
-        SetProbability(s.keys, _list_effects(costs, s.keys, given), s.unknown, s.gain, float(share))
-        for s, share in zip(listed, shares, strict=True)
-    ]
+    sets = [replace(s, probability=float(p)) for s, p in zip(listed, shares, strict=True)]
     return tuple(sorted(sets, key=lambda s: -s.probability))
 
 
-def _find_evidence_losses(sets: Sequence[SetProbability]) -> dict[str, float]:
+def _find_evidence_losses(sets: Sequence[SetEvidence]) -> dict[str, float]:
     """Return the log evidence that the best set with each effect loses without it, nats."""
     found = {}
     for effect in dict.fromkeys(e for one in sets for e in one.effects):
@@ -199,7 +192,7 @@ def _find_evidence_losses(sets: Sequence[SetProbability]) -> dict[str, float]:
     return found
 
 
-def _sum_by_effect(sets: Sequence[SetProbability]) -> dict[str, float]:
+def _sum_by_effect(sets: Sequence[SetEvidence]) -> dict[str, float]:
     names = dict.fromkeys(e for one in sets for e in one.effects)
     return {e: sum(one.probability for one in sets if e in one.effects) for e in names}
 
@@ -222,12 +215,6 @@ def _beside_unknown(
         if best is None or best[1].cost > min(one.cost for _, one in found):
             return found
         keys = best[0]
-
-
-def _list_effects(costs: SetCosts, keys: Sequence[Key], given: Sequence[str]) -> tuple[str, ...]:
-    away = removed_effects(keys)
-    kept = [e for e in costs.problem.absence if e not in away and e not in given]
-    return (*kept, *(name for name, _ in added_effects(keys)))
 
 
 def _split_evidence(

@@ -6,11 +6,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from bampipe.arrays import Array
 from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.set_cost import SetCosts, Solution, added_effects, effect_names
-from bampipe.trials.likelihood import solve_scaled
+from bampipe.trials.linear_problem import solve_scaled
 
 _STEP = 0.02
 """Step of the slope by a shape, as a share of the shape's range."""
@@ -100,8 +101,7 @@ class Search(SetCosts):
         slopes = self.shape_slopes(keys, found.strengths) if np.isfinite(found.cost) else None
         if slopes is None:
             return []
-        more = {a: c * self.problem.likelihood.root[a][:, None] for a, c in slopes.items()}
-        solved = self._solve_with_shapes(all_keys, more, found)
+        solved = self._solve_with_shapes(all_keys, slopes, found)
         steps = iter(np.clip(solved, -_LONGEST_STEP, _LONGEST_STEP))
         aims = [[float(np.clip(u + next(steps), 0.0, 1.0)) for u in s] for _, s in all_keys]
         pairs = list(zip(all_keys, aims, strict=True))
@@ -114,35 +114,22 @@ class Search(SetCosts):
         ]
 
     def _solve_with_shapes(
-        self, all_keys: tuple[Key, ...], more: Mapping[int, Array], known: Solution
+        self, all_keys: tuple[Key, ...], slopes: Mapping[int, Array], known: Solution
     ) -> Array:
         """Return the step of the shapes of a set, (d,), all other unknowns being free.
 
-        ``more`` are weighted slopes by the shapes, by axis, (n, d); ``known`` is the solution.
+        ``slopes`` are those by the shapes, by axis, (n, d); ``known`` is the solution.
         """
-        keys, left = added_effects(all_keys), self.residual_rows(all_keys)
-        p, nb, weight = self.problem, self.bb.shape[1], known.weight
-        xx, xy, places = self._sums(keys)
-        m, extra = xx.shape[1], next(iter(more.values())).shape[1]
-        b = np.concatenate([known.base, *known.strengths])
-        normal, right = np.zeros((m + extra, m + extra)), np.zeros(m + extra)
-        normal[:m, :m] = np.tensordot(weight, xx, 1)
-        right[:m] = -weight @ (xy + xx @ b)
-        normal[:nb, :nb] += p.precision
-        normal[nb:m, nb:m] += (expected := self._expected(keys))
-        right[:nb] += p.moment - p.precision @ known.base
-        right[nb:m] -= expected @ b[nb:]
-        normal[m:, m:] = np.eye(extra) / _LONGEST_STEP**2
-        for axis, slopes in more.items():
-            w = weight[axis]
-            normal[:nb, m:] += w * (p.base[axis].T @ slopes)
-            for i, key in zip(places, keys, strict=True):
-                if axis in (part := self._products(key)):
-                    normal[i, m:] += w * (part[axis][0].T @ slopes)
-            normal[m:, m:] += w * (slopes.T @ slopes)
-            right[m:] -= w * (slopes.T @ left[axis])
-        normal[m:, :m] = normal[:m, m:].T
-        free = self._free_of(all_keys, m + extra)
+        keys, p, nb = added_effects(all_keys), self.problem, self.bb.shape[1]
+        xx, xy, places = self._sums(keys, [self._multiply(slopes)])
+        m, n = places[-1].start, places[-1].stop
+        b = np.concatenate([known.base, *known.strengths, np.zeros(n - m)])
+        own, steps = self._expected(keys), np.eye(n - m) / _LONGEST_STEP**2
+        precision = block_diag(p.precision, own, steps)
+        normal = np.tensordot(known.weight, xx, 1) + precision
+        right = -known.weight @ (xy + xx @ b) - precision @ b
+        right[:nb] += p.moment
+        free = self._free_of(all_keys, n)
         step = free @ solve_scaled(free.T @ normal @ free, free.T @ right)
         return np.asarray(step[m:])
 

@@ -291,14 +291,13 @@ def gain_when_fitted(before: Fit, after: Fit, search: Search, keys: Sequence[Key
     """
     if any(len(a) != len(b) for a, b in zip(before.problem.y, after.problem.y, strict=True)):
         return np.inf
-    gained = 0.0
-    for axis, root in enumerate(before.likelihood.root):
-        if len(root):
-            squares = [
-                float(np.sum((fit.rows_beyond_bias[axis] * root) ** 2)) for fit in (before, after)
-            ]
-            ratio = max(squares[1], 1e-300) / max(squares[0], 1e-300)
-            gained -= 0.5 * before.problem.independent[axis] * float(np.log(ratio))
+
+    def sum_squares(fit: Fit) -> Array:
+        rows = zip(fit.rows_beyond_bias, before.likelihood.root, strict=True)
+        return np.array([max(float(np.sum((left * root) ** 2)), 1e-300) for left, root in rows])
+
+    ratio = sum_squares(before) / sum_squares(after)
+    gained = 0.5 * float(before.problem.independent @ np.log(ratio))
     volume = search.volume_where_fitted(keys, after.evidence)
     taken = -np.inf if volume is None else float(volume.sum())
     return gained + taken - search.solve(keys).penalty

@@ -27,22 +27,18 @@ from bampipe.results.floor import compare_with_floor
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import HELD_OUT
 from bampipe.trials.kept import KeptItems
-from bampipe.trials.likelihood import (
-    Likelihood,
+from bampipe.trials.likelihood import Likelihood, dry_friction
+from bampipe.trials.linear_problem import (
+    LinearProblem,
     LinearSolution,
-    Noise,
-    Problem,
-    Samples,
-    describe_noise,
-    dry_friction,
-    lay_out_samples,
+    pose_problem,
     solve_bounded,
-    take_samples,
 )
 from bampipe.trials.measured import MeasuredTrials
 from bampipe.trials.noise_floor import NoiseFloor
 from bampipe.trials.replicates import SimulatedTrials, keep_motion, make_replicate
 from bampipe.trials.residuals import ModelOnTrial
+from bampipe.trials.samples import Noise, Samples, describe_noise, lay_out_samples, take_samples
 from bampipe.trials.sensors import Sensors
 from bampipe.workers import process_pool
 
@@ -164,25 +160,19 @@ class Session:
         both = choosing, self.trials.folds.judged
         return [self.trials.subset(np.flatnonzero(counts).tolist()) for counts in both]
 
-    def replicate(
-        self, evidence: Evidence, p: Array, count: int, first: int = 0
-    ) -> Sequence[Array]:
-        """Return the residuals of replicates of a model, by trial, each (K, n_q, count).
-
-        Args:
-            evidence: the model on the measured trials; p: parameters of the replicates, (n_p,).
-            first: number of the first replicate, part of its seed.
+    def replicate(self, evidence: Evidence, count: int) -> Sequence[Array]:
+        """Return the residuals of replicates of a fitted model, by trial, each (K, n_q, count).
 
         Raises:
             Runaway: the simulated motion grows without bounds.
         """
-        seeds = [(self.seed, _SEED, k) for k in range(first, first + count)]
-        return self._replicate(evidence, evidence.system, p, self.trials.sensors, seeds)
+        seeds = [(self.seed, _SEED, k) for k in range(count)]
+        return self._replicate(evidence, evidence.system, self.trials.sensors, seeds)
 
     def _replicate(
-        self, e: Evidence, system: System, p: Array, sensors: Sensors, seeds: Sequence[Seed]
+        self, e: Evidence, system: System, sensors: Sensors, seeds: Sequence[Seed]
     ) -> Sequence[Array]:
-        simulated = SimulatedTrials(system, p, e.motions, sensors.rate_hz)
+        simulated = SimulatedTrials(system, e.p, e.motions, sensors.rate_hz)
         parts = [[seed] for seed in seeds] if self.jobs > 1 else [seeds]
         # Workers inherit the course of the machine, which all replicates share.
         trials = range(min(len(simulated.courses), len(simulated.rests)))
@@ -209,7 +199,7 @@ class Session:
         )
         narrow = system_of(recipe.with_sign_widths(_STOPPING_WIDTH))
         try:
-            found = self._replicate(evidence, narrow, evidence.p, exact, [(self.seed,)])
+            found = self._replicate(evidence, narrow, exact, [(self.seed,)])
         except Runaway:
             return nothing
         return [values[:, :, 0] for values in found]
@@ -229,7 +219,7 @@ class Session:
         c = self.criteria
         samples = lay_out_samples(evidence, c.block_s)
         if noise is None:
-            residuals = self.replicate(evidence, evidence.p, count or c.replicates)
+            residuals = self.replicate(evidence, count or c.replicates)
             stopping = self.replicate_stopping(recipe, evidence)
             noise = describe_noise(residuals, stopping, evidence, samples)
         force_sd = self.trials.sensors.force_sd
@@ -254,14 +244,15 @@ class Session:
         log_likelihood = problem.log_likelihood()
         # The error of the biases depends on the fitted residual.
         likelihood = self.weight_samples(recipe, evidence, likelihood.noise)
-        likelihood = likelihood.with_heavy_tails(likelihood.pose_problem(evidence), c.tails)
-        likelihood = likelihood.with_equal_weights(problem, lacking)
+        rows = pose_problem(likelihood, evidence).residual_rows()
+        likelihood = likelihood.with_heavy_tails(rows, c.tails)
+        likelihood = likelihood.with_equal_weights(problem.residual_rows(), lacking)
         evidence, problem = self._descend(recipe, evidence, likelihood)
         return Fit(recipe, evidence, likelihood, problem, log_likelihood)
 
     def _descend(
         self, recipe: Recipe, evidence: Evidence, likelihood: Likelihood
-    ) -> tuple[Evidence, Problem]:
+    ) -> tuple[Evidence, LinearProblem]:
         """Take Gauss-Newton steps to the most likely parameters within their bounds.
 
         A step is accepted if it lowers the cost with refitted nuisance parameters, since the
@@ -270,7 +261,7 @@ class Session:
         Raises:
             ValueError: fewer samples are clear of standstill than there are parameters.
         """
-        problem, count = likelihood.pose_problem(evidence), len(evidence.free)
+        problem, count = pose_problem(likelihood, evidence), len(evidence.free)
         if sum(map(len, problem.y)) <= count:
             raise ValueError("fewer samples clear of standstill than parameters")
         here = problem.solve_nuisance(count).cost
@@ -287,7 +278,7 @@ class Session:
                     moved = self.linearise(recipe, p, evidence)
                 except NotFinite:
                     continue
-                tried = likelihood.pose_problem(moved)
+                tried = pose_problem(likelihood, moved)
                 there = tried.solve_nuisance(count).cost
                 if there < here:
                     break
@@ -304,7 +295,7 @@ class Session:
         """
         evidence = self.linearise(recipe, p, judged=True)
         likelihood = self.weight_samples(recipe, evidence, count=count)
-        return Fit(recipe, evidence, likelihood, likelihood.pose_problem(evidence), is_given=True)
+        return Fit(recipe, evidence, likelihood, pose_problem(likelihood, evidence), is_given=True)
 
     def fit_plainly(self, recipe: Recipe, start: Array) -> Fit:
         """Fit a model with equal noise for all samples of an axis, without replicates."""
@@ -346,7 +337,7 @@ class Fit:
     recipe: Recipe
     evidence: Evidence
     likelihood: Likelihood
-    problem: Problem
+    problem: LinearProblem
     log_likelihood: float = float("nan")
     is_given: bool = False
 
@@ -407,14 +398,14 @@ class Fit:
     @cached_property
     def rows_beyond_bias(self) -> tuple[Array, ...]:
         """Residual after the bias has been subtracted, by axis, each (n,), N.m or N."""
-        rows = zip(self.problem.y, self.problem.base, self.likelihood.root, strict=True)
-        return tuple((y + x @ self.solution.base) / root for y, x, root in rows)
+        rows = self.problem.residual_rows(self.solution.base)
+        return tuple(left / root for left, root in zip(rows, self.likelihood.root, strict=True))
 
     def count_independent(self, criteria: Criteria) -> tuple[Samples, ...]:
         """Return the samples of each axis with the number that are independent in the residual."""
         band = self.evidence.band
         lags = int(criteria.block_s * band.rate_hz / band.step)
-        return self.likelihood.count_independent(self.problem, lags)
+        return self.likelihood.count_independent(self.problem.residual_rows(), lags)
 
     @cached_property
     def held_out_rmse(self) -> Array:
@@ -426,8 +417,8 @@ class Fit:
 
     def held_out_without(self, effects: Iterable[str] = ()) -> Array:
         """Return `held_out_rmse` without some of the model's effects."""
-        absent = {k: v for name in effects for k, v in self.problem.absence[name].items()}
         e, p, samples = self.evidence, self.problem, self.likelihood.samples
+        absent = p.removal(effects)
         groups, group_of = np.unique(e.folds.groups, return_inverse=True)
         parts = [group_of[here.trial] for here in samples]
         plain = [take_samples(e.residual, here, axis) for axis, here in enumerate(samples)]

@@ -19,14 +19,14 @@ from bampipe.arrays import Array, Indices
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.dictionary import Atom, Dictionary, Key
 from bampipe.trials.evidence import Evidence
-from bampipe.trials.likelihood import (
+from bampipe.trials.linear_problem import (
     NOTHING,
-    Problem,
-    Samples,
+    LinearProblem,
     expect_strengths,
     solve_bounded,
     solve_scaled,
 )
+from bampipe.trials.samples import Samples
 from bampipe.trials.scale import log_of_share
 
 _LEAST_SLOPE = 0.2
@@ -34,6 +34,8 @@ _LEAST_SLOPE = 0.2
 _SHAPE_COST = 2.5
 """Occam factor of a shape, nats: a typical half logarithm of the information over its range."""
 
+Products = Mapping[int, tuple[Array, Array, Array]]
+"""By axis, some weighted columns, (n, m), and their products with base, (P, m), and y, (m,)."""
 Make = Callable[[Sequence[Key]], Iterable[tuple[Key, Atom | None]]]
 
 
@@ -46,7 +48,6 @@ class Solution:
         strengths: strengths of each effect, in the order of the set.
         base: change of the model's own reduced parameters.
         scale: s^2 of each axis, (n_q,).
-        volume: term of the change of variables, by axis, (n_q,).
         penalty: Occam factors and priors, nats.
         sizes: irreplaceable size of each effect, see `SetCosts._sizes`.
         weight: weight of the squares of each axis, (n_q,).
@@ -56,9 +57,8 @@ class Solution:
     strengths: tuple[Array, ...] = ()
     base: Array = field(default_factory=lambda: np.zeros(0))
     scale: Array = field(default_factory=lambda: np.zeros(0))
-    volume: Array = field(default_factory=lambda: np.zeros(0))
     penalty: float = 0.0
-    sizes: tuple[float, ...] = ()
+    sizes: Sequence[float] = ()
     weight: Array = field(default_factory=lambda: np.zeros(0))
 
 
@@ -67,33 +67,40 @@ class SetCosts:
 
     def __init__(
         self,
-        problem: Problem,
+        problem: LinearProblem,
         dictionary: Dictionary,
         make: Make,
         criteria: Criteria,
         known: Mapping[Key, Atom | None],
     ) -> None:
-        self.problem = p = problem
         self.dictionary, self.make, self.criteria = dictionary, make, criteria
         self.log_prior = log_prior(criteria, len(dictionary.candidates))
-        self.n_q = len(p.y)
-        self.bb, self.by, self.yy = p.sums()
+        self.n_q = len(problem.y)
+        self.bb = problem.sums()[0]
         self.atoms: dict[Key, Atom | None] = dict(known)
-        self._products_by_key: dict[Key, dict[int, tuple[Array, Array, Array]]] = {}
-        self._solutions: dict[tuple[Key, ...], Solution] = {}
-        self._own_penalties: dict[str, float] = {}
         self.least_size = criteria.size
         self._squares: dict[Key, dict[int, Array]] = {}
         self._scale_without: dict[str, tuple[dict[int, Array], Array]] = {}
-        self.applied = [max(float(f @ f), 1e-300) for f in p.likelihood.applied]
-        self._weight = p.independent / np.maximum(self.yy, 1e-300)
+        self.applied = [max(float(f @ f), 1e-300) for f in problem.likelihood.applied]
         # Columns that take part of the measured force scale or filter its noise, too.
         self._moves_noise = True
         grid = [key for name in dictionary.candidates for key in dictionary.grid(name)]
         self.ensure(grid)
         places = {key: atom for key in grid if (atom := self.atoms[key]) is not None}
         self.grid_keys = list(places)
-        self._lay_out(places)
+        self._lay_out(problem, places)
+        self._set_problem(problem)
+
+    def _set_problem(self, problem: LinearProblem) -> None:
+        """Set the residual and the numbers of independent samples; the columns stay."""
+        self.problem = p = problem
+        self.by = np.array([b.T @ y for b, y in zip(p.base, p.y, strict=True)])
+        self.yy = np.array([float(y @ y) for y in p.y])
+        self.xy = [x.T @ y for x, y in zip(self.columns, p.y, strict=True)]
+        self._weight = p.independent / np.maximum(self.yy, 1e-300)
+        self._products_by_key: dict[Key, Products] = {}
+        self._solutions: dict[tuple[Key, ...], Solution] = {}
+        self._own_penalties: dict[str, float] = {}
 
     def ensure(self, keys: Iterable[Key]) -> None:
         """Compute the columns that are missing."""
@@ -101,16 +108,14 @@ class SetCosts:
         if missing:
             self.atoms |= dict(self.make(missing))
 
-    def _lay_out(self, places: Mapping[Key, Atom]) -> None:
+    def _lay_out(self, p: LinearProblem, places: Mapping[Key, Atom]) -> None:
         """Join the columns of the grid by axis, and compute their products with the base."""
         widths = [a.width for a in places.values()]
         self.first_columns = np.concatenate([[0], np.cumsum(widths)])[:-1].astype(int)
         self.widths = np.array(widths, dtype=int)
-        p = self.problem
-        self.columns, self.column_indices = [], []
+        self.columns, self.column_indices, self.xb = [], [], []
         widest = int(max(widths, default=1))
         self.own_products = np.zeros((self.n_q, len(places), widest, widest))
-        self.xb, self.xy = [], []
         for axis in range(self.n_q):
             blocks, at = [], []
             for k, atom in enumerate(places.values()):
@@ -124,7 +129,6 @@ class SetCosts:
             self.columns.append(x)
             self.column_indices.append(np.concatenate(at) if at else np.zeros(0, dtype=int))
             self.xb.append(p.base[axis].T @ x)
-            self.xy.append(x.T @ p.y[axis])
         self.n_columns = int(sum(widths))
         bounds = [b for key in places for b in self.dictionary.bounds(key[0])]
         self.lower, self.upper = np.array(bounds).reshape(-1, 2).T
@@ -132,26 +136,16 @@ class SetCosts:
 
     def on_replicate(self, number: int) -> Self:
         """Return the costs on the residual of a replicate instead of the measured one."""
-        other = copy(self)
-        p, noise = self.problem, self.problem.likelihood.noise
-        rows = zip(noise.residuals, p.likelihood.root, strict=True)
-        other.problem = replace(p, y=tuple(r[number] * root for r, root in rows))
+        other, likelihood = copy(self), self.problem.likelihood
+        rows = zip(likelihood.noise.residuals, likelihood.root, strict=True)
+        other._set_problem(replace(self.problem, y=tuple(r[number] * root for r, root in rows)))
         other._moves_noise = False
-        other.by = np.array([b.T @ y for b, y in zip(p.base, other.problem.y, strict=True)])
-        other.yy = np.array([float(y @ y) for y in other.problem.y])
-        other.xy = [x.T @ y for x, y in zip(self.columns, other.problem.y, strict=True)]
-        other._products_by_key, other._solutions = {}, {}
-        other._weight = p.independent / np.maximum(other.yy, 1e-300)
         return other
 
     def with_independent(self, samples: tuple[Samples, ...]) -> Self:
         """Return the costs with other numbers of independent samples."""
-        other = copy(self)
-        other.problem = replace(
-            self.problem, likelihood=replace(self.problem.likelihood, samples=samples)
-        )
-        other._solutions, other._own_penalties = {}, {}
-        other._weight = other.problem.independent / np.maximum(self.yy, 1e-300)
+        other, likelihood = copy(self), replace(self.problem.likelihood, samples=samples)
+        other._set_problem(replace(self.problem, likelihood=likelihood))
         return other
 
     def _atom(self, key: Key) -> Atom:
@@ -160,16 +154,19 @@ class SetCosts:
         assert atom is not None
         return atom
 
-    def _products(self, key: Key) -> dict[int, tuple[Array, Array, Array]]:
-        """Return weighted columns of a candidate and their products with base and y, by axis."""
+    def _products(self, key: Key) -> Products:
+        """Return the products of a candidate's columns."""
         if key not in self._products_by_key:
-            atom, p = self._atom(key), self.problem
-            found = {}
-            for axis, columns in atom.columns.items():
-                x = columns * p.likelihood.root[axis][:, None]
-                found[axis] = x, p.base[axis].T @ x, x.T @ p.y[axis]
-            self._products_by_key[key] = found
+            self._products_by_key[key] = self._multiply(self._atom(key).columns)
         return self._products_by_key[key]
+
+    def _multiply(self, columns: Mapping[int, Array]) -> Products:
+        """Return the products of columns, (n, m) by axis."""
+        p, found = self.problem, {}
+        for axis, column in columns.items():
+            x = column * p.likelihood.root[axis][:, None]
+            found[axis] = x, p.base[axis].T @ x, x.T @ p.y[axis]
+        return found
 
     def solve(self, keys: Sequence[Key]) -> Solution:
         """Return the most likely strengths of a set within their bounds, and its cost."""
@@ -184,9 +181,7 @@ class SetCosts:
 
     def _solve(self, all_keys: tuple[Key, ...]) -> Solution:
         p, nb = self.problem, self.bb.shape[1]
-        removed = removed_effects(all_keys)
-        absent = {k: change for name in removed for k, change in p.absence[name].items()}
-        keys = added_effects(all_keys)
+        absent, keys = p.removal(removed_effects(all_keys)), added_effects(all_keys)
         if any(self.atoms.get(key) is None for key in keys):
             return Solution(np.inf)
         xx, xy, places = self._sums(keys)
@@ -212,7 +207,7 @@ class SetCosts:
         places_of, change = list(absent), np.array([*absent.values()])
         first = self.dictionary.evidence.log_scale[1][:, places_of] @ change
         volume = volume - p.independent * (first - 0.5 * first**2)
-        sizes: tuple[float, ...] = ()
+        sizes = list[float]()
         # The cost of the model does not contain the priors of its own effects.
         penalty = self.penalty_of(all_keys) + 0.5 * float(b[nb:] @ expected @ b[nb:])
         if keys:
@@ -233,26 +228,26 @@ class SetCosts:
             own = np.tensordot(weight, xx[:, nb:, nb:], 1)[np.ix_(used, used)]
             member = np.repeat(np.arange(len(keys)), [h.stop - h.start for h in held])[used]
             sizes = self._sizes(keys, strengths, b[nb:][used], inside, own, member)
-            for k, size in enumerate(sizes):
-                # Other parameters absorb an effect only within their bounds.
-                if (
-                    size < self.least_size
-                    and self._size_within_bounds(all_keys, k, strengths, b, products)
-                    < self.least_size
-                ):
-                    return Solution(np.inf)
+            small = (k for k, size in enumerate(sizes) if size < self.least_size)
+            # Other parameters absorb an effect only within their bounds.
+            within = (self._size_within_bounds(all_keys, k, strengths, b, products) for k in small)
+            if any(size < self.least_size for size in within):
+                return Solution(np.inf)
             shapes = sum(len(key[1]) for key in keys)
             penalty += float(penalise(inside, spread[used], b[nb:][used], shapes))
         cost = solved.cost - float(volume.sum()) + penalty
-        return Solution(cost, strengths, b[:nb], scale, volume, penalty, sizes, weight)
+        return Solution(cost, strengths, b[:nb], scale, penalty, sizes, weight)
 
-    def _sums(self, keys: Sequence[Key]) -> tuple[Array, Array, list[slice]]:
-        """Return products of base and columns with each other and with y, by axis.
+    def _sums(
+        self, keys: Sequence[Key], more: Sequence[Products] = ()
+    ) -> tuple[Array, Array, list[slice]]:
+        """Return products of base and columns, ``more`` last, with each other and with y, by axis.
 
         They are (n_q, n, n) and (n_q, n); the slices of each member among the n come third.
         """
-        nb, parts = self.bb.shape[1], [self._products(key) for key in keys]
-        ends = nb + np.cumsum([0, *(self._atom(key).width for key in keys)], dtype=int)
+        nb, parts = self.bb.shape[1], [*map(self._products, keys), *more]
+        widths = [next(iter(part.values()))[0].shape[1] for part in parts]
+        ends = nb + np.cumsum([0, *widths], dtype=int)
         n, places = int(ends[-1]), [slice(*map(int, pair)) for pair in pairwise(ends)]
         xx, xy = np.zeros((self.n_q, n, n)), np.zeros((self.n_q, n))
         xx[:, :nb, :nb], xy[:, :nb] = self.bb, self.by
@@ -273,7 +268,7 @@ class SetCosts:
         inside: Array,
         own: Array,
         place: Indices,
-    ) -> tuple[float, ...]:
+    ) -> list[float]:
         """Return the size of each effect beyond what other parameters could absorb.
 
         It is a root mean square over that of the applied force, on the axis where it is largest.
@@ -288,7 +283,7 @@ class SetCosts:
                 alone = float(b[at] @ np.linalg.pinv(spread[here], hermitian=True) @ b[at])
             share = alone / max(float(b[at] @ own[here] @ b[at]), 1e-300)
             sizes.append(self._size(key, strength) * float(np.sqrt(max(share, 0.0))))
-        return tuple(sizes)
+        return sizes
 
     def _size_within_bounds(
         self,
@@ -336,7 +331,7 @@ class SetCosts:
         return np.asarray(block_diag(*blocks)) if blocks else np.zeros((0, 0))
 
     def volume_where_fitted(self, keys: Sequence[Key], evidence: Evidence) -> Array | None:
-        """Return `Solution.volume` of a set at the parameters of a model fitted with it."""
+        """Return the change of variables of a set at the parameters of a model fitted with it."""
         known = {q.name: v for q, v in zip(evidence.system.parameters, evidence.p, strict=True)}
         gains = [self.dictionary.gain_with(name, known) for name, _ in added_effects(keys)]
         gains += [self._without(name)[1] for name in removed_effects(keys)]
@@ -404,7 +399,7 @@ class SetCosts:
         """Return the cost of the priors of the parameters of one of the model's effects."""
         if name not in self._own_penalties:
             # As for a candidate, the information on the strengths is that at a given shape.
-            p, shapes = self.problem, self.problem.shapes[name]
+            p, e, shapes = self.problem, self.dictionary.evidence, self.problem.shapes[name]
             away = {k: change for k, change in p.absence[name].items() if k not in shapes}
             free = p.hold(dict.fromkeys(shapes, 0.0))[1]
             to = p.to_parameters[list(away)] @ free
@@ -412,16 +407,15 @@ class SetCosts:
             spread = to @ solve_scaled(free.T @ normal @ free, to.T)
             strengths = np.array(list(away.values()))
             known: Array = np.asarray(np.linalg.pinv(spread, hermitian=True), dtype=float)
-            own = penalise(known, p.spread[name], strengths, len(shapes))
+            prior_sd = np.array([e.system.parameters[e.free[k]].sd for k in away])
+            own = penalise(known, prior_sd, strengths, len(shapes))
             self._own_penalties[name] = float(own)
         return self._own_penalties[name]
 
     def residual_rows(self, keys: Sequence[Key]) -> list[Array]:
         """Return the residual of a set in units of the noise, by axis, (n,)."""
         solution = self.solve(keys)
-        left = [
-            y + b @ solution.base for y, b in zip(self.problem.y, self.problem.base, strict=True)
-        ]
+        left = [*self.problem.residual_rows(solution.base)]
         for key, strength in zip(
             added_effects(tuple(sorted(keys))), solution.strengths, strict=True
         ):
@@ -445,7 +439,7 @@ class SetCosts:
 
     def _free_of(self, keys: Sequence[Key], n: int) -> Array:
         """Return the directions of n unknowns that keep the effects removed by a set at zero."""
-        away = [place for name in removed_effects(keys) for place in self.problem.absence[name]]
+        away = self.problem.removal(removed_effects(keys))
         return self.problem.hold(dict.fromkeys(away, 0.0), n)[1]
 
     def gains(self, keys: Sequence[Key]) -> Array:

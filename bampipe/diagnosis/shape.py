@@ -102,6 +102,15 @@ def number_bins(values: Array, bins: int) -> Indices:
     return np.clip(found, 0, max(len(edges) - 2, 0)).astype(np.int64)
 
 
+def share_between(values: Array, which: Indices) -> float:
+    """Return the share of the variance of values (T,) that the means of their bins explain."""
+    count = np.bincount(which)
+    means = np.bincount(which, values) / np.maximum(count, 1)
+    total = float(np.sum((values - values.mean()) ** 2))
+    between = float(np.sum(count * (means - values.mean()) ** 2))
+    return min(1.0, between / total) if total > 0.0 else 0.0
+
+
 def residual_map(evidence: Evidence, axis: int, variable: Variable, bins: int = BINS) -> Map:
     """Average the residual of ``axis`` in ``bins`` parts of ``variable`` with equal counts."""
     use = np.concatenate([u[:, axis] for u in evidence.used]) > 0

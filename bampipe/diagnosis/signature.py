@@ -1,15 +1,21 @@
 """The residual of a model that lacks one effect, along a standard motion."""
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from scipy.ndimage import convolve1d
 
 from bampipe.arrays import Array
+from bampipe.diagnosis.shape import number_bins, share_between
 from bampipe.physics import Model, compile_model
-from bampipe.physics.device import INPUT_ORDERS, Coordinate, Device, derivative
+from bampipe.physics.device import Coordinate, Device
 from bampipe.physics.effect import Effect
 from bampipe.physics.system import System
+from bampipe.trials.motion import Motion, input_derivatives
+from bampipe.trials.residuals import ModelOnTrial
 
 DURATION_S, RATE_HZ = 16.0, 250.0
 SMOOTHING_S = 0.3
@@ -61,27 +67,23 @@ def _compute_signature(
     t = np.arange(0.0, DURATION_S, 1.0 / RATE_HZ)
     motion = [_motion(c, device.limits.get(c.name), n, t) for n, c in enumerate(device.coordinates)]
     q, qd, qdd = (np.column_stack([part[order] for part in motion]) for order in range(3))
-    channels: dict[str, Array] = {"t": t}
+    channels: defaultdict[str, Array] = defaultdict(partial(np.zeros_like, t))
     for number, axis in enumerate(bare.coordinates):
         if axis in device.brakes:
             channels[device.brakes[axis]] = braked * BRAKE_DAMPING * np.abs(qd[:, number])
     channels |= {name: np.ones_like(t) for name in device.channels}
-    p = bare.prior
-    u = _inputs(bare, channels, t)
-    z = bare.memory(q, qd, qdd, u, p, t)
-    needed, applied = bare.required(q, qd, qdd, z, u, p), bare.applied(q, qd, qdd, z, u, p)
-    force = _smooth(bare.least_force(q, needed - applied, u, p))
-    for number, label in enumerate(device.forces):
-        channels[label] = force[:, number]
-        rate = force[:, number]
-        for order in range(1, len(INPUT_ORDERS)):
-            rate = np.gradient(rate, t)
-            channels[derivative(label, order)] = rate
+    p, trial = bare.prior, Motion("", t, q, qd, qdd, np.zeros_like(q), channels)
+    idle = ModelOnTrial(bare, p, [trial])
+    needed = bare.required(*trial.kinematics, idle.memory, idle.inputs, p)
+    force = _smooth(bare.least_force(q, needed - idle.applied, idle.inputs, p))
+    for label, values in zip(device.forces, force.T, strict=True):
+        rates = values
+        channels[label] = values
+        for name in input_derivatives(label):
+            channels[name] = rates = np.gradient(rates, t)
 
     def leave(system: System, p: Array) -> Array:
-        u = _inputs(system, channels, t)
-        z = system.memory(q, qd, qdd, u, p, t)
-        return system.applied(q, qd, qdd, z, u, p) - system.required(q, qd, qdd, z, u, p)
+        return ModelOnTrial(system, p, [trial.with_channels({})]).residual_once
 
     by_size = [item.sd if item.strength else item.prior for item in full.parameters]
     pairs = zip(full.parameters, by_size, strict=True)
@@ -112,7 +114,9 @@ def _compute_signature(
         ),
         ("time", "s", t),
     ]
-    shares = [_explained(abscissa, residual[:, worst]) for _, _, abscissa in choices]
+    shares = [
+        share_between(residual[:, worst], number_bins(abscissa, BINS)) for _, _, abscissa in choices
+    ]
     best = int(np.argmax(np.round(shares, 2)))
     return Signature(
         axis=axis,
@@ -146,23 +150,4 @@ def _motion(
 def _smooth(force: Array) -> Array:
     """Return ``force`` without its jumps at reversals, which a hand cannot follow."""
     window = np.hanning(int(SMOOTHING_S * RATE_HZ) | 1)
-    window /= window.sum()
-    edge = len(window) // 2
-    padded = np.pad(force, ((edge, edge), (0, 0)), mode="edge")
-    return np.column_stack([np.convolve(column, window, "valid") for column in padded.T])
-
-
-def _inputs(system: System, channels: Mapping[str, Array], t: Array) -> Array:
-    return np.column_stack([channels.get(name, np.zeros_like(t)) for name in system.inputs])
-
-
-def _explained(abscissa: Array, residual: Array) -> float:
-    """Return the share of the variance of ``residual`` that its means in bins explain."""
-    edges = np.quantile(abscissa, np.linspace(0.0, 1.0, BINS + 1)[1:-1])
-    bins = np.searchsorted(edges, abscissa)
-    count = np.bincount(bins, minlength=BINS)
-    mean = np.bincount(bins, residual, minlength=BINS) / np.maximum(count, 1)
-    total = float(np.var(residual))
-    if total == 0.0:
-        return 1.0
-    return 1.0 - float(np.mean((residual - mean[bins]) ** 2)) / total
+    return np.asarray(convolve1d(force, window / window.sum(), axis=0, mode="nearest"))

@@ -15,7 +15,8 @@ from bampipe.diagnosis.dictionary import Key
 from bampipe.diagnosis.set_cost import SetCosts, removed_effects
 from bampipe.diagnosis.shape import since_reversal
 from bampipe.trials.evidence import Evidence
-from bampipe.trials.likelihood import solve_scaled, take_samples
+from bampipe.trials.linear_problem import solve_scaled
+from bampipe.trials.samples import take_samples
 
 _KNOTS = (9, 33), (9,), (9,), (9,)
 """Knots of splines of position, speed, load, and time since the last reversal."""
@@ -41,7 +42,6 @@ class Unknown:
         size: root mean square of the function over that of the applied force.
     """
 
-    axis: int
     cost: float
     residual: tuple[Array, ...]
     weight: Array
@@ -171,8 +171,7 @@ class _ModelWithout:
     def __init__(self, costs: SetCosts, splines: Splines, keys: tuple[Key, ...]) -> None:
         p = self.p = costs.problem
         self.splines, axis = splines, splines.axis
-        absent = {k: v for name in removed_effects(keys) for k, v in p.absence[name].items()}
-        self.fixed, self.free = p.hold(absent)
+        self.fixed, self.free = p.hold(p.removal(removed_effects(keys)))
         self.base = [b @ self.free for b in p.base]
         self.y = [v + b @ self.fixed for v, b in zip(p.y, p.base, strict=True)]
         self.bb = np.array([b.T @ b for b in self.base])
@@ -232,4 +231,4 @@ class _ModelWithout:
         before, after = self.before / root, left[axis] / root
         share = 1.0 - float(after @ after) / max(float(before @ before), 1e-300)
         size = float(np.sqrt(np.mean((before - after) ** 2))) / max(self.force, 1e-300)
-        return Unknown(axis, one.cost, tuple(left), one.weight, share, size)
+        return Unknown(one.cost, tuple(left), one.weight, share, size)

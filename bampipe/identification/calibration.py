@@ -46,11 +46,9 @@ def propagate_calibration(
 
 
 def _residual(system: System, motion: Motion, squares: SquaresFit) -> Array:
-    """Return the residual (T, n_q) of a trial by uncompiled functions, since they run only once."""
-    p = squares.fit.evidence.p
-    here = ModelOnTrial(system, p, [motion.with_input_timing(squares.trials.late_s)])
-    at = here.mechanism.kinematics
-    return here.applied - system.required(*at, here.memory, here.inputs, p)
+    """Return the residual (T, n_q) of a trial."""
+    timed = motion.with_input_timing(squares.trials.late_s)
+    return ModelOnTrial(system, squares.fit.evidence.p, [timed]).residual_once
 
 
 def with_calibration(estimate: Estimate, moved: Mapping[str, Array]) -> Estimate:

@@ -24,10 +24,10 @@ from bampipe.identification.filter_run import (
     Attempt,
     FilterRun,
     MotionLost,
-    TrialFilter,
     build_filter_model,
     choose_stride,
     clear_of_reversal_mask,
+    follow_trials,
     load_filter_trial,
 )
 from bampipe.identification.filter_tables import (
@@ -76,92 +76,91 @@ _SOUND_NIS = (0.5, 2.0)
 sessions, 0.06 to 0.2 and 2.8 to 3.7 in those whose motion the filter lost."""
 
 
-@dataclass(frozen=True)
-class FilterTask:
-    """The model, start and noise levels for the filter.
-
-    Attributes:
-        recipe: the model's specification; name: its name in messages.
-        start: (n_p,) initial values.
-        squares: the least-squares fit, which gives the region of the answer.
-        known: (n,) its standard deviations, those of the prior for undetermined parameters.
-    """
-
-    run: RunFolder
-    system: System
-    recipe: Recipe
-    name: str
-    start: Array
-    squares: SquaresFit
-    known: Array
-    noise: Noise
-    choice: FilterChoice
-
-    def narrowed(self, factor: float) -> System:
-        """The model with the widths of its smoothed signs multiplied by a factor."""
-        return compile_model(self.recipe.with_sign_widths(factor).model())
-
-
-class _Filtering:
+class Filtering:
     """The trials, the model and the noise levels of the filter.
 
     Attributes:
-        motions: parts of trials between disturbances; of_trial: number of each part's trial.
-        trials: their raw samples; model, settings, choice: of the filter.
+        motions: parts of trials between disturbances; trials: their raw samples.
+        model, settings, choice: of the filter.
         late_sd: (1,) standard deviation of the input delay; (0,) if it is not estimated.
     """
 
-    def __init__(self, task: FilterTask, report_progress: Progress) -> None:
-        self.task, self.report_progress = task, report_progress
-        motions: Sequence[Motion] = task.squares.trials.motions
+    def __init__(
+        self,
+        run: RunFolder,
+        system: System,
+        recipe: Recipe,
+        name: str,
+        start: Array,
+        squares: SquaresFit,
+        sd: Array,
+        noise: Noise,
+        choice: FilterChoice,
+        report_progress: Progress,
+    ) -> None:
+        """Read the trials and tune the noise levels.
+
+        Args:
+            recipe: the model's specification; name: its name in messages.
+            start: (n_p,) initial values.
+            squares: the least-squares fit, which gives the region of the answer.
+            sd: (n,) its standard deviations, those of the prior for undetermined parameters.
+        """
+        self.system, self.recipe, self.name, self.start = system, recipe, name, start
+        self.squares, self.sd, self.noise, self.report_progress = (
+            squares,
+            sd,
+            noise,
+            report_progress,
+        )
+        motions: Sequence[Motion] = squares.trials.motions
         interval = float(np.median(np.diff(motions[0].t)))
-        self.motions, self.of_trial = part_trials(motions, 1.0 / interval)
-        self.sizes = trial_sizes(self.motions)
-        stride, squares, choice = choose_stride(self.motions), task.squares, task.choice
-        self.count = task.known.size
-        near = squares.p[:-1]
+        self.motions = part_trials(motions, 1.0 / interval)
+        sizes, stride = trial_sizes(self.motions), choose_stride(self.motions)
+        near, self.count = squares.p[:-1], sd.size
         self.trials: Sequence[Trial] = KeptItems(
-            load_filter_trial(task.run, motion, task.system, near, task.noise, stride, choice)
+            load_filter_trial(run, motion, system, near, noise, stride, choice)
             for motion in self.motions
         )
         timing = squares.free.size > self.count
-        self.model = build_filter_model(task.system, self.trials, task.start, timing, squares.p[-1])
+        self.model = build_filter_model(system, self.trials, start, timing, squares.p[-1])
         self.late_sd = self.model.upper[self.count :] / np.sqrt(3.0)
-        seconds = [size * interval for size in self.sizes]
+        seconds = [size * interval for size in sizes]
         block_s = choose_block(seconds, self.model.free.size, choice.block_s)
         self.choice = replace(choice, block_s=block_s)
         report_progress(0.15, "noise levels")
-        self.settings = replace(self._tuned(), stride=stride)
-
-    @property
-    def answer(self) -> Array:
-        """(nt,) the least-squares parameters, with no change of the input delay."""
-        late = np.zeros(self.late_sd.size)
-        return np.append(self.task.squares.p[self.task.squares.free[: self.count]], late)
-
-    @property
-    def known(self) -> Array:
-        """(nt,) standard deviations of `answer`."""
-        return np.append(self.task.known, self.late_sd)
-
-    def clear(self, place: int) -> Flags:
-        """Find the samples of a trial that are clear of reversals, (T, n_q)."""
-        return clear_of_reversal_mask(self.motions[place], self.task.system, self.trials[place].t)
-
-    def _tuned(self) -> FilterSettings:
-        task = self.task
-        settings = untuned_settings(task.system, task.noise, task.choice)
+        settings = untuned_settings(system, noise, choice)
         walk = np.append(settings.walk_sd, np.zeros(self.late_sd.size))
-        places, samples = choose_tuning_trials(self.sizes)
-        return tune_noise(
+        places, samples = choose_tuning_trials(sizes)
+        tuned = tune_noise(
             replace(settings, walk_sd=walk),
             self.model,
             [self.trials[place].first(samples) for place in places],
             [np.asarray(self.clear(place)[:samples].all(axis=1)) for place in places],
             (self.answer, self.known),
-            task.noise,
-            task.choice,
+            noise,
+            choice,
         )
+        self.settings = replace(tuned, stride=stride)
+
+    def narrowed(self, factor: float) -> System:
+        """The model with the widths of its smoothed signs multiplied by a factor."""
+        return compile_model(self.recipe.with_sign_widths(factor).model())
+
+    @property
+    def answer(self) -> Array:
+        """(nt,) the least-squares parameters, with no change of the input delay."""
+        late = np.zeros(self.late_sd.size)
+        return np.append(self.squares.p[self.squares.free[: self.count]], late)
+
+    @property
+    def known(self) -> Array:
+        """(nt,) standard deviations of `answer`."""
+        return np.append(self.sd, self.late_sd)
+
+    def clear(self, place: int) -> Flags:
+        """Find the samples of a trial that are clear of reversals, (T, n_q)."""
+        return clear_of_reversal_mask(self.motions[place], self.system, self.trials[place].t)
 
     @property
     def attempts(self) -> list[Attempt]:
@@ -170,13 +169,12 @@ class _Filtering:
         A model that is nonlinear in its parameters only starts around least squares: a prior as
         wide as its range would make it diverge.
         """
-        task, count = self.task, self.count
-        places, late = task.squares.free[:count], np.zeros(self.late_sd.size)
-        free = [task.system.parameters[k] for k in places]
+        places, late = self.squares.free[: self.count], np.zeros(self.late_sd.size)
+        free = [self.system.parameters[k] for k in places]
         prior_sd = np.append([item.sd for item in free], self.late_sd)
-        first = np.append(task.start[places], late)
-        spread = np.hypot(prior_sd, first - np.append(task.system.prior[places], late))
-        if task.squares.problem.linear:
+        first = np.append(self.start[places], late)
+        spread = np.hypot(prior_sd, first - np.append(self.system.prior[places], late))
+        if self.squares.problem.linear:
             around, attempts = prior_sd, [(first, spread, 1.0)]
         else:
             least = np.hypot(self.known, _LEAST_REGION * prior_sd)
@@ -185,25 +183,26 @@ class _Filtering:
 
     def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
         """Filter all trials, from the first of some starts that follows the motion."""
-        return TrialFilter(
+        return follow_trials(
             self.model,
             self.trials,
             self.choice,
             trial_names(self.motions),
-            self.task.system.coordinates,
-            f"model {self.task.name}",
-            "try --method least-squares, or set the trial aside if its sensors jumped there",
-            lambda fraction, message: self.report_progress(0.35 + 0.6 * fraction, message),
-        ).run(attempts, settings)
+            attempts,
+            settings,
+            where=f"model {self.name}",
+            remedy="try --method least-squares, or set the trial aside if its sensors jumped there",
+            report_progress=lambda done, name: self.report_progress(0.35 + 0.6 * done, name),
+        )
 
     def find(self) -> tuple[FilterRun, _Width | None, _Widths]:
         """Return the run to publish, the narrower sign width if chosen, and the widths compared."""
         found = self.run(self.attempts, self.settings)
         widths = self._widths_around(found)
-        width = None if self.task.system.model.device.prescribed else widths.choose()
+        width = None if self.system.model.device.prescribed else widths.choose()
         if width is None:
             return found, None, widths
-        functions, declared = self.task.narrowed(width.factor), self.model
+        functions, declared = self.narrowed(width.factor), self.model
         self.model = replace(self.model, functions=functions)
         value, slope = self.model.to_physical(found.theta)
         around = _AROUND * slope * np.sqrt(np.diag(found.covariance))
@@ -219,26 +218,26 @@ class _Filtering:
 
     def _widths_around(self, found: FilterRun, width: float = 1.0) -> _Widths:
         some, step = _some_of(self.trials, found), self.choice.longest_step_s
-        return _Widths(found, self.model, width, some, self.task.narrowed, step)
+        return _Widths(found, self.model, width, some, self.narrowed, step)
 
 
-def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
-    """Tune the noise, search on the first trial, then filter all trials.
+def estimate_by_filter(filtering: Filtering) -> Estimate:
+    """Search on the first trial, then filter all trials.
 
     Raises:
         MotionLost: the filter does not follow the motion.
     """
-    filtering = _Filtering(task, progress)
     found, width, widths = filtering.find()
-    model, count, system = filtering.model, filtering.count, task.system
-    problem, motions = task.squares.problem, filtering.motions
+    model, count, system = filtering.model, filtering.count, filtering.system
+    squares = filtering.squares
+    problem, motions = squares.problem, filtering.motions
     sandwich, blocks = sandwich_covariance(
         found.ends, model.n_states, found.search_theta, found.search_covariance
     )
     value, slope = model.to_physical(constrain(model, found.theta, sandwich))
     scaled = sandwich * np.outer(slope, slope)
     off, spread = _find_smoothing(width, widths)
-    p = np.append(task.start, task.squares.p[-1])
+    p = np.append(filtering.start, squares.p[-1])
     p[problem.free] = value
     tight = slope * np.sqrt(np.diag(found.covariance))
     at_bound = (value - model.lower < tight) | (model.upper - value < tight)
@@ -247,7 +246,7 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
     report = {
         "nis": nis,
         "innovations": check_innovations(system, found, filtering.clear),
-        "noise": noise_levels(system, found.settings, task.noise),
+        "noise": noise_levels(system, found.settings, filtering.noise),
         "input_timing": input_timing(p, problem, scaled),
         "blocks": blocks,
         "restarts": found.restarts,
@@ -268,7 +267,7 @@ def estimate_by_filter(task: FilterTask, progress: Progress) -> Estimate:
         problem=problem,
         covariance=covariance,
         at_bound=at_bound[:count],
-        held_out_rmse=task.squares.held_out_rmse(p),
+        held_out_rmse=squares.held_out_rmse(p),
         details=[{"filter_sd": tight[k], "smoothing_sd": smoothing[k]} for k in range(count)],
         report=report,
         tabulate=lambda: (

@@ -250,99 +250,92 @@ def build_filter_model(
     )
 
 
-@dataclass(frozen=True)
-class TrialFilter:
-    """The filter over all trials of a session.
+def follow_trials(
+    model: FilterModel,
+    trials: Sequence[Trial],
+    choice: FilterChoice,
+    names: Sequence[str],
+    attempts: Sequence[Attempt],
+    settings: FilterSettings,
+    *,
+    where: str,
+    remedy: str,
+    report_progress: Progress,
+) -> FilterRun:
+    """Search on the first trial, then filter all, from the first attempt that succeeds.
 
-    Attributes:
-        model, trials, choice: of the filter; names: of the trials; axes: of the readings.
-        where, remedy: of the error if the motion is lost.
+    A filter that starts far from the truth but trusts its model does not recover. The first
+    trial is therefore filtered with high process noise, which adds almost no information, and
+    filtered again at the end.
+
+    Args:
+        names: of the trials; where, remedy: of the error if the motion is lost.
         report_progress: called with the fraction of the trials done and the name of the next one.
+
+    Raises:
+        MotionLost: no attempt followed the motion.
     """
-
-    model: FilterModel
-    trials: Sequence[Trial]
-    choice: FilterChoice
-    names: Sequence[str]
-    axes: Sequence[str]
-    where: str
-    remedy: str
-    report_progress: Progress
-
-    def run(self, attempts: Sequence[Attempt], settings: FilterSettings) -> FilterRun:
-        """Search on the first trial, then filter all, from the first attempt that succeeds.
-
-        A filter that starts far from the truth but trusts its model does not recover. The first
-        trial is therefore filtered with high process noise, which adds almost no information, and
-        filtered again at the end.
-
-        Raises:
-            MotionLost: no attempt followed the motion.
-        """
-        engine, trials = filter_trials, self.trials
-        if self.choice.engine == "filterpy":
-            from bampipe.estimate.filterpy_engine import filter_trials_by_filterpy as engine
-        order = (*range(1, len(trials)), 0)
-        why, found = "", None
-        for restarts, (value, sd, factor) in enumerate(attempts):
-            mean, spread = self.model.to_estimated(value, sd)
-            level = replace(settings, noise_sd=factor * settings.noise_sd)
-            coarse = replace(level, noise_sd=_COARSE * level.noise_sd)
-            place = 0
-            try:
-                self._report(0, place)
-                search = engine(self.model, trials[:1], mean, np.diag(spread**2), coarse)
-                theta, covariance, passes = search.theta, search.covariance, []
-                for done, place in enumerate(order, start=1):
-                    one = engine(self.model, [trials[place]], theta, covariance, level)
-                    theta, covariance = one.theta, one.covariance
-                    passes.append(self._summarise(one, place))
-                    self._report(done, place)
-                    if _is_lost(passes[-1]):
-                        break  # other trials cannot rescue it
-            except FilterFailure as lost:
-                t = trials[place].t[min(lost.sample, trials[place].t.size - 1)]
-                why = f"the filter lost the motion of trial {self.names[place]} at {t:.2f} s:"
-                why += f" {lost.reason}"
-                continue
-            found = FilterRun(
-                self._summarise(search, 0), search.theta, search.covariance, tuple(passes),
-                theta, covariance, level, order, restarts,
-            )  # fmt: skip
-            if not _is_lost(passes[-1]):
-                return found
-        if found is not None:
-            worst = int(np.argmax([trial.nis for trial in found.trials]))
-            ratio = found.trials[worst].ratio
-            axis = (*self.axes, *self.axes)[int(np.argmax(ratio))]
-            why = (
-                f"the filter does not follow trial {self.names[found.order[worst]]}: the error of"
-                f" its one-step prediction of {axis} is {ratio.max():.0f} times that of noise"
-            )
-        raise MotionLost(why, where=self.where, remedy=self.remedy)
-
-    def _report(self, done: int, place: int) -> None:
-        self.report_progress(done / (len(self.names) + 1), self.names[place])
-
-    def _summarise(self, filtered: FilterOutcome, place: int) -> Pass:
-        """Summarise a filtered trial, whose number is ``place``, for later steps."""
-        one, trial = filtered.trials[0], self.trials[place]
-        size = np.asarray(one.innovation / one.innovation_sd)
-        present = ~np.isnan(one.nis)
-        samples = max(1, round(STRETCH_S / float(np.median(np.diff(trial.t)))))
-        return Pass(
-            t=one.t,
-            mean=one.mean,
-            variance=np.diagonal(one.covariance, axis1=1, axis2=2).copy(),
-            ends=at_block_ends(one, self.choice.block_s),
-            nis=float(one.nis[present].mean()) if present.any() else np.inf,
-            counted=int(present.sum()),
-            log_likelihood=float(np.nansum(one.log_likelihood)),
-            ratio=np.sqrt(np.nanmean(size**2, axis=0)),
-            stretches=average_stretches(size, samples),
-            inputs=average_stretches(trial.u, samples),
-            stretch_samples=samples,
+    engine = filter_trials
+    if choice.engine == "filterpy":
+        from bampipe.estimate.filterpy_engine import filter_trials_by_filterpy as engine
+    order = (*range(1, len(trials)), 0)
+    why, found = "", None
+    for restarts, (value, sd, factor) in enumerate(attempts):
+        mean, spread = model.to_estimated(value, sd)
+        level = replace(settings, noise_sd=factor * settings.noise_sd)
+        coarse = replace(level, noise_sd=_COARSE * level.noise_sd)
+        place = 0
+        try:
+            report_progress(0.0, names[place])
+            search = engine(model, trials[:1], mean, np.diag(spread**2), coarse)
+            theta, covariance, passes = search.theta, search.covariance, []
+            for done, place in enumerate(order, start=1):
+                one = engine(model, [trials[place]], theta, covariance, level)
+                theta, covariance = one.theta, one.covariance
+                passes.append(_summarise(one, trials[place], choice.block_s))
+                report_progress(done / (len(names) + 1), names[place])
+                if _is_lost(passes[-1]):
+                    break  # other trials cannot rescue it
+        except FilterFailure as lost:
+            t = trials[place].t[min(lost.sample, trials[place].t.size - 1)]
+            why = f"the filter lost the motion of trial {names[place]} at {t:.2f} s: {lost.reason}"
+            continue
+        found = FilterRun(
+            _summarise(search, trials[0], choice.block_s), search.theta, search.covariance,
+            tuple(passes), theta, covariance, level, order, restarts,
+        )  # fmt: skip
+        if not _is_lost(passes[-1]):
+            return found
+    if found is not None:
+        worst = int(np.argmax([trial.nis for trial in found.trials]))
+        ratio, axes = found.trials[worst].ratio, model.functions.coordinates
+        axis = (*axes, *axes)[int(np.argmax(ratio))]
+        why = (
+            f"the filter does not follow trial {names[found.order[worst]]}: the error of its"
+            f" one-step prediction of {axis} is {ratio.max():.0f} times that of noise"
         )
+    raise MotionLost(why, where=where, remedy=remedy)
+
+
+def _summarise(filtered: FilterOutcome, trial: Trial, block_s: float) -> Pass:
+    """Summarise a filtered trial for later steps."""
+    one = filtered.trials[0]
+    size = np.asarray(one.innovation / one.innovation_sd)
+    present = ~np.isnan(one.nis)
+    samples = max(1, round(STRETCH_S / float(np.median(np.diff(trial.t)))))
+    return Pass(
+        t=one.t,
+        mean=one.mean,
+        variance=np.diagonal(one.covariance, axis1=1, axis2=2).copy(),
+        ends=at_block_ends(one, block_s),
+        nis=float(one.nis[present].mean()) if present.any() else np.inf,
+        counted=int(present.sum()),
+        log_likelihood=float(np.nansum(one.log_likelihood)),
+        ratio=np.sqrt(np.nanmean(size**2, axis=0)),
+        stretches=average_stretches(size, samples),
+        inputs=average_stretches(trial.u, samples),
+        stretch_samples=samples,
+    )
 
 
 def _is_lost(one: Pass) -> bool:

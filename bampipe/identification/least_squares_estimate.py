@@ -32,10 +32,11 @@ from bampipe.physics import System
 from bampipe.physics.recipe import Recipe
 from bampipe.results.identify import Convergence, StateBound
 from bampipe.trials.kept import KeptItems
-from bampipe.trials.likelihood import lay_out_samples, solve_bounded, take_samples
+from bampipe.trials.linear_problem import solve_bounded
 from bampipe.trials.measured import MeasuredTrials, cut_blocks
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import problem_of, rms
+from bampipe.trials.samples import lay_out_samples, take_samples
 
 _REPLICATES = 6
 _LACKING = 3.0
@@ -93,8 +94,7 @@ class SquaresFit:
     @cached_property
     def _left(self) -> Sequence[tuple[Array, float]]:
         """By axis: the residual, (n,), and its root mean square."""
-        pairs = zip(self.fit.problem.y, self.fit.problem.base, strict=True)
-        every = (y + x @ self.fit.solution.base for y, x in pairs)
+        every = self.fit.problem.residual_rows(self.fit.solution.base)
         return KeptItems(
             (left, max(float(np.sqrt(np.mean(left**2))), 1e-300) if left.size else 1.0)
             for left in every

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bampipe.arrays import Array, Flags, Indices
-from bampipe.diagnosis.shape import Variable, number_bins, variables
+from bampipe.diagnosis.shape import Variable, number_bins, share_between, variables
 from bampipe.errors import InputError
 from bampipe.estimate.low_pass import Band
 from bampipe.physics import System
@@ -159,7 +159,7 @@ def _curves(
         own_states = ("", part.name.replace(":", "."))
         causes = [v for v in known[axis] if v.name.partition(" of ")[2] in own_states]
         binned = [number_bins(np.concatenate(v.values)[use], _BINS) for v in causes]
-        shares = [_explained(own, which) for which in binned]
+        shares = [share_between(own, which) for which in binned]
         best = int(np.argmax(shares))
         share, variable, which = shares[best], causes[best], binned[best]
         values = np.concatenate(variable.values)[use]
@@ -185,12 +185,3 @@ def _curves(
 
 def _means(values: Array, which: Indices, bins: Sequence[int]) -> Array:
     return np.array([values[which == b].mean() for b in bins])
-
-
-def _explained(values: Array, which: Indices) -> float:
-    """Return the fraction of the variance of ``values`` between the bins."""
-    count = np.bincount(which)
-    means = np.bincount(which, values) / np.maximum(count, 1)
-    total = float(np.sum((values - values.mean()) ** 2))
-    between = float(np.sum(count * (means - values.mean()) ** 2))
-    return min(1.0, between / total) if total > 0.0 else 0.0

@@ -18,9 +18,10 @@ from bampipe.diagnosis.session import Fit, Session
 from bampipe.results.next import ExpectedConfusion, join_effects
 from bampipe.trials.evidence import Evidence, gather_evidence
 from bampipe.trials.folds import Folds
-from bampipe.trials.likelihood import Likelihood, Noise, lay_out_samples, take_samples
+from bampipe.trials.likelihood import Likelihood
 from bampipe.trials.motion import Motion
 from bampipe.trials.residuals import ModelOnTrial
+from bampipe.trials.samples import Noise, lay_out_samples, take_samples
 
 _SLOPE_STEP = 1e-3
 """Relative step of a parameter for the slope of the residual of its effect."""

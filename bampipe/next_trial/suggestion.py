@@ -18,6 +18,7 @@ from bampipe.phrases.proposal import say_chance
 from bampipe.physics.recipe import Recipe
 from bampipe.results.diagnose import DiagnoseResult, SuggestedTrial
 from bampipe.results.next import AS_FORECAST
+from bampipe.trials.linear_problem import pose_problem
 
 _MOST_ALTERNATIVES = 4
 _REFINEMENTS = 4
@@ -56,7 +57,7 @@ def compare_alternatives(session: Session, final: Fit, odds: Odds) -> Comparison
     known = {q.name: v for q, v in zip(e.system.parameters, e.p, strict=True)}
     start = np.array([known[q.name] for q in system_of(recipe).parameters])
     evidence = session.linearise(recipe, start)
-    bare = Fit(recipe, evidence, final.likelihood, final.likelihood.pose_problem(evidence))
+    bare = Fit(recipe, evidence, final.likelihood, pose_problem(final.likelihood, evidence))
     others = {*session.candidate_names(recipe)} - members
     with open_search(session, bare, others) as search:
         found = [_fit_alternative(search, recipe, *pair) for pair in odds.items()]

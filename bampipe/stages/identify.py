@@ -29,7 +29,7 @@ from bampipe.identification.choice import (
     why_not_filtered,
 )
 from bampipe.identification.estimates import Estimate, collect_result
-from bampipe.identification.filter_estimate import FilterTask, estimate_by_filter
+from bampipe.identification.filter_estimate import Filtering, estimate_by_filter
 from bampipe.identification.filter_run import MotionLost
 from bampipe.identification.identifiability import assess_identifiability
 from bampipe.identification.least_squares_estimate import (
@@ -249,12 +249,12 @@ def _filter(
         why_not = why_not_filtered(task.system, squares, config.longest_step_s)
         if why_not is not None:
             return None, why_not
-    asked = FilterTask(
-        task.run, task.system, task.recipe, config.model, start, squares, by_squares.sd, noise,
-        config,
-    )  # fmt: skip
     try:
-        return estimate_by_filter(asked, progress), ""
+        filtering = Filtering(
+            task.run, task.system, task.recipe, config.model, start, squares, by_squares.sd, noise,
+            config, progress,
+        )  # fmt: skip
+        return estimate_by_filter(filtering), ""
     except MotionLost as error:
         if config.method == "ukf":
             raise

@@ -20,9 +20,9 @@ from bampipe.estimate.filter_uncertainty import sandwich_covariance
 from bampipe.identification.filter_run import (
     Attempt,
     FilterRun,
-    TrialFilter,
     build_filter_model,
     choose_stride,
+    follow_trials,
     load_filter_trial,
 )
 from bampipe.identification.filter_tables import tabulate_trace
@@ -138,16 +138,17 @@ def _estimated(
     sd = np.maximum(sd, 1e-9 * np.maximum(np.abs(value), 1e-6))
 
     attempts: list[Attempt] = [(value, sd, 4.0**k) for k in range(_RESTARTS)]
-    found = TrialFilter(
+    found = follow_trials(
         model,
         readings,
         config,
         trial_names(motions),
-        system.coordinates,
-        f"model {config.model}",
-        "set the trial aside, or identify with an effect of the brakes",
-        lambda fraction, message: progress(0.2 + 0.75 * fraction, message),
-    ).run(attempts, settings)
+        attempts,
+        settings,
+        where=f"model {config.model}",
+        remedy="set the trial aside, or identify with an effect of the brakes",
+        report_progress=lambda fraction, message: progress(0.2 + 0.75 * fraction, message),
+    )
     estimate, slope = model.to_physical(found.theta)
     names = [item.name for item in free]
     field = [i for i, name in enumerate(names) if name.startswith(f"{FIELD}.")]

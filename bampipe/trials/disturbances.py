@@ -234,27 +234,23 @@ def _merge_touching(stretches: list[Disturbance]) -> tuple[Disturbance, ...]:
     )
 
 
-def part_trials(motions: Sequence[Motion], rate_hz: float) -> tuple[Sequence[Motion], list[int]]:
+def part_trials(motions: Sequence[Motion], rate_hz: float) -> Sequence[Motion]:
     """Split trials at their disturbances, for filters that follow a motion from sample to sample.
 
     Returns:
-        The parts that are long enough, or the trials themselves if nothing disturbs them; and the
-        number of the trial that each part belongs to.
+        The parts that are long enough, or the trials themselves if nothing disturbs them.
     """
-    rows: list[slice] = []
-    of_trial: list[int] = []
+    rows: list[tuple[int, slice]] = []
     for number, motion in enumerate(motions):
         sound = np.ones(motion.t.size, dtype=bool)
         if motion.left_out is not None:
             sound = np.logical_not(motion.left_out.any(axis=1))
         for start, end in find_runs(sound):
             if end - start >= _SHORTEST_S * rate_hz or end - start == motion.t.size:
-                rows.append(slice(start, end))
-                of_trial.append(number)
-    if [part.stop - part.start for part in rows] == trial_sizes(motions):
-        return motions, of_trial
-    parts = (motions[k].rows(part) for k, part in zip(of_trial, rows, strict=True))
-    return KeptItems(parts, MOST_OF_TRIALS), of_trial
+                rows.append((number, slice(start, end)))
+    if [part.stop - part.start for _, part in rows] == trial_sizes(motions):
+        return motions
+    return KeptItems((motions[k].rows(part) for k, part in rows), MOST_OF_TRIALS)
 
 
 def _lay_out_blocks(times: Sequence[Array], ends_s: Sequence[float], band: Band) -> _Blocks:

@@ -251,6 +251,13 @@ class ModelOnTrial:
         at = self.mechanism.kinematics
         return self.system.applied(*at, self.memory, self.inputs, self.p)
 
+    @property
+    def residual_once(self) -> Array:
+        """`residual` by functions that need no compilation, for a model that is seen only once."""
+        at = self.mechanism.kinematics
+        required = self.system.required(*at, self.memory, self.inputs, self.p)
+        return self.applied - required
+
     @cached_property
     def contribution(self) -> Array:
         """Contribution of the effects to the residual, see `System.contribution`, (T, n_q)."""

@@ -36,8 +36,8 @@ from bampipe.diagnosis.ranges import MachineScale
 from bampipe.diagnosis.session import Session, candidates_of
 from bampipe.physics import compile_model
 from bampipe.results.identify import IdentifyResult
-from bampipe.trials.likelihood import take_samples
 from bampipe.trials.measured import read_measured_trials
+from bampipe.trials.samples import take_samples
 from missing_effects.make import make_session
 from missing_effects.recipes import PARTS, Recipe, read_recipes
 

@@ -23,8 +23,8 @@ from bampipe.diagnosis.search import Search
 from bampipe.diagnosis.select import Selection, open_search, select_effects
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.results.identify import IdentifyResult
-from bampipe.trials.likelihood import take_samples
 from bampipe.trials.measured import read_measured_trials
+from bampipe.trials.samples import take_samples
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

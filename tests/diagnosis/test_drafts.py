@@ -34,7 +34,7 @@ from bampipe.results.draft import ChanceOfDraft, DraftResult
 from bampipe.run.models import ensure_base
 from bampipe.stages import draft as draft_stage
 from bampipe.stages import identify
-from bampipe.trials.likelihood import lay_out_samples
+from bampipe.trials.samples import lay_out_samples
 
 
 def open_forms(session, fit, axis, only=None):

@@ -18,6 +18,7 @@ from bampipe.diagnosis.select import change_set, gain_when_fitted, open_search
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import device_from
+from bampipe.trials.linear_problem import pose_problem
 from bampipe.trials.measured import MeasuredTrials, read_measured_trials
 from bampipe.trials.residuals import ModelOnTrial
 from bampipe.trials.scale import log_scale, slopes_by_force
@@ -60,7 +61,7 @@ def test_a_drive_that_hardly_acts_any_more_explains_nothing(tmp_path: Path) -> N
         for sag in (0.0, 1e3)
     )
     keys = (("drive_sag:joint", (0.5,)),)
-    small = replace(weaker, problem=before.likelihood.pose_problem(weaker.evidence))
+    small = replace(weaker, problem=pose_problem(before.likelihood, weaker.evidence))
     with open_search(session, before, only=("drive_sag:joint",)) as search:
         assert search.volume_where_fitted(keys, same.evidence) == pytest.approx([0.0])
         assert search.volume_where_fitted(keys, weaker.evidence) is None

@@ -9,15 +9,9 @@ from sessions import fit_from_priors
 from bampipe.diagnosis.criteria import Criteria
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.identification.least_squares_estimate import fit_squares
-from bampipe.trials.likelihood import (
-    Likelihood,
-    Noise,
-    Problem,
-    Samples,
-    describe_noise,
-    solve_bounded,
-    take_samples,
-)
+from bampipe.trials.likelihood import Likelihood
+from bampipe.trials.linear_problem import LinearProblem, pose_problem, solve_bounded
+from bampipe.trials.samples import Noise, Samples, describe_noise, take_samples
 
 pytest_plugins = ("recorded",)
 
@@ -33,7 +27,7 @@ def fitted(record):
 def factors(fit, residual):
     """Of the common bias, and of the replicate that stops, by axis, each (n_q,)."""
     y = tuple(r * root for r, root in zip(residual, fit.likelihood.root, strict=True))
-    problem = replace(fit.likelihood.pose_problem(fit.evidence), y=y)
+    problem = replace(pose_problem(fit.likelihood, fit.evidence), y=y)
     solved = problem.to_parameters @ problem.solve().base
     n_q = len(residual)
     return solved[-2 * n_q : -n_q], solved[-n_q:]
@@ -44,8 +38,8 @@ def test_a_replicate_has_unit_variance_in_units_of_its_noise(fitted):
     session, fit = fitted
     e, samples = fit.evidence, fit.likelihood.samples
     nothing = [np.zeros_like(r) for r in e.residual]
-    noise = describe_noise(session.replicate(e, e.p, 24), nothing, e, samples)
-    fresh = session.replicate(e, e.p, 24, first=100)
+    noise = describe_noise(session.replicate(e, 24), nothing, e, samples)
+    fresh = replace(session, seed=1).replicate(e, 24)
     for axis, here in enumerate(samples):
         rows = take_samples(fresh, here, axis).T - noise.bias[axis]
         square = rows**2 / noise.variance[axis]
@@ -60,8 +54,8 @@ def test_a_replicate_has_unit_variance_in_units_of_its_noise(fitted):
 def test_replicates_are_the_same_in_other_processes(fitted):
     session, fit = fitted
     e = fit.evidence
-    alone = session.replicate(e, e.p, 3)
-    beside = replace(session, jobs=2).replicate(e, e.p, 3)
+    alone = session.replicate(e, 3)
+    beside = replace(session, jobs=2).replicate(e, 3)
     assert len(alone) == len(e.motions)
     assert all(np.array_equal(a, b) for a, b in zip(alone, beside, strict=True))
     assert not np.array_equal(alone[0][:, :, 0], alone[0][:, :, 1])
@@ -115,7 +109,7 @@ def problem_of(y, base, *, independent=None, lower=-np.inf, upper=np.inf, absenc
     bounds = np.broadcast_to(lower, n), np.broadcast_to(upper, n)
     precision = 1e-4 * np.eye(n)
     scale = np.zeros(1), np.zeros((1, n))
-    return Problem(
+    return LinearProblem(
         like, (y,), (base,), precision, np.zeros(n), *scale, np.eye(n), *bounds, absence or {}
     )
 
@@ -171,13 +165,11 @@ def test_a_few_samples_that_no_replicate_has_do_not_decide_under_heavy_tails(lin
     y[wild] += 6.0 * np.sign(base[wild, 0])
     plain = problem_of(y, base)
     off = abs(plain.solve().base[0] - 2.0)
-    like, problem = plain.likelihood, plain
+    problem = plain
     for _ in range(4):
-        like = plain.likelihood.with_heavy_tails(problem, tails=4.0)
-        rows = zip(like.root, (y,), (base,), strict=True)
-        ((root, one, columns),) = rows
-        problem = replace(plain, likelihood=like, y=(root * one,), base=(root[:, None] * columns,))
-        problem = replace(problem, likelihood=plain.likelihood)
+        like = plain.likelihood.with_heavy_tails(problem.residual_rows(), tails=4.0)
+        root = like.root[0]
+        problem = replace(plain, y=(root * y,), base=(root[:, None] * base,))
     assert abs(problem.solve().base[0] - 2.0) < 0.5 * off
     calm = np.setdiff1d(np.arange(400), wild)
     assert like.root[0][wild].max() < 0.5 * like.root[0][calm].mean()
@@ -189,9 +181,8 @@ def test_what_comes_back_with_the_motion_counts_as_few_independent_samples(fitte
     like = fit.likelihood
     forces = [f * root for f, root in zip(like.applied, like.root, strict=True)]
 
-    def counted(y):
-        problem = replace(fit.problem, y=tuple(y), base=tuple(0.0 * b for b in fit.problem.base))
-        return np.array([s.independent for s in like.count_independent(problem, 100)])
+    def counted(left):
+        return np.array([s.independent for s in like.count_independent(left, 100)])
 
     before = np.array([s.independent for s in like.samples])
     rows = zip(like.noise.residuals, like.noise.bias, like.root, strict=True)

@@ -19,6 +19,7 @@ from bampipe.diagnosis.set_cost import log_prior
 from bampipe.next_trial.sensitivity import find_detectability
 from bampipe.next_trial.suggestion import compare_alternatives, find_ambiguity, suggest_trial
 from bampipe.trials.folds import Folds
+from bampipe.trials.linear_problem import pose_problem
 from bampipe.trials.measured import MeasuredTrials
 
 NAMES = ("quadratic_drag:yaw", "return_spring:pitch", "force_bias:z", "shear_thinning:yaw")
@@ -41,7 +42,7 @@ def search_beside(fit: Fit, residual, known: Search | None = None) -> Search:
     scale = MachineScale.of_trials(fit.evidence)
     dictionary = Dictionary(fit.evidence, fit.likelihood.samples, candidates, scale)
     y = tuple(r * root for r, root in zip(residual, fit.likelihood.root, strict=True))
-    problem = replace(fit.likelihood.pose_problem(fit.evidence), y=y)
+    problem = replace(pose_problem(fit.likelihood, fit.evidence), y=y)
     atoms = known.atoms if known is not None else {}
     return Search(
         problem, dictionary, partial(make_columns, dictionary=dictionary), CRITERIA, atoms

@@ -27,7 +27,7 @@ from bampipe.diagnosis.drafts.forms import (
 from bampipe.diagnosis.drafts.shapes import SHAPES
 from bampipe.estimate.low_pass import low_pass_at
 from bampipe.trials.evidence import Evidence
-from bampipe.trials.likelihood import Samples
+from bampipe.trials.samples import Samples
 
 _FINER = 5
 """Smallest ratio of the rate at which columns are computed to the thinned rate."""

@@ -19,7 +19,7 @@ from bampipe.diagnosis.drafts.forms import FORCE, Form, Quantity, list_quantitie
 from bampipe.diagnosis.drafts.shapes import Shape
 from bampipe.errors import InputError
 from bampipe.physics.expression import build, parse
-from bampipe.trials.likelihood import Problem
+from bampipe.trials.linear_problem import LinearProblem
 
 EXTRA = "formulas"
 """Extra of bampipe that installs pyoperon."""
@@ -45,7 +45,7 @@ def is_available() -> bool:
     return find_spec("pyoperon") is not None
 
 
-def breed(forms: FormDictionary, problem: Problem) -> None:
+def breed(forms: FormDictionary, problem: LinearProblem) -> None:
     """Add formulas for the residual of ``problem`` on the axis of ``forms``."""
     device, axis = forms.evidence.system.model.device, forms.axis
     known = [

@@ -1,0 +1,369 @@
+"""The weighted linear problem of a linearised model under the likelihood, and its solution."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from bampipe.arrays import Array, Flags, Indices
+from bampipe.physics.parameter import Parameter
+from bampipe.trials.evidence import Evidence
+from bampipe.trials.kept import KeptItems
+from bampipe.trials.likelihood import Likelihood
+from bampipe.trials.samples import MOST_STOPPING, take_samples
+
+NOTHING = 1e-4
+"""A parameter whose whole range moves the data by fewer standard deviations has no effect."""
+_DETERMINED = 1e-9
+"""A direction of the model's parameters is undetermined, and keeps its value, if its eigenvalue of
+the scaled normal equations is below this fraction of the largest."""
+_LOOSE = 1e-6
+"""Smallest part of a parameter, in its standard deviations, in a direction without effect."""
+_TOGETHER = 100_000
+"""Rows of columns that are weighted in one pass."""
+_RIDGE = 1e-10
+_PASSES, _REWEIGHTS = 8, 5
+_STEADY = 0.02
+"""Relative change of the weights at convergence; the cost changes by its square."""
+
+
+def pose_problem(likelihood: Likelihood, evidence: Evidence) -> LinearProblem:
+    """Weight the residual and slopes of a linearised model, and add its priors."""
+    samples, noise, weights = likelihood.samples, likelihood.noise, likelihood.root
+    n_q = len(samples)
+    if evidence.factors:  # the unit is that of the measured force: small factors gain nothing
+        ratio = np.array(likelihood.model.factors) / np.array(evidence.factors)
+        weights = [root * by for root, by in zip(weights, ratio, strict=True)]
+    timing = evidence.timing if evidence.by_timing else ()
+    n = len(evidence.free) + len(timing[:1])
+
+    def weighted_columns(axis: int) -> Iterator[tuple[slice, Array]]:
+        """Yield the columns of all unknowns, (k, n_all), in chunks, since they are large."""
+        bias, stopping, weight = noise.bias[axis], noise.stopping[axis], weights[axis]
+        for part, slopes in _stack_chunks(samples[axis].take(evidence.slopes, axis)):
+            columns = np.zeros((len(slopes), n + 2 * n_q))
+            columns[:, :n] = slopes
+            columns[:, n + axis] = -bias[part]
+            columns[:, n + n_q + axis] = -stopping[part]
+            columns *= weight[part, None]
+            yield part, columns
+
+    def combined_columns(axis: int) -> Array:
+        out = np.empty((len(samples[axis].rows), to.shape[1]))
+        for part, x in weighted_columns(axis):
+            out[part] = x @ to
+        return out
+
+    # The standard deviation of a uniform distribution is 0.29 of its width.
+    of_timing = [(3.5 / max(timing[1] - timing[0], 1e-12)) ** 2] if timing else []
+    n_timing, none = len(of_timing), np.zeros(n_q)
+    precision = np.concatenate([evidence.precision, of_timing, none + 1.0, none + 1.0])
+    known = np.concatenate([evidence.known, np.zeros(n_timing), none + 1.0, none])
+    lower = np.concatenate([evidence.lower, timing[:1], none - np.inf, none])
+    upper = np.concatenate([evidence.upper, timing[1:], none + np.inf, none + MOST_STOPPING])
+    y = [
+        take_samples(evidence.residual, here, axis) * weights[axis]
+        for axis, here in enumerate(samples)
+    ]
+    weight = [s.independent / max(float(v @ v), 1e-300) for s, v in zip(samples, y, strict=True)]
+    products = (w * (x.T @ x) for axis, w in enumerate(weight) for _, x in weighted_columns(axis))
+    known_precision, moment = np.diag(precision), precision * known
+    cost_of_known = 0.5 * float(precision @ known**2)
+    effects, p = evidence.system.model.effects, evidence.p[list(evidence.free)]
+    strengths = [_find_places(evidence, [q for q in e.parameters if q.strength]) for e in effects]
+    shapes = [_find_places(evidence, [q for q in e.parameters if q.shape]) for e in effects]
+    if at := [place for places in strengths for place in places]:
+        member = np.repeat(np.arange(len(effects)), [*map(len, strengths)])
+        own = (take_samples(evidence.slopes, here, a)[:, at] for a, here in enumerate(samples))
+        expected = expect_strengths([x.T @ x for x in own], likelihood.applied)
+        expected = expected * (member[:, None] == member)
+        known_precision[np.ix_(at, at)] += expected
+        moment[at] -= expected @ p[at]
+        cost_of_known += 0.5 * float(p[at] @ expected @ p[at])
+    normal = sum(products) + known_precision
+    # Unknowns without effect over their range stay, like the shape of an effect of no strength.
+    size, parameters = np.sqrt(np.diag(normal)), evidence.system.parameters
+    reach = np.ones(size.size)
+    reach[: len(evidence.free)] = [parameters[i].sd or 1.0 for i in evidence.free]
+    per_unit = np.divide(1.0, size, out=np.zeros_like(size), where=size * reach > NOTHING)
+    values, vectors = np.linalg.eigh(normal * per_unit * per_unit[:, None])
+    kept = values > _DETERMINED * values[-1]
+    to = vectors[:, kept] / np.sqrt(values[kept]) * per_unit[:, None]
+    loose = vectors[:, ~kept] * per_unit[:, None]
+    log_scale, by_parameters = evidence.log_scale
+    by_parameters = np.pad(by_parameters, ((0, 0), (0, 2 * n_q)))
+    return LinearProblem(
+        likelihood, KeptItems(y), KeptItems(map(combined_columns, range(n_q))),
+        to.T @ known_precision @ to, to.T @ moment, log_scale,
+        by_parameters @ to, to, lower, upper,
+        {
+            # Without a strength the data say nothing of the shape: it does not move to its prior.
+            item.name: {k: -float(p[k]) for k in own} | dict.fromkeys(others, 0.0)
+            for item, own, others in zip(effects, strengths, shapes, strict=True)
+        },
+        {item.name: tuple(own) for item, own in zip(effects, shapes, strict=True)},
+        cost_of_known, loose,
+    )  # fmt: skip
+
+
+def _find_places(evidence: Evidence, parameters: Sequence[Parameter]) -> list[int]:
+    """Indices, among the free parameters, of some parameters."""
+    names, every = {q.name for q in parameters}, evidence.system.parameters
+    return [k for k, number in enumerate(evidence.free) if every[number].name in names]
+
+
+def _stack_chunks(parts: Iterable[Array]) -> Iterator[tuple[slice, Array]]:
+    """Yield the stacked arrays in chunks of `_TOGETHER` rows or a few more, with their rows."""
+    few, end, size = list[Array](), 0, 0
+    for part in parts:
+        few, size = [*few, part], size + len(part)
+        if size >= _TOGETHER:
+            yield slice(end, end + size), np.concatenate(few)
+            few, end, size = [], end + size, 0
+    if few:
+        yield slice(end, end + size), np.concatenate(few)
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """A weighted linear problem: the residual of all axes in units of noise, and its columns.
+
+    Attributes:
+        likelihood: weights and samples.
+        y: residual by axis, (n,); base: by axis, (n, P), columns of the determined combinations of
+            the model's parameters.
+        known_precision, known_moment: (P, P) and (P,), the priors of these.
+        log_scale: mean log of the fraction of the measured quantity that the effects leave, by
+            axis, (n_q,); log_scale_slopes: its slopes by the same combinations, (n_q, P).
+        to_parameters: (n_all, P), from these to the free parameters, nuisance parameters last.
+        lower, upper: bounds of the change of the parameters, (n_all,).
+        absence: by effect, the change of each of its free parameters (by index) that removes it.
+        shapes: by effect, the indices of its free shape parameters.
+        cost_of_known: negative log density of the priors if nothing changes.
+        loose: (n_all, m) directions of the parameters in which nothing measured changes.
+    """
+
+    likelihood: Likelihood
+    y: Sequence[Array]
+    base: Sequence[Array]
+    known_precision: Array
+    known_moment: Array
+    log_scale: Array
+    log_scale_slopes: Array
+    to_parameters: Array
+    lower: Array
+    upper: Array
+    absence: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
+    shapes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    cost_of_known: float = 0.0
+    loose: Array | None = None
+
+    @property
+    def independent(self) -> Array:
+        """Independent samples of each axis, (n_q,)."""
+        return np.array([s.independent for s in self.likelihood.samples])
+
+    @property
+    def count(self) -> Array:
+        """Number of samples of each axis, at least one, (n_q,)."""
+        return np.array([max(float(len(y)), 1.0) for y in self.y])
+
+    @property
+    def moment(self) -> Array:
+        """Gradient of the log density, without the residual, if nothing changes, (P,)."""
+        return np.asarray(self.known_moment + self.independent @ self.log_scale_slopes)
+
+    @cached_property
+    def precision(self) -> Array:
+        """Its curvature, (P, P): a fraction of the scale is linear in the strength of an effect."""
+        slopes = self.log_scale_slopes
+        return np.asarray(self.known_precision + (self.independent * slopes.T) @ slopes)
+
+    @property
+    def fixed_cost(self) -> float:
+        """Negative log density, without the residual, if nothing changes, nats."""
+        return self.cost_of_known - float(self.independent @ self.log_scale)
+
+    def sums(self) -> tuple[Array, Array, Array]:
+        """Products of the base with itself, of the base with y, and of y with itself, by axis."""
+        return (
+            np.array([b.T @ b for b in self.base]),
+            np.array([b.T @ y for b, y in zip(self.base, self.y, strict=True)]),
+            np.array([float(y @ y) for y in self.y]),
+        )
+
+    def sums_of(self, parts: Sequence[Indices], count: int) -> tuple[Array, Array, Array]:
+        """`sums` of ``count`` parts separately; ``parts`` numbers each axis' samples, (n,)."""
+        n_q, n = len(self.y), self.to_parameters.shape[1]
+        xx, xy, yy = (np.zeros((count, n_q, *shape)) for shape in ((n, n), (n,), ()))
+        for axis, (y, base, part) in enumerate(zip(self.y, self.base, parts, strict=True)):
+            order = np.argsort(part, kind="stable")
+            ends = np.searchsorted(part[order], np.arange(count + 1))
+            for k, (first, last) in enumerate(pairwise(ends)):
+                b, v = base[order[first:last]], y[order[first:last]]
+                xx[k, axis], xy[k, axis], yy[k, axis] = b.T @ b, b.T @ v, v @ v
+        return xx, xy, yy
+
+    def hold(self, values: Mapping[int, float], n: int | None = None) -> tuple[Array, Array]:
+        """Fix some parameters: unknowns (n,) with the given values, and (n, m) free directions.
+
+        A value that can be reached along a direction without effect constrains nothing else.
+
+        Args:
+            values: values by index of the parameter.
+            n: number of unknowns, the model's own first; by default these alone.
+        """
+        nb, places = self.to_parameters.shape[1], list(values)
+        n = nb if n is None else n
+        fixed, free = np.zeros(n), np.eye(n)
+        rows, wanted = self.to_parameters[places], np.array(list(values.values()))
+        # Scale each row to its own unit; a row of zeros needs no constraint.
+        norm = np.linalg.norm(rows, axis=1)
+        moves = norm > 0.0
+        rows, wanted = rows[moves] / norm[moves, None], wanted[moves] / norm[moves]
+        if self.loose is not None and rows.size:
+            u, size, _ = np.linalg.svd(self.loose[places][moves] / norm[moves, None])
+            bound = u[:, int(np.sum(size > _LOOSE)) :].T
+            rows, wanted = bound @ rows, bound @ wanted
+        if not rows.size:
+            return fixed, free
+        u, size, vt = np.linalg.svd(rows)
+        rank = int(np.sum(size > 1e-9 * max(float(size[0]), 1e-300)))
+        fixed[:nb] = vt[:rank].T @ ((u.T @ wanted)[:rank] / size[:rank])
+        free = np.zeros((n, n - rank))
+        free[:nb, : nb - rank] = vt[rank:].T
+        free[nb:, nb - rank :] = np.eye(n - nb)
+        return fixed, free
+
+    def removal(self, effects: Iterable[str]) -> dict[int, float]:
+        """Changes of the parameters, by index, that remove some of the model's effects."""
+        return {k: change for name in effects for k, change in self.absence[name].items()}
+
+    def residual_rows(self, base: Array | None = None) -> Iterator[Array]:
+        """The residual after a change ``base``, (P,), by default the most likely; by axis, (n,)."""
+        change = self.solve().base if base is None else base
+        return (y + x @ change for y, x in zip(self.y, self.base, strict=True))
+
+    def solve(self) -> LinearSolution:
+        """The most likely change of the model's own parameters."""
+        return solve_bounded(self, *self.sums())
+
+    def log_likelihood(self) -> float:
+        """Log likelihood of the samples at the solution, nats, up to a constant free of weights."""
+        roots = [float(np.mean(np.log(r))) if r.size else 0.0 for r in self.likelihood.root]
+        return float(self.independent @ roots) - self.solve().cost
+
+    def solve_nuisance(self, count: int) -> LinearSolution:
+        """The most likely nuisance parameters while the model's ``count`` parameters stay."""
+        return solve_bounded(self, *self.sums(), absent=dict.fromkeys(range(count), 0.0))
+
+
+def expect_strengths(squares: Sequence[Array], applied: Sequence[Array]) -> Array:
+    """Return the prior precision of the strengths of an effect about zero, (m, m).
+
+    The contribution of the effect has the root mean square of the applied force as its standard
+    deviation, so that similar effects cannot cancel each other with excessive forces.
+
+    Args:
+        squares: by axis, products of the columns of unit strength, (m, m); applied: by axis, (n,).
+    """
+    pairs = zip(squares, applied, strict=True)
+    return np.asarray(sum(square / max(float(f @ f), 1e-300) for square, f in pairs))
+
+
+@dataclass(frozen=True)
+class LinearSolution:
+    """The most likely unknowns of a linear problem.
+
+    Attributes:
+        unknowns: (n,), of which the first P are the model's own combinations of parameters.
+        held: which of the other unknowns are held at zero by a bound, (n - P,).
+        left: sum of squares by axis, (n_q,); weight: that of the squares at the solution.
+        cost: negative log density, nats.
+    """
+
+    unknowns: Array
+    held: Flags
+    left: Array
+    weight: Array
+    cost: float
+
+    @property
+    def base(self) -> Array:
+        """The first P unknowns, those of the model."""
+        return self.unknowns[: len(self.unknowns) - len(self.held)]
+
+
+def solve_bounded(
+    problem: LinearProblem,
+    xx: Array,
+    xy: Array,
+    yy: Array,
+    low: Array | None = None,
+    high: Array | None = None,
+    absent: Mapping[int, float] | None = None,
+    weight: Array | None = None,
+    expected: Array | None = None,
+) -> LinearSolution:
+    """Minimise the negative log likelihood, alternating between axis weights and bounds.
+
+    An unknown that leaves its bounds is held at the bound it crossed.
+
+    Args:
+        problem: the model's own columns, which come first.
+        xx, xy, yy: sums of products by axis, (n_q, n, n), (n_q, n), (n_q,).
+        low, high: bounds of the other unknowns, (n - P,).
+        absent: prescribed changes of the model's parameters, by index.
+        weight: initial weight of the squares of each axis, (n_q,).
+        expected: prior precision of the other unknowns about zero, (n - P, n - P).
+    """
+    p, n = problem, xx.shape[1]
+    nb, independent = p.to_parameters.shape[1], p.independent
+    low = np.zeros(0) if low is None else low
+    high = np.zeros(0) if high is None else high
+    precision, moment = np.zeros((n, n)), np.zeros(n)
+    precision[:nb, :nb], moment[:nb] = p.precision, p.moment
+    precision[nb:, nb:] = 0.0 if expected is None else expected
+    fixed_at = dict(absent or {})
+    held, bound = np.zeros(n - nb, dtype=bool), np.zeros(n - nb)
+    weight = independent / np.maximum(yy, 1e-300) if weight is None else weight
+    for _ in range(_PASSES):
+        fixed, free = p.hold(fixed_at, n)
+        fixed[nb:] = bound
+        chosen = free[:, np.append(np.ones(free.shape[1] - n + nb, dtype=bool), ~held)]
+        for _ in range(_REWEIGHTS):
+            normal = np.tensordot(weight, xx, 1) + precision
+            right = moment - weight @ xy - normal @ fixed
+            b = fixed + chosen @ solve_scaled(chosen.T @ normal @ chosen, chosen.T @ right)
+            left = np.maximum(yy + 2.0 * xy @ b + (xx @ b) @ b, 1e-12 * yy)
+            left = left + 1e-300
+            before, weight = weight, independent / left
+            if np.all(np.abs(weight - before) <= _STEADY * before):
+                break
+        out = ~held & ((b[nb:] < low - 1e-12) | (b[nb:] > high + 1e-12))
+        change = p.to_parameters @ b[:nb]
+        slack = 1e-6 * (1.0 + np.abs(change))
+        below, above = change < p.lower - slack, change > p.upper + slack
+        fresh = {*np.flatnonzero(below | above).tolist()} - {*fixed_at}
+        if not out.any() and not fresh:
+            break
+        held |= out
+        bound[out] = np.clip(b[nb:], low, high)[out]
+        fixed_at |= {k: float(p.lower[k] if below[k] else p.upper[k]) for k in fresh}
+    cost = float(independent @ (0.5 * np.log(left / p.count)))
+    off = b[:nb]
+    cost += p.fixed_cost + 0.5 * float(off @ p.precision @ off) - float(p.moment @ off)
+    return LinearSolution(b, held & (bound == 0.0), left, weight, cost)
+
+
+def solve_scaled(normal: Array, right: Array) -> Array:
+    """Solve a symmetric system whose unknowns have different units; ``right``: (n,) or (n, k)."""
+    size = 1.0 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    scaled = normal * size * size[:, None]
+    scaled.flat[:: len(scaled) + 1] += _RIDGE
+    by = size if right.ndim == 1 else size[:, None]
+    return np.asarray(np.linalg.solve(scaled, right * by) * by)
