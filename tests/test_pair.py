@@ -42,12 +42,8 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         specimen.law["viscous"] *= THICKER
         return specimen
 
-    for name, effects in (
-        ("first", {}),
-        ("same", {}),
-        ("thick", {}),
-        ("stick", {"stribeck:joint": 1.0}),
-    ):
+    for name in ("first", "same", "thick", "stick"):
+        effects = {"stribeck:joint": 1.0} if name == "stick" else {}
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(joint, "_draw_specimen", draw_thicker if name == "thick" else draw)
             independent.record("joint", root / name, 5, effects, RECORDED)
@@ -77,9 +73,7 @@ def test_nothing_changes_between_sessions_of_one_machine(sessions: dict[str, Pat
 
 
 @pytest.mark.slow
-def test_a_parameter_that_changed_is_named_and_makes_the_model_travel(
-    sessions: dict[str, Path],
-) -> None:
+def test_a_parameter_that_changed_is_named_and_makes_the_model_travel(sessions) -> None:
     pair = bampipe.compare_runs(sessions["first"], sessions["thick"])
     assert [name for name, one in pair.parameters.items() if one.changed] == ["viscous.joint"]
     one = pair.parameters["viscous.joint"]
@@ -147,9 +141,7 @@ def test_the_command_prints_tables_and_writes_json_and_a_page(
 
 
 @pytest.mark.slow
-def test_sessions_that_cannot_be_compared_are_refused(
-    sessions: dict[str, Path], tmp_path: Path
-) -> None:
+def test_sessions_that_cannot_be_compared_are_refused(sessions: dict[str, Path]) -> None:
     first, same = sessions["first"], sessions["same"]
     with pytest.raises(InputError, match="both runs are the same"):
         bampipe.compare_runs(first, first)

@@ -80,8 +80,7 @@ def test_a_folder_for_a_file_or_a_file_for_a_folder_is_one_line_or_mended(
     else:
         path.unlink(missing_ok=True)
         path.mkdir()
-    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs, "--force")
-    code, _, said = command("run", toy.session, *arguments)
+    code, _, said = command("run", toy.session, *toy.options, "--force")
     assert code == 2 and "in the way" in said.splitlines()[-1]
     assert "Traceback" not in said
 
@@ -125,6 +124,7 @@ def test_inside_means_links_followed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("outputs", "remove", "step"),
     [
+        ({"toy/more.json": digest("cut off")}, (), "toy_double"),
         ({"../../../../outside/double.json": digest("planted")}, (), "toy_double"),
         ({"run.json": digest("planted")}, (), "toy_double"),
         ({"toy/more.json": digest("planted")}, ("../../outside/double.json",), "toy_double"),
@@ -132,7 +132,7 @@ def test_inside_means_links_followed(tmp_path: Path) -> None:
         ({"toy/more.json": digest("planted")}, (), "../toy_double"),
     ],
 )
-def test_a_planted_commit_that_reaches_further_is_dropped(
+def test_a_planted_commit_that_reaches_further_or_was_cut_off_is_dropped(
     toy: Toy, outside: Path, outputs: dict[str, str], remove: tuple[str, ...], step: str
 ) -> None:
     good, kept = toy.files(), everything(outside)
@@ -173,16 +173,10 @@ def test_an_edited_record_is_one_line_or_rebuilt(
         table = table[key]
     table[path[-1]] = value
     (toy.root / "run.json").write_text(json.dumps(content))
-    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs)
-    for given in (
-        ("status", "first", "--runs", toy.runs),
-        ("verify", "first", "--runs", toy.runs),
-        ("extend", "first", "stribeck:yaw", "--runs", toy.runs),
-        ("accept", "first", "--runs", toy.runs),
-    ):
-        code, _, said = command(*given)
+    for given in (("status",), ("verify",), ("extend", "stribeck:yaw"), ("accept",)):
+        code, _, said = command(given[0], "first", *given[1:], "--runs", toy.runs)
         assert code in (0, 1, 2) and all(map(is_said, said.splitlines())), said
-    code, _, said = command("run", toy.session, *arguments)
+    code, _, said = command("run", toy.session, *toy.options)
     assert code == 0, said
     assert toy.files() == good and everything(outside) == kept
 
@@ -215,10 +209,10 @@ def test_what_json_and_toml_can_do_is_one_line_or_rebuilt(
     path = toy.root / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(UNREADABLE[kind])
-    for given in (("status", "first"), ("verify", "first")):
-        code, _, said = command(*given, "--runs", toy.runs)
+    for given in ("status", "verify"):
+        code, _, said = command(given, "first", "--runs", toy.runs)
         assert code in (0, 1, 2) and all(map(is_said, said.splitlines())), said
-    code, _, said = command("run", toy.session, "--pipeline", toy.pipeline_file, "--runs", toy.runs)
+    code, _, said = command("run", toy.session, *toy.options)
     assert code == 0, said
     assert toy.files() == good
 
@@ -246,7 +240,7 @@ def test_trials_that_are_no_tables_are_one_line(toy: Toy, command: Command, tria
     file = toy.session / "session.toml"
     head = file.read_text().partition("[[trials]]")[0]
     file.write_text(f"{head}trials = {trials}\n")
-    code, _, said = command("run", toy.session, "--pipeline", toy.pipeline_file, "--runs", toy.runs)
+    code, _, said = command("run", toy.session, *toy.options)
     assert code == 0, said  # the toys want no trials
     with pytest.raises(InputError, match="trials"):
         read_session(toy.session)
