@@ -6,9 +6,9 @@ from pathlib import Path
 import independent
 import numpy as np
 import pytest
-from binary_logs import to_parquet
 from independent import joint
 from independent.sensors import Conditions
+from independent_runs import run_short
 from made_results import diagnosis, write_result
 from scipy.stats import norm
 
@@ -20,7 +20,12 @@ from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.pair import PairResult
 
 THICKER = 1.4
-STAGES = 'stages = ["ingest", "filter", "identify", "validate", "compare"]'
+PIPELINE = """schema = "bampipe.pipeline/1"
+name = "short"
+stages = ["ingest", "filter", "identify", "validate", "compare"]
+[settings.validate]
+free_run = false
+"""
 RECORDED = Conditions(creep=True, trials=8, seconds=8.0)
 
 
@@ -31,10 +36,6 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     Each has four trials; the first session those that the others do not have.
     """
     root = tmp_path_factory.mktemp("pair")
-    (root / "short.toml").write_text(
-        f'schema = "bampipe.pipeline/1"\nname = "short"\n{STAGES}\n[settings.validate]\n'
-        "free_run = false\n"
-    )
     found, draw = {}, joint._draw_specimen
 
     def draw_thicker(*given: object) -> joint.Specimen:
@@ -51,10 +52,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         head, *trials = path.read_text().split("[[trials]]")
         kept = trials[:4] if name == "first" else trials[4:]
         path.write_text("[[trials]]".join([head, *kept]))
-        run = bampipe.run_session(
-            to_parquet(root / name), runs=root / "runs", pipeline=str(root / "short.toml")
-        )
-        found[name] = run.root
+        found[name] = run_short(root / name, root, PIPELINE).root
     return found
 
 
