@@ -30,9 +30,13 @@ from bampipe.run.state import RunState
 
 ROOT = Path(__file__).parent.parent
 CHANGE = Gate(
-    name="change", result="models/{model}/identify.json", value="parameters.*.estimate",
-    against="accepted", max=5.0, optional=True,
-)  # fmt: skip
+    name="change",
+    result="models/{model}/identify.json",
+    value="parameters.*.estimate",
+    against="accepted",
+    max=5.0,
+    optional=True,
+)
 
 
 def write(path: Path, content: object) -> None:

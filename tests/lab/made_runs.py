@@ -72,9 +72,13 @@ class Made:
         return root
 
     def _model(
-        self, root: Path, name: str, effects: tuple[str, ...],
-        parameters: Mapping[str, float], error: Mapping[str, float],
-    ) -> None:  # fmt: skip
+        self,
+        root: Path,
+        name: str,
+        effects: tuple[str, ...],
+        parameters: Mapping[str, float],
+        error: Mapping[str, float],
+    ) -> None:
         models.write(root, ModelFile(name=name, device="bam", effects=effects))
         known = {"sd": self.sd, "unit": "N.m", "at_bound": False}
         entries = {key: {"estimate": value, **known} for key, value in parameters.items()}
