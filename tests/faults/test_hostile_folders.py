@@ -52,7 +52,8 @@ def plant(
     files: tuple[str, ...] = (),
 ) -> Path:
     """Leave a commit file as a killed run would, which names ``outputs`` and ``remove``."""
-    made = json.loads((toy.root / "run.json").read_text())["stages"]["toy_double"]
+    kept = json.loads((toy.root / "run.json").read_text())
+    made = kept["stages"]["toy_double"]
     folder = toy.root / ".bampipe" / "staging" / "toy_double"
     folder.mkdir(parents=True, exist_ok=True)
     for name in files or outputs:
@@ -62,7 +63,7 @@ def plant(
     entry = {
         "step": step,
         "record": {**made, "outputs": {**made["outputs"], **outputs}},
-        "timing": {},
+        "timing": kept["timings"]["toy_double"],
         "remove": list(remove),
     }
     (folder / ".commit.json").write_text(json.dumps(entry))

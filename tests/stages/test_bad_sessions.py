@@ -236,7 +236,7 @@ REFUSED: dict[str, tuple[Damage, str]] = {
     "trial path absolute": (put("trials.0.file", "/etc/passwd"), "absolute path"),
     "trial path of Windows": (put("trials.0.file", "C:\\data\\x.csv"), "absolute path"),
     "trial path with a NUL": (put("trials.0.file", "a\0b.csv"), "not portable"),
-    "unit of time": (put("time", {"column": "time_us", "unit": "min"}), 'time.unit: found "min"'),
+    "unit of time": (put("time", {"column": "time_us", "unit": "eon"}), 'time.unit: found "eon"'),
     "trial folder linked out of the session": (
         lambda made: link_folder_out,
         "none of the 3 trials .* outside the session folder",
