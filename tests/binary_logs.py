@@ -1,8 +1,25 @@
-"""Logs turned from text into Parquet, which is read in a tenth of the time."""
+"""Logs as binary files: text turned into Parquet, read in a tenth of the time; MCAP of JSON."""
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import BinaryIO
 
 import pandas as pd
+import pytest
+
+
+def write_mcap(
+    stream: BinaryIO, topic: str, messages: Iterable[tuple[int, bytes]], **options: int
+) -> None:
+    """Write messages in JSON, each with its time in ns, as MCAP; ``options`` of the writer."""
+    writer_module = pytest.importorskip("mcap.writer")
+    writer = writer_module.Writer(stream, **options)
+    writer.start()
+    schema = writer.register_schema("state", "jsonschema", b'{"type": "object"}')
+    channel = writer.register_channel(topic, "json", schema)
+    for moment, content in messages:
+        writer.add_message(channel, moment, content, moment)
+    writer.finish()
 
 
 def to_parquet(folder: Path) -> Path:

@@ -1,8 +1,12 @@
 """Fixtures of the whole test suite: toy stages, folders to work in, paths of shared modules."""
 
 import json
+import os
+import resource
+import signal
+import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -75,6 +79,45 @@ class Toy:
     def request(self, **changes: Any) -> Request:
         pipeline = pipelines.load(str(self.pipeline_file))
         return replace(Request(self.root, pipeline, session=self.session, judge=True), **changes)
+
+    def many(self, sessions: Mapping[str, str]) -> list[Request]:
+        """Requests for further sessions, which have these numbers by name."""
+        made = [
+            install_toys.make_session(self.folder / "many" / name, numbers)
+            for name, numbers in sessions.items()
+        ]
+        return [self.request(root=self.runs / path.name, session=path) for path in made]
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """The pipeline and the run folders, as the command line is told."""
+        return ("--pipeline", str(self.pipeline_file), "--runs", str(self.runs))
+
+    def start(
+        self, *arguments: str, pause: float = 0.0, jobs: int = 0, limit: int | None = None
+    ) -> subprocess.Popen[str]:
+        """``bampipe run`` of the toys in another process.
+
+        Args:
+            arguments: of the command; pause: for which doubling a number waits, s; jobs: processes
+                in which numbers are doubled; limit: of the size of a file, bytes.
+        """
+
+        def prepare() -> None:
+            # A shell has its background jobs ignore Ctrl-C, and so their children.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+            if limit is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+        toys = {
+            "TOY_PAUSE": str(pause), "TOY_JOBS": str(jobs),
+            "TOY_WORKERS": str(self.folder / "workers"),
+        }  # fmt: skip
+        return subprocess.Popen(
+            [sys.executable, str(TOYS / "toy_bampipe.py"), "run", *arguments, *self.options],
+            cwd=self.folder, env={**os.environ, **toys}, preexec_fn=prepare, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
 
     def run(self, **changes: Any) -> Outcome:
         return run_session(self.request(**changes), self.events.append)

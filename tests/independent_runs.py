@@ -36,6 +36,13 @@ stages = ["ingest", "filter", "identify", "validate"]
 """
 
 
+def run_short(folder: Path, root: Path, pipeline: str = PIPELINE) -> bampipe.Run:
+    """Run the session in ``folder``, its logs as Parquet, through a pipeline of a few stages."""
+    path = root / "short.toml"
+    path.write_text(pipeline)
+    return bampipe.run_session(to_parquet(folder), runs=root / "runs", pipeline=str(path))
+
+
 def record_run(
     root: Path, machine: str, seed: int, *effects: str, **conditions: Any
 ) -> tuple[bampipe.Run, dict[str, float]]:
@@ -46,10 +53,7 @@ def record_run(
     chosen = replace(SHORT[machine], **conditions)
     strengths = dict.fromkeys(effects, 1.0)
     truth = independent.record(machine, root / machine, seed, strengths, chosen)
-    to_parquet(root / machine)
-    (root / "short.toml").write_text(PIPELINE)
-    run = bampipe.run_session(root / machine, runs=root / "runs", pipeline=str(root / "short.toml"))
-    return run, truth["parameters"]
+    return run_short(root / machine, root), truth["parameters"]
 
 
 def device_of(machine: str) -> Device:

@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import install_toys
 import pytest
 from conftest import TOYS, Toy, contents
 
@@ -47,12 +46,7 @@ def cluster() -> Iterator[Any]:
         yield cluster
 
 
-def requests(toy: Toy) -> list[Request]:
-    texts = {"a": "1 2", "b": "two", "c": "3", "d": "4 5 6"}
-    folders = [install_toys.make_session(toy.folder / "many" / n, t) for n, t in texts.items()]
-    return [
-        replace(toy.request(), root=toy.runs / folder.name, session=folder) for folder in folders
-    ]
+FOUR = {"a": "1 2", "b": "two", "c": "3", "d": "4 5 6"}
 
 
 def check(toy: Toy, given: list[Request], states: list[str]) -> None:
@@ -66,14 +60,14 @@ def check(toy: Toy, given: list[Request], states: list[str]) -> None:
 
 @pytest.mark.slow
 def test_same_bytes_as_the_local_engine(toy: Toy, cluster: Any) -> None:
-    given = requests(toy)
+    given = toy.many(FOUR)
     outcomes = run_on_cluster(given, cluster.scheduler_address, ignore_event)
     check(toy, given, [outcome.state for outcome in outcomes])
 
 
 @pytest.mark.slow
 def test_a_worker_killed_in_mid_run_loses_nothing(toy: Toy, cluster: Any) -> None:
-    given = requests(toy)
+    given = toy.many(FOUR)
     victim = next(iter(cluster.workers.values())).pid
 
     def kill() -> None:
@@ -95,7 +89,7 @@ def test_workers_publish_what_they_have_run(toy: Toy, cluster: Any) -> None:
     from bampipe.run.publish import fetch, published
 
     url = f"file://{toy.folder / 'far'}"
-    given = [replace(request, publish=url) for request in requests(toy)]
+    given = [replace(request, publish=url) for request in toy.many(FOUR)]
     outcomes = run_on_cluster(given, cluster.scheduler_address, ignore_event)
     check(toy, given, [outcome.state for outcome in outcomes])
     assert published(url) == sorted(
@@ -222,12 +216,7 @@ def test_a_scheduler_lost_in_mid_run_keeps_what_was_done(
 ) -> None:
     monkeypatch.setenv("TOY_PAUSE", "0.2")
     monkeypatch.setattr(engine, "PATIENCE_S", 4.0)
-    first = install_toys.make_session(toy.folder / "many" / "a", "1")
-    second = install_toys.make_session(toy.folder / "many" / "b", "1 " * 400)
-    given = [
-        replace(toy.request(), root=toy.runs / folder.name, session=folder)
-        for folder in (first, second)
-    ]
+    given = toy.many({"a": "1", "b": "1 " * 400})
     lost: list[float] = []
     with scheduler(toy.folder, "one") as (address, processes):
 

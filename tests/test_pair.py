@@ -6,9 +6,9 @@ from pathlib import Path
 import independent
 import numpy as np
 import pytest
-from binary_logs import to_parquet
 from independent import joint
 from independent.sensors import Conditions
+from independent_runs import run_short
 from made_results import diagnosis, write_result
 from scipy.stats import norm
 
@@ -20,7 +20,12 @@ from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.pair import PairResult
 
 THICKER = 1.4
-STAGES = 'stages = ["ingest", "filter", "identify", "validate", "compare"]'
+PIPELINE = """schema = "bampipe.pipeline/1"
+name = "short"
+stages = ["ingest", "filter", "identify", "validate", "compare"]
+[settings.validate]
+free_run = false
+"""
 RECORDED = Conditions(creep=True, trials=8, seconds=8.0)
 
 
@@ -31,10 +36,6 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     Each has four trials; the first session those that the others do not have.
     """
     root = tmp_path_factory.mktemp("pair")
-    (root / "short.toml").write_text(
-        f'schema = "bampipe.pipeline/1"\nname = "short"\n{STAGES}\n[settings.validate]\n'
-        "free_run = false\n"
-    )
     found, draw = {}, joint._draw_specimen
 
     def draw_thicker(*given: object) -> joint.Specimen:
@@ -42,12 +43,8 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         specimen.law["viscous"] *= THICKER
         return specimen
 
-    for name, effects in (
-        ("first", {}),
-        ("same", {}),
-        ("thick", {}),
-        ("stick", {"stribeck:joint": 1.0}),
-    ):
+    for name in ("first", "same", "thick", "stick"):
+        effects = {"stribeck:joint": 1.0} if name == "stick" else {}
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(joint, "_draw_specimen", draw_thicker if name == "thick" else draw)
             independent.record("joint", root / name, 5, effects, RECORDED)
@@ -55,10 +52,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         head, *trials = path.read_text().split("[[trials]]")
         kept = trials[:4] if name == "first" else trials[4:]
         path.write_text("[[trials]]".join([head, *kept]))
-        run = bampipe.run_session(
-            to_parquet(root / name), runs=root / "runs", pipeline=str(root / "short.toml")
-        )
-        found[name] = run.root
+        found[name] = run_short(root / name, root, PIPELINE).root
     return found
 
 
@@ -77,9 +71,7 @@ def test_nothing_changes_between_sessions_of_one_machine(sessions: dict[str, Pat
 
 
 @pytest.mark.slow
-def test_a_parameter_that_changed_is_named_and_makes_the_model_travel(
-    sessions: dict[str, Path],
-) -> None:
+def test_a_parameter_that_changed_is_named_and_makes_the_model_travel(sessions) -> None:
     pair = bampipe.compare_runs(sessions["first"], sessions["thick"])
     assert [name for name, one in pair.parameters.items() if one.changed] == ["viscous.joint"]
     one = pair.parameters["viscous.joint"]
@@ -147,9 +139,7 @@ def test_the_command_prints_tables_and_writes_json_and_a_page(
 
 
 @pytest.mark.slow
-def test_sessions_that_cannot_be_compared_are_refused(
-    sessions: dict[str, Path], tmp_path: Path
-) -> None:
+def test_sessions_that_cannot_be_compared_are_refused(sessions: dict[str, Path]) -> None:
     first, same = sessions["first"], sessions["same"]
     with pytest.raises(InputError, match="both runs are the same"):
         bampipe.compare_runs(first, first)

@@ -169,7 +169,7 @@ def test_a_session_that_is_not_published_is_one_line(tmp_path: Path) -> None:
 
 def test_run_publishes_and_fetch_fetches(toy: Toy, command: Command) -> None:
     url = f"file://{toy.folder / 'far'}"
-    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs, "--publish", url)
+    arguments = (*toy.options, "--publish", url)
     assert command("run", toy.session, *arguments)[0] == 0
     files = toy.files()
     shutil.rmtree(toy.root)
@@ -186,8 +186,7 @@ def test_run_publishes_and_fetch_fetches(toy: Toy, command: Command) -> None:
 
 @pytest.mark.parametrize("url", ["nowhere://x", "dir://x", "hdfs://x"])
 def test_an_address_of_no_use_is_said_before_the_run(toy: Toy, command: Command, url: str) -> None:
-    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs, "--publish", url)
-    code, _, said = command("run", toy.session, *arguments)
+    code, _, said = command("run", toy.session, *toy.options, "--publish", url)
     assert code == 2 and said.count("\n") == 1 and "no such file system" in said
     assert toy.ran() == []
     assert command("fetch", url, "--runs", toy.runs)[0] == 2

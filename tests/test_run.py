@@ -3,15 +3,12 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
-import install_toys
 import pytest
-from conftest import TOYS, Toy, contents
+from conftest import Toy, contents
 from made_results import write_result
 
 from bampipe.declarations.model import ModelFile
@@ -91,14 +88,10 @@ def test_changed_trial_reruns_what_depends_on_it(toy: Toy) -> None:
     outcome = toy.run()
     assert outcome.steps[0].reason == "session.toml changed"
     assert states(outcome) == ["done", "unchanged", "unchanged", "unchanged"]
-
-
-def test_fewer_outputs_leave_no_stale_files(toy: Toy) -> None:
-    toy.run()
     assert (toy.root / "toy/parts/2.json").exists()
     (toy.session / "numbers.txt").write_text("1 2")
     toy.run()
-    assert not (toy.root / "toy/parts/2.json").exists()
+    assert not (toy.root / "toy/parts/2.json").exists(), "fewer outputs leave no stale files"
 
 
 def test_changed_setting_reruns_from_there(toy: Toy) -> None:
@@ -133,16 +126,12 @@ def test_damaged_output_is_noticed_named_and_rebuilt(toy: Toy, damage: str) -> N
     assert toy.files() == good
 
 
-def test_from_takes_what_is_before_as_it_stands(toy: Toy) -> None:
+def test_from_takes_what_is_before_as_it_stands_unless_tampered_with(toy: Toy) -> None:
     toy.run()
     toy.ran()
     (toy.session / "numbers.txt").write_text("5")
     assert states(toy.run(first="toy_double")) == ["unchanged"] * 3
     assert toy.ran() == []
-
-
-def test_from_refuses_what_was_tampered_with(toy: Toy) -> None:
-    toy.run()
     (toy.root / "toy/numbers.json").write_text('{"numbers": [9]}')
     with pytest.raises(InputError, match=r"toy/numbers\.json was changed since toy_read wrote it"):
         toy.run(first="toy_double")
@@ -163,11 +152,6 @@ def test_until_and_force_choose_the_steps(toy: Toy) -> None:
     assert toy.ran() == ALL[2:]
     with pytest.raises(InputError, match="comes after"):
         toy.run(first="toy_sum", last="toy_read")
-
-
-def test_force_runs_the_selected_steps(toy: Toy) -> None:
-    toy.run()
-    toy.ran()
     toy.run(first="toy_double", last="toy_fit", force=True)
     assert toy.ran() == ["toy_double", "toy_fit:base"]
 
@@ -239,29 +223,12 @@ def test_kill_between_stage_and_commit_is_completed(
     assert toy.files() == good
 
 
-def start(toy: Toy, *arguments: str, pause: float = 0.0) -> subprocess.Popen[str]:
-    environment = {**os.environ, "TOY_PAUSE": str(pause)}
-    return subprocess.Popen(
-        [sys.executable, str(TOYS / "toy_bampipe.py"), *arguments],
-        env=environment,
-        cwd=toy.folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def run_arguments(toy: Toy, sessions: Path | None = None) -> list[str]:
-    session, runs = str(sessions or toy.session), str(toy.runs)
-    return ["run", session, "--pipeline", str(toy.pipeline_file), "--runs", runs]
-
-
 def test_kill_in_mid_stage_leaves_the_previous_result(toy: Toy) -> None:
     toy.run()
     good = toy.files()
     (toy.session / "numbers.txt").write_text("7 8 9")
     toy.ran()
-    process = start(toy, *run_arguments(toy), pause=5.0)
+    process = toy.start(str(toy.session), pause=5.0)
     staged = toy.root / ".bampipe" / "staging" / "toy_double" / "toy" / "parts" / "0.json"
     deadline = time.monotonic() + 20.0
     while not staged.exists() and time.monotonic() < deadline:
@@ -282,7 +249,7 @@ def test_kill_in_mid_stage_leaves_the_previous_result(toy: Toy) -> None:
 
 
 def test_second_run_waits_or_refuses(toy: Toy) -> None:
-    process = start(toy, *run_arguments(toy), pause=0.5)
+    process = toy.start(str(toy.session), pause=0.5)
     while not (toy.root / ".bampipe" / "staging" / "toy_double").exists():
         time.sleep(0.02)
     with pytest.raises(InputError, match="another bampipe is at work"):
@@ -297,18 +264,22 @@ def test_second_run_waits_or_refuses(toy: Toy) -> None:
 # Models
 
 
+def add_child(toy: Toy) -> str:
+    """Write a child of the base model and return its name."""
+    name = models.child_name("base", ("stribeck:yaw",))
+    device = models.read(toy.root, "base").device
+    file = ModelFile(name=name, parent="base", device=device, effects=("stribeck:yaw",))
+    models.write(toy.root, file)
+    return name
+
+
 def test_children_are_refreshed_once_they_were_run(toy: Toy) -> None:
     toy.run()
     toy.ran()
-    parent = models.read(toy.root, "base")
-    name = models.child_name("base", ("stribeck:yaw",))
+    name = add_child(toy)
     assert name == "base+stribeck.yaw"
     many = tuple(f"position_dependent_friction:axis_{k}" for k in range(9))
     assert models.child_name(name, many).startswith(f"{name}+9_effects_")
-    models.write(
-        toy.root,
-        ModelFile(name=name, parent="base", device=parent.device, effects=("stribeck:yaw",)),
-    )
     toy.run()
     assert toy.ran() == [], "nobody has asked for the child yet"
     toy.run(first="toy_fit", last="toy_fit", model=name, judge=False)
@@ -328,10 +299,7 @@ def test_gates_judge_the_best_confirmed_model_and_its_stages_run(toy: Toy) -> No
             'value = "total"\nmax = 1e9\n'
         )
     assert [verdict.model for verdict in toy.run().verdicts if verdict.gate == "fits"] == ["base"]
-    child = models.child_name("base", "stribeck:yaw")
-    device = models.read(toy.root, "base").device
-    file = ModelFile(name=child, parent="base", device=device, effects=("stribeck:yaw",))
-    models.write(toy.root, file)
+    child = add_child(toy)
     write_result(toy.root, CompareResult, best=child, ladder=[{"model": "base"}, {"model": child}])
     toy.ran()
     outcome = toy.run()
@@ -508,19 +476,9 @@ def test_assignment() -> None:
 # Several sessions
 
 
-def several(toy: Toy, contents: dict[str, str]) -> list[Path]:
-    return [
-        install_toys.make_session(toy.folder / "many" / name, text)
-        for name, text in contents.items()
-    ]
-
-
 def test_one_failing_session_stops_no_other(toy: Toy) -> None:
-    folders = several(toy, {"a": "1", "b": "two", "c": "crash", "d": "5000", "e": "4"})
-    requests = [
-        replace(toy.request(), root=toy.runs / folder.name, session=folder) for folder in folders
-    ]
-    outcomes = batch.run_sessions(requests, 1, toy.events.append)
+    given = toy.many({"a": "1", "b": "two", "c": "crash", "d": "5000", "e": "4"})
+    outcomes = batch.run_sessions(given, 1, toy.events.append)
     assert [outcome.exit_code for outcome in outcomes] == [0, 2, 3, 1, 0]
     assert "ZeroDivisionError" in outcomes[2].error
     assert "Traceback" in outcomes[2].traceback
@@ -528,17 +486,16 @@ def test_one_failing_session_stops_no_other(toy: Toy) -> None:
 
 @pytest.mark.slow
 def test_worker_processes_survive_a_death_and_give_the_same_bytes(toy: Toy) -> None:
-    several(toy, {"a": "1", "b": "two", "c": "die", "d": "4", "e": "5 6"})
-    many = run_arguments(toy, toy.folder / "many" / "*")
-    process = start(toy, *many, "--jobs", "2", "--json")
+    given = toy.many({"a": "1", "b": "two", "c": "die", "d": "4", "e": "5 6"})
+    process = toy.start(str(toy.folder / "many" / "*"), "--jobs", "2", "--json")
     out, _ = process.communicate()
     found = {Path(item["run"]).name: item["state"] for item in json.loads(out)["sessions"]}
     assert found == {"a": "done", "b": "refused", "c": "crashed", "d": "done", "e": "done"}
     assert process.returncode == 3
-    for name in ("a", "d", "e"):
-        root = toy.folder / "serial" / name
-        run_session(replace(toy.request(), root=root, session=toy.folder / "many" / name))
-        assert contents(root) == contents(toy.runs / name)
+    for request in (given[0], *given[3:]):
+        alone = replace(request, root=toy.folder / "serial" / request.root.name)
+        run_session(alone)
+        assert contents(alone.root) == contents(request.root)
 
 
 def test_lock_is_free_after_a_crash(toy: Toy) -> None:

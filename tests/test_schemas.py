@@ -77,15 +77,10 @@ class Machine(Declaration):
             ],
         ),
         (
-            {
-                "axes": {
-                    "x": {"gain": 9, "modes": ["slow"]},
-                    "y": {"gain": 1, "modes": ["slow"] * 2},
-                }
-            },
+            {"axes": {"x": {"gain": 9, "modes": ["slow"]}, "y": {"gain": 1, "modes": TWICE}}},
             [
                 "m: axes.x.gain: too much; take less",
-                'm: axes.y.modes: found ["slow", "slow"], expected no entry twice',
+                'm: axes.y.modes: found ["fast", "fast"], expected no entry twice',
             ],
         ),
         ({"axes": {"x": 3}}, ["m: axes.x: found 3, expected a table"]),

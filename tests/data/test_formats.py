@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+from binary_logs import write_mcap
 
 from bampipe.data.readers import columns_of, read_trial
 from bampipe.errors import InputError
@@ -16,6 +17,7 @@ from bampipe.errors import InputError
 T = np.arange(50) / 100.0
 Q = np.sin(T)
 F = np.cos(2 * T)
+ROWS = np.column_stack([T, Q, F]).tolist()
 STARTED = 1_790_000_000_000_000_000
 
 
@@ -88,9 +90,7 @@ def test_columns_of_matrices_in_matlab_files(tmp_path):
     trial = read_trial(path, ("X[0]", "X[2]"))
     np.testing.assert_array_equal(trial.columns["X[2]"], F)
     assert list(columns_of(path)) == ["X[0]", "X[1]", "X[2]", "s.q"]
-    assert "a structure, expected a vector of numbers; name what is in it: s.q" in refused(
-        path, ("X[0]", "s")
-    )
+    assert "a structure, expected a vector of numbers" in refused(path, ("X[0]", "s"))
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -125,9 +125,8 @@ def test_fields_of_matlab_structs(tmp_path, compressed):
     assert "did you mean 'log.axis.q'" in refused(path, ("log.time", "log.axis.qq"))
     with h5py.File(tmp_path / "b.mat", "w", userblock_size=512) as file:
         file["log/axis/q"] = Q  # a struct as version 7.3 keeps it
-    np.testing.assert_array_equal(
-        read_trial(tmp_path / "b.mat", ("log.axis.q",)).columns["log.axis.q"], Q
-    )
+    trial = read_trial(tmp_path / "b.mat", ("log.axis.q",))
+    np.testing.assert_array_equal(trial.columns["log.axis.q"], Q)
     # Gains by axis belong to no sample, and an object of MATLAB has no extents.
     scipy.io.savemat(path, {"q": Q, "tau": F, "scale": 2.0, "gains": np.arange(6.0)})
     body = b"\x06\0\0\0\x08\0\0\0\x11" + bytes(7) + b"\x01\0\x03\0obj\0" + bytes(8)
@@ -343,9 +342,7 @@ def test_messages_in_lists_of_ros_messages(tmp_path):
 def test_ros_refused(tmp_path):
     path = write_ros(tmp_path, "ros1")
     state = "/joint_states:header.stamp"
-    assert "no column '/joint_stats', did you mean '/joint_states'?" in refused(
-        path, ("/joint_stats:@time",)
-    )
+    assert "did you mean '/joint_states'?" in refused(path, ("/joint_stats:@time",))
     line = refused(path, (state, "/joint_states:position[knee]"))
     assert "no field 'position[knee]'; it has " in line and "position[elbow]" in line
     assert "does not say which field" in refused(path, ("/joint_states",))
@@ -356,16 +353,9 @@ def test_ros_refused(tmp_path):
 
 def write_json_mcap(path: Path, messages: list[tuple[float, dict]]) -> Path:
     """An MCAP file of JSON messages at times in s."""
-    writer_module = pytest.importorskip("mcap.writer")
+    stamped = ((STARTED + round(1e9 * t), json.dumps(content).encode()) for t, content in messages)
     with path.open("wb") as stream:
-        writer = writer_module.Writer(stream)
-        writer.start()
-        schema = writer.register_schema("state", "jsonschema", b'{"type": "object"}')
-        channel = writer.register_channel("/state", "json", schema)
-        for t, message in messages:
-            moment = STARTED + round(1e9 * t)
-            writer.add_message(channel, moment, json.dumps(message).encode(), moment)
-        writer.finish()
+        write_mcap(stream, "/state", stamped)
     return path
 
 
@@ -416,21 +406,17 @@ def test_many_samples_in_a_message(tmp_path):
 @pytest.mark.parametrize(
     ("content", "names"),
     [
+        ({"data": ROWS}, ("data[0]", "data[1]", "data[2]")),
+        ({"columns": ["t", "q", "f"], "data": ROWS}, ("t", "q", "f")),
         (
-            {"data": np.column_stack([T, Q, F]).tolist(), "dt": 0.01},
-            ("data[0]", "data[1]", "data[2]"),
+            {"t": T.tolist(), "arm": {"q": Q.tolist(), "f": F.tolist()}, "gains": [1, 2]},
+            ("t", "arm.q", "arm.f"),
         ),
-        (
-            {"columns": ["t", "q", "f"], "data": np.column_stack([T, Q, F]).tolist(), "dt": 0.01},
-            ("t", "q", "f"),
-        ),
-        ({"t": T.tolist(), "arm": {"q": Q.tolist(), "f": F.tolist()}, "gains": [1, 2], "dt": 0.01},
-         ("t", "arm.q", "arm.f")),
     ],
-)  # fmt: skip
+)
 def test_json_of_arrays(tmp_path, content, names):
     path = tmp_path / "a.json"
-    path.write_text(json.dumps(content))
+    path.write_text(json.dumps(content | {"dt": 0.01}))
     assert tuple(columns_of(path)) == (*names, "dt")
     trial = read_trial(path, (*names, "dt"))
     for name, values in zip(names, (T, Q, F), strict=True):

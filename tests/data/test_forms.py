@@ -152,10 +152,7 @@ def test_signals_in_rows_of_their_own_are_put_beside_one_another(tmp_path: Path)
     k = np.flatnonzero(np.isfinite(raw.columns["u"]))
     np.testing.assert_allclose(raw.columns["u"][k], k, atol=1e-9)
     assert not {*range(202, 229)} & {*k} and len(k) > 560
-    assert (
-        "'u' stands in rows of its own: interpolated linearly at the times of 'q'"
-        in raw.remarks[-1]
-    )
+    assert "'u' stands in rows of its own: interpolated linearly at the ti" in raw.remarks[-1]
     long = ["time,signal,value"]
     for k in range(200):
         long += [f"{0.01 * k:.3f},q,{k}", f"{0.01 * k:.3f},u,{2 * k}"]
@@ -174,9 +171,8 @@ def test_signals_in_rows_of_their_own_are_put_beside_one_another(tmp_path: Path)
 )  # fmt: skip
 def test_dates_as_people_write_them(tmp_path: Path, form: str):
     path = tmp_path / "a.csv"
-    path.write_text(
-        "when,q\n" + "".join(f"{form.format(t)},{q}\n" for t, q in zip(T, Q, strict=True))
-    )
+    rows = [f"{form.format(t)},{q}\n" for t, q in zip(T, Q, strict=True)]
+    path.write_text("".join(["when,q\n", *rows]))
     assert columns_of(path) == {"when": "datetime", "q": ""}
     trial = read_trial(path, ("when", "q"), datetimes={"when": ""})
     np.testing.assert_allclose(trial.columns["when"], T, atol=1e-9)
@@ -300,9 +296,7 @@ def test_data_of_other_kinds_are_named_with_what_to_do(tmp_path: Path):
         survey(tmp_path)
     wide = "\n".join(",".join(f"{v:.3f}" for v in np.tile(row, 20)) for row in (T, Q, U))
     (tmp_path / "b.csv").write_text(wide + "\n")
-    with pytest.raises(
-        InputError, match="3 rows of 1200 columns are no log; has it a channel a row"
-    ):
+    with pytest.raises(InputError, match="3 rows of 1200 columns are no log; has it a channel"):
         survey(tmp_path)
     (tmp_path / "a.xls").unlink()
     np.savez(tmp_path / "c.npz", trials=np.zeros((3, 60, 2)))
@@ -413,10 +407,8 @@ def test_codes_for_no_reading_are_taken_for_none_and_hours_pass(tmp_path):
         second, reading = 3599.7 + 0.01 * n, -9999.0 if n in (7, 30, 31) else u
         text += f"{int(second // 60) % 60:02d}:{second % 60:06.3f},{q},{reading}\n"
     (tmp_path / "a.csv").write_text("Time,q,u\n" + text)
-    raw = read_recording(
-        tmp_path, TrialEntry(file="a.csv", kind="free"), ["Time", "q", "u"],
-        Clock(column="Time", unit="datetime"),
-    )  # fmt: skip
+    entry, clock = TrialEntry(file="a.csv", kind="free"), Clock(column="Time", unit="datetime")
+    raw = read_recording(tmp_path, entry, ["Time", "q", "u"], clock)
     assert np.flatnonzero(np.isnan(raw.columns["u"])).tolist() == [7, 30, 31]
     assert "column 'u': 3 readings of -9999 are taken for none" in raw.notes
     np.testing.assert_allclose(np.diff(raw.columns["Time"]), 0.01, atol=2e-3)

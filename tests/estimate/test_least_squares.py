@@ -74,9 +74,8 @@ def sd_of(found: Linearised, inner: Problem, block_s: float = 2.0) -> np.ndarray
     """Standard deviations by blocks of time."""
     rows, blocks = rows_of([*as_measured(inner, found.p, found.stacked)], block_s)
     alone = float(inner.band.independent_share[0]) * len(blocks)
-    return np.sqrt(
-        np.diag(covariance_by_blocks([rows], np.diag(inner.precision), [blocks], [alone]))
-    )
+    covariance = covariance_by_blocks([rows], np.diag(inner.precision), [blocks], [alone])
+    return np.sqrt(np.diag(covariance))
 
 
 @pytest.mark.parametrize("factor", [0.2, 1.0, 5.0])
@@ -91,16 +90,15 @@ def test_gauss_newton_finds_what_is_not_linear_within_bounds() -> None:
     def residual(trial: int, p: np.ndarray) -> np.ndarray:
         return inner.residual(trial, np.exp(p))
 
-    curved = problem(
-        residual=residual, linear=False, step=np.full(3, 1e-5), lower=np.full(3, -np.inf)
-    )
+    unbounded = np.full(3, -np.inf)
+    curved = problem(residual=residual, linear=False, step=np.full(3, 1e-5), lower=unbounded)
     found = minimise(curved, np.log(2.0 * TRUTH))
     np.testing.assert_allclose(np.exp(found.p), minimise(inner, TRUTH).p, rtol=1e-5)
     truth = np.array([4.0, 0.0, 2.0])
     inside = problem(truth=truth, lower=np.array([0.0, 0.5, 0.01]))
     found = minimise(inside, TRUTH)
     assert found.p[1] == 0.5
-    free = minimise(problem(truth=truth, lower=np.full(3, -np.inf)), TRUTH)
+    free = minimise(problem(truth=truth, lower=unbounded), TRUTH)
     assert error_of(found) > error_of(free)
 
 
@@ -148,9 +146,8 @@ def largest_step(
 
 
 def test_parameters_held_and_trials_left_out_are_as_never_seen() -> None:
-    held = problem(
-        free=np.array([0, 1]), lower=np.zeros(2), upper=np.full(2, np.inf), step=np.ones(2)
-    )
+    bounds = {"lower": np.zeros(2), "upper": np.full(2, np.inf)}
+    held = problem(free=np.array([0, 1]), step=np.ones(2), **bounds)
     found = minimise(held, np.array([1.0, 1.0, 2.0]))
     assert found.p[2] == 2.0
     assert found.stacked[0].slope.shape[2] == 2
@@ -200,13 +197,6 @@ def test_intervals_of_fewer_blocks_than_parameters_hold() -> None:
         off.append(np.abs(found.p - clean) / sd_of(found, noisy))
     assert 0.92 <= np.mean(np.array(off) < 1.96) <= 0.99
     assert np.max(off) < 4.0
-
-
-def test_trials_that_stand_still_are_refused() -> None:
-    inner = problem(1)
-    still = problem(1, standstill=[np.ones((len(inner.residual(0, TRUTH)), 1), dtype=bool)])
-    with pytest.raises(ValueError, match="clear of standstill"):
-        minimise(still, TRUTH)
 
 
 def _with(
@@ -278,22 +268,19 @@ def test_samples_at_rest_do_not_count_unless_a_brake_may_hold_the_axis() -> None
     mask[1000:2000] = True
     spoiled = np.zeros((4000, 1))
     spoiled[1200:1800] = 50.0
-    found = minimise(
-        problem(1, residual=lambda k, p: inner.residual(k, p) + spoiled, standstill=[mask]), TRUTH
-    )
+    braked = problem(1, residual=lambda k, p: inner.residual(k, p) + spoiled, standstill=[mask])
+    found = minimise(braked, TRUTH)
     np.testing.assert_allclose(found.p, TRUTH, rtol=2e-2)
 
 
 def test_what_cannot_be_fitted_is_refused() -> None:
     inner = problem(1)
-    short = problem(
-        1,
-        residual=lambda k, p: inner.residual(k, p)[:220],
-        standstill=[np.zeros((220, 1), dtype=bool)],
-    )
+    rest = np.ones((len(inner.residual(0, TRUTH)), 1), dtype=bool)
+    with pytest.raises(ValueError, match="clear of standstill"):
+        minimise(problem(1, standstill=[rest]), TRUTH)
+    few = {"residual": lambda k, p: inner.residual(k, p)[:220], "standstill": [~rest[:220]]}
     with pytest.raises(ValueError, match="fewer samples"):
-        minimise(short, TRUTH)
-    inner = problem(1)
+        minimise(problem(1, **few), TRUTH)
 
     def lost(trial: int, p: np.ndarray) -> np.ndarray:
         return inner.residual(trial, p) + np.sqrt(5.0 - p[0])

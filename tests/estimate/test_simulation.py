@@ -73,13 +73,14 @@ def test_step_length_does_not_change_the_answer_and_growth_is_reported():
         run(np.zeros((3000, 3)), [1.0, -800.0, 0.0], v0=1.0)
 
 
-def recording():
+T = 0.002 * np.arange(4000)
+WANTED = 0.15 * np.sin(2 * np.pi * 0.4 * T)[:, None]
+
+
+def recording(**options):
     """A stick-slip motion and the force that made it."""
-    t = 0.002 * np.arange(4000)
-    u = np.zeros((4000, 3))
-    q_ref = 0.15 * np.sin(2 * np.pi * 0.4 * t)[:, None]
-    qd_ref = np.gradient(q_ref, t, axis=0)
-    return track(u, [3.5, 10.0, 3.5], q_ref, qd_ref)
+    rate = np.gradient(WANTED, T, axis=0)
+    return track(np.zeros((4000, 3)), [3.5, 10.0, 3.5], WANTED, rate, **options)
 
 
 def track(u, p, q_ref, qd_ref, **options):
@@ -92,8 +93,7 @@ def track(u, p, q_ref, qd_ref, **options):
 
 def test_the_arm_follows_the_motion_it_wants_and_its_force_gives_it_again():
     x, u = recording()
-    t = 0.002 * np.arange(4000)
-    assert np.abs(x[:, 0] - 0.15 * np.sin(2 * np.pi * 0.4 * t)).max() < 0.05
+    assert np.abs(x[:, 0] - WANTED[:, 0]).max() < 0.05
     assert np.abs(u[:, 0]).max() > 3.5
     again = simulate(slider, x[0], u, np.array([3.5, 10.0, 3.5]), 0.002, width=WIDTH, n_noise=1)
     np.testing.assert_allclose(again, x, atol=1e-12)
@@ -108,21 +108,12 @@ def test_the_arm_follows_the_motion_it_wants_and_its_force_gives_it_again():
 
 
 def test_the_rate_of_the_arm_force_is_its_rate():
-    t = 0.002 * np.arange(4000)
-    q_ref = 0.15 * np.sin(2 * np.pi * 0.4 * t)[:, None]
-    _, u = track(
-        np.zeros((4000, 3)), [3.5, 10.0, 3.5], q_ref, np.gradient(q_ref, t, axis=0), rate=[2]
-    )
-    np.testing.assert_allclose(u[2:-2, 2], np.gradient(u[:, 0], t)[2:-2], atol=2.0)
-    assert np.corrcoef(u[2:-2, 2], np.gradient(u[:, 0], t)[2:-2])[0, 1] > 0.999
+    _, u = recording(rate=[2])
+    np.testing.assert_allclose(u[2:-2, 2], np.gradient(u[:, 0], T)[2:-2], atol=2.0)
+    assert np.corrcoef(u[2:-2, 2], np.gradient(u[:, 0], T)[2:-2])[0, 1] > 0.999
 
 
 def test_brakes_render_the_damping():
-    t = 0.002 * np.arange(4000)
-    q_ref = 0.15 * np.sin(2 * np.pi * 0.4 * t)[:, None]
-    x, u = track(
-        np.zeros((4000, 3)), [3.5, 10.0, 3.5], q_ref, np.gradient(q_ref, t, axis=0),
-        brake=[1], brake_gain=np.full((4000, 1), 40.0),
-    )  # fmt: skip
-    late = np.abs(np.interp(t - 0.011, t, x[:, 1]))
+    x, u = recording(brake=[1], brake_gain=np.full((4000, 1), 40.0))
+    late = np.abs(np.interp(T - 0.011, T, x[:, 1]))
     np.testing.assert_allclose(u[500:, 1], 40 * late[500:], atol=0.5)

@@ -79,16 +79,21 @@ def test_square_root_runs_where_the_covariance_is_lost() -> None:
     assert lost > 0
 
 
+def with_idle(values):
+    """The slider with further parameters, which do nothing."""
+    slider, count = model(), TRUTH.size + values.size
+    return replace(
+        slider,
+        parameters=np.concatenate([TRUTH, values, [0.0]]),
+        free=np.arange(count),
+        lower=np.concatenate([slider.lower, np.full(values.size, -np.inf)]),
+        upper=np.full(count, np.inf),
+    )
+
+
 def test_more_sigma_points_than_one_call_takes() -> None:
     """Parameters beyond the three that matter: 87 points, in two calls of the model."""
-    idle = 40 - TRUTH.size
-    slider = replace(
-        model(),
-        parameters=np.concatenate([TRUTH, np.linspace(0.5, 1.5, idle), [0.0]]),
-        free=np.arange(40),
-        lower=np.concatenate([model().lower, np.full(idle, -np.inf)]),
-        upper=np.full(40, np.inf),
-    )
+    slider = with_idle(np.linspace(0.5, 1.5, 40 - TRUTH.size))
     value = 1.2 * slider.parameters[:-1]
     mean, spread = slider.to_estimated(value, 0.1 * value)
     chosen = settings(walk_sd=np.full(40, 0.01))
@@ -129,18 +134,11 @@ def test_intervals_cover_and_innovations_are_consistent() -> None:
 
 def test_a_parameter_of_which_no_block_says_anything_keeps_its_spread() -> None:
     trials = [position_only(record(seed)) for seed in range(2)]
-    slider = replace(
-        model(),
-        parameters=np.concatenate([TRUTH, [0.7], [0.0]]),
-        free=np.arange(4),
-        lower=np.append(model().lower, -np.inf),
-        upper=np.full(4, np.inf),
-    )
+    slider = with_idle(np.array([0.7]))
     value, sd = np.append(TRUTH, 0.7), np.append(0.3 * TRUTH, 0.05)
     mean, spread = slider.to_estimated(value, sd)
-    found = filter_trials(
-        slider, trials, mean, np.diag(spread**2), settings(walk_sd=np.zeros(value.size))
-    )
+    still = settings(walk_sd=np.zeros(value.size))
+    found = filter_trials(slider, trials, mean, np.diag(spread**2), still)
     ends = [at_block_ends(trial, 1.0) for trial in found.trials]
     covariance, blocks = sandwich_covariance(ends, 2, mean, np.diag(spread**2))
     assert blocks > value.size

@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
+from binary_logs import write_mcap
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="peak memory is read from /proc")
 
@@ -60,16 +61,10 @@ def page(path: Path) -> None:
 
 def mcap(path: Path) -> None:
     """A chunk of 150 MB, compressed by zstd."""
-    writer_module = pytest.importorskip("mcap.writer")
     size = 150 << 20
+    messages = [(0, b'{"x": 1.0}'), (10**9, b'{"x": 1.0' + b" " * size + b"}")]
     with path.open("wb") as stream:
-        writer = writer_module.Writer(stream, chunk_size=size // 2)
-        writer.start()
-        schema = writer.register_schema("state", "jsonschema", b'{"type": "object"}')
-        channel = writer.register_channel("/state", "json", schema)
-        writer.add_message(channel, 0, b'{"x": 1.0}', 0)
-        writer.add_message(channel, 10**9, b'{"x": 1.0' + b" " * size + b"}", 10**9)
-        writer.finish()
+        write_mcap(stream, "/state", messages, chunk_size=size // 2)
 
 
 def ros1(path: Path) -> None:

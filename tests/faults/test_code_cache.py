@@ -135,10 +135,11 @@ def test_code_that_was_cut_off_is_compiled_again(
     assert call(2.0) == 7.0 and saved == []
 
 
-def test_a_full_disk_costs_the_cache_only(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
+def full(*_: object, **__: object) -> None:
+    raise OSError(28, "No space left on device")
 
+
+def test_a_full_disk_costs_the_cache_only(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(caching.IndexDataCacheFile, "_open_for_write", full)
     monkeypatch.setattr(compiled.FileLock, "acquire", full)
     assert call(4.0) == 13.0
@@ -170,10 +171,8 @@ assert outer_of_test.outer(3.0) == 7.0
 def test_processes_that_start_together_compile_once(
     call: Call, cached: Path, tmp_path: Path
 ) -> None:
-    for path in code_files(cached).values():
-        for each in path.parent.iterdir():
-            each.unlink()
-        break
+    for path in next(iter(code_files(cached).values())).parent.iterdir():
+        path.unlink()
     command = [sys.executable, "-c", COMPILE.format(folder=str(tmp_path / "code"))]
     running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     printed = "".join(process.communicate()[0] for process in running)
@@ -184,12 +183,10 @@ def test_processes_that_start_together_compile_once(
 class Cache(compiled._Cache):
     """A function's cache as another process would see it: nothing compiled yet."""
 
+    index = property(lambda self: self.folder / "function.nbi")
+
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-
-    @property
-    def index(self) -> Path:
-        return self.folder / "function.nbi"
 
 
 def test_a_process_that_dies_while_compiling_holds_up_nobody(tmp_path: Path) -> None:
@@ -266,34 +263,24 @@ def test_the_memory_of_an_effect_is_compiled_once_for_all_joints(
         qd[:, k] = 0.3 * np.sin(12.0 * t)
         assert np.ptp(system.memory(still, qd, still, u, system.prior, t)) > 0.0
         assert np.ptp(system.memory(still, np.roll(qd, 1, 1), still, u, system.prior, t)) == 0.0
-    assert len({system._code.sources["memory0"] for system in systems}) == 1
+    (source,) = {system._code.sources["memory0"] for system in systems}
     both = compile_model(Model(device, [f"presliding:{axis}" for axis in axes]))
-    assert {both._code.sources[g.module] for g in both.state_groups} == {
-        systems[0]._code.sources["memory0"]
-    }
+    assert {both._code.sources[g.module] for g in both.state_groups} == {source}
     together = both.memory(still, qd, still, u, both.prior, t)
-    np.testing.assert_array_equal(
-        together[:, 1:], systems[1].memory(still, qd, still, u, systems[1].prior, t)
-    )
+    alone = systems[1].memory(still, qd, still, u, systems[1].prior, t)
+    np.testing.assert_array_equal(together[:, 1:], alone)
 
 
-def test_a_cache_that_cannot_be_made_is_said(
+def test_generated_code_that_cannot_be_kept_is_said(
     model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", full)
+        with pytest.raises(InputError, match=r"the disk is full; set BAMPIPE_CACHE_DIR"):
+            compile_model(model)
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("BAMPIPE_CACHE_DIR", str(tmp_path / "file" / "cache"))
     with pytest.raises(InputError, match=r"cannot make .*not a directory.*BAMPIPE_CACHE_DIR"):
-        compile_model(model)
-
-
-def test_generated_code_that_cannot_be_written_is_said(
-    model: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(InputError, match=r"the disk is full; set BAMPIPE_CACHE_DIR"):
         compile_model(model)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+from binary_logs import write_mcap
 
 from bampipe.data.readers import columns_of, read_trial
 from bampipe.errors import InputError
@@ -36,35 +37,22 @@ def as_lines() -> bytes:
     return "\n".join(rows).encode()
 
 
-def as_hdf5() -> bytes:
-    stream = io.BytesIO()
+def as_hdf5(stream: io.BytesIO) -> None:
     with h5py.File(stream, "w") as file:
         for name, values in TABLE.items():
             file[name] = values
-    return stream.getvalue()
 
 
-def as_tdms() -> bytes:
+def as_tdms(stream: io.BytesIO) -> None:
     nptdms = pytest.importorskip("nptdms")
-    stream = io.BytesIO()
     with nptdms.TdmsWriter(stream) as writer:
         for part in np.array_split(np.arange(ROWS), 5):
             writer.write_segment([nptdms.ChannelObject("g", c, v[part]) for c, v in TABLE.items()])
-    return stream.getvalue()
 
 
-def as_mcap() -> bytes:
-    writer_module = pytest.importorskip("mcap.writer")
-    stream = io.BytesIO()
-    writer = writer_module.Writer(stream, chunk_size=1000)
-    writer.start()
-    schema = writer.register_schema("state", "jsonschema", b'{"type": "object"}')
-    channel = writer.register_channel("/g", "json", schema)
-    for n in range(ROWS):
-        moment = n * 15_625_000
-        writer.add_message(channel, moment, b'{"x": %.3f}' % TABLE["x"][n], moment)
-    writer.finish()
-    return stream.getvalue()
+def as_mcap(stream: io.BytesIO) -> None:
+    messages = ((n * 15_625_000, b'{"x": %.3f}' % TABLE["x"][n]) for n in range(ROWS))
+    write_mcap(stream, "/g", messages, chunk_size=1000)
 
 
 def binary(write: Callable[[io.BytesIO], object]) -> bytes:
@@ -80,9 +68,9 @@ LOGS: dict[str, tuple[Callable[[], bytes], tuple[str, str]]] = {
     ".json": (lambda: FRAME.to_json(orient="records").encode(), ("t", "x")),
     ".parquet": (lambda: binary(FRAME.to_parquet), ("t", "x")),
     ".mat": (lambda: binary(lambda s: scipy.io.savemat(s, TABLE)), ("t", "x")),
-    ".h5": (as_hdf5, ("t", "x")),
-    ".tdms": (as_tdms, ("g/t", "g/x")),
-    ".mcap": (as_mcap, ("/g:@time", "/g:x")),
+    ".h5": (lambda: binary(as_hdf5), ("t", "x")),
+    ".tdms": (lambda: binary(as_tdms), ("g/t", "g/x")),
+    ".mcap": (lambda: binary(as_mcap), ("/g:@time", "/g:x")),
 }  # fmt: skip
 
 

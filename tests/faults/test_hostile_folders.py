@@ -52,7 +52,8 @@ def plant(
     files: tuple[str, ...] = (),
 ) -> Path:
     """Leave a commit file as a killed run would, which names ``outputs`` and ``remove``."""
-    made = json.loads((toy.root / "run.json").read_text())["stages"]["toy_double"]
+    kept = json.loads((toy.root / "run.json").read_text())
+    made = kept["stages"]["toy_double"]
     folder = toy.root / ".bampipe" / "staging" / "toy_double"
     folder.mkdir(parents=True, exist_ok=True)
     for name in files or outputs:
@@ -62,7 +63,7 @@ def plant(
     entry = {
         "step": step,
         "record": {**made, "outputs": {**made["outputs"], **outputs}},
-        "timing": {},
+        "timing": kept["timings"]["toy_double"],
         "remove": list(remove),
     }
     (folder / ".commit.json").write_text(json.dumps(entry))
@@ -80,8 +81,7 @@ def test_a_folder_for_a_file_or_a_file_for_a_folder_is_one_line_or_mended(
     else:
         path.unlink(missing_ok=True)
         path.mkdir()
-    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs, "--force")
-    code, _, said = command("run", toy.session, *arguments)
+    code, _, said = command("run", toy.session, *toy.options, "--force")
     assert code == 2 and "in the way" in said.splitlines()[-1]
     assert "Traceback" not in said
 
@@ -142,6 +142,15 @@ def test_a_planted_commit_that_reaches_further_is_dropped(
     assert everything(outside) == kept
 
 
+def test_a_commit_whose_files_were_cut_off_is_dropped(toy: Toy, outside: Path) -> None:
+    """A sealed step, as a kill before its files were moved leaves it."""
+    good = toy.files()
+    toy.ran()
+    plant(toy, {}, files=("toy/double.json",))
+    toy.run()
+    assert toy.files() == good and toy.ran() == [], "what was there counts"
+
+
 def test_a_commit_through_a_link_in_staging_is_dropped(toy: Toy, outside: Path) -> None:
     staging = plant(toy, {"toy/link/double.json": digest("mine")}, files=("toy/x",))
     (staging / "toy/link").symlink_to(outside)
@@ -173,16 +182,10 @@ def test_an_edited_record_is_one_line_or_rebuilt(
         table = table[key]
     table[path[-1]] = value
     (toy.root / "run.json").write_text(json.dumps(content))
-    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs)
-    for given in (
-        ("status", "first", "--runs", toy.runs),
-        ("verify", "first", "--runs", toy.runs),
-        ("extend", "first", "stribeck:yaw", "--runs", toy.runs),
-        ("accept", "first", "--runs", toy.runs),
-    ):
-        code, _, said = command(*given)
+    for given in (("status",), ("verify",), ("extend", "stribeck:yaw"), ("accept",)):
+        code, _, said = command(given[0], "first", *given[1:], "--runs", toy.runs)
         assert code in (0, 1, 2) and all(map(is_said, said.splitlines())), said
-    code, _, said = command("run", toy.session, *arguments)
+    code, _, said = command("run", toy.session, *toy.options)
     assert code == 0, said
     assert toy.files() == good and everything(outside) == kept
 
@@ -215,10 +218,10 @@ def test_what_json_and_toml_can_do_is_one_line_or_rebuilt(
     path = toy.root / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(UNREADABLE[kind])
-    for given in (("status", "first"), ("verify", "first")):
-        code, _, said = command(*given, "--runs", toy.runs)
+    for given in ("status", "verify"):
+        code, _, said = command(given, "first", "--runs", toy.runs)
         assert code in (0, 1, 2) and all(map(is_said, said.splitlines())), said
-    code, _, said = command("run", toy.session, "--pipeline", toy.pipeline_file, "--runs", toy.runs)
+    code, _, said = command("run", toy.session, *toy.options)
     assert code == 0, said
     assert toy.files() == good
 
@@ -246,7 +249,7 @@ def test_trials_that_are_no_tables_are_one_line(toy: Toy, command: Command, tria
     file = toy.session / "session.toml"
     head = file.read_text().partition("[[trials]]")[0]
     file.write_text(f"{head}trials = {trials}\n")
-    code, _, said = command("run", toy.session, "--pipeline", toy.pipeline_file, "--runs", toy.runs)
+    code, _, said = command("run", toy.session, *toy.options)
     assert code == 0, said  # the toys want no trials
     with pytest.raises(InputError, match="trials"):
         read_session(toy.session)

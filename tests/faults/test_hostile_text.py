@@ -11,15 +11,7 @@ from conftest import Command, Toy
 
 from bampipe.cli import show
 from bampipe.errors import InputError, printable
-from bampipe.report.document import (
-    Bullets,
-    Callout,
-    Document,
-    Paragraph,
-    Section,
-    Subheading,
-    Table,
-)
+from bampipe.report import document
 from bampipe.report.page import render_page
 from bampipe.report.typeset import render_pdf
 from bampipe.results.run import GateVerdict
@@ -95,13 +87,8 @@ carriage = {{ column = "x", counts_per_unit = 1.0, unit = "m" }}
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_junit_is_xml_whatever_a_session_is_called(control: str) -> None:
-    verdict = GateVerdict(
-        gate=f"gate{control}",
-        key=f"yaw{control}",
-        state="failed",
-        value=1.0,
-        message=f"bad{control}{MARKUP}",
-    )
+    given = {"gate": f"gate{control}", "key": f"yaw{control}", "message": f"bad{control}{MARKUP}"}
+    verdict = GateVerdict(**given, state="failed", value=1.0)
     outcomes = [
         Outcome(Path(f"s{control}"), "done", verdicts=(verdict,)),
         Outcome(Path("s2"), "refused", error=f"no{control}{MARKUP}"),
@@ -127,31 +114,25 @@ def test_markdown_takes_a_session_for_text(tmp_path: Path) -> None:
 def test_a_path_that_is_no_text_is_one_line(toy: Toy, command: Command) -> None:
     folder = os.fsdecode(os.fsencode(toy.folder) + b"/b\xffd")
     shutil.copytree(toy.session, folder)
-    arguments = ("--pipeline", toy.pipeline_file, "--runs", toy.runs)
-    code, _, err = command("run", folder, *arguments)
+    code, _, err = command("run", folder, *toy.options)
     assert code == 2 and err.count("\n") == 1, err
     assert "\\udcff" in err and "rename" in err
 
 
-HOSTILE = (
-    MARKUP,
-    '#import "/etc/passwd"; #read("/etc/passwd")',
-    "$\\input{/etc/passwd}$",
-    "`*_**`",
-)
+HOSTILE = (MARKUP, '#import "/etc/passwd"; #read("/etc/x")', "$\\input{/etc/passwd}$", "`*_**`")
 
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_the_report_takes_names_for_text(text: str) -> None:
     blocks = (
-        Paragraph(text),
-        Subheading(text),
-        Bullets((text,)),
-        Callout("good", text, text),
-        Table(text, text.replace(" | ", " "), ((text,),)),
+        document.Paragraph(text),
+        document.Subheading(text),
+        document.Bullets((text,)),
+        document.Callout("good", text, text),
+        document.Table(text, text.replace(" | ", " "), ((text,),)),
     )
-    document = Document(text, text, (Section(text, blocks),))
-    body = render_page(document)
+    hostile = document.Document(text, text, (document.Section(text, blocks),))
+    body = render_page(hostile)
     for tag in ("<script>alert", "<img src=x"):
         assert tag not in body
-    assert render_pdf(document, 0).startswith(b"%PDF")
+    assert render_pdf(hostile, 0).startswith(b"%PDF")

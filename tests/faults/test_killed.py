@@ -3,13 +3,12 @@
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 
 import psutil
 import pytest
-from conftest import TOYS, Toy
+from conftest import Toy
 
 from bampipe.errors import InputError
 from bampipe.run import record
@@ -23,26 +22,6 @@ def wait_for(condition: Callable[[], object], seconds: float = 20.0) -> None:
     while not condition():
         assert time.monotonic() < deadline, "nothing happened"
         time.sleep(0.02)
-
-
-def start(toy: Toy, *more: str, pause: float, jobs: int) -> subprocess.Popen[str]:
-    """Start a run of the toys whose doubling takes ``pause`` s a number, in ``jobs`` processes."""
-    toys = ["--pipeline", str(toy.pipeline_file), "--runs", str(toy.runs)]
-    return subprocess.Popen(
-        [sys.executable, str(TOYS / "toy_bampipe.py"), "run", *more, *toys],
-        env={
-            **os.environ,
-            "TOY_PAUSE": str(pause),
-            "TOY_JOBS": str(jobs),
-            "TOY_WORKERS": str(toy.folder / "workers"),
-        },
-        cwd=toy.folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        # A shell has its background jobs ignore Ctrl-C, and so their children.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
 
 
 def workers_of(toy: Toy, process: subprocess.Popen[str], number: int) -> list[psutil.Process]:
@@ -65,7 +44,7 @@ SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
 def test_workers_and_lock_go_with_the_command(toy: Toy, number: signal.Signals) -> None:
     toy.run()
     good = toy.files()
-    process = start(toy, str(toy.session), "--force", pause=60.0, jobs=2)
+    process = toy.start(str(toy.session), "--force", pause=60.0, jobs=2)
     workers = workers_of(toy, process, 2)
     began = time.monotonic()
     process.send_signal(number)
@@ -95,25 +74,23 @@ def test_workers_and_lock_go_with_the_command(toy: Toy, number: signal.Signals) 
 @pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
 def test_workers_of_workers_go_too(toy: Toy, number: signal.Signals) -> None:
     """Several sessions at once: each in a process of its own, which has workers in its turn."""
-    import install_toys
-
-    sessions = [install_toys.make_session(toy.folder / "many" / name) for name in "ab"]
-    process = start(toy, *map(str, sessions), "--jobs", "2", pause=60.0, jobs=2)
+    given = toy.many(dict.fromkeys("ab", "1 2 3"))
+    process = toy.start(*(str(r.session) for r in given), "--jobs", "2", pause=60.0, jobs=2)
     workers = workers_of(toy, process, 4)
     process.send_signal(number)
     process.communicate(timeout=10.0)
     assert ended(workers)
-    for session in sessions:
-        with record.lock(toy.runs / session.name, False):
+    for request in given:
+        with record.lock(request.root, False):
             pass
 
 
 def test_the_next_command_says_that_it_takes_over(toy: Toy) -> None:
-    process = start(toy, str(toy.session), pause=60.0, jobs=1)
+    process = toy.start(str(toy.session), pause=60.0, jobs=1)
     workers_of(toy, process, 1)
     process.kill()
     process.communicate()
-    again = start(toy, str(toy.session), "--no-wait", pause=0.0, jobs=1)
+    again = toy.start(str(toy.session), "--no-wait", jobs=1)
     _, said = again.communicate(timeout=30.0)
     assert again.returncode == 0
     assert f"bampipe: process {process.pid} on " in said and " was killed in first" in said

@@ -5,11 +5,10 @@ from pathlib import Path
 import independent
 import numpy as np
 import pytest
-from binary_logs import to_parquet
 from independent.sensors import Conditions
+from independent_runs import run_short
 from mistakes import scale_column, set_text
 
-import bampipe
 from bampipe.results.identify import IdentifyResult, ParameterEstimate
 from bampipe.results.stiffness import StiffnessResult
 
@@ -27,9 +26,7 @@ def parameters_of(root: Path, *changes) -> dict[str, ParameterEstimate]:
     independent.record("joint", folder, 41, {}, Conditions(creep=True, trials=3, seconds=8.0))
     for change in changes:
         change(folder)
-    to_parquet(folder)
-    (root / "short.toml").write_text(PIPELINE)
-    run = bampipe.run_session(folder, runs=root / "runs", pipeline=str(root / "short.toml"))
+    run = run_short(folder, root, PIPELINE)
     return dict(IdentifyResult.read(run.root / "models/base/identify.json").parameters)
 
 
@@ -83,9 +80,8 @@ def test_the_zero_of_an_encoder_is_known_to_a_step(tmp_path) -> None:
     turned = step / np.sqrt(3.0)
     across, moment = found["moment_across"], found["moment"]
     assert across.calibration_sd == pytest.approx(abs(moment.estimate) * turned, rel=0.05)
-    assert moment.calibration_sd == pytest.approx(
-        abs(across.estimate) * turned, abs=0.1 * moment.sd
-    )
+    share = abs(across.estimate) * turned
+    assert moment.calibration_sd == pytest.approx(share, abs=0.1 * moment.sd)
     for name in ("inertia", "viscous.joint", "coulomb.joint"):
         assert found[name].calibration_sd < 0.1 * found[name].sd, name
 
@@ -94,12 +90,8 @@ def test_a_stiffness_is_as_uncertain_as_its_force(tmp_path) -> None:
     conditions = Conditions(trials=1, seconds=3.0, locked_trials=True)
     independent.record("bam", tmp_path / "bam", 41, {}, conditions)
     set_text("noise_sd_n", "gain_sd = 0.01\nnoise_sd_n")(tmp_path / "bam")
-    to_parquet(tmp_path / "bam")
     pipeline = PIPELINE.replace('"filter", "identify"', '"filter", "stiffness"')
-    (tmp_path / "short.toml").write_text(pipeline.replace("settings", "#"))
-    run = bampipe.run_session(
-        tmp_path / "bam", runs=tmp_path / "runs", pipeline=str(tmp_path / "short.toml")
-    )
+    run = run_short(tmp_path / "bam", tmp_path, pipeline.replace("settings", "#"))
     axes = StiffnessResult.read(run.root / "stiffness/stiffness.json").axes
     for entry in axes.values():
         assert entry.calibration_sd == pytest.approx(0.01 * entry.stiffness, rel=0.02)

@@ -7,13 +7,15 @@ from pathlib import Path
 from made_results import diagnosis, write_result
 
 from bampipe.data import store
-from bampipe.files import write_json, write_text
+from bampipe.declarations.model import ModelFile
+from bampipe.files import write_json
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.floor import compare_with_floor
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
 from bampipe.results.stiffness import StiffnessResult
 from bampipe.results.validate import ValidateResult
+from bampipe.run import models
 
 AXES = ("yaw", "pitch")
 
@@ -40,15 +42,9 @@ class Made:
 
     def write(self, runs: Path) -> Path:
         root = runs / self.name
-        write_result(
-            root,
-            IngestResult,
-            session_id=self.name,
-            device=self.device,
-            recorded_at=self.recorded,
-            sample_rate_hz=500.0,
-            axes={axis: {"unit": "rad", "resolution": 1e-4} for axis in AXES},
-        )
+        axes = {axis: {"unit": "rad", "resolution": 1e-4} for axis in AXES}
+        session = {"session_id": self.name, "device": self.device, "recorded_at": self.recorded}
+        write_result(root, IngestResult, **session, sample_rate_hz=500.0, axes=axes)
         trials = {
             "trial_id": ["t1", "t2"], "kind": ["free"] * 2, "status": ["ok", "set_aside"],
             "reason": ["", "t2.csv, row 7: time goes backwards"], "repairs": [""] * 2,
@@ -56,10 +52,9 @@ class Made:
         }  # fmt: skip
         store.write_parquet(root / "ingest/trials.parquet", trials)  # type: ignore[arg-type]
         stiff = {"stiffness": self.stiffness, "sd": 1.0, "unit": "N.m/rad", "n_cycles": 6}
-        cycles = {"cycles": [{"trial_id": "t3"}]}
-        axes = {} if self.stiffness is None else {"yaw": stiff | cycles}
+        axes = {} if self.stiffness is None else {"yaw": stiff | {"cycles": [{"trial_id": "t3"}]}}
         write_result(root, StiffnessResult, axes=axes)
-        self._model(root, "base", [], self.parameters, self.error)
+        self._model(root, "base", (), self.parameters, self.error)
         if self.verdicts is not None:
             axes = {
                 axis: {"verdict": verdict, "sentence": f"{axis}: {verdict}", "unit": "N.m"}
@@ -71,7 +66,7 @@ class Made:
         if self.child is not None:
             effect, parameters = self.child
             name = f"base+{effect.replace(':', '.')}"
-            self._model(root, name, [effect], parameters, {axis: 1.0 for axis in AXES})
+            self._model(root, name, (effect,), parameters, dict.fromkeys(AXES, 1.0))
         record = {"schema": "bampipe.run/1", "stages": {}, "gates": [], "failures": {}}
         write_json(root / "run.json", record)
         return root
@@ -80,18 +75,13 @@ class Made:
         self,
         root: Path,
         name: str,
-        effects: list[str],
+        effects: tuple[str, ...],
         parameters: Mapping[str, float],
         error: Mapping[str, float],
     ) -> None:
-        listed = ", ".join(f'"{effect}"' for effect in effects)
-        text = f'schema = "bampipe.model/1"\nname = "{name}"\ndevice = "bam"\n'
-        text += f"effects = [{listed}]\n"
-        write_text(root / f"models/{name}/model.toml", text)
-        entries = {
-            key: {"estimate": value, "sd": self.sd, "unit": "N.m", "at_bound": False}
-            for key, value in parameters.items()
-        }
+        models.write(root, ModelFile(name=name, device="bam", effects=effects))
+        known = {"sd": self.sd, "unit": "N.m", "at_bound": False}
+        entries = {key: {"estimate": value, **known} for key, value in parameters.items()}
         nis = {"by_trial": {"t1": 1.1}}
         write_result(root, IdentifyResult, model=name, method="ukf", parameters=entries, nis=nis)
         axes = {

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from bampipe.lab.folders import is_current
 from bampipe.phrases import lab as phrases
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
+from bampipe.results.run import RunResult
+from bampipe.run import record
 from bampipe.run.accepted import accept
 
 ROOT = Path(__file__).parent.parent.parent
@@ -34,23 +37,24 @@ def estimates(number: int, **changes: float) -> dict[str, float]:
     return found | {name.replace("__", "."): value for name, value in changes.items()}
 
 
-def make_lab(folder: Path, changed: dict[int, Made] | None = None, sessions: int = 9) -> Path:
-    """Runs of a lab, all in order but those in ``changed``; recorded in the order of numbers."""
+def made(number: int, parameters: dict[str, float], **more: object) -> Made:
+    """A run; recorded in the order of numbers."""
+    when = f"2026-09-{number:02d}T09:30:00+00:00"
+    return Made(f"s{number:02d}", when, parameters, **more)  # type: ignore[arg-type]
+
+
+def make_lab(folder: Path, *changed: Made, sessions: int = 9) -> Path:
+    """Runs of a lab, all in order but those that ``changed``."""
     for number in range(1, sessions + 1):
-        plain = Made(
-            f"s{number:02d}",
-            f"2026-09-{number:02d}T09:30:00+00:00",
-            estimates(number),
-            verdicts=CLEAN,
-            stiffness=2300.0 + number,
-        )
-        (changed or {}).get(number, plain).write(folder / "runs")
+        stiffness = 2300.0 + number
+        made(number, estimates(number), verdicts=CLEAN, stiffness=stiffness).write(folder / "runs")
+    for one in changed:
+        shutil.rmtree(folder / "runs" / one.name, ignore_errors=True)
+        one.write(folder / "runs")
     return folder / "runs"
 
 
-def changed(number: int, parameters: dict[str, float], **more: object) -> Made:
-    when = f"2026-09-{number:02d}T09:30:00+00:00"
-    return Made(f"s{number:02d}", when, parameters, **more)  # type: ignore[arg-type]
+DRIFTED = made(5, estimates(5, coulomb__yaw=4.9), verdicts=CLEAN)
 
 
 def verdicts(runs: Path) -> dict[str, dict[str, object]]:
@@ -66,18 +70,19 @@ def test_a_parameter_that_stays_out_with_the_effect_is_the_device_too(
     tmp_path: Path, with_effect: float, verdict: str
 ) -> None:
     child = ("stribeck:yaw", estimates(7, coulomb__yaw=with_effect))
-    made = changed(7, estimates(7, coulomb__yaw=4.9), verdicts=MISSING, child=child)
-    one = verdicts(make_lab(tmp_path, {7: made}))["s07"]
+    parameters = estimates(7, coulomb__yaw=4.9)
+    runs = make_lab(tmp_path, made(7, parameters, verdicts=MISSING, child=child))
+    one = verdicts(runs)["s07"]
     assert one["verdict"] == verdict
     assert ("back within the limits" in str(one["sentence"])) == (with_effect < 4.1)
 
 
 def test_an_effect_on_another_axis_does_not_account_for_a_parameter(tmp_path: Path) -> None:
-    other = changed(7, estimates(7, viscous__pitch=4.9), verdicts=MISSING)
-    one = verdicts(make_lab(tmp_path, {7: other}))["s07"]
+    other = made(7, estimates(7, viscous__pitch=4.9), verdicts=MISSING)
+    one = verdicts(make_lab(tmp_path, other))["s07"]
     assert one["verdict"] == "device drifted, and missing effect"
-    own = changed(7, estimates(7, viscous__yaw=4.9), verdicts=MISSING)
-    one = verdicts(make_lab(tmp_path, {7: own}))["s07"]
+    made(7, estimates(7, viscous__yaw=4.9), verdicts=MISSING).write(tmp_path / "runs")
+    one = verdicts(tmp_path / "runs")["s07"]
     assert one["verdict"] == "missing effect"
     assert one["remedy"] == "bampipe extend s07 --auto, then bampipe lab"
 
@@ -108,19 +113,18 @@ def test_what_is_undecided_or_has_no_verdict_is_said(tmp_path: Path) -> None:
 
 
 def test_what_was_not_diagnosed_is_said(tmp_path: Path) -> None:
-    unasked = changed(3, estimates(3, mass=5.0))
-    above = changed(4, estimates(4), error={"yaw": 3.0, "pitch": 1.0})
-    found = verdicts(make_lab(tmp_path, {3: unasked, 4: above}))
+    unasked = made(3, estimates(3, mass=5.0))
+    above = made(4, estimates(4), error={"yaw": 3.0, "pitch": 1.0})
+    found = verdicts(make_lab(tmp_path, unasked, above))
     assert found["s03"]["verdict"] == found["s04"]["verdict"] == "not diagnosed"
     assert found["s04"]["remedy"] == "bampipe diagnose s04 --model base"
 
 
 def test_a_session_is_judged_by_its_best_confirmed_model(tmp_path: Path) -> None:
     name, high = "base+stribeck.yaw", {"yaw": 3.0, "pitch": 1.0}
-    extended = changed(
-        4, estimates(4), error=high, verdicts=MISSING, child=("stribeck:yaw", estimates(4))
-    )
-    runs = make_lab(tmp_path, {4: extended})
+    child = ("stribeck:yaw", estimates(4))
+    extended = made(4, estimates(4), error=high, verdicts=MISSING, child=child)
+    runs = make_lab(tmp_path, extended)
     before = verdicts(runs)["s04"]
     assert (before["model"], before["above_floor"]) == ("base", True)
     assert before["verdict"] == "missing effect"
@@ -133,12 +137,10 @@ def test_a_session_is_judged_by_its_best_confirmed_model(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("sessions", [2, 9])
 def test_its_json_files_are_as_their_schemas_say(tmp_path: Path, sessions: int) -> None:
-    drifted = changed(2, estimates(2, coulomb__yaw=4.9), verdicts=MISSING)
-    collect(make_lab(tmp_path, {2: drifted}, sessions), tmp_path / "lab", report=False)
-    assert sorted(path.name for path in (tmp_path / "lab").glob("*.json")) == [
-        "lab.json",
-        "trends.json",
-    ]
+    drifted = made(2, estimates(2, coulomb__yaw=4.9), verdicts=MISSING)
+    collect(make_lab(tmp_path, drifted, sessions=sessions), tmp_path / "lab", report=False)
+    written = {path.name for path in (tmp_path / "lab").glob("*.json")}
+    assert written == {"lab.json", "trends.json"}
     assert misfits(tmp_path / "lab") == []
 
 
@@ -174,7 +176,7 @@ def test_the_lines_in_the_documents_work(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_the_same_runs_give_the_same_bytes_and_a_lost_device_goes(tmp_path: Path) -> None:
     runs = make_lab(tmp_path, sessions=3)
-    changed(10, {"mass": 1.0}, device="rail/2").write(runs)
+    made(10, {"mass": 1.0}, device="rail/2").write(runs)
     lab = tmp_path / "lab"
 
     def contents() -> dict[str, bytes]:
@@ -225,13 +227,9 @@ def test_a_result_of_another_form_leaves_its_run_out(
 def test_a_result_that_was_edited_leaves_its_run_out(tmp_path: Path) -> None:
     runs = make_lab(tmp_path, sessions=2)
     path = runs / "s01/models/base/identify.json"
-    step = {
-        "key": "0" * 64, "config": {}, "settings": {}, "declared_inputs": [], "inputs": {},
-        "code": "0" * 64,
-        "versions": {}, "summary": {}, "outputs": {"models/base/identify.json": digest_file(path)},
-    }  # fmt: skip
-    kept = {"schema": "bampipe.run/1", "stages": {"identify:base": step}}
-    (runs / "s01/run.json").write_text(json.dumps(kept))
+    outputs = {"models/base/identify.json": digest_file(path)}
+    step = {"key": "0" * 64, "code": "0" * 64, "outputs": outputs}
+    write_result(runs / "s01", RunResult, schema=record.SCHEMA, stages={"identify:base": step})
     assert collect(runs, tmp_path / "lab", report=False).skipped == ()
     path.write_text(path.read_text().replace("4.", "5.", 1))
     (skipped,) = collect(runs, tmp_path / "lab", report=False).skipped
@@ -256,14 +254,12 @@ def test_current_until_a_run_changes(tmp_path: Path) -> None:
     assert not is_current(runs, lab)
     collect(runs, lab, report=False)
     assert is_current(runs, lab)
-    changed(11, estimates(11)).write(runs)
+    made(11, estimates(11)).write(runs)
     assert not is_current(runs, lab)
 
 
 def test_the_report_says_what_the_trends_say(tmp_path: Path) -> None:
-    drifted = changed(5, estimates(5, coulomb__yaw=4.9), verdicts=CLEAN)
-    runs = make_lab(tmp_path, {5: drifted})
-    collect(runs, tmp_path / "lab")
+    collect(make_lab(tmp_path, DRIFTED), tmp_path / "lab")
     page = (tmp_path / "lab/report.html").read_text(encoding="utf-8")
     assert "s05: device drifted" in page
     assert "t2.csv, row 7" in page
@@ -309,8 +305,7 @@ def test_the_page_links_the_pages_of_every_session(tmp_path: Path) -> None:
 
 
 def test_the_command(tmp_path: Path, command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    drifted = changed(5, estimates(5, coulomb__yaw=4.9), verdicts=CLEAN)
-    make_lab(tmp_path, {5: drifted})
+    make_lab(tmp_path, DRIFTED)
     monkeypatch.chdir(tmp_path)
     code, out, _ = command("lab")
     assert code == 0

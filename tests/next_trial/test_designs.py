@@ -159,9 +159,8 @@ def test_what_leaves_what_has_been_seen_is_recorded_in_two_trials():
         # Each of them has room for three strokes.
         longest = 1.875 * (stroke.high - stroke.low) / np.sqrt(stroke.slow * stroke.fast)
         assert design.parts == 1 or 3.0 * longest < 1.01 * design.part_s
-    assert ", for 20 s in 2 trials of 10 s; " in describe_design(
-        beyond[0], seen, registry.device("bam")
-    )
+    said = describe_design(beyond[0], seen, registry.device("bam"))
+    assert ", for 20 s in 2 trials of 10 s; " in said
     assert all(d.parts == 1 for d in every_design(seen) if not any(find_beyond(d, seen)))
     assert all(d.parts == 1 for d in list_primitives(seen, 6.0, [0], with_rests=False))
 
@@ -175,9 +174,8 @@ def made_motion(name: str, rate: float) -> Motion:
 
 
 def test_a_trial_that_is_imitated_goes_on_smoothly_and_stays_where_it_was():
-    (first, second) = imitate_trials(
-        [made_motion("t02@0.0s", 1.0), made_motion("t01", 2.0)], SEEN, 30.0
-    )
+    seen = [made_motion("t02@0.0s", 1.0), made_motion("t01", 2.0)]
+    first, second = imitate_trials(seen, SEEN, 30.0)
     assert [first.example.trial, second.example.trial] == ["t01", "t02"]
     t = np.arange(30000) / 1000.0
     q, qd, qdd = example_path(first.example, t)
@@ -270,9 +268,8 @@ def test_a_sentence_says_what_goes_beyond_the_trials_at_hand():
         (fast, "; this takes yaw faster than so far."),
         (replace(far, fast=4.0), "; this takes yaw farther and faster than so far: try the way"),
     ):
-        assert ending in describe_design(
-            Primitive({0: stroke, **gentle}, seen.usual, 20.0), seen, device
-        )
+        design = Primitive({0: stroke, **gentle}, seen.usual, 20.0)
+        assert ending in describe_design(design, seen, device)
     both = Primitive({0: fast, 1: Stroke(-0.9, -0.5, 0.1, 0.2, gentle=True)}, seen.usual, 20.0)
     said = describe_design(both, seen, device)
     assert "this takes pitch farther and yaw faster than so far: try the way slowly first" in said
@@ -303,13 +300,16 @@ def made_result(best: Proposal, purpose: str = "precision", **more) -> NextResul
     )  # fmt: skip
 
 
-def explain(
-    purpose, best, table=(), unlimited=(), lacking=(), missing=(), unbraked=(), unpromised=()
-):
+def explain(purpose, best, table=(), lacking=(), missing=(), unbraked=(), unpromised=()):
     """Why the best proposal is made, and what it is expected to give."""
     found = made_result(best, purpose, sensitivity=dict(table), unpromised=unpromised)
-    why, expected = explain_proposal(found, unlimited, lacking, missing, unbraked)
-    return SimpleNamespace(why=why, expected=expected)
+    return explain_proposal(found, (), lacking, missing, unbraked)
+
+
+def detectable(name: str, smallest: float | None, then: float | None = None) -> Detectable:
+    return Detectable(
+        parameter=name, smallest=smallest, typical=1.0, unit="N", axis="x", with_proposal=then
+    )
 
 
 def test_a_forecast_in_the_terms_of_another_version_does_not_stop_a_new_proposal(tmp_path):
@@ -323,56 +323,42 @@ def test_a_forecast_in_the_terms_of_another_version_does_not_stop_a_new_proposal
 
 def test_what_a_model_lacks_is_said_to_count_as_noise():
     best = made_proposal(0.1).model_copy(update={"sd": {"mass": WIDE, "moment": SHARP}})
-    said = explain("precision", best, {}, (), ()).expected
+    _, said = explain("precision", best)
     assert said == (
         "Expected: `mass` ± 0.002 to 0.01 kg, now ± 0.05; `moment` ± 0.005 kg, now ± 0.05"
         " (eight cases in ten)."
     )
-    said = explain("precision", best, {}, (), ("yaw", "pitch")).expected
+    _, said = explain("precision", best, lacking=("yaw", "pitch"))
     assert "The error of yaw and pitch is above the noise floor" in said
     # What the diagnosis found comes before any trial; where effects compete, nothing need be said.
-    reasons = explain("precision", best, {}, (), ("yaw",), ["lag:x"])
-    assert reasons.why.startswith("According to the diagnosis, the model lacks lag:x. Ext")
-    assert reasons.expected.endswith("of a model that lacks something.")
-    assert "noise floor" not in reasons.expected
-    why = explain("precision", best, {}, (), ("yaw",), None).why
-    assert why.startswith(
-        "The error of yaw is above the noise floor: find the missing effect first"
-    )
-    said = explain("decision", made_proposal(0.01), {}, (), ("yaw",)).expected
-    assert "noise floor" not in said
+    why, said = explain("precision", best, lacking=("yaw",), missing=["lag:x"])
+    assert why.startswith("According to the diagnosis, the model lacks lag:x. Ext")
+    assert said.endswith("of a model that lacks something.") and "noise floor" not in said
+    why, _ = explain("precision", best, lacking=("yaw",), missing=None)
+    assert why.startswith("The error of yaw is above the noise floor: find the missing effect")
+    assert "noise floor" not in explain("decision", made_proposal(0.01), lacking=("yaw",))[1]
 
 
 def test_effects_of_brakes_are_said_to_need_viscous_trials():
-    entry = Detectable(
-        parameter="brake_lag.time_constant", smallest=None, typical=0.06, unit="s", axis=""
-    )
-    best, table = made_proposal(0.1), {"brake_lag": entry}
-    reasons = explain("sensitivity", best, table, (), (), unbraked=["brake_lag"])
-    assert "every other effect of the library at its typical size. Effects of brakes" in reasons.why
-    assert "(brake_lag) show in viscous trials only, and there are none" in reasons.why
-    assert "invisible" not in reasons.why
-    assert "No size" not in reasons.why
-    unpromised = explain("sensitivity", best, {}, (), (), unpromised=["stribeck:yaw"])
-    assert (
-        "every other effect of the library at its typical size. No size is given for stri"
-        in unpromised.why
-    )
+    best = made_proposal(0.1)
+    table = {"brake_lag": detectable("brake_lag.time_constant", None)}
+    why, _ = explain("sensitivity", best, table, unbraked=["brake_lag"])
+    assert "every other effect of the library at its typical size. Effects of brakes" in why
+    assert "(brake_lag) show in viscous trials only, and there are none" in why
+    assert "invisible" not in why and "No size" not in why
+    why, _ = explain("sensitivity", best, unpromised=["stribeck:yaw"])
+    assert "of the library at its typical size. No size is given for stri" in why
     braked = best.model_copy(update={"brakes": 1.0})
-    why = explain("sensitivity", braked, table, (), ()).why
+    why, _ = explain("sensitivity", braked, table)
     assert why.endswith("Add it to session.toml as a viscous trial.")
 
 
 def test_what_the_trial_would_show_is_named_first():
-    def entry(smallest: float, then: float) -> Detectable:
-        return Detectable(
-            parameter="p", smallest=smallest, typical=1.0, unit="N", axis="x", with_proposal=then
-        )
-
-    table = {f"far:{k}": entry(50.0 + k, 50.0 + k) for k in range(3)} | {"drag:x": entry(3.0, 1.0)}
-    reasons = explain("sensitivity", made_proposal(0.1), table, (), ())
-    assert reasons.why.startswith("These trials would not have shown drag:x below 3 N, far:2")
-    assert reasons.expected.startswith("It would show drag:x from 1 N on")
+    table = {f"far:{k}": detectable("p", 50.0 + k, 50.0 + k) for k in range(3)}
+    table["drag:x"] = detectable("p", 3.0, 1.0)
+    why, expected = explain("sensitivity", made_proposal(0.1), table)
+    assert why.startswith("These trials would not have shown drag:x below 3 N, far:2")
+    assert expected.startswith("It would show drag:x from 1 N on")
 
 
 def made_precision(sd: float, formal: float, blocks: int, lasting: float = 0.0) -> Precision:
@@ -500,15 +486,11 @@ def test_what_came_is_held_against_a_range(came, said):
 def test_what_a_trial_was_to_show_is_held_against_the_diagnosis_that_knows_it(
     weighed, selected, said
 ):
-    entry = Detectable(
-        parameter="drag.x.size", smallest=5.0, typical=1.0, unit="N", axis="x", with_proposal=0.9
-    )
     best = made_proposal(0.1).model_copy(update={"sd": {"mass": SHARP}, "confusion": ()})
-    table = {"drag:x": entry}
+    table = {"drag:x": detectable("drag.x.size", 5.0, 0.9)}
     proposed = made_result(best, "sensitivity", sensitivity=table, shows=find_shown(table))
-    identified = SimpleNamespace(
-        trials=("t1", "t2", "t3"), parameters={"mass": SimpleNamespace(sd=0.005)}
-    )
+    mass = SimpleNamespace(sd=0.005)
+    identified = SimpleNamespace(trials=("t1", "t2", "t3"), parameters={"mass": mass})
     diagnosed = SimpleNamespace(trials=weighed, selected=selected, axes={})
     first, second = compare_forecast(proposed, identified, diagnosed)
     assert "was forecast with trials t2 and t3, ± 0.005 resulted" in first

@@ -7,7 +7,7 @@ from pathlib import Path
 import independent
 import pytest
 from independent.person import Task
-from independent_runs import SHORT, record_run
+from independent_runs import SHORT, record_run, run_short
 
 import bampipe
 from bampipe.errors import InputError
@@ -57,11 +57,7 @@ def test_a_plan_reaches_what_is_asked_in_few_trials_and_says_what_came(tmp_path)
         "joint", tmp_path / "now" / "joint", 922, {},
         replace(SHORT["joint"], **LONG, tasks=Task.read(path)),
     )  # fmt: skip
-    again = bampipe.run_session(
-        tmp_path / "now" / "joint",
-        runs=tmp_path / "now" / "runs",
-        pipeline=str(tmp_path / "now" / "short.toml"),
-    )
+    again = run_short(tmp_path / "now" / "joint", tmp_path / "now")
     identified = IdentifyResult.read(again.root / IdentifyResult.file("base"))
     (said,) = compare_forecast(easy, identified, None)
     came = identified.parameters["coulomb.joint"].sd

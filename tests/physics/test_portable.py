@@ -4,6 +4,7 @@ import ctypes
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,19 +33,20 @@ def sample(model: Model) -> tuple[np.ndarray, ...]:
     return q, qd, qdd, u, p, system.required(q, qd, qdd, np.zeros((30, 0)), u, p)
 
 
-def used_inputs(names: tuple[str, ...], model: Model, u: np.ndarray) -> np.ndarray:
+def printed(model: Model) -> tuple[dict[str, Any], np.ndarray, list[np.ndarray], np.ndarray]:
+    """What the Python text defines, parameters, arguments of the function, and true forces."""
+    q, qd, qdd, u, p, required = sample(model)
+    space: dict[str, Any] = {}
+    exec(portable_source(model, p, "python"), space)
     inputs = compile_model(model).inputs
-    return u[:, [inputs.index(name) for name in names]]
+    used = [inputs.index(name) for name in space["INPUTS"]]
+    return space, p, [q, qd, qdd, *([u[:, used]] if used else [])], required
 
 
 @pytest.mark.parametrize("model", models(), ids=lambda m: f"{m.device.name}_{len(m.effects)}")
 def test_python(model: Model) -> None:
-    q, qd, qdd, u, p, required = sample(model)
-    space: dict[str, object] = {}
-    exec(portable_source(model, p, "python"), space)
-    names = space["INPUTS"]
-    given = [q, qd, qdd] + ([used_inputs(names, model, u)] if names else [])  # type: ignore[arg-type]
-    found = [space["inverse_dynamics"](*row) for row in zip(*given, strict=True)]  # type: ignore[operator]
+    space, _, given, required = printed(model)
+    found = [space["inverse_dynamics"](*row) for row in zip(*given, strict=True)]
     np.testing.assert_allclose(found, required, rtol=1e-10, atol=1e-10)
     assert space["COORDINATES"] == tuple(c.name for c in model.device.coordinates)
 
@@ -52,19 +54,15 @@ def test_python(model: Model) -> None:
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 @pytest.mark.parametrize("model", models(), ids=lambda m: f"{m.device.name}_{len(m.effects)}")
 def test_c(model: Model, tmp_path: Path) -> None:
-    q, qd, qdd, u, p, required = sample(model)
-    space: dict[str, object] = {}
-    exec(portable_source(model, p, "python"), space)
+    _, p, given, required = printed(model)
     source, library = tmp_path / "model.c", tmp_path / "model.so"
     source.write_text(portable_source(model, p, "c"))
     command = ["cc", "-std=c99", "-Wall", "-Werror", "-O1", "-shared", "-fPIC", "-o"]
     subprocess.run([*command, str(library), str(source), "-lm"], check=True)
     function = ctypes.CDLL(str(library)).inverse_dynamics
-    names = space["INPUTS"]
-    given = [q, qd, qdd] + ([used_inputs(names, model, u)] if names else [])  # type: ignore[arg-type]
     pointer = ctypes.POINTER(ctypes.c_double)
-    for k in range(len(q)):
-        out = np.empty(q.shape[1])
+    for k in range(len(required)):
+        out = np.empty(required.shape[1])
         rows = [np.ascontiguousarray(part[k]) for part in given]
         function(*(row.ctypes.data_as(pointer) for row in [*rows, out]))
         np.testing.assert_allclose(out, required[k], rtol=1e-10, atol=1e-10)
@@ -75,8 +73,7 @@ def test_models_with_memory_or_of_what_encoders_read_are_refused() -> None:
     p = compile_model(model).prior
     with pytest.raises(InputError, match="has internal states"):
         portable_source(model, p, "c")
-    device = registry.device("bam")
-    model = Model(device, ["encoder_scale:yaw"])
+    model = Model(registry.device("bam"), ["encoder_scale:yaw"])
     with pytest.raises(InputError, match="acts on encoder readings"):
         portable_source(model, compile_model(model).prior, "python")
 
@@ -89,6 +86,5 @@ def test_the_offset_of_a_drive_is_no_part_of_the_force_and_is_named() -> None:
     without = portable_source(bare, p[: len(bare.parameters)], "python")
     text = portable_source(biased, p, "python")
     assert f"logged values differ by {name}." in text
-    assert (
-        text.replace(f" Forces are those that act; logged values differ by {name}.", "") == without
-    )
+    said = f" Forces are those that act; logged values differ by {name}."
+    assert text.replace(said, "") == without

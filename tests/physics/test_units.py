@@ -124,9 +124,7 @@ def wrong_device(change):
 
 def test_wrong_units_and_expressions_of_a_device_are_found_where_they_matter():
     found = wrong_device(lambda d: d["constants"]["I_g"].update(unit="kg.m"))
-    assert len(found) == 1
-    assert found[0].startswith("energy.kinetic: ")
-    assert "(kg.m)" in found[0]
+    assert len(found) == 1 and found[0].startswith("energy.kinetic: ") and "(kg.m)" in found[0]
     found = wrong_device(lambda d: d["applied"].update(pitch="force_y"))
     assert found == ["applied.pitch: is N where N.m is needed"]
     found = wrong_device(lambda d: d["energy"].update(potential="mass*g*sin(pitch)"))
@@ -143,15 +141,10 @@ def test_wrong_units_and_expressions_of_a_device_are_found_where_they_matter():
         "process_noise.gravity_compensator.torque.pitch: is a pure number where m is needed"
     ]
     found = wrong_device(lambda d: d["inputs"].update(force_unit="N.m"))
-    assert [f.partition(":")[0] for f in found] == [
-        "applied.yaw",
-        "applied.pitch",
-        "applied.extension",
-    ]
+    fields = [f"applied.{axis}" for axis in ("yaw", "pitch", "extension")]
+    assert [f.partition(":")[0] for f in found] == fields
     found = wrong_device(lambda d: d["constants"]["L"].update(unit="inch"))
-    assert len(found) == 1
-    assert "constants.L" in found[0]
-    assert "'inch'" in found[0]
+    assert len(found) == 1 and "constants.L" in found[0] and "'inch'" in found[0]
     found = wrong_device(lambda d: d["torque"].update(pitch="compensatoin"))
     assert found == ["torque.pitch: unknown symbol 'compensatoin', did you mean 'compensation'?"]
 

@@ -75,20 +75,13 @@ def write_ingest(root: Path, trials: tuple[str, ...] = FREE) -> None:
 
     write_parquet(root / "ingest/samples.parquet", _by_trial(samples))
     units = {"yaw": ("rad", 47e-6), "pitch": ("rad", 98e-6), "extension": ("m", 30e-6)}
+    columns = [f"force_{c}" for c in "xyz"]
     write_result(
-        root,
-        IngestResult,
-        session_id=root.name,
-        device="bam",
+        root, IngestResult, session_id=root.name, device="bam", sample_rate_hz=RATE,
         axes={axis: {"unit": u, "resolution": r} for axis, (u, r) in units.items()},
-        force={
-            "noise_sd": {"force_x": 0.05},
-            "unit": "N",
-            "columns": ["force_x", "force_y", "force_z"],
-        },
-        sample_rate_hz=RATE,
+        force={"noise_sd": {"force_x": 0.05}, "unit": "N", "columns": columns},
         recorded_at="2026-10-03T10:12:00+00:00",
-    )
+    )  # fmt: skip
 
 
 def _trial(name: str, kind: str) -> dict[str, object]:
@@ -240,16 +233,10 @@ def write_validation(root: Path, model: str) -> None:
         for axis, error in held_out(model).items()
     }  # fmt: skip
     write_result(
-        root,
-        ValidateResult,
-        model=model,
-        axes=axes,
+        root, ValidateResult, model=model, axes=axes, cutoff_hz=dict.fromkeys(AXES, 8.0),
         trials={name: {**axes, "held_out": True} for name in FREE},
-        forces={"force_x": {"rmse": 0.1234, "unit": "N"}},
-        cutoff_hz=dict.fromkeys(AXES, 8.0),
-        notes=["A note of the validation."],
-    )
-
+        forces={"force_x": {"rmse": 0.1234, "unit": "N"}}, notes=["A note of the validation."],
+    )  # fmt: skip
     size = 0.3 if model == "base" else 0.1
 
     def residuals(number: int) -> pd.DataFrame:

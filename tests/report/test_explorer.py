@@ -48,10 +48,7 @@ def unpack(packer: Packer, column: PackedColumn) -> np.ndarray:
     return np.where(codes == 65535, np.nan, column.low + column.step * codes)
 
 
-@given(
-    st.lists(st.floats(-1e9, 1e9, width=32) | st.just(float("nan")), max_size=200),
-    st.integers(0, 3),
-)
+@given(st.lists(st.floats(-1e9, 1e9, width=32) | st.just(np.nan), max_size=200), st.integers(0, 3))
 def test_a_column_comes_back_within_half_a_step(values: list[float], smooth: int) -> None:
     column = np.array(values, dtype=float)
     for _ in range(smooth):
@@ -183,6 +180,12 @@ def opened(browser: Any) -> Iterator[Opened]:
     assert complaints == []
 
 
+@pytest.fixture
+def page(opened: Opened, page_file: Path) -> Any:
+    """The page of the run, opened."""
+    return opened(page_file)
+
+
 def figure(page: Any, title: str) -> Any:
     return page.locator("figure.plot").filter(has_text=title).first
 
@@ -209,10 +212,7 @@ def drag(page: Any, title: str, start: tuple[float, float], stop: tuple[float, f
     page.mouse.up()
 
 
-def test_traces_hold_every_sample_of_every_trial(
-    opened: Opened, page_file: Path, run: Path
-) -> None:
-    page = opened(page_file)
+def test_traces_hold_every_sample_of_every_trial(page: Any, run: Path) -> None:
     shown = csv_of(page, "torque yaw")
     stored = pd.read_parquet(run / "models/base/residuals.parquet")
     assert shown["trial"].tolist() == stored["trial_id"].tolist()
@@ -224,23 +224,18 @@ def test_traces_hold_every_sample_of_every_trial(
     assert "version 1 (N·m)" in shown
 
 
-def test_one_zoom_moves_all_traces_and_reset_shows_all(opened: Opened, page_file: Path) -> None:
-    page = opened(page_file)
+def test_one_zoom_moves_all_traces_and_reset_shows_all(page: Any) -> None:
     everything = len(csv_of(page, "velocity yaw"))
     drag(page, "torque yaw", (0.1, 0.5), (0.2, 0.5))
     parts = [csv_of(page, title) for title in ("torque yaw", "residual yaw", "velocity yaw")]
-    spans = [
-        (part["trial"].unique().tolist(), part["t (s)"].min(), part["t (s)"].max())
-        for part in parts
-    ]
+    spans = [(*part["trial"].unique(), part["t (s)"].min(), part["t (s)"].max()) for part in parts]
     assert spans[0] == spans[1] == spans[2]
     assert 0 < len(parts[2]) < 0.15 * everything
     page.get_by_role("button", name="Show all").click()
     assert len(csv_of(page, "velocity yaw")) == everything
 
 
-def test_versions_are_shown_and_hidden(opened: Opened, page_file: Path, run: Path) -> None:
-    page = opened(page_file)
+def test_versions_are_shown_and_hidden(page: Any, run: Path) -> None:
     counts = page.locator(".counts").inner_text()
     assert counts.startswith("base is") == (Results(run).model == "base")
     assert "base" in figure(page, "residual yaw").locator(".key").inner_text()
@@ -249,10 +244,7 @@ def test_versions_are_shown_and_hidden(opened: Opened, page_file: Path, run: Pat
     assert "base (N·m)" not in csv_of(page, "torque yaw")
 
 
-def test_a_region_of_a_map_marks_its_samples_and_a_view_shows_in_maps(
-    opened: Opened, page_file: Path, run: Path
-) -> None:
-    page = opened(page_file)
+def test_a_region_of_a_map_marks_its_samples_and_a_view_shows_in_maps(page: Any, run: Path) -> None:
     drag(page, "residual yaw by velocity", (0.6, 0.05), (0.8, 0.95))
     words = page.locator("#marked").inner_text()
     count = int(words.split()[0])
@@ -262,11 +254,8 @@ def test_a_region_of_a_map_marks_its_samples_and_a_view_shows_in_maps(
     chosen = marked[marked["marked"] == 1]
     assert len(chosen) == count > 20
     between = marked["velocity"].between(chosen["velocity"].min(), chosen["velocity"].max())
-    tall = marked["residual version 1"]
-    inside = between & tall.between(
-        chosen["residual version 1"].min(), chosen["residual version 1"].max()
-    )
-    assert inside.sum() == count
+    tall, within = marked["residual version 1"], chosen["residual version 1"]
+    assert (between & tall.between(within.min(), within.max())).sum() == count
     before = figure(page, "residual yaw ").first.locator("canvas").screenshot()
     page.get_by_role("button", name="Remove the mark").click()
     assert not page.locator("#marked").is_visible()
@@ -278,8 +267,7 @@ def test_a_region_of_a_map_marks_its_samples_and_a_view_shows_in_maps(
     assert canvas.screenshot() != everything
 
 
-def test_a_strip_of_a_map_is_marked_by_keyboard(opened: Opened, page_file: Path) -> None:
-    page = opened(page_file)
+def test_a_strip_of_a_map_is_marked_by_keyboard(page: Any) -> None:
     canvas = figure(page, "residual yaw by velocity").locator(".canvas")
 
     def marked_velocities() -> pd.Series:
@@ -303,8 +291,7 @@ def test_a_strip_of_a_map_is_marked_by_keyboard(opened: Opened, page_file: Path)
     assert not page.locator("#marked").is_visible()
 
 
-def test_a_worst_window_is_one_choice_away(opened: Opened, page_file: Path) -> None:
-    page = opened(page_file)
+def test_a_worst_window_is_one_choice_away(page: Any) -> None:
     page.get_by_role("button", name="Next worst window").click()
     part = csv_of(page, "torque yaw")
     assert part["trial"].unique().tolist() == [synthetic_run.FREE[1]]
@@ -312,8 +299,7 @@ def test_a_worst_window_is_one_choice_away(opened: Opened, page_file: Path) -> N
     assert np.ptp(part["t (s)"]) < 3.0
 
 
-def test_keys_move_view_and_cursor_and_the_reading_is_said(opened: Opened, page_file: Path) -> None:
-    page = opened(page_file)
+def test_keys_move_view_and_cursor_and_the_reading_is_said(page: Any) -> None:
     page.locator(".canvas").first.focus()
     page.keyboard.press("PageDown")
     assert csv_of(page, "torque yaw")["trial"].unique().tolist() == [synthetic_run.FREE[0]]
@@ -327,8 +313,7 @@ def test_keys_move_view_and_cursor_and_the_reading_is_said(opened: Opened, page_
     assert np.ptp(csv_of(page, "torque yaw")["t (s)"]) < 4.1
 
 
-def test_another_axis_brings_its_traces_and_maps(opened: Opened, page_file: Path) -> None:
-    page = opened(page_file)
+def test_another_axis_brings_its_traces_and_maps(page: Any) -> None:
     page.get_by_label("pitch", exact=True).check()
     page.wait_for_selector("text=residual pitch by velocity")
     assert figure(page, "torque pitch").count() == 1
@@ -337,8 +322,7 @@ def test_another_axis_brings_its_traces_and_maps(opened: Opened, page_file: Path
     assert figure(page, "velocity yaw").count() == 0
 
 
-def test_tables_sort_and_search(opened: Opened, page_file: Path) -> None:
-    page = opened(page_file)
+def test_tables_sort_and_search(page: Any) -> None:
     table = page.get_by_role("region", name="Candidate effects, base")
     table.get_by_role("button", name="With", exact=True).click()
     table.get_by_role("button", name="With", exact=True).click()
@@ -351,8 +335,7 @@ def test_tables_sort_and_search(opened: Opened, page_file: Path) -> None:
     assert all("stribeck" in row.inner_text() and "mass" in row.inner_text() for row in visible)
 
 
-def test_every_figure_is_saved_as_svg_and_csv(opened: Opened, page_file: Path) -> None:
-    page = opened(page_file)
+def test_every_figure_is_saved_as_svg_and_csv(page: Any) -> None:
     names = [
         button.get_attribute("aria-label").removesuffix(": SVG")
         for button in page.locator('button[aria-label$=": SVG"]').all()
@@ -378,8 +361,7 @@ def test_the_page_fits_the_window_in_either_scheme(
     assert len(papers) == 2
 
 
-def test_the_spectrum_shows_the_wave_of_the_residual(opened: Opened, page_file: Path) -> None:
-    page = opened(page_file)
+def test_the_spectrum_shows_the_wave_of_the_residual(page: Any) -> None:
     found = csv_of(page, "power spectrum yaw")
     peak = found.loc[found["residual, version 1"].idxmax(), "frequency (Hz)"]
     assert peak == pytest.approx(7.0 / (2.0 * np.pi), abs=0.13)
@@ -420,8 +402,7 @@ def test_correlations_come_with_the_variables_of_a_diagnosis(
     assert page.get_by_text("No diagnosis of").count() == int(not diagnosed)
 
 
-def test_a_bar_opens_the_evidence_of_an_effect(opened: Opened, page_file: Path, run: Path) -> None:
-    page = opened(page_file)
+def test_a_bar_opens_the_evidence_of_an_effect(page: Any, run: Path) -> None:
     found = read_json(run / "models/base/diagnose.json")
     share = found["axes"]["yaw"]["probabilities"]["stribeck:yaw"]
     verdict = page.locator(".verdict").filter(has_text="yaw, base")
@@ -504,10 +485,8 @@ def test_two_sessions_stand_on_one_page(opened: Opened, run: Path, tmp_path: Pat
     page = opened(write_page_of_two(*roots))
     assert page.locator("h1").inner_text() == "Sessions s07 and s08"
     assert page.locator(".callout .title").count() == 2
-    shown, stored = (
-        csv_of(page, "torque yaw"),
-        pd.read_parquet(run / "models/base/residuals.parquet"),
-    )
+    shown = csv_of(page, "torque yaw")
+    stored = pd.read_parquet(run / "models/base/residuals.parquet")
     names = [f"{root.name} {trial}" for root in roots for trial in stored["trial_id"]]
     assert shown["trial"].tolist() == names
     assert shown["t (s)"].to_numpy() == pytest.approx(np.tile(stored["t"], 2), abs=1e-6)

@@ -10,8 +10,8 @@ import mistakes
 import numpy as np
 import pandas as pd
 import pytest
-from binary_logs import to_parquet
 from independent.sensors import Conditions
+from independent_runs import run_short
 from mistakes import MISTAKES, Case, run_case, set_text
 
 import bampipe
@@ -78,10 +78,7 @@ def inspected(root: Path, *changes: Callable[[Path], None], machine: str = "join
 
 def inspect_session(root: Path) -> SetupResult:
     """What `filter` says of the set-up of the session in a folder."""
-    to_parquet(root / "session")
-    (root / "short.toml").write_text(mistakes.PIPELINE)
-    pipeline = str(root / "short.toml")
-    run = bampipe.run_session(root / "session", runs=root / "runs", pipeline=pipeline)
+    run = run_short(root / "session", root, mistakes.PIPELINE)
     return SetupResult.read(run.root / "filter/setup.json")
 
 
@@ -106,10 +103,8 @@ def test_an_axis_that_hardly_moves_is_said(tmp_path: Path) -> None:
 
     found = inspected(tmp_path, stop)
     assert found.axes["joint"].state == "hardly_moves"
-    assert any(
-        line.startswith("joint hardly moves: it stands still in")
-        for line in list_setup_faults(found)
-    )
+    lines = list_setup_faults(found)
+    assert any(line.startswith("joint hardly moves: it stands still in") for line in lines)
 
 
 def test_an_axis_that_moves_beyond_reason_is_said(tmp_path: Path) -> None:
@@ -122,11 +117,8 @@ def test_an_axis_that_moves_beyond_reason_is_said(tmp_path: Path) -> None:
 
 
 def test_a_device_without_a_scale_is_refused(tmp_path: Path) -> None:
-    free = set_text(
-        r"\[parameters\]",
-        '[parameters]\ngain = { unit = "1", prior = 1.0, sd = 1.0 }',
-        "joint.toml",
-    )
+    gain = '[parameters]\ngain = { unit = "1", prior = 1.0, sd = 1.0 }'
+    free = set_text(r"\[parameters\]", gain, "joint.toml")
     used = set_text(r"torque_per_ampere\*current", "gain*torque_per_ampere*current", "joint.toml")
     with pytest.raises(bampipe.InputError, match="the scale of its equation is undetermined"):
         inspected(tmp_path, free, used)
@@ -137,12 +129,9 @@ def reversed_joint(tmp_path_factory: pytest.TempPathFactory) -> bampipe.Run:
     root = tmp_path_factory.mktemp("reversed")
     independent.record("joint", root / "session", 31, {}, mistakes.SHORT["joint"])
     MISTAKES["joint"]["encoder reversed"].spoil(root / "session")
-    to_parquet(root / "session")
     stages = '["ingest", "filter", "identify", "validate", "report"]'
-    (root / "short.toml").write_text(mistakes.PIPELINE.replace('["ingest", "filter"]', stages))
-    return bampipe.run_session(
-        root / "session", runs=root / "runs", pipeline=str(root / "short.toml")
-    )
+    pipeline = mistakes.PIPELINE.replace('["ingest", "filter"]', stages)
+    return run_short(root / "session", root, pipeline)
 
 
 def test_the_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(
@@ -159,9 +148,8 @@ def test_the_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(
         bampipe.diagnose(reversed_joint, replicates=4, jobs=1)
     page = Path(reversed_joint.root / "report/report.html").read_text(encoding="utf-8")
     first = page.partition('class="verdict">')[2]
-    assert first.startswith(
-        ("Set-up: the encoder of joint counts", "Set-up: current has the wrong")
-    )
+    said = "Set-up: the encoder of joint counts", "Set-up: current has the wrong"
+    assert first.startswith(said)
     assert "leaves something unexplained" not in page
 
 
@@ -170,23 +158,17 @@ def test_the_evidence_is_measured_and_no_effect_is_looked_for_under_a_mistake(
     [
         ("joint", "q", (1, -1, 1, 1), "t02: joint"),
         pytest.param(
-            "axis",
-            "u",
-            (1, -1, -1, 1),
-            "t02 and t03: carriage or force_motor",
+            "axis", "u", (1, -1, -1, 1), "t02 and t03: carriage or force_motor",
             marks=pytest.mark.long,
         ),
         # Each of another damper.
         ("damper", "f", (1, -2, -3, 4), "t02 and t03: piston or force_load_cell"),
         pytest.param(
-            "bam",
-            "enc_pitch",
-            (1, -1, 1, -1, 1),
-            "t02_free and t04_free: pitch has",
+            "bam", "enc_pitch", (1, -1, 1, -1, 1), "t02_free and t04_free: pitch has",
             marks=pytest.mark.long,
         ),
     ],
-)
+)  # fmt: skip
 def test_trials_with_a_sign_of_their_own_are_named_and_taken_in(
     machine: str, column: str, factors: Sequence[float], named: str, tmp_path: Path
 ) -> None:

@@ -88,6 +88,12 @@ def motions(
     return found
 
 
+def counted(motion: Motion, factors: np.ndarray, zeros: np.ndarray | float = 0.0) -> Motion:
+    """The motion as encoders read it that count otherwise than drawn, (4,) each."""
+    q = motion.q * factors + zeros
+    return replace(motion, q=q, qd=motion.qd * factors, qdd=motion.qdd * factors)
+
+
 FORCES = tuple(f"torque_{name}" for name in JOINTS)
 
 
@@ -113,10 +119,7 @@ def test_much_friction_is_no_mistake_of_units(viscous: float) -> None:
 def test_torques_of_another_unit_are_told_from_reductions_known_badly() -> None:
     """Bodies come out wrong in shape, more in what few motions show than their spread says."""
     gears = np.array([1.1, 1.0, 1.0, 0.9])
-    given = [
-        replace(m, q=m.q * gears, qd=m.qd * gears, qdd=m.qdd * gears) for m in motions(1.0, 9.0)
-    ]
-    assert find_mistakes(given) == ()
+    assert find_mistakes([counted(m, gears) for m in motions(1.0, 9.0)]) == ()
     (found,) = find_mistakes(motions(4.0, 2.0))
     assert found.correction.kind == "scale" and len(found.correction.signals) == 4
     assert found.correction.factor == pytest.approx(0.25)
@@ -138,9 +141,8 @@ def test_a_drive_that_one_trial_has_turned_is_named_with_it() -> None:
     given = [*motions(1.0, 2.0), *motions(1.0, 2.0)]
     names = [f"t{k}" for k in range(4)]
     signs = np.array([1.0, -1.0, 1.0, 1.0])
-    given[2] = replace(
-        given[2], channels={n: s * given[2].channels[n] for n, s in zip(FORCES, signs, strict=True)}
-    )
+    channels = {n: s * given[2].channels[n] for n, s in zip(FORCES, signs, strict=True)}
+    given[2] = replace(given[2], channels=channels)
     search, folds = search_in(given[:2]), Folds.of_trials(names, [], names)
     found = find_turned_trials(search.system, given, search.band, folds, search.signals)
     assert [(one.place, one.corrections[0].signals) for one in found] == [(2, (FORCES[1],))]
@@ -149,15 +151,10 @@ def test_a_drive_that_one_trial_has_turned_is_named_with_it() -> None:
 
 def turned(factor: float, zero: float, joint: int, drive: float) -> list[Motion]:
     """Motions of which a joint, or its drive, is counted otherwise than drawn."""
-    found = []
+    found, at, name = [], np.eye(len(JOINTS))[joint], FORCES[joint]
     for motion in motions(1.0, 2.0):
-        q, qd, qdd = motion.q.copy(), motion.qd.copy(), motion.qdd.copy()
-        q[:, joint] = factor * q[:, joint] + zero
-        qd[:, joint] *= factor
-        qdd[:, joint] *= factor
-        name = FORCES[joint]
         channels = {**motion.channels, name: drive * motion.channels[name]}
-        found.append(replace(motion, q=q, qd=qd, qdd=qdd, channels=channels))
+        found.append(replace(counted(motion, factor**at, zero * at), channels=channels))
     return found
 
 
@@ -180,11 +177,8 @@ def test_what_free_bodies_take_on_is_found_with_bodies_as_drawn(
 
 def test_two_joints_of_a_makers_zero_posture_are_found_together() -> None:
     """Setting one of them right alone leaves the other joints worse than before."""
-    given = []
-    for motion in motions(1.0, 2.0):
-        q = motion.q + 0.5 * np.pi * np.array([0.0, 1.0, -1.0, 0.0])
-        given.append(replace(motion, q=q))
-    found = find_mistakes(given)
+    zeros = 0.5 * np.pi * np.array([0.0, 1.0, -1.0, 0.0])
+    found = find_mistakes([counted(m, np.ones(4), zeros) for m in motions(1.0, 2.0)])
     zeros = {f.correction.signals[0]: f.correction.offset for f in found}
     assert zeros == {"two": -0.5 * np.pi, "three": 0.5 * np.pi}
     assert all(f.after.unexplained is None and f.after.worst_error < 0.15 for f in found)
@@ -196,15 +190,9 @@ def test_two_joints_of_a_makers_zero_posture_are_found_together() -> None:
 def test_a_base_that_does_not_stand_is_found_with_the_joint_that_is_reversed(
     gravity: tuple[float, float, float],
 ) -> None:
-    given = [
-        replace(m, q=m.q * REVERSED, qd=m.qd * REVERSED, qdd=m.qdd * REVERSED)
-        for m in motions(1.0, 2.0, gravity)
-    ]
-    found = find_mistakes(given)
-    assert {f.correction.kind: f.correction.signals for f in found} == {
-        "gravity": (),
-        "sign": ("two",),
-    }
+    found = find_mistakes([counted(m, REVERSED) for m in motions(1.0, 2.0, gravity)])
+    named = {f.correction.kind: f.correction.signals for f in found}
+    assert named == {"gravity": (), "sign": ("two",)}
     (mounted,) = (f.correction.change.gravity for f in found if f.correction.kind == "gravity")
     assert mounted == pytest.approx(gravity, abs=1e-3)
     assert all(f.after.worst_error < 0.15 for f in found[-1:])

@@ -20,6 +20,10 @@ from bampipe.trials.sensors import Sensors
 
 RATE = 500.0
 RESOLUTION = {"yaw": 4.6875e-5, "pitch": 9.8125e-5, "extension": 3.0e-5}
+AXES = {
+    axis: {"unit": "m" if axis == "extension" else "rad", "resolution": step}
+    for axis, step in RESOLUTION.items()
+}
 TRUTH = {
     "viscous.yaw": 4.2, "coulomb.yaw": 1.05, "viscous.pitch": 3.6, "coulomb.pitch": 2.2,
     "viscous.extension": 13.0, "coulomb.extension": 3.5, "mass": 3.5,
@@ -63,11 +67,7 @@ def simulated_run(
         for axis in RESOLUTION:
             frame[f"brake_{axis}"] = recording.channels[f"brake_{axis}"]
         frames[wanted.trial_id] = frame
-    axes = {
-        axis: {"unit": "m" if axis == "extension" else "rad", "resolution": step}
-        for axis, step in RESOLUTION.items()
-    }
-    return _filtered(write_ingested(root, frames, {name: ("free", None) for name in frames}, axes))
+    return _filtered(write_ingested(root, frames, dict.fromkeys(frames, ("free", None)), AXES))
 
 
 def shared_run(root: Path, name: str) -> RunFolder:

@@ -177,11 +177,11 @@ def wrap(t):
 REFUSED: dict[str, tuple[Damage, str]] = {
     "no session file": (
         lambda made: lambda root: (root / "session.toml").unlink(),
-        "no session.toml here",
+        "no session.toml",
     ),
     "session file is not TOML": (
-        file("schema = 1\nfoo = = 2\n", "session.toml"),
-        r"session.toml, line 2: not TOML",
+        file("a = 1\nb = = 2\n", "session.toml"),
+        "toml, line 2: not TOML",
     ),
     "unknown key": (put("sample_rate", 1), 'unknown key "sample_rate", did you mean'),
     "session_id is a path": (put("session_id", "../x"), "session_id must be a name of letters"),
@@ -209,10 +209,7 @@ REFUSED: dict[str, tuple[Damage, str]] = {
     "axis in the wrong unit": (put("encoders.yaw.unit", "mm"), "brakes.unit: found"),
     "unknown unit": (put("encoders.yaw.unit", "radain"), "did you mean 'rad'"),
     "zero counts_per_unit": (put("encoders.yaw.counts_per_unit", 0), "counts_per_unit: found 0"),
-    "one column for two channels": (
-        put("encoders.yaw.column", "enc_pitch"),
-        "column 'enc_pitch' is used for 2 channels",
-    ),
+    "one column for two channels": (put("encoders.yaw.column", "enc_pitch"), "used for 2 channels"),
     "calibration missing": (drop("force.calibration_n_per_v"), "'calibration_n_per_v' is missing"),
     "force without its columns": (drop("force.columns"), "'columns' is missing"),
     "an input of the device missing": (drop("force"), "no channel for input 'force_x'"),
@@ -234,18 +231,12 @@ REFUSED: dict[str, tuple[Damage, str]] = {
     "locked without an axis": (put("trials.0.kind", "locked"), "'locked_axis' is missing"),
     "locked on an unknown axis": (put("trials.2.locked_axis", "yow"), "did you mean 'yaw'"),
     "locked axis on a free trial": (put("trials.0.locked_axis", "yaw"), 'given for a "free"'),
-    "viscous without its damping": (
-        put("trials.0.kind", "viscous"),
-        "'viscous_n_s_per_m' is missing",
-    ),
+    "viscous without damping": (put("trials.0.kind", "viscous"), "'viscous_n_s_per_m' is missing"),
     "trial path leaves the session": (put("trials.0.file", "../x.csv"), "leaves the session"),
     "trial path absolute": (put("trials.0.file", "/etc/passwd"), "absolute path"),
     "trial path of Windows": (put("trials.0.file", "C:\\data\\x.csv"), "absolute path"),
     "trial path with a NUL": (put("trials.0.file", "a\0b.csv"), "not portable"),
-    "unit of time unknown": (
-        put("time", {"column": "time_us", "unit": "minutes"}),
-        'time.unit: found "minutes"',
-    ),
+    "unit of time": (put("time", {"column": "time_us", "unit": "eon"}), 'time.unit: found "eon"'),
     "trial folder linked out of the session": (
         lambda made: link_folder_out,
         "none of the 3 trials .* outside the session folder",
@@ -271,10 +262,7 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         cell(700, "force_x_v", '"0,5"'),
         "row 700, column 'force_x_v': found '0,5', expected a number; .*decimal sign",
     ),
-    "column missing": (
-        renamed(",".join(COLUMNS).replace("enc_yaw", "other")),
-        "no column 'enc_yaw'",
-    ),
+    "column missing": (renamed(",".join(COLUMNS).replace("enc_yaw", "x")), "no column 'enc_yaw'"),
     "column twice": (
         renamed(",".join(COLUMNS).replace("enc_pitch", "enc_yaw")),
         r"row 1: no column 'enc_yaw', did you mean 'enc_yaw \(2\)'\?",
@@ -331,10 +319,7 @@ ASIDE: dict[str, tuple[Damage, str]] = {
         table(lambda t: t["enc_yaw"].__setitem__(slice(500, None), t["enc_yaw"][500:] - 20_000)),
         "column 'enc_yaw': jumps by 0.9.* rad .*counter was reset",
     ),
-    "fractional counts": (
-        cell(9, "enc_yaw", "100.5"),
-        "row 9, column 'enc_yaw': found 100.5, expected whole",
-    ),
+    "fractional counts": (cell(9, "enc_yaw", "100.5"), "'enc_yaw': found 100.5, expected whole"),
     "a column of NaN": (samples("enc_pitch", slice(None), np.nan), "holds no number at all"),
     "force frozen": (samples("force_z_v", slice(200, 800), 0.25), "reads 0.25 without a change"),
     "force out of this world": (samples("force_z_v", 300, 1e9), "which no such machine does"),
@@ -345,7 +330,7 @@ ASIDE: dict[str, tuple[Damage, str]] = {
     ),
     "free trial with brakes": (
         samples("brake_pitch", slice(None), 50.0),
-        "declared free, but the brake is commanded up to 50 N.m",
+        "declared free, but .* commanded up to 50 N.m",
     ),
     "viscous trial without brakes": (
         both(put("trials.0.kind", "viscous"), put("trials.0.viscous_n_s_per_m", 40)),
@@ -401,10 +386,7 @@ REPAIRED: dict[str, tuple[Damage, str]] = {
         samples("time_us", [100, 200], [198_000, 398_000]),
         "2 rows with a repeated time stamp dropped",
     ),
-    "a stamp that leaps ahead": (
-        samples("time_us", 100, 1e9),
-        "1 row with a time stamp out of order dropped",
-    ),
+    "a stamp that leaps ahead": (samples("time_us", 100, 1e9), "1 row .* out of order dropped"),
     "a stamp missing": (cell(60, "time_us", ""), "1 row without a time stamp dropped"),
     "a gap near the end": (
         table(lambda t: t["time_us"].__setitem__(slice(800, None), t["time_us"][800:] + 1e6)),

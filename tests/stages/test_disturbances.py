@@ -9,11 +9,9 @@ import independent
 import numpy as np
 import pandas as pd
 import pytest
-from binary_logs import to_parquet
 from disturbances import DRIVES, SPOILT
-from independent_runs import PIPELINE, SHORT
+from independent_runs import SHORT, run_short
 
-import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.results.filter import Disturbance, FilterResult
 from bampipe.results.identify import IdentifyResult
@@ -35,10 +33,7 @@ def identified(root: Path, name: str, spoil: Spoil | None = None, machine: str =
         spoil(force, 1.0 / float(np.median(np.diff(table["t"]))))
         table[DRIVES[machine]] = force
         table.to_csv(path, index=False)
-    to_parquet(folder)
-    (root / "short.toml").write_text(PIPELINE)
-    run = bampipe.run_session(folder, runs=root / "runs", pipeline=str(root / "short.toml"))
-    return RunFolder(run.root)
+    return RunFolder(run_short(folder, root).root)
 
 
 def stretches(run: RunFolder) -> tuple[Disturbance, ...]:
@@ -87,7 +82,6 @@ def test_what_disturbs_is_left_out(root: Path, sound: RunFolder, how: str) -> No
 
 def test_an_error_that_comes_back_is_none(tmp_path: Path) -> None:
     """A stop that the piston runs into again and again is an effect, not an event."""
-    independent.record(
-        "damper", tmp_path / "damper", 3, {"upper_stop:piston": 1.0}, SHORT["damper"]
-    )
+    stop = {"upper_stop:piston": 1.0}
+    independent.record("damper", tmp_path / "damper", 3, stop, SHORT["damper"])
     assert stretches(identified(tmp_path, "stop", machine="damper")) == ()

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
-from made_session import COUNTS, SESSION, Made, free_trial, toml_text
+from made_session import COUNTS, SESSION, Made, free_trial, parquet, toml_text
 from run_folders import SESSIONS
 
 from bampipe.data.run_folder import RunFolder
@@ -152,10 +152,7 @@ def sled(unit: str = "N", motor: Callable[[np.ndarray], np.ndarray] = lambda for
         },
         "trials": [{"file": "one.parquet", "kind": "free"}],
     }
-    stream = pa.BufferOutputStream()
-    pq.write_table(pa.table(table), stream)
-    content = stream.getvalue().to_pybytes()
-    return Made(session, {}, {"one.parquet": content, "my/sled.toml": SLED})
+    return Made(session, {}, {"one.parquet": parquet(table), "my/sled.toml": SLED})
 
 
 def test_a_device_of_another_kind(tmp_path):
@@ -182,19 +179,19 @@ def test_a_number_that_was_to_be_filled_in_is_named(tmp_path):
     summary = run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
     content = read_json(tmp_path / "out/ingest/session.json")
     assert content["placeholders"] == ["device.constants.ratio"]
-    assert summary["notes"] == [
-        "device.constants.ratio: still a placeholder, with `fill in` as its source"
-    ]
+    (note,) = summary["notes"]
+    assert note.startswith("device.constants.ratio: still a placeholder")
 
 
 @pytest.mark.parametrize(
     ("unit", "offset", "size", "counts"),
     [("N", 2050.0, 240.0, True), ("N", 2600.0, 240.0, True), ("N", 2048.0, 1900.0, True),
      ("N", 300.0, 240.0, False), ("N", 0.0, 240.0, False), ("mN", 2050.0, 240.0, False),
-     ("N", 2050.0, 6.0, False)],
+     ("N", 2050.0, 6.0, False), ("N", 2050.5, 240.0, False)],
 )  # fmt: skip
 def test_a_force_in_counts_of_a_converter_is_said(tmp_path, unit, offset, size, counts):
-    made = sled(unit, lambda force: np.rint(offset + size * force))
+    """Large, broken numbers are none."""
+    made = sled(unit, lambda force: np.rint(size * force) + offset)
     summary = run_ingest(made.write(tmp_path / "session"), tmp_path / "out")
     said = [note for note in summary["notes"] if "counts of a converter" in note]
     content = read_json(tmp_path / "out/ingest/session.json")
@@ -205,11 +202,6 @@ def test_a_force_in_counts_of_a_converter_is_said(tmp_path, unit, offset, size, 
         low, high = offset - size, offset + size
         assert f"force_motor: whole numbers from {low:.0f} to {high:.0f} look" in said[0]
         assert '[force] unit = "V", calibration_n_per_v with the force of one count' in said[0]
-
-
-def test_a_force_of_large_but_broken_numbers_is_none_in_counts(tmp_path):
-    made = sled("N", lambda force: 2050.0 + 240.0 * force)
-    assert run_ingest(made.write(tmp_path / "session"), tmp_path / "out")["notes"] == []
 
 
 def test_a_force_in_another_unit_than_the_device_takes(tmp_path):
@@ -226,9 +218,7 @@ def test_what_a_motor_is_told_may_rest_or_stand_at_its_limit_a_sensor_may_not(tm
     table = pq.read_table(pa.BufferReader(made.files["one.parquet"])).to_pandas()
     table["motor"] = np.clip(2.0 * table["motor"], -1.0, 1.0)
     table["pulse"] = np.where(table.index < 700, 0.0, 40.0)
-    stream = pa.BufferOutputStream()
-    pq.write_table(pa.Table.from_pandas(table, preserve_index=False), stream)
-    made.files["one.parquet"] = stream.getvalue().to_pybytes()
+    made.files["one.parquet"] = parquet(table)
     if driven:
         made.files["my/sled.toml"] = SLED.replace("force_unit", "drive = true\nforce_unit")
     session = made.write(tmp_path / "session")

@@ -7,22 +7,26 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from conftest import Command
 from identified_run import MODEL, RESOLUTION, TRUTH, simulated_run
 from made_results import write_result
 
+from bampipe.cli.monitor import _Output, follow
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
+from bampipe.data.stream import SampleStream
 from bampipe.errors import InputError
 from bampipe.estimate.unscented import Trial, filter_trials
 from bampipe.files import read_json, write_text
 from bampipe.monitor.monitor import Monitor
-from bampipe.monitor.start import MonitorOptions, start_from_run
+from bampipe.monitor.start import MonitorOptions, list_layouts, open_stream, start_from_run
 from bampipe.physics import Model, compile_model, registry
 from bampipe.results.identify import IdentifyResult
 from bampipe.results.ingest import IngestResult
@@ -60,16 +64,24 @@ def begun(run: RunFolder):
     return start_from_run(run, "base", MonitorOptions())
 
 
-def samples(run: RunFolder, trial: str):
-    frame = read_parquet(run.path("ingest/samples.parquet"), trial=trial).drop(columns="trial_id")
-    return frame
+def samples(run: RunFolder, trial: str) -> pd.DataFrame:
+    return read_parquet(run.path("ingest/samples.parquet"), trial=trial).drop(columns="trial_id")
+
+
+def monitor_of(begun: tuple, tell: Callable[[str], object] = pytest.fail) -> Monitor:
+    """A monitor with the usual options; where none is given, it must have nothing to tell."""
+    return Monitor(*begun, MonitorOptions(), tell)
+
+
+def push(monitor: Monitor, frame: pd.DataFrame) -> None:
+    monitor.push(tuple(frame.columns), frame.to_numpy(dtype=float))
 
 
 def test_same_estimates_as_the_batch_filter(run: RunFolder, begun: tuple) -> None:
     system, start = begun
     frame = samples(run, "t01")
     names, values = tuple(frame.columns), frame.to_numpy(dtype=float)
-    monitor = Monitor(system, start, MonitorOptions(), pytest.fail)
+    monitor = monitor_of(begun)
     for first in range(0, len(values), 77):
         monitor.push(names, values[first : first + 77])
     n = len(system.coordinates)
@@ -100,10 +112,8 @@ def test_a_run_of_thinned_logs_is_refused(run: RunFolder, tmp_path: Path) -> Non
 
 
 def test_no_alarm_while_nothing_changes(run: RunFolder, begun: tuple) -> None:
-    system, start = begun
-    monitor = Monitor(system, start, MonitorOptions(), pytest.fail)
-    frame = samples(run, "t00")
-    monitor.push(tuple(frame.columns), frame.to_numpy(dtype=float))
+    monitor = monitor_of(begun)
+    push(monitor, samples(run, "t00"))
     report = monitor.report()
     assert report["nis"]["windows"] >= 10
     assert report["alarms"] == 0
@@ -118,10 +128,9 @@ def test_begins_where_the_mechanism_is_and_not_its_encoder(tmp_path: Path) -> No
     found = simulated_run(tmp_path, trials=1, effect="encoder_scale:yaw", hidden=hidden)
     wrong = MODEL.replace("[]", '["encoder_scale:yaw"]')
     write_text(found.path("models/base/model.toml"), wrong)
-    system, start = start_from_run(known(found, TRUTH | hidden), "base", MonitorOptions())
+    monitor = monitor_of(start_from_run(known(found, TRUTH | hidden), "base", MonitorOptions()))
     values = samples(found, "t00")
-    monitor = Monitor(system, start, MonitorOptions(), pytest.fail)
-    monitor.push(tuple(values.columns), values.to_numpy(dtype=float)[:5])
+    push(monitor, values.head(5))
     read = float(values["q_yaw"].iloc[4])
     state = monitor.report()["state"]["yaw"]
     assert abs(0.05 * read) > 10.0 * RESOLUTION["yaw"]
@@ -129,28 +138,23 @@ def test_begins_where_the_mechanism_is_and_not_its_encoder(tmp_path: Path) -> No
 
 
 def test_alarm_when_a_sensor_changes(run: RunFolder, begun: tuple) -> None:
-    system, start = begun
-    monitor = Monitor(system, start, MonitorOptions(), lambda _: None)
+    monitor = monitor_of(begun, lambda _: None)
     frame = samples(run, "t00")
-    frame.loc[frame["t"] > 6.0, "force_x"] *= 1.2
-    values = frame.to_numpy(dtype=float)
-    first_rows = int(np.searchsorted(values[:, 0], 6.0))
-    monitor.push(tuple(frame.columns), values[:first_rows])
+    changed = frame["t"] > 6.0
+    frame.loc[changed, "force_x"] *= 1.2
+    push(monitor, frame[~changed])
     assert monitor.alarms == 0
-    monitor.push(tuple(frame.columns), values[first_rows:])
+    push(monitor, frame[changed])
     assert monitor.alarms > 0
 
 
 def test_a_gap_starts_the_motion_and_not_the_parameters(run: RunFolder, begun: tuple) -> None:
-    system, start = begun
     said: list[str] = []
-    monitor = Monitor(system, start, MonitorOptions(), said.append)
+    monitor = monitor_of(begun, said.append)
     frame = samples(run, "t00")
-    values = frame.to_numpy(dtype=float)
-    kept = (values[:, 0] < 4.0) | (values[:, 0] > 6.0)
-    monitor.push(tuple(frame.columns), values[values[:, 0] < 4.0])
+    push(monitor, frame[frame["t"] < 4.0])
     before = monitor.report()["parameters"]["mass"]
-    monitor.push(tuple(frame.columns), values[kept & (values[:, 0] > 5.0)])
+    push(monitor, frame[frame["t"] > 6.0])
     after = monitor.report()["parameters"]["mass"]
     assert monitor.restarts == 1
     assert "gap" in said[0]
@@ -160,13 +164,11 @@ def test_a_gap_starts_the_motion_and_not_the_parameters(run: RunFolder, begun: t
 
 def test_a_lost_motion_starts_anew(run: RunFolder, begun: tuple) -> None:
     """A force of 1e200 N: the filter fails, the monitor goes on."""
-    system, start = begun
     said: list[str] = []
-    monitor = Monitor(system, start, MonitorOptions(), said.append)
+    monitor = monitor_of(begun, said.append)
     frame = samples(run, "t00")
-    values = frame.to_numpy(dtype=float, copy=True)
-    values[1000, frame.columns.get_loc("force_x")] = 1e200
-    monitor.push(tuple(frame.columns), values)
+    frame.loc[1000, "force_x"] = 1e200
+    push(monitor, frame)
     assert monitor.restarts >= 1
     assert "grew without bound" in said[0]
     state = monitor.report()["state"]
@@ -175,14 +177,10 @@ def test_a_lost_motion_starts_anew(run: RunFolder, begun: tuple) -> None:
 
 def test_memory_and_speed_hold(run: RunFolder, begun: tuple) -> None:
     """5 kHz sustained, parsing included, on one core; nothing grows."""
-    from bampipe.data.stream import SampleStream
-    from bampipe.monitor.start import list_layouts
-
-    system, start = begun
     frame = samples(run, "t00")
     source, sink = os.pipe()
-    stream = SampleStream(source, "pipe", list_layouts(system, None), True, pytest.fail)
-    monitor = Monitor(system, start, MonitorOptions(), pytest.fail)
+    stream = SampleStream(source, "pipe", list_layouts(begun[0], None), True, pytest.fail)
+    monitor = monitor_of(begun)
     text = frame.to_csv(index=False).encode()
     step, taken, begin = 1 << 14, 0, time.process_time()
     for first in range(0, len(text), step):
@@ -234,11 +232,7 @@ def test_follows_a_growing_file_until_told_to_stop(run: RunFolder, tmp_path: Pat
     ],
 )
 def test_mistakes_are_one_line(
-    tmp_path: Path,
-    command: Command,
-    text: str,
-    options: list[str],
-    said: str,
+    tmp_path: Path, command: Command, text: str, options: list[str], said: str
 ) -> None:
     log = tmp_path / "log.csv"
     log.write_text(text)
@@ -247,8 +241,6 @@ def test_mistakes_are_one_line(
 
 
 def test_a_model_with_a_force_rate_is_refused() -> None:
-    from bampipe.monitor.start import list_layouts
-
     system = compile_model(Model(registry.device("bam"), ("force_delay",)))
     with pytest.raises(InputError, match="not known in real time"):
         list_layouts(system, None)
@@ -299,14 +291,10 @@ def test_a_slow_sensor_is_no_useless_one(run: RunFolder, begun: tuple, tmp_path:
 
 def followed(begun: tuple, text: str, folder: Path) -> dict:
     """What the monitor says in the end of a file that holds ``text``."""
-    from bampipe.cli.monitor import _Output, follow
-    from bampipe.monitor.start import open_stream
-
-    system, start = begun
     path = folder / "log.csv"
     path.write_text(text)
-    watch = Monitor(system, start, MonitorOptions(), lambda _: None)
-    stream = open_stream(str(path), system, None, False, lambda _: None)
+    watch = monitor_of(begun, lambda _: None)
+    stream = open_stream(str(path), begun[0], None, False, lambda _: None)
     try:
         follow(stream, watch, _Output(None, 1.0), wait=False)
     finally:

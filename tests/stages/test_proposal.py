@@ -39,8 +39,8 @@ from bampipe.stages import ingest
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def samples(folder: Path, out: Path, trial: str):
-    """What ingest makes of a trial of the session in ``folder``."""
+def samples(folder: Path, out: Path, trial: str | None):
+    """What ingest makes of a trial of the session in ``folder``, or of all."""
     ingest.execute(RunFolder(out), out, ingest.Config(session=str(folder)), silent)
     trials = read_parquet(out / "ingest/trials.parquet")
     assert (trials["status"] != "set_aside").all(), trials["reason"].tolist()
@@ -52,6 +52,13 @@ def proposed(folder: Path, device: str = "") -> tuple[dict, object]:
     proposal = propose(folder, device)
     write_proposal(folder, proposal)
     return tomllib.loads((folder / "session.toml").read_text()), proposal
+
+
+def proposed_for(log: dict[str, np.ndarray], folder: Path) -> tuple[dict, object]:
+    """The same for a folder with one log."""
+    folder.mkdir(exist_ok=True)
+    write_table(folder / "a.parquet", log)
+    return proposed(folder)
 
 
 def test_a_joint_with_motor_current(tmp_path):
@@ -98,8 +105,7 @@ def test_a_fine_encoder_allows_a_narrow_sign(tmp_path, step: float, width: float
     angle = np.round(0.8 * np.sin(1.3 * t) / step) * step
     pushed = 2.0 * np.sign(np.cos(1.3 * t)) + np.cos(1.3 * t)
     table = {"time_s": t, "joint_angle_rad": angle, "torque_nm": pushed}
-    write_table(tmp_path / "run.parquet", table, "%.9g")
-    proposed(tmp_path)
+    proposed_for(table, tmp_path)
     device = tomllib.loads((tmp_path / "device.toml").read_text())
     (axis,) = device["coordinates"].values()
     assert axis.get("sign_width") == width
@@ -117,16 +123,15 @@ def test_a_fine_encoder_allows_a_narrow_sign(tmp_path, step: float, width: float
 def test_where_only_the_command_was_logged_it_is_the_input(tmp_path, column: str, role: str):
     log = joint_log(1)
     names = {"stamp": "time [s]", "joint_angle": "angle [deg]", "motor_current": column}
-    write_table(tmp_path / "a.csv", {called: log[name] for name, called in names.items()}, "%.6f")
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(
+        {called: log[name] for name, called in names.items()}, tmp_path
+    )
     assert proposal.fill_in == [] and f"driven by a {role}" in proposal.device
     assert "drive = true" in proposal.device
     inputs = session.get("channels") or {"force": {"column": session["force"]["columns"][0]}}
     assert [given["column"] for given in inputs.values()] == [column]
     log["target_current"] = np.roll(log["motor_current"], -1)  # what was measured comes first
-    (tmp_path / "b").mkdir()
-    write_table(tmp_path / "b/a.csv", log, "%.6f")
-    session, _ = proposed(tmp_path / "b")
+    session, _ = proposed_for(log, tmp_path / "b")
     assert session["channels"]["motor_current"]["column"] == "motor_current"
 
 
@@ -151,8 +156,7 @@ def test_what_is_asked_of_a_coil_beside_a_measured_force_is_its_current(tmp_path
     """Of a small brake, whose mass is below what is the least of a damper's."""
     table = damper_log(1)
     table["i_cmd"], table["Force"] = table.pop("Current"), 1e-3 * table["Force"]
-    write_table(tmp_path / "a.parquet", table)
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(table, tmp_path)
     assert session["force"]["columns"] == ["Force"]
     assert session["channels"]["coil_current"]["column"] == "i_cmd"
     assert any(line.startswith("i_cmd is taken for the current") for line in proposal.check)
@@ -219,8 +223,7 @@ def test_duty_cycle_and_supply_make_a_motor(tmp_path):
     t, q, torque = arm_log().values()
     table = {"t": t - t[0], "present_angle_deg": np.rad2deg(q), "pwm_percent": 8 * torque}
     table["vbat"] = 12 + 0.01 * (np.arange(len(t)) % 3)
-    write_table(tmp_path / "a.parquet", table, "%.4f")
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(table, tmp_path)
     assert session["encoders"]["joint"] == {"column": "present_angle_deg", "unit": "deg"}
     duty, supply = session["channels"]["duty"], session["channels"]["supply"]
     assert duty == {"column": "pwm_percent", "unit": "percent"}
@@ -235,17 +238,13 @@ def test_duty_cycle_and_supply_make_a_motor(tmp_path):
 def test_a_damper_whose_velocity_alone_was_kept_and_a_log_too_short_to_look_into(tmp_path):
     log = damper_log(1)
     table = {"V": log["Velocity"] / 10, "F": log["Force"], "Ts": np.full_like(log["Force"], 1e-3)}
-    write_table(tmp_path / "a.parquet", table)
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(table, tmp_path)
     assert session["time"] == {"unit": "samples"} and session["sample_rate_hz"] == 1000
     (axis,) = session["encoders"].values()
     assert axis["column"] == "V" and any("integral of V" in line for line in proposal.check)
     assert session["force"]["columns"] == ["F"]
-    (tmp_path / "b").mkdir()
-    write_table(
-        tmp_path / "b/a.parquet", {n: v[:6] for n, v in labelled("t,angle_deg,w,u_nm").items()}
-    )
-    assert "[encoders]" in propose(tmp_path / "b").session
+    short = {n: v[:6] for n, v in labelled("t,angle_deg,w,u_nm").items()}
+    assert "encoders" in proposed_for(short, tmp_path / "b")[0]
 
 
 def test_the_measured_axis_is_understood_from_its_motion(tmp_path):
@@ -303,7 +302,7 @@ def test_a_clock_of_no_likely_unit_is_left_open_and_costs_no_time(tmp_path):
     t = np.arange(1000) * 1e-9
     wave = np.arange(1000) / 50
     table = {"time": t, "angle_deg": np.sin(wave), "torque_nm": np.cos(wave)}
-    write_table(tmp_path / "a.parquet", table, "%.12g")
+    write_table(tmp_path / "a.parquet", table)
     proposal = propose(tmp_path)
     assert 'unit = "?"' in proposal.session and "from the time stamps" not in proposal.session
     assert any("unit of time" in line for line in proposal.fill_in)
@@ -339,24 +338,19 @@ def stage_log() -> dict[str, np.ndarray]:
     force = 8.0 * np.gradient(v, t) + 40.0 * v + 6.0 * np.tanh(v / 1e-3)
     force += np.random.default_rng(3).normal(0.0, 3.0, t.size)
     # The other joint goes with the velocity of the first better than any noisy force does.
-    return {"ms": 1e3 * t, "pos_mm": 1e3 * x, "load_cell_N": force, "Joint 2 (rad)": 3.0 * v}
-
-
-def write_stage_log(folder: Path, *columns: str) -> None:
-    folder.mkdir(parents=True)
-    write_table(folder / "a.parquet", {name: stage_log()[name] for name in columns}, "%.6f")
+    return {"ms": 1e3 * t, "pos_mm": 1e3 * x, "Joint 2 (rad)": 3.0 * v, "load_cell_N": force}
 
 
 def test_a_rate_that_nobody_knows_is_refused_until_it_is_given(tmp_path):
-    write_stage_log(tmp_path / "a", "pos_mm", "load_cell_N")
-    _, proposal = proposed(tmp_path / "a")
+    log = stage_log()
+    pair = {name: log[name] for name in ("pos_mm", "load_cell_N")}
+    _, proposal = proposed_for(pair, tmp_path / "a")
     (ask,) = proposal.fill_in
     assert ask.startswith("sample_rate_hz, rows a second. To find it: ")
     with pytest.raises(InputError, match=r'sample_rate_hz: found "\?"'):
         read_session(tmp_path / "a")
     # The position of another joint is no force.
-    write_stage_log(tmp_path / "b", "ms", "pos_mm", "Joint 2 (rad)", "load_cell_N")
-    session, _ = proposed(tmp_path / "b")
+    session, _ = proposed_for(log, tmp_path / "b")
     assert session["encoders"]["carriage"]["column"] == "pos_mm"
     assert session["force"]["columns"] == ["load_cell_N"]
 
@@ -365,8 +359,7 @@ def test_a_force_that_is_not_there_is_asked_for_where_it_is_read(tmp_path, comma
     """A line under [channels] would be refused by the name of the device's own input."""
     t = 0.01 * np.arange(2000)
     table = {"time [s]": t, "position [rad]": np.sin(t), "current [A]": np.full_like(t, 1.25)}
-    write_table(tmp_path / "a.parquet", table, "%.6f")
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(table, tmp_path)
     assert proposal.fill_in == ["the column of force_drive in N.m. To find it: " + COLUMNS]
     assert session["force"] == {"columns": ["?"], "components": ["drive"], "unit": "N.m"}
     code, _, err = command("ingest", tmp_path)
@@ -415,8 +408,7 @@ def test_of_two_joints_without_a_drawing_a_position_has_its_own_drive(tmp_path):
     table["tau_con1"] = table["tau1"] - rng.normal(0.0, 1e-3, samples)
     table["tau1"] = table["tau1"] + rng.normal(0.0, 0.3, samples)
     table["tau2"] = table["tau_con1"]
-    write_table(tmp_path / "a.parquet", table)
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(table, tmp_path)
     assert session["encoders"]["joint"]["column"] == "pos_meas1"
     assert session["force"]["columns"] == ["tau1"]
     assert any("if these are a robot's, put its URDF" in line for line in proposal.check)
@@ -466,9 +458,7 @@ def test_motion_and_force_with_clocks_of_their_own_are_joined(tmp_path, shift: f
         part | {"file": "force.parquet", "join": way, "time": "stamp_ms", "time_unit": "ms"} == part
     )
     assert ("as if started together" in str(proposal.check)) == (way == "start")
-    out = tmp_path / "out"
-    ingest.execute(RunFolder(out), out, ingest.Config(session=str(tmp_path)), silent)
-    found = read_parquet(out / "ingest/samples.parquet")
+    found = samples(tmp_path, tmp_path / "out", None)
     (name,) = (column for column in found if column.startswith("force_"))
     stamps = t[round(shift / 0.01) if shift < 20 else 0 :][: len(found)]
     first = found["trial_id"] == found["trial_id"][0]
@@ -503,38 +493,31 @@ def labelled(names: str, **scales: float) -> dict[str, np.ndarray]:
 
 def test_units_at_the_end_of_names_and_what_slides(tmp_path):
     table = labelled("t_ms,pos_deg,vel_deg_s,cur_mA", t=1e3, q=57.29578, qd=57.29578, u=1e3)
-    write_table(tmp_path / "a.parquet", table)
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(table, tmp_path)
     assert session["time"] == {"column": "t_ms", "unit": "ms"}
     velocity = {"velocity": {"column": "vel_deg_s", "unit": "deg/s"}}
     assert session["encoders"]["joint"] == {"column": "pos_deg", "unit": "deg"} | velocity
     assert session["channels"]["motor_current"] == {"column": "cur_mA", "unit": "mA"}
     assert "driven by a current" in proposal.device
-    (tmp_path / "b").mkdir()
-    write_table(tmp_path / "b/a.parquet", labelled("t,dist,w,forc"))
-    session, proposal = proposed(tmp_path / "b")
+    session, proposal = proposed_for(labelled("t,dist,w,forc"), tmp_path / "b")
     assert session["force"]["unit"] == "N" and "linear axis" in " ".join(proposal.check)
 
 
 def test_a_current_position_is_no_current_and_an_acceleration_drives_nothing(tmp_path):
     table = labelled("t,current_position,acc_x,torque_nm")
     table["acc_x"] = np.gradient(np.gradient(table["current_position"], table["t"]), table["t"])
-    write_table(tmp_path / "a.parquet", table)
-    session, _ = proposed(tmp_path)
+    session, _ = proposed_for(table, tmp_path)
     assert [e["column"] for e in session["encoders"].values()] == ["current_position"]
     assert session["force"]["columns"] == ["torque_nm"]
     del table["torque_nm"]
-    (tmp_path / "b").mkdir()
-    write_table(tmp_path / "b/a.parquet", table)
-    session, _ = proposed(tmp_path / "b")
+    session, _ = proposed_for(table, tmp_path / "b")
     assert session["force"]["columns"] == ["?"]
 
 
 def test_a_torque_in_per_cent_asks_for_its_gain(tmp_path):
-    write_table(
-        tmp_path / "a.parquet", labelled("t,angle_deg,w,torque_percent", q=57.29578, u=20.0)
+    session, proposal = proposed_for(
+        labelled("t,angle_deg,w,torque_percent", q=57.29578, u=20.0), tmp_path
     )
-    session, proposal = proposed(tmp_path)
     assert session["force"]["unit"] == "V" and session["force"]["calibration_n_per_v"] == [[0.0]]
     (ask,) = proposal.fill_in
     assert ask.startswith('calibration_n_per_v, N.m for one of "torque_percent". To find')
@@ -563,8 +546,7 @@ def test_a_load_in_a_register_is_a_duty_cycle_and_no_force(tmp_path, beside: str
     del table["w"]
     table["load"] = np.mod(np.rint(300.0 * table["load"]), 65536.0)
     table[beside] = 5.0 + 0.01 * (np.arange(len(table["t"])) % 3)
-    write_table(tmp_path / "a.parquet", table)
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(table, tmp_path)
     assert "driven by a duty" in proposal.device and "force" not in session
     (drive,) = (c for c in session["channels"].values() if c["column"] == "load")
     assert drive["wrap_bits"] == 16 and drive["signed"]
@@ -588,8 +570,9 @@ def test_sign_bits_of_a_servo_are_taken_off_and_its_counts_shown_by_its_weight(t
     signed = {name: np.rint(table[name]) for name in ("pos", "load")}
     for name, bit in (("pos", 15), ("load", 10)):
         table[name] = np.where(signed[name] < 0, 2.0**bit - signed[name], signed[name])
-    write_table(tmp_path / "a.parquet", table | {"voltage": np.full(len(table["time"]), 12.0)})
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(
+        table | {"voltage": np.full(len(table["time"]), 12.0)}, tmp_path
+    )
     encoder = session["encoders"]["joint"]
     assert encoder["sign_bit"] == 15
     assert encoder["counts_per_unit"] == pytest.approx(4096 / (2.0 * np.pi), rel=1e-4)
@@ -604,8 +587,7 @@ def test_sign_bits_of_a_servo_are_taken_off_and_its_counts_shown_by_its_weight(t
 )
 def test_a_force_on_a_joint_needs_a_lever(tmp_path, command: Command, column: str, unit: str):
     scale = {"kN": 1e-3, "kgf": 1.0 / 9.80665}.get(unit, 1.0)
-    write_table(tmp_path / "a.parquet", labelled(f"t,angle_rad,w,{column}", u=scale / 0.31))
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(labelled(f"t,angle_rad,w,{column}", u=scale / 0.31), tmp_path)
     assert (session["force"]["unit"], session["force"]["lever_m"]) == (unit, 0.0)
     (ask,) = proposal.fill_in
     assert ask.startswith("lever_m, how far from the axis") and "measure it" in ask
@@ -622,26 +604,23 @@ def test_a_current_that_goes_with_the_torque_is_no_coil(tmp_path):
     table = labelled("t,angle_rad,w,torque_nm")
     rng = np.random.default_rng(1)
     table["current"] = table["torque_nm"] / 1.9 + rng.normal(0.0, 0.02, len(table["t"]))
-    write_table(tmp_path / "a.parquet", table)
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(table, tmp_path)
     assert session["force"]["columns"] == ["torque_nm"] and "coil_current" not in proposal.device
     assert any("current goes with torque_nm" in line for line in proposal.check)
 
 
 def test_the_gear_of_a_motor_is_what_the_weight_says_and_missed_in_its_torque(tmp_path):
-    write_table(
-        tmp_path / "a.parquet", pendulum("t,motor_angle_deg,torque_nm", 70.0 * 57.29578, 1.0)
+    session, proposal = proposed_for(
+        pendulum("t,motor_angle_deg,torque_nm", 70.0 * 57.29578, 1.0), tmp_path
     )
-    session, proposal = proposed(tmp_path)
     assert session["encoders"]["joint"]["gear_ratio"] == pytest.approx(70.0, rel=0.02)
     assert any("times for one turn of it, by its weight" in line for line in proposal.check)
     assert "moment" in proposal.device and session["encoders"]["joint"]["scale_sd"] < 0.02
-    (tmp_path / "c").mkdir()
-    write_table(tmp_path / "c/a.parquet", pendulum("T.t,exp.position,exp.torque", 0.159155, 1.0))
-    assert proposed(tmp_path / "c")[0]["encoders"]["joint"]["unit"] == "rev"  # of no stated unit
-    (tmp_path / "b").mkdir()
-    write_table(tmp_path / "b/a.parquet", pendulum("t,motor_deg,motor_torque_mNm", 4000.0, 14.0))
-    session, proposal = proposed(tmp_path / "b")
+    turned = pendulum("T.t,exp.position,exp.torque", 0.159155, 1.0)  # of no stated unit
+    assert proposed_for(turned, tmp_path / "c")[0]["encoders"]["joint"]["unit"] == "rev"
+    session, proposal = proposed_for(
+        pendulum("t,motor_deg,motor_torque_mNm", 4000.0, 14.0), tmp_path / "b"
+    )
     assert any("motor_torque_mNm is the torque of a motor" in line for line in proposal.check)
     assert session["force"]["unit"] == "mN.m"
 
@@ -675,22 +654,21 @@ def test_held_rows_are_proposed_at_their_true_rate(tmp_path):
     log = labelled("t,angle_rad,w,torque_nm")
     rows = np.arange(10 * len(log["t"]))
     table = {name: values[rows // 10] for name, values in log.items()} | {"t": rows / 1000.0}
-    write_table(tmp_path / "a.parquet", table)
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(table, tmp_path)
     assert session["sample_rate_hz"] == 100
     assert any(line.startswith("90% of the rows repeat the positions") for line in proposal.check)
 
 
 def test_ticks_of_a_counter_and_slow_logs_are_asked_about(tmp_path):
     log = labelled("ticks,angle_rad,w,torque_nm", t=168e6)
-    write_table(tmp_path / "a.parquet", log | {"ticks": np.rint(np.mod(log["ticks"], 2.0**32))})
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(
+        log | {"ticks": np.rint(np.mod(log["ticks"], 2.0**32))}, tmp_path
+    )
     assert session["time"] == {"column": "ticks", "unit": "ticks", "ticks_per_s": 0.0}
     (ask,) = proposal.fill_in
     assert ask.startswith("ticks_per_s, what ticks counts in a second") and "data sheet" in ask
-    (tmp_path / "b").mkdir()
-    write_table(tmp_path / "b/a.parquet", {n: v[::10] for n, v in labelled("t,q,w,u").items()})
-    assert any("too slow for inertia" in line for line in propose(tmp_path / "b").check)
+    slow = {n: v[::10] for n, v in labelled("t,q,w,u").items()}
+    assert "too slow for inertia" in str(proposed_for(slow, tmp_path / "b")[1].check)
 
 
 def machine(seed: int, size: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -708,8 +686,7 @@ def machine(seed: int, size: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.nd
 def test_trials_side_by_side_are_read_as_the_session_says(tmp_path):
     (t, *one), (_, *two) = machine(1), machine(2)
     names = ("time_s", "angle_1", "torque_1", "angle_2", "torque_2")
-    write_table(tmp_path / "a.parquet", dict(zip(names, [t, *one, *two], strict=True)))
-    session, proposal = proposed(tmp_path)
+    session, proposal = proposed_for(dict(zip(names, [t, *one, *two], strict=True)), tmp_path)
     assert len(session["trials"]) == 1
     assert any("if other trials', say so by columns in [[trials]]" in x for x in proposal.check)
     path = tmp_path / "session.toml"
@@ -723,14 +700,11 @@ def test_trials_side_by_side_are_read_as_the_session_says(tmp_path):
 
 def test_a_record_of_unknown_rate_is_not_cut_and_lost_rows_are_counted(tmp_path):
     _, q, u = machine(4)
-    write_table(tmp_path / "a.parquet", {"angle_rad": q, "torque_Nm": u})
-    session, _ = proposed(tmp_path)
+    session, _ = proposed_for({"angle_rad": q, "torque_Nm": u}, tmp_path)
     assert len(session["trials"]) == 1 and session["sample_rate_hz"] == "?"
     kept = np.r_[0:500, 520:1600]
     table = {"sample": np.arange(1600.0)[kept], "angle_rad": q[kept], "torque_Nm": u[kept]}
-    (tmp_path / "b").mkdir()
-    write_table(tmp_path / "b/b.parquet", table)
-    session, proposal = proposed(tmp_path / "b")
+    session, proposal = proposed_for(table, tmp_path / "b")
     assert session["time"] == {"column": "sample", "unit": "ticks", "ticks_per_s": 0.0}
     assert "sample numbers the rows, and some are lost" in proposal.fill_in[0]
 
@@ -738,9 +712,7 @@ def test_a_record_of_unknown_rate_is_not_cut_and_lost_rows_are_counted(tmp_path)
 def test_what_needs_a_gain_gets_wide_priors(tmp_path):
     t, q, u = machine(5)
     for name, scale in (("torque_Nm", 1.0), ("torque_percent", 12.5)):
-        (tmp_path / name).mkdir()
-        write_table(tmp_path / name / "a.parquet", {"time_s": t, "angle_rad": q, name: scale * u})
-        proposed(tmp_path / name)
+        proposed_for({"time_s": t, "angle_rad": q, name: scale * u}, tmp_path / name)
         device = tomllib.loads((tmp_path / name / "device.toml").read_text())
         inertia = device["parameters"]["inertia"]
         assert inertia["sd"] == pytest.approx((5, 100)[scale > 1] * inertia["prior"], rel=0.05)

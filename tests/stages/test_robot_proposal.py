@@ -16,6 +16,7 @@ from bampipe.data.session import read_session
 from bampipe.errors import InputError
 from bampipe.files import read_json
 from bampipe.physics import Model, compile_model, registry
+from bampipe.physics.robot import Motor
 from bampipe.setup.drawn_bodies import Drive
 from bampipe.setup.proposal import ProposedSession, propose, write_proposal
 from bampipe.setup.proposal.notes import COLUMNS
@@ -78,6 +79,13 @@ def proposed(folder: Path) -> ProposedSession:
     return proposal
 
 
+def motors_of(folder: Path) -> dict[str, Motor]:
+    """The motors in the proposed device file."""
+    robot = registry.device_from(read_device_file(folder / "device.toml")).robot
+    assert robot is not None
+    return robot.motors
+
+
 def about(proposal: ProposedSession, column: str) -> list[str]:
     own = (line for line in proposal.check if line.startswith(f"{column} is "))
     return [line for line in own if "drawing" in line]
@@ -114,14 +122,11 @@ def test_weight_that_would_make_friction_drive_the_joint_tells_no_sign() -> None
     assert Drive(share=-0.9, error=0.1, left=0.1, losses=0.5).is_turned
 
 
-def test_a_position_beyond_the_range_that_the_drives_agree_with_is_said(tmp_path: Path) -> None:
+def test_a_position_beyond_the_range_is_said_with_what_may_explain_it(tmp_path: Path) -> None:
     write_log(tmp_path, swing=8.0)
     assert any("is the range of the drawing right?" in line for line in proposed(tmp_path).check)
-
-
-def test_a_position_beyond_the_range_that_nothing_explains_may_be_that_of_a_motor(
-    tmp_path: Path,
-) -> None:
+    for name in ("session.toml", "device.toml"):
+        (tmp_path / name).unlink()
     table = write_log(tmp_path)
     rng = np.random.default_rng(0)
     table[["q1", "q2"]] *= 50.0
@@ -179,9 +184,7 @@ def test_torque_constants_are_proposed_by_the_drawing(tmp_path: Path) -> None:
     positions, drives, _ = paired(tmp_path / "log")
     assert list(positions.values()) == [f"actual_q_{k}" for k in range(4)]
     assert list(drives.values()) == [f"actual_current_{k}" for k in range(4)]
-    device = registry.device_from(read_device_file(tmp_path / "log/device.toml"))
-    assert device.robot is not None
-    constants = [motor.torque_constant for motor in device.robot.motors.values()]
+    constants = [motor.torque_constant for motor in motors_of(tmp_path / "log").values()]
     np.testing.assert_allclose(constants, truth["constants"], rtol=0.1)
 
 
@@ -190,9 +193,7 @@ def test_all_torque_constants_but_one_are_estimated(tmp_path: Path) -> None:
     """A drawing that is off gives constants that are off, each by its own: drives would lack it."""
     truth = record_logs(tmp_path / "log", 6, "ZYYX", style="controller", drawing_error=0.15)
     paired(tmp_path / "log")
-    device = registry.device_from(read_device_file(tmp_path / "log/device.toml"))
-    assert device.robot is not None
-    motors = device.robot.motors
+    motors = motors_of(tmp_path / "log")
     (known,) = [k for k, m in enumerate(motors.values()) if m.torque_constant_sd is None]
     bampipe.run_session(tmp_path / "log", runs=tmp_path / "runs", last="identify")
     found = read_json(tmp_path / "runs/log/models/base/identify.json")["parameters"]
@@ -237,9 +238,7 @@ def test_reductions_of_a_log_from_the_motors_side_follow_from_the_drawing(tmp_pa
     session = read_session(tmp_path / "log")
     gears = [encoder.gear_ratio for encoder in session.encoders]
     np.testing.assert_allclose(gears, truth["ratio"], rtol=0.05)
-    device = registry.device_from(read_device_file(tmp_path / "log/device.toml"))
-    assert device.robot is not None
-    turns = [next(iter(motor.turns.values())) for motor in device.robot.motors.values()]
+    turns = [next(iter(motor.turns.values())) for motor in motors_of(tmp_path / "log").values()]
     np.testing.assert_allclose(turns, gears, rtol=0.01)
     assert {c.name for c in session.channels if c.scale < 0.0} == {"torque_elbow"}
     assert proposal.fill_in == []
@@ -356,9 +355,8 @@ def test_an_mjcf_that_cannot_be_read_is_not_passed_over(
 ) -> None:
     (tmp_path / "arm.xml").write_text(text)
     t = np.arange(400) / 100.0
-    pd.DataFrame({"t": t, "position": np.sin(t), "current": np.cos(t)}).to_parquet(
-        tmp_path / "log.parquet"
-    )
+    table = pd.DataFrame({"t": t, "position": np.sin(t), "current": np.cos(t)})
+    table.to_parquet(tmp_path / "log.parquet")
     with pytest.raises(InputError, match=said) as caught:
         propose(tmp_path)
     assert "take it out of the folder" in str(caught.value)

@@ -99,14 +99,8 @@ def test_shared_sessions_stand_out_where_something_is_missing(
 
 def test_what_brakes_do_is_judged_in_the_trials_in_which_they_act(tmp_path: Path) -> None:
     """A lag of the brakes: free trials know nothing of it, and must not suffer from it."""
-    hidden = simulation.Config(
-        effects=("brake_lag",),
-        seed=5,
-        trials=2,
-        viscous_trials=2,
-        duration=5,
-        file_format="parquet",
-    )
+    days = {"trials": 2, "viscous_trials": 2, "duration": 5}
+    hidden = simulation.Config(effects=("brake_lag",), seed=5, file_format="parquet", **days)
     truth = simulation.simulate_session(tmp_path / "session", hidden)
     run = recorded_run(tmp_path / "run", tmp_path / "session")
     ratios = {}
@@ -162,11 +156,8 @@ def test_residuals_add_up(simulated: RunFolder, tmp_path: Path) -> None:
     table = read_parquet(tmp_path / "models/base/residuals.parquet")
     assert table["held_out"].all()
     for axis in ("yaw", "pitch", "extension"):
-        np.testing.assert_allclose(
-            table[f"torque_measured_{axis}"] - table[f"torque_predicted_{axis}"],
-            table[f"residual_{axis}"],
-            atol=1e-9,
-        )
+        left = table[f"torque_measured_{axis}"] - table[f"torque_predicted_{axis}"]
+        np.testing.assert_allclose(left, table[f"residual_{axis}"], atol=1e-9)
         assert f"torque_predicted_without_friction_{axis}" in table
     assert {"force_measured_x", "force_predicted_x"} <= set(table.columns)
     share = (table["force_measured_z"] - table["force_predicted_z"]).std()
@@ -240,7 +231,7 @@ def judged(run: RunFolder, hold_out: bool) -> tuple[dict, dict]:
     trials = read_parquet(path)
     trials["hold_out"] = (trials["trial_id"] == SPOILT) & hold_out
     write_parquet(path, trials)
-    identify.execute(run, run.root, identify.Config(method="least-squares"), silent)
+    identified(run)
     validate.execute(run, run.root, validate.Config(free_run=False), silent)
     names = ("models/base/identify.json", "models/base/validate.json")
     return tuple(read_json(run.path(name)) for name in names)

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from identified_run import recorded_run
 from independent_runs import record_run
@@ -34,9 +35,8 @@ def identified(root: Path, session: Path) -> RunFolder:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunFolder]:
     folder = tmp_path_factory.mktemp("viscous")
-    config = simulation.Config(
-        seed=31, trials=2, viscous_trials=2, duration=10.0, file_format="parquet"
-    )
+    days = {"trials": 2, "viscous_trials": 2, "duration": 10.0}
+    config = simulation.Config(seed=31, file_format="parquet", **days)
     simulation.simulate_session(folder / "session", config)
     yield identified(folder / "run", folder / "session")
 
@@ -77,35 +77,33 @@ def test_the_damping_rendered_is_found_and_does_not_differ(run: RunFolder) -> No
     assert not any(name.startswith("viscous.") for name in trace)
 
 
-def test_a_command_that_was_not_kept_is_found(run: RunFolder, tmp_path: Path) -> None:
+@pytest.fixture
+def trials(run: RunFolder) -> Iterator[pd.DataFrame]:
+    """The table of trials, which a test may write otherwise."""
     path = run.path("ingest/trials.parquet")
-    trials = read_parquet(path)
-    kept = trials.copy()
+    kept = read_parquet(path)
+    yield kept.copy()
+    write_parquet(path, kept)
+
+
+def test_a_command_that_was_not_kept_is_found(run: RunFolder, trials: pd.DataFrame) -> None:
     trials.loc[trials["kind"] == "viscous", "viscous_n_s_per_m"] = 44.0
-    write_parquet(path, trials)
-    try:
-        directions = found(run)["directions"]
-    finally:
-        write_parquet(path, kept)
+    write_parquet(run.path("ingest/trials.parquet"), trials)
+    directions = found(run)["directions"]
     assert all(entry["differs"] for entry in directions.values())
     assert "differs from the commanded 44" in directions["x"]["verdict"]
 
 
-def test_a_session_without_a_field_says_so(run: RunFolder) -> None:
-    path = run.path("ingest/trials.parquet")
-    trials = read_parquet(path)
-    write_parquet(path, trials[trials["kind"] == "free"])
-    try:
-        content = found(run)
-    finally:
-        write_parquet(path, trials)
+def test_a_session_without_a_field_says_so(run: RunFolder, trials: pd.DataFrame) -> None:
+    write_parquet(run.path("ingest/trials.parquet"), trials[trials["kind"] == "free"])
+    content = found(run)
     assert content["directions"] == {}
     assert "No trials" in content["headline"]
+
+
+def test_settings_that_make_no_sense_are_refused() -> None:
     with pytest.raises(InputError, match=r"viscous\.block_s: found 0.0, expected more than 0"):
         configure("viscous", {"block_s": 0.0})
-
-
-def test_a_setting_of_performance_that_makes_no_sense_is_refused() -> None:
     with pytest.raises(InputError, match=r"performance\.points: found 1, expected 2 or more"):
         configure("performance", {"points": 1})
 
