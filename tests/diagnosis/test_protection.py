@@ -172,7 +172,7 @@ def test_what_no_effect_of_the_library_is_is_called_unknown(record, machine, eff
 
 
 def test_a_vibration_that_depends_on_time_alone_is_called_unknown(record):
-    """Half a per cent of the force, in no state of the machine, with another phase in each trial."""
+    """Half a per cent of the force, in no state of the machine; another phase in each trial."""
     trials, recipe = record("axis", 41)
     motions = [
         replace(m, channels={**m.channels, "force_motor": m.channels["force_motor"] + shake})

@@ -385,7 +385,7 @@ def test_each_recording_of_a_file_is_a_trial(tmp_path, command: Command, header:
         np.testing.assert_allclose(found["q_joint"], np.sin(rate * t[: len(found)]), atol=1e-6)
     text = re.sub("recording = .*", "", (tmp_path / "session.toml").read_text())
     (tmp_path / "session.toml").write_text(text)
-    code, out, err = command("ingest", tmp_path)
+    code, out, err = command("ingest", tmp_path, "--runs", tmp_path / "runs")
     assert code in (0, 2) and f"row {begins}: " in out + err
     assert "2 recordings in one file; give each a [[trials]] entry with recording = 1" in out + err
 
