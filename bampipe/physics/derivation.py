@@ -197,7 +197,7 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
             for i, added in enumerate(_move_bias(d, item, effect.ahead, symbols)):
                 other[i] += added
         for key, tree in effect.expressions.items():
-            value, place = d.rebuild_for(item, tree, symbols, key), item.target_of(key)
+            value, place = d.build(tree, symbols, key, item), item.target_of(key)
             label = f"effect {item.name!r}: {key}"
             if effect.kind == "energy":
                 pair = (value, sp.S.Zero) if key == "kinetic" else (sp.S.Zero, value)
@@ -215,7 +215,7 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
             if by_axis is other and effect.acting_link:
                 delivered_force[axis] += value
         for state in effect.states:
-            rate, initial = d.rebuild_state(item, state, symbols)
+            rate, initial = d.build_state(item, state, symbols)
             z = d.z[item.prefix, state.name]
             states[z] = signals.put_in(rate), signals.put_in_initial(initial)
     other = [signals.put_in(e) for e in other]
@@ -225,12 +225,12 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
 def _move_bias(d: Vocabulary, item: BoundEffect, ahead: Ahead, symbols: Symbols) -> list[Any]:
     """Evaluate the bias at the mechanism, ahead of an encoder; return the added terms, by axis."""
     i = d.axes.index(item.target)
-    position = d.rebuild_for(item, ahead.position, symbols, "ahead.position")
-    rate = d.rebuild_for(item, ahead.rate, symbols, "ahead.rate")
+    position = d.build(ahead.position, symbols, "ahead.position", item)
+    rate = d.build(ahead.rate, symbols, "ahead.rate", item)
     true = {d.q[i]: d.q[i] + position, d.qd[i]: d.qd[i] + rate}
     moved = [h.subs(true, simultaneous=True) for h in d.bias]
     symbols["axis_bias"] = moved[i]
-    share = d.rebuild_for(item, ahead.share, symbols, "ahead.share")
+    share = d.build(ahead.share, symbols, "ahead.share", item)
     return [share * (h - m) for h, m in zip(d.bias, moved, strict=True)]
 
 

@@ -74,15 +74,24 @@ class Vocabulary:
             size = expression.expanded_size(tree, self.sizes)
             self.sizes[name] = max(size, int(sp.count_ops(self.base[name])))
 
-    def build(self, tree: ast.expr, symbols: Mapping[str, Any], what: str) -> Any:
-        return self.rebuild(tree, symbols, f"device {self.model.device.name!r}: {what}")
-
-    def rebuild(self, tree: ast.expr, symbols: Mapping[str, Any], where: str) -> Any:
+    def build(
+        self,
+        tree: ast.expr,
+        symbols: Mapping[str, Any],
+        what: str,
+        item: BoundEffect | None = None,
+    ) -> Any:
         """`expression.build` of a tree that stays of bounded size with definitions put in.
+
+        Args:
+            what: the field, for messages; item: the effect that it is of, None for the device.
 
         Raises:
             InputError: it does not, or takes longer than the limit that the caller has set.
         """
+        device = self.model.device
+        owner = f"device {device.name!r}" if item is None else f"effect {item.name!r}"
+        where = f"{owner}: {what}"
         size = expression.expanded_size(tree, self.sizes)
         if size <= expression.MAX_EXPANDED:
             try:
@@ -204,10 +213,10 @@ class Vocabulary:
             return (forces[self.model.device.components.index(item.target)],)
         return force_pairs(self.model.device)[item.target]
 
-    def rebuild_for(self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str) -> Any:
-        return self.rebuild(tree, symbols, f"effect {item.name!r}: {what}")
-
-    def rebuild_state(self, item: BoundEffect, state: State, symbols: Symbols) -> tuple[Any, Any]:
+    def build_state(self, item: BoundEffect, state: State, symbols: Symbols) -> tuple[Any, Any]:
         """Rate and initial value of an internal state of ``item``."""
-        rate = self.rebuild_for(item, state.rate, symbols, f"states.{state.name}.rate")
-        return rate, self.rebuild_for(item, state.initial, symbols, f"states.{state.name}.initial")
+        what = f"states.{state.name}"
+        return (
+            self.build(state.rate, symbols, f"{what}.rate", item),
+            self.build(state.initial, symbols, f"{what}.initial", item),
+        )
