@@ -150,10 +150,7 @@ class System:
         Raises:
             KeyError: there is none.
         """
-        for i, parameter in enumerate(self.parameters):
-            if parameter.name == name:
-                return i
-        raise KeyError(name)
+        return {p.name: i for i, p in enumerate(self.parameters)}[name]
 
     @cached_property
     def _arrays(self) -> ModuleType:
