@@ -33,8 +33,13 @@ from math import atan as arctan, cos, exp, log, sin, sqrt, tan, tanh
 from numba import types
 from numpy import sign
 from bampipe.compiled import njit, part
-from bampipe.physics.elementary import heaviside
 maximum, minimum, absolute = max, min, abs
+
+
+@part(inline="always")
+def heaviside(x, half):
+    return 1.0 if x > 0.0 else (half if x == 0.0 else 0.0)
+
 
 V = types.float64[::1]
 M = types.float64[:, ::1]

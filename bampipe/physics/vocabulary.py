@@ -25,7 +25,8 @@ class Vocabulary:
     """The symbols of one model, and expressions of its device and effects built from them.
 
     Attributes:
-        model: the device and its effects; named_constants: whether constants stay symbols.
+        model: the device and its effects.
+        constants: symbols of the device's constants, unless numbers replace them.
         axes: names of the coordinates.
         q, qd, qdd: their symbols and those of their rates.
         channels: every input there may be; channel: their symbols.
@@ -40,7 +41,7 @@ class Vocabulary:
     """
 
     def __init__(self, model: Model, named_constants: bool = False) -> None:
-        self.model, self.named_constants = model, named_constants
+        self.model = model
         device = model.device
         self.axes = [c.name for c in device.coordinates]
         # Symbols are numbered, so that no name from a file is ever printed into generated code.
@@ -63,10 +64,9 @@ class Vocabulary:
         self.dry, self.weight, self.pull, self.inertia, self.bias = (zeros for _ in range(5))
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
-        self.base |= {
-            name: constant_symbol(name) if named_constants else sp.Float(c.value)
-            for name, c in device.constants.items()
-        }
+        self.constants = [constant_symbol(name) for name in device.constants if named_constants]
+        values = self.constants or [sp.Float(c.value) for c in device.constants.values()]
+        self.base |= dict(zip(device.constants, values, strict=True))
         self.base |= {p.name: self.p[p.name] for p in device.parameters if "." not in p.name}
         self.base |= self.channel
         for name, tree in device.definitions.items():
