@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from bampipe.data.run_folder import RunFolder
 from bampipe.declarations.model_file import load_model, read_estimate
-from bampipe.estimate.simulation import simulate
+from bampipe.estimate.simulation import make_plant, simulate
 from bampipe.physics import System, compile_model
 from bampipe.trials.motion import Motion
 from bampipe.trials.reading import read_motions
@@ -141,11 +141,10 @@ def run_free(
     """
     every = motion.inputs(system.inputs)
     u, p = np.ascontiguousarray(every[first : last + 1]), p[: len(system.parameters)]
-    x = simulate(
-        system.derivative, np.concatenate([q, qd, system.initial_memory(q, u[0], p)]), u, p,
-        float(motion.t[1] - motion.t[0]), n_noise=len(system.noise), smooth=system.forced,
-        width=np.array([c.sign_width for c in system.model.device.coordinates]), max_step=1e-3,
-    )  # fmt: skip
+    start = np.concatenate([q, qd, system.initial_memory(q, u[0], p)])
+    plant = make_plant(p, len(system.noise), system.sign_widths, max_step=1e-3)
+    dt = float(motion.t[1] - motion.t[0])
+    x, _ = simulate(system.derivative, plant, start, u, dt, smooth=system.forced)
     return np.asarray(x[:, : 2 * len(q)])
 
 

@@ -9,7 +9,7 @@ from numba import float64, int64, void
 from bampipe.arrays import Array, Indices
 from bampipe.compiled import njit, part, record_type
 from bampipe.estimate.runge_kutta import runge_kutta
-from bampipe.estimate.simulation import MAX_STEP_S, PLANT, make_plant, require_finite, stable_steps
+from bampipe.estimate.simulation import PLANT, Plant, require_finite, stable_steps
 from bampipe.model_functions import COMMAND, DERIVATIVE, MEASURE
 
 _V = float64[::1]
@@ -98,14 +98,12 @@ def simulate_controlled(
     derivative: Any,
     measure: Any,
     command: Any,
+    plant: Plant,
     x0: Array,
     u: Array,
     r: Array,
-    p: Array,
     dt: float,
     *,
-    width: Array,
-    n_noise: int,
     force: Sequence[int],
     rate_hz: float = 0.0,
     limits: Sequence[tuple[float, float]] = (),
@@ -116,7 +114,7 @@ def simulate_controlled(
     integrals start at values for which its first command is nearest to the recorded one.
 
     Args:
-        derivative, x0, p, dt, width, n_noise: as in `simulate`.
+        derivative, plant, x0, dt: as in `simulate`.
         measure: compiled h(x, u, p, y), the encoder readings.
         command: compiled c(y, r, s, out): the commands from readings, references, gains and the
             states of the controller, followed by the rates of these states.
@@ -137,9 +135,8 @@ def simulate_controlled(
     x[0] = x0
     recorded = total[0, columns]
     total[:, columns] = 0.0
-    readings = np.zeros((len(u), 2 * len(width)))
+    readings = np.zeros((len(u), 2 * len(plant.width)))
     bounds = np.array(limits, dtype=np.float64).reshape(-1, 2)
-    plant = make_plant(p, n_noise, width, MAX_STEP_S)
     measure(x[0], total[0], plant.p, readings[0])
     states = _first_states(command, readings[0], references[0], recorded, bounds)
     controller = _Controller(

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from bampipe.arrays import Array
-from bampipe.errors import InputError
 from bampipe.estimate.runge_kutta import runge_kutta
 from bampipe.estimate.unscented import (
     ALPHA,
@@ -40,9 +39,7 @@ def filter_trials_by_filterpy(
 
     Raises:
         FilterFailure: the covariance lost positive definiteness.
-        InputError: filterpy 2 is not installed.
     """
-
     return in_sequence(partial(_filter, model, settings, advance), trials, theta, covariance)
 
 
@@ -92,12 +89,7 @@ def _make_filter(
     model: FilterModel, trial: Trial, settings: FilterSettings, advance: Callable[..., None]
 ) -> Any:
     """Return filterpy's filter of state, parameters and noise at the first sample of a trial."""
-    try:
-        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
-    except ImportError as error:
-        raise InputError(
-            "engine filterpy needs filterpy 2", remedy="pip install 'filterpy>=2'"
-        ) from error
+    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
     nx, nw = model.n_states, settings.noise_sd.size
     n, ny = nx + model.free.size, settings.observed.size

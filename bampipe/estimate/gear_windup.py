@@ -85,12 +85,8 @@ def find_windup(
     inverse = np.linalg.pinv(table.T @ table)
     found = inverse @ (table.T @ wanted)
     left = wanted - table @ found
-    scores = [
-        part.T @ rest
-        for part, rest in zip(
-            np.array_split(table, _BLOCKS), np.array_split(left, _BLOCKS), strict=True
-        )
-    ]
+    blocks = (np.array_split(rows, _BLOCKS) for rows in (table, left))
+    scores = [part.T @ rest for part, rest in zip(*blocks, strict=True)]
     covariance = inverse @ sum(np.outer(s, s) for s in scores) @ inverse
     sd = np.sqrt(np.diag(covariance) * _BLOCKS / (_BLOCKS - len(found)))
     values, errors = found / size, sd / size

@@ -15,6 +15,7 @@ regression (Fuller 1987, eq. 1.2.3), because it would make the axis appear too s
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -170,44 +171,56 @@ def split_branches(torque: Array, deflection: Array, rate_hz: float) -> tuple[Br
     return tuple(branches)
 
 
-def _regression(
+class _Line(NamedTuple):
+    """A line through branches, with an intercept for each.
+
+    Attributes:
+        compliance, error: its slope and that slope's standard error.
+        approach: amplitude of an exponential approach to the line, 0 without one.
+        intercepts: (branches,); squares: sum of squares that line and approach leave.
+    """
+
+    compliance: float
+    error: float
+    approach: float
+    intercepts: Array
+    squares: float
+
+
+def _fit_line(
     branches: Sequence[Branch],
     noise_sd: float,
-    window: tuple[float, float],
+    start: float = 0.0,
+    stop: float = np.inf,
     decay: float | None = None,
-) -> tuple[float, float, Array]:
+) -> _Line:
     """Regress deflection on torque, with an intercept for each branch.
 
     Args:
         noise_sd: standard deviation of the torque at a count change.
-        window: first and last travel of the points used.
+        start, stop: first and last travel of the points used.
         decay: length, in torque, of an exponential approach to the straight line, which is fitted
             with one amplitude for all branches; None for no approach.
-
-    Returns:
-        Compliance, its standard error, and the coefficients: compliance, (amplitude of the
-        approach,) intercepts.
     """
-    rows = [(branch.travel >= window[0]) & (branch.travel <= window[1]) for branch in branches]
-    torque = np.concatenate([b.torque[r] for b, r in zip(branches, rows, strict=True)])
-    deflection = np.concatenate([b.deflection[r] for b, r in zip(branches, rows, strict=True)])
-    columns = [torque]
-    if decay is not None:
-        approach = [
-            -b.direction * np.exp(-b.travel[r] / decay) for b, r in zip(branches, rows, strict=True)
-        ]
-        columns.append(np.concatenate(approach))
-    owner = np.repeat(np.arange(len(branches)), [int(np.sum(r)) for r in rows])
-    columns += [(owner == number).astype(np.float64) for number in range(len(branches))]
-    design = np.stack(columns, axis=1)
+    rows = [(branch.travel >= start) & (branch.travel <= stop) for branch in branches]
+    torque, deflection, travel = (
+        np.concatenate([getattr(b, name)[r] for b, r in zip(branches, rows, strict=True)])
+        for name in ("torque", "deflection", "travel")
+    )
+    owner = np.repeat(np.arange(len(branches)), [np.count_nonzero(r) for r in rows])
+    direction = np.array([branch.direction for branch in branches])[owner]
+    approach = [] if decay is None else [-direction * np.exp(-travel / decay)]
+    design = np.column_stack([torque, *approach, np.eye(len(branches))[owner]])
     moments = design.T @ design
     moments[0, 0] -= len(torque) * noise_sd**2
     inverse = np.linalg.pinv(moments, hermitian=True)
     coefficients = inverse @ (design.T @ deflection)
     residual = deflection - design @ coefficients
+    squares = float(residual @ residual)
     spare = max(len(torque) - design.shape[1], 1)
-    error = float(np.sqrt(max(inverse[0, 0], 0.0) * (residual @ residual) / spare))
-    return float(coefficients[0]), error, np.asarray(coefficients)
+    error = float(np.sqrt(max(inverse[0, 0], 0.0) * squares / spare))
+    amplitude = float(coefficients[1]) if approach else 0.0
+    return _Line(float(coefficients[0]), error, amplitude, coefficients[-len(branches) :], squares)
 
 
 def find_transition(branches: Sequence[Branch], noise_sd: float) -> float:
@@ -218,32 +231,19 @@ def find_transition(branches: Sequence[Branch], noise_sd: float) -> float:
     """
     span = float(np.median([branch.travel[-1] for branch in branches]))
 
-    def fit(log_length: float) -> tuple[float, Array]:
-        length = float(np.exp(log_length))
-        _, _, coefficients = _regression(branches, noise_sd, (0.0, np.inf), length)
-        return _sum_of_squares(branches, coefficients, length), coefficients
+    def fit(log_length: float) -> _Line:
+        return _fit_line(branches, noise_sd, decay=float(np.exp(log_length)))
 
     grid = np.log(np.geomspace(0.005 * span, 0.5 * span, 15))
-    best = int(np.argmin([fit(float(value))[0] for value in grid]))
-    around = (float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)]))
+    best = int(np.argmin([fit(value).squares for value in grid]))
     found = minimize_scalar(
-        lambda value: fit(float(value))[0], bounds=around, method="bounded",
-        options={"xatol": 1e-3},
+        lambda value: fit(value).squares, method="bounded", options={"xatol": 1e-3},
+        bounds=(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]),
     )  # fmt: skip
-    length, coefficients = float(np.exp(found.x)), fit(float(found.x))[1]
-    steepness = abs(float(coefficients[1])) / length / abs(float(coefficients[0]))
+    length, line = float(np.exp(found.x)), fit(found.x)
+    steepness = abs(line.approach) / length / abs(line.compliance)
     end = length * float(np.log(max(steepness / _LEFTOVER, 1.0)))
     return min(end, _LATEST_START * span)
-
-
-def _sum_of_squares(branches: Sequence[Branch], coefficients: Array, length: float) -> float:
-    """Return the sum of squares that line and approach leave at all points of ``branches``."""
-    total = 0.0
-    for number, b in enumerate(branches):
-        line = coefficients[0] * b.torque + coefficients[2 + number]
-        approach = -b.direction * coefficients[1] * np.exp(-b.travel / length)
-        total += float(np.sum((b.deflection - line - approach) ** 2))
-    return total
 
 
 def energy_lost(torque: Array, deflection: Array, stiffness: float) -> float:
@@ -273,21 +273,20 @@ def measure_hysteresis(torque: Array, deflection: Array, rate_hz: float) -> Hyst
         raise ValueError("the deflection changes by fewer than 8 encoder counts on a branch")
     noise = white_noise_sd(torque) / np.sqrt(2.0)  # a count change averages two samples
     start = find_transition(branches, noise)
-    window = (start, np.inf)
-    compliance, error, _ = _regression(branches, noise, window)
-    if compliance <= 0.0:
+    line = _fit_line(branches, noise, start)
+    if line.compliance <= 0.0:
         raise ValueError("the deflection does not follow the torque")
     middle = 0.5 * (start + float(np.median([branch.travel[-1] for branch in branches])))
-    early, early_error, _ = _regression(branches, noise, (start, middle))
-    late, late_error, _ = _regression(branches, noise, (middle, np.inf))
-    slope_change = late / early - 1.0
-    slope_change_error = float(np.hypot(early_error, late_error)) / compliance
+    early = _fit_line(branches, noise, start, middle)
+    late = _fit_line(branches, noise, middle)
+    slope_change = late.compliance / early.compliance - 1.0
+    slope_change_error = float(np.hypot(early.error, late.error)) / line.compliance
     cycles = tuple(
-        _cycle(torque, deflection, branches[k : k + 2], noise, window)
+        _measure_cycle(torque, deflection, branches[k : k + 2], noise, start)
         for k in range(0, len(branches) - 1, 2)
     )
-    stiffness = 1.0 / compliance
-    standard_error = error * stiffness**2
+    stiffness = 1.0 / line.compliance
+    standard_error = line.error * stiffness**2
     values = [cycle.stiffness for cycle in cycles]
     scatter = float(np.std(values, ddof=1)) if len(values) > 1 else standard_error
     return Hysteresis(
@@ -300,21 +299,18 @@ def measure_hysteresis(torque: Array, deflection: Array, rate_hz: float) -> Hyst
     )  # fmt: skip
 
 
-def _cycle(
-    torque: Array,
-    deflection: Array,
-    pair: Sequence[Branch],
-    noise_sd: float,
-    window: tuple[float, float],
+def _measure_cycle(
+    torque: Array, deflection: Array, pair: Sequence[Branch], noise_sd: float, transition: float
 ) -> Cycle:
     """Return the results of one cycle."""
-    compliance, _, coefficients = _regression(pair, noise_sd, window)
-    intercepts = {b.direction: float(c) for b, c in zip(pair, coefficients[-2:], strict=True)}
-    across = intercepts[-1] - intercepts[1]
+    line = _fit_line(pair, noise_sd, transition)
+    rising, falling = line.intercepts[:: pair[0].direction]
     start, stop = pair[0].start, pair[1].stop
     load, moved = torque[start : stop + 1], deflection[start : stop + 1]
     return Cycle(
-        start=start, stop=stop, stiffness=1.0 / compliance, width_torque=across / compliance,
-        width_deflection=across, energy=energy_lost(load, moved, 1.0 / compliance),
-        amplitude=0.5 * float(np.ptp(load)), centre=0.5 * (intercepts[-1] + intercepts[1]),
+        start=start, stop=stop, stiffness=1.0 / line.compliance,
+        width_torque=float(falling - rising) / line.compliance,
+        width_deflection=float(falling - rising),
+        energy=energy_lost(load, moved, 1.0 / line.compliance),
+        amplitude=0.5 * float(np.ptp(load)), centre=float(0.5 * (falling + rising)),
     )  # fmt: skip

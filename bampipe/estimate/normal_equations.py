@@ -41,8 +41,8 @@ class NormalEquations:
         slopes: Sequence[Array],
         residuals: Sequence[Array],
         used: Sequence[Flags],
-        precision: Array | None = None,
-        known: Array | None = None,
+        precision: Array,
+        known: Array,
     ) -> NormalEquations:
         """Sum over the samples of each trial.
 
@@ -60,11 +60,8 @@ class NormalEquations:
             xy.append(-np.einsum("atp,at->ap", by_axis, right))
             yy.append(np.sum(right**2, axis=1))
         count = np.array([np.sum(u, axis=0, dtype=float) for u in used])
-        missing = slopes[0].shape[2] - (0 if precision is None else precision.size)
-        prior = [
-            np.append(np.zeros(0) if part is None else part, np.zeros(missing))
-            for part in (precision, known)
-        ]
+        free = np.zeros(slopes[0].shape[2] - precision.size)
+        prior = [np.append(part, free) for part in (precision, known)]
         return cls(np.array(xx), np.array(xy), np.array(yy), count, *prior)
 
     def subset(self, trials: Sequence[int]) -> NormalEquations:

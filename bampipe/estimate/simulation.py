@@ -40,7 +40,7 @@ class Runaway(InputError):
 
 
 @dataclass(frozen=True)
-class Impedance:
+class Arm:
     """The arm that pulls the mechanism towards a reference motion.
 
     The arm demands the acceleration ``natural_frequency**2 * (q_ref - q) + 2 * damping_ratio *
@@ -49,14 +49,30 @@ class Impedance:
     continuous derivatives.
 
     Attributes:
+        q_ref, qd_ref: (T, n_q) motion that the arm follows.
+        force: columns of the inputs with the handle force, N. If they are fewer than the
+            coordinates, the arm's force is the least-squares one.
+        rate, curvature: columns with its first and second derivative, to which those of the arm's
+            force are added; in the order of ``force``, -1 for one that the model does not use.
+        moved_first: (n_q, 2) indices in the state of the positions that the arm moves along
+            ``q_ref``, and of their rates; by default those of the coordinates.
         natural_frequency: rad/s; 0 leaves the mechanism to the given force alone.
         damping_ratio: 1 is critical.
         bandwidth: of the low-pass on the force, rad/s.
     """
 
+    q_ref: Array
+    qd_ref: Array
+    force: Sequence[int]
+    rate: Sequence[int] = ()
+    curvature: Sequence[int] = ()
+    moved_first: Indices | None = None
     natural_frequency: float = 12.0
     damping_ratio: float = 1.0
     bandwidth: float = 120.0
+
+
+_NOBODY = Arm(np.zeros((0, 0)), np.zeros((0, 0)), ())
 
 
 class Plant(NamedTuple):
@@ -75,11 +91,11 @@ class Plant(NamedTuple):
 
 
 class _Arm(NamedTuple):
-    """The arm: columns of the inputs with its force and derivatives, and its `Impedance`.
+    """The same as the kernel takes it.
 
     Attributes:
-        at, moving: (n,) places in the state of the positions that it moves, by coordinate, and of
-            their rates.
+        at, moving: (n_q,) places in the state of the positions that it moves, by coordinate, and
+            of their rates.
     """
 
     at: Indices
@@ -87,6 +103,8 @@ class _Arm(NamedTuple):
     force: Indices
     rate: Indices
     curvature: Indices
+    q_ref: Array
+    qd_ref: Array
     natural_frequency: float
     damping_ratio: float
     bandwidth: float
@@ -100,7 +118,7 @@ class _Brakes(NamedTuple):
 
 
 PLANT = record_type(Plant, _V, _V, _V, float64)
-_ARM = record_type(_Arm, _I, _I, _I, _I, _I, float64, float64, float64)
+_ARM = record_type(_Arm, *[_I] * 5, _M, _M, *[float64] * 3)
 
 
 @part()
@@ -153,8 +171,8 @@ def _count_steps(derivative, x, u, plant, dt):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, out):  # type: ignore[no-untyped-def]
-    """Write the handle force that alone would give the acceleration which the arm demands."""
+def _solve_goal(derivative, x, u, plant, arm, k, out):  # type: ignore[no-untyped-def]
+    """Write the force that alone would give the acceleration which the arm demands at sample k."""
     p, w, force = plant.p, plant.w, arm.force
     frequency, damping = arm.natural_frequency, arm.damping_ratio
     nx, n, nf = x.shape[0], plant.width.shape[0], force.shape[0]
@@ -170,15 +188,15 @@ def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, out):  # type: igno
     trace = 0.0
     for j in range(nf):
         out[j] = 0.0
-        for k in range(nf):
+        for other in range(nf):
             total = 0.0
             for i in range(n):
-                total += response[i, j] * response[i, k]
-            normal[j, k] = total
+                total += response[i, j] * response[i, other]
+            normal[j, other] = total
         trace += normal[j, j]
     for i in range(n):
-        error = frequency * frequency * (q_ref[i] - x[arm.at[i]])
-        error += 2.0 * damping * frequency * (qd_ref[i] - x[arm.moving[i]])
+        error = frequency * frequency * (arm.q_ref[k, i] - x[arm.at[i]])
+        error += 2.0 * damping * frequency * (arm.qd_ref[k, i] - x[arm.moving[i]])
         for j in range(nf):
             out[j] += response[i, j] * error
     for j in range(nf):  # keeps the solution finite where a force moves nothing
@@ -189,21 +207,16 @@ def _solve_goal(derivative, x, u, plant, arm, q_ref, qd_ref, out):  # type: igno
         return
     forward_substitute(factor, nf, out)
     for j in range(nf - 1, -1, -1):
-        for k in range(j + 1, nf):
-            out[j] -= factor[k, j] * out[k]
+        for i in range(j + 1, nf):
+            out[j] -= factor[i, j] * out[i]
         out[j] /= factor[j, j]
 
 
-@njit(
-    void(
-        DERIVATIVE, _M, _M, PLANT, _ARM, record_type(_Brakes, _I, _M), _M, _M, float64,
-    ),
-    cache=True,
-)  # fmt: skip
-def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt):  # type: ignore[no-untyped-def]
+@njit(void(DERIVATIVE, _M, _M, PLANT, _ARM, record_type(_Brakes, _I, _M), float64), cache=True)
+def _run(derivative, x, u, plant, arm, brakes, dt):  # type: ignore[no-untyped-def]
     """Fill the rows of ``x`` after the first and add arm force and brake commands to ``u``.
 
-    Without columns of force there is no arm, and ``q_ref``, ``qd_ref`` are not read.
+    Without columns of force there is no arm.
     """
     force, rate, curvature, bandwidth = arm.force, arm.rate, arm.curvature, arm.bandwidth
     brake, brake_gain = brakes.columns, brakes.gain
@@ -215,7 +228,7 @@ def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt):  # type: igno
     follow = 1.0 - np.exp(-dt / _BRAKES_S)
     for k in range(x.shape[0] - 1):
         if nf > 0:
-            _solve_goal(derivative, x[k], u[k], plant, arm, q_ref[k], qd_ref[k], goal)
+            _solve_goal(derivative, x[k], u[k], plant, arm, k, goal)
         for j in range(nf):  # the low-pass, exact for a goal that is constant over dt
             gap = pull[j] - goal[j]
             slope = pull_rate[j] + bandwidth * gap
@@ -242,80 +255,31 @@ def _run(derivative, x, u, plant, arm, brakes, q_ref, qd_ref, dt):  # type: igno
 
 def simulate(
     derivative: Any,
+    plant: Plant,
     x0: Array,
     u: Array,
-    p: Array,
     dt: float,
     *,
-    width: Array,
-    n_noise: int,
-    smooth: Sequence[int] = (),
-    max_step: float = MAX_STEP_S,
-) -> Array:
-    """Integrate the model from ``x0`` (nx,) under given inputs, without process noise.
-
-    Args:
-        derivative: compiled f(x, u, p, w, dx), positions first in x, then rates, then states.
-        u: (T, nu) inputs at samples ``dt`` seconds apart, linear in between; its columns ``smooth``
-            follow cubic splines instead, as forces do.
-        width: (n_q,) velocity over which friction changes sign, rad/s or m/s.
-        n_noise: length of the model's process noise w; max_step: longest integration step, s.
-
-    Returns:
-        (T, nx) states at the samples.
-
-    Raises:
-        Runaway: the motion grows without bounds.
-    """
-    nobody = np.zeros((0, 0))
-    return simulate_tracking(
-        derivative, x0, u, p, dt, nobody, nobody, width=width, n_noise=n_noise, force=(),
-        smooth=smooth, max_step=max_step,
-    )[0]  # fmt: skip
-
-
-def simulate_tracking(
-    derivative: Any,
-    x0: Array,
-    u: Array,
-    p: Array,
-    dt: float,
-    q_ref: Array,
-    qd_ref: Array,
-    *,
-    width: Array,
-    n_noise: int,
-    force: Sequence[int],
-    rate: Sequence[int] = (),
-    curvature: Sequence[int] = (),
-    impedance: Impedance | None = None,
+    arm: Arm | None = None,
     brake: Sequence[int] = (),
     brake_gain: Array | None = None,
     smooth: Sequence[int] = (),
-    max_step: float = MAX_STEP_S,
-    moved_first: Indices | None = None,
 ) -> tuple[Array, Array]:
-    """Integrate the model under given inputs plus an arm that holds it near a given motion.
+    """Integrate the model from ``x0`` (nx,) under given inputs, without process noise.
 
-    It simulates a recording with the friction, including sticking, of a fitted model. The recorded
-    forces act, and the arm adds the force that keeps the motion from drifting away. The returned
-    inputs include the arm's force, so that with the returned motion they form one consistent
-    recording.
+    An arm may hold it near a given motion. That simulates a recording with the friction, including
+    sticking, of a fitted model: the recorded forces act, and the arm adds the force that keeps the
+    motion from drifting away. The returned inputs include the arm's force, so that with the
+    returned motion they form one consistent recording.
 
     Args:
-        derivative, x0, p, dt, width, n_noise, smooth, max_step: as in `simulate`.
-        u: (T, nu) inputs without the arm's force; copied.
-        q_ref, qd_ref: (T, n_q) motion that the arm follows.
-        force: columns of ``u`` with the handle force, N. If they are fewer than the coordinates,
-            the arm's force is the least-squares one. Without any there is no arm.
-        rate, curvature: columns with its first and second derivative, to which those of the arm's
-            force are added; in the order of ``force``, -1 for one that the model does not use.
-        impedance: of the arm; by default 12 rad/s, critically damped.
+        derivative: compiled f(x, u, p, w, dx), positions first in x, then rates, then states.
+        plant: the rest of what is simulated; see `make_plant`.
+        u: (T, nu) inputs at samples ``dt`` seconds apart, linear in between, without the arm's
+            force; copied. Its columns ``smooth`` follow cubic splines instead, as forces do.
         brake: columns with the brake command of each coordinate, in their order, or none.
         brake_gain: (T, n_q) damping that the brakes render: each command is this times the
             speed, low-passed as a controller sees it. N.m.s/rad or N.s/m.
-        moved_first: (n_q, 2) indices in the state of the positions that the arm moves along
-            ``q_ref``, and of their rates; by default those of the coordinates.
 
     Returns:
         states (T, nx) and inputs (T, nu) with the total handle force and the brake commands.
@@ -323,31 +287,29 @@ def simulate_tracking(
     Raises:
         Runaway: the motion grows without bounds.
     """
+    arm, n = arm or _NOBODY, len(plant.width)
     u, fine_dt = read_finely(u, dt, smooth)
     finer, dt = round(dt / fine_dt), fine_dt
+    gain = np.zeros((0, 0)) if brake_gain is None else brake_gain
+    q_ref, qd_ref = arm.q_ref, arm.qd_ref
     if finer > 1:
-        everything = range(q_ref.shape[1])
-        q_ref, qd_ref = (_read_between(ref, finer, everything) for ref in (q_ref, qd_ref))
-        brake_gain = None if brake_gain is None else _read_between(brake_gain, finer)
+        axes = range(q_ref.shape[1])
+        q_ref, qd_ref = (_read_between(ref, finer, axes) for ref in (q_ref, qd_ref))
+        gain = _read_between(gain, finer)
     x = np.zeros((len(u), len(x0)))
     x[0] = x0
     total = np.array(u, dtype=np.float64, order="C")
-    gain = np.zeros((0, 0)) if brake_gain is None else np.ascontiguousarray(brake_gain)
-    n, arm = len(width), impedance or Impedance()
-    if moved_first is None:
-        moved_first = np.arange(2 * n).reshape(2, n).T
-    _run(
-        derivative, x, total, make_plant(p, n_noise, width, max_step),
-        _Arm(
-            moved_first[:, 0].copy(), moved_first[:, 1].copy(),
-            np.array(force, dtype=np.int64), np.array(rate, dtype=np.int64),
-            np.array(curvature, dtype=np.int64),
-            arm.natural_frequency, arm.damping_ratio, arm.bandwidth,
-        ),
-        _Brakes(np.array(brake[: gain.shape[1]], dtype=np.int64), gain),
-        np.array(q_ref, dtype=np.float64, order="C"),  # a copy: columns of a table are read-only
-        np.array(qd_ref, dtype=np.float64, order="C"), dt,
+    first = np.arange(2 * n).reshape(2, n).T if arm.moved_first is None else arm.moved_first
+    indices = (*first.T, arm.force, arm.rate, arm.curvature)
+    at, moving, force, rate, curvature = (np.array(some, dtype=np.int64) for some in indices)
+    # Copies: columns of a table are read-only.
+    q_ref, qd_ref = (np.array(ref, dtype=np.float64, order="C") for ref in (q_ref, qd_ref))
+    pull = _Arm(
+        at, moving, force, rate, curvature, q_ref, qd_ref,
+        arm.natural_frequency, arm.damping_ratio, arm.bandwidth,
     )  # fmt: skip
+    brakes = _Brakes(np.array(brake[: gain.shape[1]], dtype=np.int64), np.ascontiguousarray(gain))
+    _run(derivative, x, total, plant, pull, brakes, dt)
     require_finite(x, dt)
     return np.ascontiguousarray(x[::finer]), np.ascontiguousarray(total[::finer])
 
@@ -372,31 +334,26 @@ def _read_between(values: Array, finer: int, smooth: Sequence[int] = ()) -> Arra
     return between
 
 
-def make_plant(p: Array, n_noise: int, width: Array, max_step: float) -> Plant:
-    """Return the plant in the form of the compiled functions, without process noise."""
+def make_plant(p: Array, n_noise: int, width: Array, max_step: float = MAX_STEP_S) -> Plant:
+    """Return the plant in the form of the compiled functions.
+
+    Args:
+        p: (np,) parameters; n_noise: length of the model's process noise w.
+        width: (n_q,) velocity over which friction changes sign, rad/s or m/s.
+        max_step: longest integration step, s.
+    """
     return Plant(
         np.ascontiguousarray(p, dtype=np.float64), np.zeros(n_noise),
         np.ascontiguousarray(width, dtype=np.float64), max_step,
     )  # fmt: skip
 
 
-def count_steps(
-    derivative: Any,
-    x: Array,
-    u: Array,
-    p: Array,
-    dt: float,
-    *,
-    width: Array,
-    n_noise: int,
-    max_step: float = MAX_STEP_S,
-) -> float:
+def count_steps(derivative: Any, plant: Plant, x: Array, u: Array, dt: float) -> float:
     """Mean number of integration steps from one sample to the next, over some states.
 
     Args:
         x: (K, nx) states; u: (K, nu) inputs there; the others as in `simulate`.
     """
-    plant = make_plant(p, n_noise, width, max_step)
     rows = np.ascontiguousarray(x), np.ascontiguousarray(u)
     return float(_count_steps(derivative, *rows, plant, dt) / len(x))
 

@@ -24,7 +24,6 @@ from bampipe.estimate.triangular import (
     covariance_of,
     forward_substitute,
     padded,
-    rank_one_update,
     transpose,
 )
 from bampipe.model_functions import DERIVATIVE_ROWS, MEASURE_ROWS
@@ -129,10 +128,10 @@ def filter_square_root(  # type: ignore[no-untyped-def]
     points = allocate_points(nx, u.shape[1], p, nw)
     # root is R = L^T, so that the rotated elements are contiguous; columns are deviations.
     root, columns = np.zeros((n, wide)), np.zeros((n, padded(pairs + nw)))
-    reading_columns, gain = np.zeros((ny, wide)), np.empty((ny, wide))
+    reading_columns, gain = np.zeros((ny, padded(n + 1))), np.empty((ny, wide))
     # Noise of the readings given the state (a lower root), and readings along R^T.
     noise, cross = np.empty((ny, ny)), np.empty((ny, n))
-    cosine, sine, single, whitened = np.empty((4, n + ny + 1))
+    cosine, sine, whitened = np.empty((3, n + ny + 1))
     centre_image = 2 * nw * other
     size = t.shape[0]
     means, covariances = np.empty((-(-size // stride), n)), np.empty((-(-size // stride), n, n))
@@ -206,9 +205,8 @@ def filter_square_root(  # type: ignore[no-untyped-def]
                     cross[i, pair] = half * (readings[i, pair] - readings[i, n + pair])
                 for j in range(ny):
                     noise[i, j] = reading_sd[i] if i == j else 0.0
-                single[i] = centre_image**0.5 * (middle - predicted)
-            append_rows(noise, ny, reading_columns, wide)
-            rank_one_update(noise, ny, single)
+                reading_columns[i, n] = centre_image**0.5 * (middle - predicted)
+            append_rows(noise, ny, reading_columns, reading_columns.shape[1])
             for i in range(ny):
                 for j in range(i):
                     noise[i, j] = noise[j, i]

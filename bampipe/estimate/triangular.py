@@ -26,24 +26,16 @@ def padded(n):  # type: ignore[no-untyped-def]
 def cholesky(covariance, factor):  # type: ignore[no-untyped-def]
     """Write the lower Cholesky factor of ``covariance`` (n, n) into ``factor`` (n, n).
 
-    A coordinate with exactly zero variance gets a zero column: it is known and stays so.
-
     Returns:
-        Whether the matrix is positive semidefinite; ``factor`` is meaningless otherwise.
+        Whether the matrix is positive definite; ``factor`` is meaningless otherwise.
     """
     n = covariance.shape[0]
     for j in range(n):
         for k in range(j):
             factor[k, j] = 0.0
         pivot = covariance[j, j]
-        known = pivot == 0.0
         for k in range(j):
             pivot -= factor[j, k] * factor[j, k]
-        if known:
-            factor[j, j] = 0.0
-            for i in range(j + 1, n):
-                factor[i, j] = 0.0
-            continue
         if not pivot > 0.0:
             return False
         diagonal = pivot**0.5
@@ -154,34 +146,6 @@ def forward_substitute(factor, n, vector):  # type: ignore[no-untyped-def]
         for k in range(i):
             total -= factor[i, k] * vector[k]
         vector[i] = total / factor[i, i]
-
-
-@part()
-def rank_one_update(upper, n, vector):  # type: ignore[no-untyped-def]
-    """Replace R by the factor of R^T R + vector vector^T; ``vector`` (>= n,) is destroyed.
-
-    Args:
-        upper: (>= n, >= n) R, upper triangular; its leading (n, n) block is replaced.
-        n: size; vector: (>= n,).
-    """
-    for k in range(n):
-        if vector[k] == 0.0:
-            continue
-        diagonal = upper[k, k]
-        updated = (diagonal * diagonal + vector[k] * vector[k]) ** 0.5
-        if diagonal == 0.0:
-            # Sigma points leave the centre behind along a direction of no spread.
-            upper[k, k] = updated
-            for i in range(k + 1, n):
-                upper[k, i] = vector[i] * vector[k] / updated
-                vector[i] = 0.0
-            continue
-        cosine = updated / diagonal
-        sine = vector[k] / diagonal
-        upper[k, k] = updated
-        for i in range(k + 1, n):
-            upper[k, i] = (upper[k, i] + sine * vector[i]) / cosine
-            vector[i] = cosine * vector[i] - sine * upper[k, i]
 
 
 @part()

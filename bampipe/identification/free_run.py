@@ -19,7 +19,14 @@ from bampipe.arrays import Array, Flags
 from bampipe.data.run_folder import RunFolder
 from bampipe.data.store import read_parquet
 from bampipe.errors import InputError
-from bampipe.estimate.simulation import MAX_STEP_S, Runaway, read_finely, simulate
+from bampipe.estimate.simulation import (
+    MAX_STEP_S,
+    Plant,
+    Runaway,
+    make_plant,
+    read_finely,
+    simulate,
+)
 from bampipe.physics import System
 from bampipe.physics.control_law import ControlLaw, compile_law
 from bampipe.physics.device import INPUT_ORDERS, derivative
@@ -152,10 +159,9 @@ def _run_closed_loop(
     u = motion.inputs(system.inputs)
     force = [system.inputs.index(name) for name in law.forces]
     _, total, readings = simulate_controlled(
-        system.derivative, system.measure, law.command, _initial_state(system, motion, p), u, r,
-        p[: len(system.parameters)], float(motion.t[1] - motion.t[0]),
-        width=system.sign_widths, n_noise=len(system.noise), force=force, rate_hz=law.rate_hz,
-        limits=law.limits,
+        system.derivative, system.measure, law.command, _make_plant(system, p),
+        _initial_state(system, motion, p), u, r, float(motion.t[1] - motion.t[0]),
+        force=force, rate_hz=law.rate_hz, limits=law.limits,
     )  # fmt: skip
     measured = np.hstack([motion.q, motion.qd])
     return _Run(motion.trial_id, measured, readings, u[:, force], total[:, force])
@@ -165,7 +171,8 @@ def _run_open_loop(system: System, motion: Motion, p: Array, push: Array | None 
     start, u = _initial_state(system, motion, p), motion.inputs(system.inputs)
     if push is not None:
         start[: len(push)] += push
-    x = _simulate(system, start, u, p, float(motion.t[1] - motion.t[0]), system.forced, MAX_STEP_S)
+    plant, dt = _make_plant(system, p), float(motion.t[1] - motion.t[0])
+    x, _ = simulate(system.derivative, plant, start, u, dt, smooth=system.forced)
     readings = system.encoder_readings(x, u, p)
     none = np.zeros((len(x), 0))
     return _Run(motion.trial_id, np.hstack([motion.q, motion.qd]), readings, none, none)
@@ -298,18 +305,14 @@ def _simulate_from(system: System, state: Array, u: Array, p: Array, dt: float) 
     """Return the state (nx,) at the last of inputs (T, n_u), `read_finely`; None if it diverges."""
     for step in _STEPS_S:
         with contextlib.suppress(Runaway):
-            return np.asarray(_simulate(system, state, u, p, dt, (), step)[-1])
+            x, _ = simulate(system.derivative, _make_plant(system, p, step), state, u, dt)
+            return np.asarray(x[-1])
     return None
 
 
-def _simulate(
-    system: System, state: Array, u: Array, p: Array, dt: float, smooth: Sequence[int], step: float
-) -> Array:
-    """Return states (T, nx) under the inputs (T, n_u) alone, from ``state`` on."""
-    return simulate(
-        system.derivative, state, u, p[: len(system.parameters)], dt, width=system.sign_widths,
-        n_noise=len(system.noise), smooth=smooth, max_step=step,
-    )  # fmt: skip
+def _make_plant(system: System, p: Array, longest_step_s: float = MAX_STEP_S) -> Plant:
+    own = p[: len(system.parameters)]
+    return make_plant(own, len(system.noise), system.sign_widths, longest_step_s)
 
 
 def _summarise_drift(

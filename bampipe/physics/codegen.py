@@ -230,26 +230,17 @@ def function_source(
     return f"\n\ndef {name}({', '.join(groups)}):\n    " + "\n    ".join(body) + "\n"
 
 
-def portable_expressions(
-    e: Equations, parameters: Mapping[Any, float]
-) -> tuple[list[str], list[str], list[Any]]:
-    """Return the force that a motion requires, as text with numbers for the parameters.
+def print_portable(e: Equations, parameters: Mapping[Any, float]) -> Block:
+    """Return the force that a motion requires, by axis, as text with numbers for the parameters.
 
     Args:
         e: the equations of a model without internal states; parameters: value of each symbol.
-
-    Returns:
-        Assignments ``name = expression``, one expression an axis, and the inputs it still needs.
     """
     numbers = {symbol: sp.Float(value) for symbol, value in parameters.items()}
-    numbers |= dict.fromkeys(e.w, sp.S.Zero)
-    required = [
-        sp.sympify(f - o, strict=True).xreplace(numbers)
-        for f, o in zip(e.dynamics, e.other, strict=True)
-    ]
+    forces = zip(e.dynamics, e.quiet_other, strict=True)
+    required = [sp.sympify(f - o, strict=True).xreplace(numbers) for f, o in forces]
     steps = [(name, value.xreplace(numbers)) for name, value in e.steps]
-    block = print_block(required, steps, kind=_PortablePrinter)
-    return block.lines, block.values, [symbol for symbol in e.u if symbol in block.used]
+    return print_block(required, steps, kind=_PortablePrinter)
 
 
 def array_source(e: Equations, added: Sequence[Any]) -> str:
@@ -296,10 +287,9 @@ def slopes_source(e: Equations) -> tuple[str, list[tuple[int, int]]]:
 
 def dynamics_source(e: Equations) -> str:
     """Source of the functions over columns of the whole mechanism: long where it is a robot."""
-    no_noise = dict.fromkeys(e.w, 0)
-    required = [f - o.subs(no_noise) for f, o in zip(e.dynamics, e.other, strict=True)]
+    forces = zip(e.dynamics, e.quiet_other, strict=True)
     results = {
-        "required": ("q qd qdd z u p", required),
+        "required": ("q qd qdd z u p", [f - o for f, o in forces]),
         "mass_matrix": ("q p", [m for row in e.mass for m in row]),
         "energy": ("q qd p", [e.kinetic, e.potential]),
     }
@@ -451,10 +441,8 @@ def residual_source(e: Equations, bodies: Sequence[Any]) -> str:
     Args:
         e: the equations; bodies: names of what ``b`` holds, by `bodies_along_motion`.
     """
-    no_noise = dict.fromkeys(e.w, 0)
-    residual = [
-        a + o.subs(no_noise) - f for a, o, f in zip(e.applied, e.other, e.dynamics, strict=True)
-    ]
+    forces = zip(e.applied, e.quiet_other, e.dynamics, strict=True)
+    residual = [a + o - f for a, o, f in forces]
     block = print_block(residual, e.steps, bodies)
     groups = {**_select_groups(e, "q qd qdd"), "b": bodies, **_select_groups(e, "z u")}
     return _print_along_motion("residual", groups, e.p, block)

@@ -33,7 +33,7 @@ from bampipe.physics.robot import gravity_vector
 from bampipe.physics.roles import find_compensation, find_delays
 from bampipe.physics.signals import ActingInputs, order_of_action
 from bampipe.physics.time_limit import OutOfTime, time_limit
-from bampipe.physics.vocabulary import Symbols, Vocabulary, constant_symbol
+from bampipe.physics.vocabulary import Symbols, Vocabulary
 
 LONGEST_S = 60.0
 """Processor time that a derivation may take: the BAM takes 1 s, a planar arm with four links 23 s.
@@ -197,7 +197,7 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
             for i, added in enumerate(_move_bias(d, item, effect.ahead, symbols)):
                 other[i] += added
         for key, tree in effect.expressions.items():
-            value, place = d.rebuild_for(item, tree, symbols, key), item.target_of(key)
+            value, place = d.build(tree, symbols, key, item), item.target_of(key)
             label = f"effect {item.name!r}: {key}"
             if effect.kind == "energy":
                 pair = (value, sp.S.Zero) if key == "kinetic" else (sp.S.Zero, value)
@@ -215,7 +215,7 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
             if by_axis is other and effect.acting_link:
                 delivered_force[axis] += value
         for state in effect.states:
-            rate, initial = d.rebuild_state(item, state, symbols)
+            rate, initial = d.build_state(item, state, symbols)
             z = d.z[item.prefix, state.name]
             states[z] = signals.put_in(rate), signals.put_in_initial(initial)
     other = [signals.put_in(e) for e in other]
@@ -225,12 +225,12 @@ def _collect_terms(d: Vocabulary, forces: _Forces) -> _Terms:
 def _move_bias(d: Vocabulary, item: BoundEffect, ahead: Ahead, symbols: Symbols) -> list[Any]:
     """Evaluate the bias at the mechanism, ahead of an encoder; return the added terms, by axis."""
     i = d.axes.index(item.target)
-    position = d.rebuild_for(item, ahead.position, symbols, "ahead.position")
-    rate = d.rebuild_for(item, ahead.rate, symbols, "ahead.rate")
+    position = d.build(ahead.position, symbols, "ahead.position", item)
+    rate = d.build(ahead.rate, symbols, "ahead.rate", item)
     true = {d.q[i]: d.q[i] + position, d.qd[i]: d.qd[i] + rate}
     moved = [h.subs(true, simultaneous=True) for h in d.bias]
     symbols["axis_bias"] = moved[i]
-    share = d.rebuild_for(item, ahead.share, symbols, "ahead.share")
+    share = d.build(ahead.share, symbols, "ahead.share", item)
     return [share * (h - m) for h, m in zip(d.bias, moved, strict=True)]
 
 
@@ -270,17 +270,12 @@ def _find_dry_friction(d: Vocabulary, other: Sequence[Any]) -> list[Any]:
     return [(e.subs(s, -1) - e.subs(s, 1)) / 2 for e, s in zip(other, signs, strict=True)]
 
 
-def _constants(d: Vocabulary) -> list[Any]:
-    """Symbols of the device's constants, unless numbers replace them."""
-    return [constant_symbol(c) for c in d.model.device.constants if d.named_constants]
-
-
 def _check_dependence(d: Vocabulary, forces: _Forces, terms: _Terms) -> None:
     """Refuse expressions with names that their place in the equations does not allow."""
     device = d.model.device
     others = [d.channel[c] for c in device.channels]
     prompt_force = [d.channel[derivative(f, k)] for f in device.forces for k in range(LAST_ORDER)]
-    free, u, motion = [*d.p.values(), *_constants(d)], [*d.channel.values()], [*d.q, *d.qd]
+    free, u, motion = [*d.p.values(), *d.constants], [*d.channel.values()], [*d.q, *d.qd]
     all_symbols = [*motion, *u, *free, *d.z.values()]
     words = "motion, inputs, parameters and internal states"
     rates, initial = ([entry[k] for entry in terms.states.values()] for k in (0, 1))
@@ -313,7 +308,7 @@ def _combine_motion(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
     """Add the terms of the energies and of a robot's bodies."""
     energy_motion, robot = _apply_lagrange(d, energies), d.model.device.robot
     if robot is None:
-        check_inertia(d.model, energy_motion.mass, [*d.q, *_constants(d)])
+        check_inertia(d.model, energy_motion.mass, [*d.q, *d.constants])
         return energy_motion
     numbers = tuple(d.p[p.name] for p in robot.parameters)
     motion = tuple(d.q), tuple(d.qd), tuple(d.qdd)
@@ -330,7 +325,7 @@ def _take_inertia(d: Vocabulary, other: list[Any]) -> list[Any]:
     found: list[Any] = [sp.S.Zero for _ in d.axes]
     for i in {d.axes.index(e.target) for e in d.model.effects if "qdd" in e.effect.names}:
         found[i], other[i] = sp.diff(other[i], d.qdd[i]), other[i].subs(d.qdd[i], 0)
-    allowed = [*d.q, *d.p.values(), *_constants(d)]
+    allowed = [*d.q, *d.p.values(), *d.constants]
     allow("what a torque has per acceleration", found, allowed, "positions and parameters")
     return found
 
@@ -362,7 +357,7 @@ def _apply_lagrange(d: Vocabulary, energies: Sequence[_Energy]) -> _Motion:
         bias_terms.append(bias)
     mass = [[sum((m[i][j] for m in mass_terms), sp.S.Zero) for j in range(n)] for i in range(n)]
     bias = [sum((h[i] for h in bias_terms), sp.S.Zero) for i in range(n)]
-    symbols_allowed = [*d.q, *d.qd, *d.p.values(), *_constants(d)]
+    symbols_allowed = [*d.q, *d.qd, *d.p.values(), *d.constants]
     for row, term in zip(mass, bias, strict=True):
         allow("the equation of motion", [*row, term], symbols_allowed, "motion and parameters")
     dynamics = [

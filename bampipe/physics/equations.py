@@ -81,17 +81,20 @@ class Equations:
     compensation: list[Any]
     delays: list[str]
 
+    @property
+    def quiet_other(self) -> list[Any]:
+        """Q_other without process noise."""
+        return [sp.sympify(o, strict=True).subs(dict.fromkeys(self.w, 0)) for o in self.other]
+
 
 def contribution(full: Equations, bare: Equations) -> list[Any]:
     """Return the terms of the effects in ``full`` beyond the residual of ``bare``, by axis."""
-    quiet = dict.fromkeys(full.w, 0)
+    other, bare_other = full.quiet_other, bare.quiet_other
     added = []
     for i in range(len(full.q)):
         inertia = sum(
             (m - n) * a for m, n, a in zip(full.mass[i], bare.mass[i], full.qdd, strict=True)
         )
-        force = full.applied[i] - bare.applied[i] + full.other[i] - bare.other[i]
-        added.append(
-            sp.sympify(force - (full.bias[i] - bare.bias[i]) - inertia, strict=True).subs(quiet)
-        )
+        force = full.applied[i] - bare.applied[i] + other[i] - bare_other[i]
+        added.append(sp.sympify(force - (full.bias[i] - bare.bias[i]) - inertia, strict=True))
     return added

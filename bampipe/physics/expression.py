@@ -7,6 +7,7 @@ a sympy expression; nothing of it is ever evaluated.
 import ast
 import keyword
 import math
+import operator
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
@@ -29,7 +30,9 @@ FUNCTIONS = dict.fromkeys(
     ("sin", "cos", "tan", "atan", "exp", "log", "sqrt", "tanh", "abs", "sgn", "heaviside", "ddt"), 1
 ) | {"min": 2, "max": 2, "clip": 3}
 """Number of arguments, by name."""
-_OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow)
+_ARITHMETIC: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
+}  # fmt: skip
 
 
 def parse(text: object, where: str) -> ast.expr:
@@ -83,7 +86,7 @@ def _check_node(node: ast.AST, where: str, power: float = 1.0, rates: int = 0) -
                 raise InputError(f"the number {value!r:.60} is too large", where=where)
         case ast.Name():
             pass
-        case ast.BinOp(left=left, op=op, right=right) if isinstance(op, _OPERATORS):
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in (*_ARITHMETIC, ast.Pow):
             if isinstance(op, ast.Pow):
                 power *= _check_power(right, where, power)
             _check_node(left, where, power, rates)
@@ -258,18 +261,8 @@ def build(
                 return symbols[name]
             case ast.UnaryOp(op=op, operand=operand):
                 return -walk(operand) if isinstance(op, ast.USub) else walk(operand)
-            case ast.BinOp(left=left, op=op, right=right):
+            case ast.BinOp(left=left, op=ast.Pow(), right=right):
                 a, b = walk(left), walk(right)
-                if isinstance(op, ast.Add):
-                    return a + b
-                if isinstance(op, ast.Sub):
-                    return a - b
-                if isinstance(op, ast.Mult):
-                    return a * b
-                if isinstance(op, ast.Div):
-                    if b == 0:
-                        raise InputError("division by zero", where=where)
-                    return a / b
                 if a == 0 and b < 0:
                     raise InputError("division by zero", where=where)
                 if a.is_number and a != 0 and b * math.log(abs(a)) > math.log(MAX_NUMBER):
@@ -277,6 +270,11 @@ def build(
                 # Halves stay exact: sympy then sees a square root.
                 halves = 2.0 * float(b)
                 return a ** (sp.Rational(int(halves), 2) if halves.is_integer() else b)
+            case ast.BinOp(left=left, op=op, right=right):
+                a, b = walk(left), walk(right)
+                if isinstance(op, ast.Div) and b == 0:
+                    raise InputError("division by zero", where=where)
+                return _ARITHMETIC[type(op)](a, b)
             case ast.Call(func=ast.Name(id=name), args=args):
                 values = [walk(argument) for argument in args]
                 if name == "exp" and values[0].is_number and values[0] > 69:

@@ -9,7 +9,7 @@ from typing import Literal
 
 from bampipe.arrays import Array
 from bampipe.errors import InputError
-from bampipe.physics.codegen import portable_expressions
+from bampipe.physics.codegen import print_portable
 from bampipe.physics.derivation import derive
 from bampipe.physics.model import Model
 
@@ -86,16 +86,17 @@ def portable_source(model: Model, parameters: Array, language: Language) -> str:
                 remedy="export a model without it",
             )
     e = derive(model)
-    lines, values, inputs = portable_expressions(
-        e, dict(zip(e.p, map(float, parameters), strict=True))
-    )
+    block = print_portable(e, dict(zip(e.p, map(float, parameters), strict=True)))
+    inputs = [symbol for symbol in e.u if symbol in block.used]
     names = [e.inputs[e.u.index(symbol)] for symbol in inputs]
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "u": inputs}
     places = {str(s): f"{group}[{i}]" for group, some in groups.items() for i, s in enumerate(some)}
-    pattern = re.compile(r"\b(" + "|".join(sorted(places, key=len, reverse=True)) + r")\b")
     lines, values = (
-        [pattern.sub(lambda found: places[found[0]], text) for text in texts]
-        for texts in (lines, values)
+        [
+            re.sub(r"\b[a-z]+\d+\b", lambda found: places.get(found[0], found[0]), text)
+            for text in texts
+        ]
+        for texts in (block.lines, block.values)
     )
     axes = model.device.coordinates
     of = ", ".join(f"{c.name} ({c.unit})" for c in axes)

@@ -115,11 +115,10 @@ def _print_templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
         (e.u, e.inputs), (e.z, e.z_names), (e.p, labels),
     ):  # fmt: skip
         names |= {s: sp.Symbol(text, real=True) for s, text in zip(symbols, texts, strict=True)}
-    quiet = dict.fromkeys(e.w, 0)
     sign = sp.Function("sgn")
 
     def text(expr: Any) -> str:
-        plain = sp.sympify(expr, strict=True).subs(quiet)
+        plain = sp.sympify(expr, strict=True)
         # A factor of 1.0 is redundant, and 2.0 is 2.
         plain = plain.xreplace({f: sp.Integer(f) for f in plain.atoms(sp.Float) if f == int(f)})
         for rate in e.qd:
@@ -139,7 +138,7 @@ def _print_templates(model: Model, labels: Sequence[str]) -> dict[str, Any]:
                 if j >= i and e.mass[i][j] != 0:
                     lines.append((f"M[{a},{b}] = ", text(e.mass[i][j])))
         lines += [(f"h[{a}] = ", text(h)) for a, h in zip(marks, e.bias, strict=True)]
-    for a, applied, other in zip(marks, e.applied, e.other, strict=True):
+    for a, applied, other in zip(marks, e.applied, e.quiet_other, strict=True):
         lines.append((f"Q[{a}] = ", text(applied + other)))
     lines += [(f"d {z}/dt = ", text(rate)) for z, rate in zip(e.z_names, e.rates, strict=True)]
     return {"potential": text(e.potential), "lines": lines}

@@ -39,7 +39,7 @@ def find_compensation(
             place = d.axes.index(item.target_of(key))
             if balanced[place] and expression.names(tree) & own:
                 symbols = d.effect_symbols(item, logged, side)
-                results[place] += d.rebuild_for(item, tree, symbols, key)
+                results[place] += d.build(tree, symbols, key, item)
     return results
 
 

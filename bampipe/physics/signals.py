@@ -92,10 +92,10 @@ class ActingInputs:
                 if place == EACH:
                     for k in range(len(INPUT_ORDERS)):
                         symbols[derivative("f", k)] = d.channel[derivative(name, k)]
-                found[d.channel[name]] = self.put_in(d.rebuild_for(item, tree, symbols, key))
+                found[d.channel[name]] = self.put_in(d.build(tree, symbols, key, item))
         for state in item.effect.states:
             z = d.z[item.prefix, state.name]
-            rate, initial = d.rebuild_state(item, state, symbols)
+            rate, initial = d.build_state(item, state, symbols)
             self.rates[z], self.initial[z] = self.put_in(rate), self.put_in_initial(initial)
         self.acting |= found
 

@@ -9,11 +9,9 @@ Robotics and Automation 6(3)). The scale is that of the measured force.
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from bampipe import generated_code
 from bampipe.arrays import Array
-from bampipe.physics.system import System
+from bampipe.physics.system import System, stack_columns
 
 
 @dataclass(frozen=True)
@@ -61,11 +59,9 @@ class Structure:
 
         Arguments as in `System.required`.
         """
-        out = np.empty((len(q), q.shape[1] * len(self.numbers)))
         columns = self._slopes(q.T, qd.T, qdd.T, z.T, u.T, p) if self.numbers else ()
-        for i, column in enumerate(columns):
-            out[:, i] = column
-        return out.reshape(len(q), q.shape[1], len(self.numbers))
+        shape = len(q), q.shape[1], len(self.numbers)
+        return stack_columns(columns, len(q)).reshape(shape)
 
 
 def structure(system: System) -> Structure:

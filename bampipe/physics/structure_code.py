@@ -31,13 +31,11 @@ def _separate_numbers(model: Model, e: Equations) -> tuple[list[Any], list[Any],
     names = constants | dict(zip(e.p, (p.name for p in model.parameters), strict=True))
     motion = {*e.q, *e.qd, *e.z, *e.u}
     factors: list[Any] = []
-    no_noise = dict.fromkeys(e.w, 0)
     # Without motion there is no force. For a robot's bodies, see `base_parameters`.
     for expr in (e.kinetic, e.potential) if model.device.robot is None else ():
         factors += _collect_factors(expr - expr.subs(dict.fromkeys(motion, 0)), motion, set(names))
-    for expr in (*e.applied, *e.other, *e.rates, *e.offset):
-        plain = sp.sympify(expr, strict=True).subs(no_noise)
-        factors += _collect_factors(plain, motion, set(names))
+    for expr in (*e.applied, *e.quiet_other, *e.rates, *e.offset):
+        factors += _collect_factors(expr, motion, set(names))
     known_symbols: set[Any] = set()
     while True:
         open_factors = _select_distinct([_strip_known(f, known_symbols) for f in factors])
@@ -146,12 +144,10 @@ def _print_slopes(model: Model, e: Equations, pivots: Sequence[str]) -> str:
     numbers: Mapping[Any, Any] = {
         constant_symbol(name): sp.Float(c.value) for name, c in model.device.constants.items()
     }
-    no_noise = dict.fromkeys(e.w, 0)
-    slopes = []
-    for a, o, f in zip(e.applied, e.other, e.dynamics, strict=True):
-        residual = a + o - f
-        for name in pivots:
-            slope = sp.diff(residual, constant_symbol(name))
-            slopes.append(sp.sympify(slope, strict=True).subs(no_noise).subs(numbers))
+    slopes = [
+        sp.diff(a + o - f, constant_symbol(name)).subs(numbers)
+        for a, o, f in zip(e.applied, e.quiet_other, e.dynamics, strict=True)
+        for name in pivots
+    ]
     groups = {"q": e.q, "qd": e.qd, "qdd": e.qdd, "z": e.z, "u": e.u, "p": e.p}
     return function_source("slopes", groups, slopes, e.steps)

@@ -150,10 +150,7 @@ class System:
         Raises:
             KeyError: there is none.
         """
-        for i, parameter in enumerate(self.parameters):
-            if parameter.name == name:
-                return i
-        raise KeyError(name)
+        return {p.name: i for i, p in enumerate(self.parameters)}[name]
 
     @cached_property
     def _arrays(self) -> ModuleType:
@@ -230,7 +227,7 @@ class System:
         Args:
             q: readings, (T, n_q); u: inputs, (T, n_u); p: parameters, (n_p,).
         """
-        return _stack(self._arrays.offset(q.T, u.T, p), len(q))
+        return stack_columns(self._arrays.offset(q.T, u.T, p), len(q))
 
     def required(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """Generalised force that the user must supply for this motion.
@@ -248,7 +245,7 @@ class System:
         Returns:
             (T, n_q), N.m or N.
         """
-        return _stack(self._dynamics.required(q.T, qd.T, qdd.T, z.T, u.T, p), len(q))
+        return stack_columns(self._dynamics.required(q.T, qd.T, qdd.T, z.T, u.T, p), len(q))
 
     def applied(self, q: Array, qd: Array, qdd: Array, z: Array, u: Array, p: Array) -> Array:
         """Generalised force of the measured input mapped to the joints (eq 19), (T, n_q).
@@ -256,7 +253,7 @@ class System:
         Arguments as in `required`; effects of kind ``input`` are included. The model's residual
         is ``applied - required``.
         """
-        return _stack(self._arrays.applied(q.T, qd.T, qdd.T, z.T, u.T, p), len(q))
+        return stack_columns(self._arrays.applied(q.T, qd.T, qdd.T, z.T, u.T, p), len(q))
 
     def residual(
         self,
@@ -359,7 +356,7 @@ class System:
         n = len(self.coordinates)
         u = np.zeros((len(q), len(self.inputs))) if u is None else u
         columns = self._arrays.input_map(q.T, u.T, self.prior if p is None else p)
-        return _stack(columns, len(q)).reshape(len(q), n, -1)
+        return stack_columns(columns, len(q)).reshape(len(q), n, -1)
 
     def least_force(
         self, q: Array, load: Array, u: Array | None = None, p: Array | None = None
@@ -380,11 +377,11 @@ class System:
     def mass_matrix(self, q: Array, p: Array) -> Array:
         """Mass matrix (eq 13), (T, n_q, n_q), kg m2, kg m, kg."""
         n = len(self.coordinates)
-        return _stack(self._dynamics.mass_matrix(q.T, p), len(q)).reshape(len(q), n, n)
+        return stack_columns(self._dynamics.mass_matrix(q.T, p), len(q)).reshape(len(q), n, n)
 
     def energy(self, q: Array, qd: Array, p: Array) -> tuple[Array, Array]:
         """Kinetic and potential energy, each (T,), J."""
-        both = _stack(self._dynamics.energy(q.T, qd.T, p), len(q))
+        both = stack_columns(self._dynamics.energy(q.T, qd.T, p), len(q))
         return both[:, 0], both[:, 1]
 
     def compensation(self, q: Array, qd: Array, z: Array, u: Array, p: Array) -> Array:
@@ -419,7 +416,7 @@ class System:
         """
         out = np.empty((len(q), len(self.memory_names)))
         first = [part.start or 0 for part in parts]
-        z0 = _stack(self._arrays.initial_memory(q[first].T, u[first].T, p), len(first))
+        z0 = stack_columns(self._arrays.initial_memory(q[first].T, u[first].T, p), len(first))
         known = {} if known is None else known
         for group in self.state_groups:
             module, start = self._state_modules[group.module], z0[:, group.places]
@@ -432,8 +429,8 @@ class System:
         return {group.module: self._code.module(group.module) for group in self.state_groups}
 
 
-def _stack(columns: tuple[Any, ...], rows: int) -> Array:
-    """Columns, some of them constants, as one (rows, n) array."""
+def stack_columns(columns: Sequence[Any], rows: int) -> Array:
+    """Return columns, some of them constants, as one (rows, n) array."""
     out = np.empty((rows, len(columns)))
     for i, column in enumerate(columns):
         out[:, i] = column

@@ -25,7 +25,8 @@ class Vocabulary:
     """The symbols of one model, and expressions of its device and effects built from them.
 
     Attributes:
-        model: the device and its effects; named_constants: whether constants stay symbols.
+        model: the device and its effects.
+        constants: symbols of the device's constants, unless numbers replace them.
         axes: names of the coordinates.
         q, qd, qdd: their symbols and those of their rates.
         channels: every input there may be; channel: their symbols.
@@ -40,7 +41,7 @@ class Vocabulary:
     """
 
     def __init__(self, model: Model, named_constants: bool = False) -> None:
-        self.model, self.named_constants = model, named_constants
+        self.model = model
         device = model.device
         self.axes = [c.name for c in device.coordinates]
         # Symbols are numbered, so that no name from a file is ever printed into generated code.
@@ -63,10 +64,9 @@ class Vocabulary:
         self.dry, self.weight, self.pull, self.inertia, self.bias = (zeros for _ in range(5))
         self.base: Symbols = dict(zip(self.axes, self.q, strict=True))
         self.base |= {f"qd_{a}": s for a, s in zip(self.axes, self.qd, strict=True)}
-        self.base |= {
-            name: constant_symbol(name) if named_constants else sp.Float(c.value)
-            for name, c in device.constants.items()
-        }
+        self.constants = [constant_symbol(name) for name in device.constants if named_constants]
+        values = self.constants or [sp.Float(c.value) for c in device.constants.values()]
+        self.base |= dict(zip(device.constants, values, strict=True))
         self.base |= {p.name: self.p[p.name] for p in device.parameters if "." not in p.name}
         self.base |= self.channel
         for name, tree in device.definitions.items():
@@ -74,15 +74,24 @@ class Vocabulary:
             size = expression.expanded_size(tree, self.sizes)
             self.sizes[name] = max(size, int(sp.count_ops(self.base[name])))
 
-    def build(self, tree: ast.expr, symbols: Mapping[str, Any], what: str) -> Any:
-        return self.rebuild(tree, symbols, f"device {self.model.device.name!r}: {what}")
-
-    def rebuild(self, tree: ast.expr, symbols: Mapping[str, Any], where: str) -> Any:
+    def build(
+        self,
+        tree: ast.expr,
+        symbols: Mapping[str, Any],
+        what: str,
+        item: BoundEffect | None = None,
+    ) -> Any:
         """`expression.build` of a tree that stays of bounded size with definitions put in.
+
+        Args:
+            what: the field, for messages; item: the effect that it is of, None for the device.
 
         Raises:
             InputError: it does not, or takes longer than the limit that the caller has set.
         """
+        device = self.model.device
+        owner = f"device {device.name!r}" if item is None else f"effect {item.name!r}"
+        where = f"{owner}: {what}"
         size = expression.expanded_size(tree, self.sizes)
         if size <= expression.MAX_EXPANDED:
             try:
@@ -204,10 +213,10 @@ class Vocabulary:
             return (forces[self.model.device.components.index(item.target)],)
         return force_pairs(self.model.device)[item.target]
 
-    def rebuild_for(self, item: BoundEffect, tree: ast.expr, symbols: Symbols, what: str) -> Any:
-        return self.rebuild(tree, symbols, f"effect {item.name!r}: {what}")
-
-    def rebuild_state(self, item: BoundEffect, state: State, symbols: Symbols) -> tuple[Any, Any]:
+    def build_state(self, item: BoundEffect, state: State, symbols: Symbols) -> tuple[Any, Any]:
         """Rate and initial value of an internal state of ``item``."""
-        rate = self.rebuild_for(item, state.rate, symbols, f"states.{state.name}.rate")
-        return rate, self.rebuild_for(item, state.initial, symbols, f"states.{state.name}.initial")
+        what = f"states.{state.name}"
+        return (
+            self.build(state.rate, symbols, f"{what}.rate", item),
+            self.build(state.initial, symbols, f"{what}.initial", item),
+        )

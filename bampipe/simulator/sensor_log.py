@@ -49,15 +49,10 @@ def record_trial(
 
 def _sensor_inputs(system: System, true: TrueTrial, force: Array) -> Array:
     """Return the inputs of the sensor models, (T, nu)."""
-    u = np.zeros((len(true.t), len(system.inputs)))
-    for j, f in enumerate(system.model.device.forces):
-        u[:, system.inputs.index(f)] = force[:, j]
-    for j, b in enumerate(system.model.device.brakes.values()):
-        if b in system.inputs:
-            u[:, system.inputs.index(b)] = true.brake[:, j]
-    if "t" in system.inputs:
-        u[:, system.inputs.index("t")] = true.t
-    return u
+    device, nothing = system.model.device, np.zeros(len(true.t))
+    columns = dict(zip(device.forces, force.T, strict=True)) | {"t": true.t}
+    columns |= dict(zip(device.brakes.values(), true.brake.T, strict=True))
+    return np.column_stack([columns.get(name, nothing) for name in system.inputs])
 
 
 def _sensed_position(specimen: Specimen, true: TrueTrial, force: Array) -> Array:

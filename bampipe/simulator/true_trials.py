@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bampipe.arrays import Array
-from bampipe.estimate.simulation import Impedance, simulate_tracking
+from bampipe.estimate.simulation import Arm, make_plant, simulate
 from bampipe.physics.device import Coordinate, Device, derivative
 from bampipe.simulator.specimen import Config, Specimen, find_input_column
 
@@ -66,7 +66,6 @@ def simulate_moving_trial(
     dt = 1.0 / config.sample_rate
     t = np.arange(round(config.duration * config.sample_rate), dtype=np.float64) * np.float64(dt)
     q_ref, qd_ref = _draw_wanted_motion(device, config, rng, t, 0.6 if viscous else 1.0)
-    arm = Impedance(natural_frequency=rng.uniform(7.0, 10.0), damping_ratio=1.0, bandwidth=50.0)
     u = np.zeros((len(t), len(system.inputs)))
     if "t" in system.inputs:
         u[:, system.inputs.index("t")] = t
@@ -77,16 +76,19 @@ def simulate_moving_trial(
         viscous or set(device.brakes) == {c.name for c in device.coordinates}
     ) else []  # fmt: skip
     p = specimen.p(system)
+    plant = make_plant(p, len(system.noise), system.sign_widths)
+    arm = Arm(
+        q_ref, qd_ref, force, slopes[0], slopes[1], system.moved_first,
+        natural_frequency=rng.uniform(7.0, 10.0), damping_ratio=1.0, bandwidth=50.0,
+    )  # fmt: skip
     x0 = np.concatenate([q_ref[0], np.zeros(n), system.initial_memory(q_ref[0], u[0], p)])
     pose = q_ref
     # The field J^T K J depends on the pose, which settles after a few iterations.
     for _ in range(4 if viscous else 1):
         gain = config.viscous_damping * (system.input_map(pose) ** 2).sum(axis=2)
-        x, total = simulate_tracking(
-            system.derivative, x0, u, p, dt, q_ref, qd_ref,
-            width=system.sign_widths, n_noise=len(system.noise), force=force,
-            rate=slopes[0], curvature=slopes[1], impedance=arm, brake=brakes,
-            brake_gain=gain if viscous else None, moved_first=system.moved_first,
+        x, total = simulate(
+            system.derivative, plant, x0, u, dt, arm=arm, brake=brakes,
+            brake_gain=gain if viscous else None,
         )  # fmt: skip
         pose = x[:, :n]
     brake = [system.inputs.index(b) for b in device.brakes.values()]

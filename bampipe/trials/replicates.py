@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 from bampipe.arrays import Array, Flags
 from bampipe.estimate.butterworth import zero_phase
 from bampipe.estimate.differentiation import UniformGrid
-from bampipe.estimate.simulation import Runaway, count_steps, simulate_tracking
+from bampipe.estimate.simulation import Arm, Runaway, count_steps, make_plant, simulate
 from bampipe.physics import System
 from bampipe.physics.device import derivative
 from bampipe.trials.kept import KeptItems
@@ -111,12 +111,11 @@ def follow_motion(system: System, p: Array, motion: Motion, rate_hz: float) -> C
             if name in at:
                 acting[:, at[name]] = _shifted(u[:, at[name]], -samples)
     try:
-        x, total = simulate_tracking(
-            system.derivative, start, acting, prompt, 1.0 / rate_hz, q, qd,
-            width=system.sign_widths, n_noise=len(system.noise), force=columns,
-            rate=[at.get(derivative(f, 1), -1) for f in forces],
-            curvature=[at.get(derivative(f, 2), -1) for f in forces],
-            smooth=system.forced, moved_first=system.moved_first,
+        rate, curvature = ([at.get(derivative(f, k), -1) for f in forces] for k in (1, 2))
+        x, total = simulate(
+            system.derivative, make_plant(prompt, len(system.noise), system.sign_widths), start,
+            acting, 1.0 / rate_hz, arm=Arm(q, qd, columns, rate, curvature, system.moved_first),
+            smooth=system.forced,
         )  # fmt: skip
     except Runaway:
         if not _is_controlled(system):
@@ -143,11 +142,9 @@ def steps_to_follow(
     true = motion.of_mechanism(system, u, p)
     memory = true.memory(system, p)
     rows = slice(None, None, -(-len(u) // probed))
-    return count_steps(
-        system.derivative, np.hstack([true.q, true.qd, memory])[rows], u[rows],
-        np.ascontiguousarray(p), float(motion.t[1] - motion.t[0]),
-        width=system.sign_widths, n_noise=len(system.noise), max_step=longest_step_s,
-    )  # fmt: skip
+    plant = make_plant(p, len(system.noise), system.sign_widths, longest_step_s)
+    x, dt = np.hstack([true.q, true.qd, memory]), float(motion.t[1] - motion.t[0])
+    return count_steps(system.derivative, plant, x[rows], u[rows], dt)
 
 
 def _lateness(fitted: ModelOnTrial) -> Array:

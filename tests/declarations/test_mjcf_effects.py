@@ -8,7 +8,7 @@ from exported_run import write_run
 from made_results import write_result
 
 from bampipe.declarations.export import export_model
-from bampipe.estimate.simulation import simulate
+from bampipe.estimate.simulation import make_plant, simulate
 from bampipe.results.identify import IdentifyResult
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed: pip install mujoco")
@@ -87,10 +87,8 @@ class Case:
         for k, name in enumerate(system.model.device.forces):
             u[:, system.inputs.index(name)] = np.interp(t - late[k], t, torque[:, k])
         start = np.concatenate([np.zeros(4), system.initial_memory(np.zeros(2), u[0], p)])
-        width = np.array([c.sign_width for c in system.model.device.coordinates])
-        return simulate(
-            system.derivative, start, u, p, 1.0 / RATE, width=width, n_noise=len(system.noise)
-        )[:, :2]
+        plant = make_plant(p, len(system.noise), system.sign_widths)
+        return simulate(system.derivative, plant, start, u, 1.0 / RATE)[0][:, :2]
 
     def theirs(self, torque: np.ndarray) -> np.ndarray:
         """Positions (T, 2) by MuJoCo, joint torques ``torque`` at its drives."""

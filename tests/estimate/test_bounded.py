@@ -148,5 +148,6 @@ def test_what_is_known_beforehand_counts_as_so_many_samples() -> None:
     expected = np.linalg.lstsq(np.vstack([rows, unit]), np.append(target, [3.0] * 4), rcond=None)[0]
     np.testing.assert_allclose(found.solve(weight, -FREE, FREE), expected, rtol=1e-9)
     x = RNG.normal(size=(400, 1))
-    exact = NormalEquations.from_samples([x[:, :, None]], [-x], [np.ones((400, 1), dtype=bool)])
+    nothing, every = np.zeros(0), np.ones((400, 1), dtype=bool)
+    exact = NormalEquations.from_samples([x[:, :, None]], [-x], [every], nothing, nothing)
     assert 0.0 < exact.mean_square(np.array([1.0]))[0] < 1e-10 * float(np.mean(x**2))

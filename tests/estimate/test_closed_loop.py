@@ -6,6 +6,7 @@ from numba import njit
 
 from bampipe.errors import InputError
 from bampipe.estimate.closed_loop import simulate_controlled
+from bampipe.estimate.simulation import make_plant
 from bampipe.model_functions import COMMAND, DERIVATIVE, MEASURE
 
 MASS, STIFFNESS, DAMPING = 2.0, 800.0, 8.0
@@ -32,8 +33,8 @@ def command(y, r, none, out):
 def run(count: int, start: float, limit: float = 1e9, compliance: float = 0.0, rate: float = 1e6):
     r = np.tile([0.0, STIFFNESS, limit], (count, 1))
     return simulate_controlled(
-        derivative, measure, command, np.array([start, 0.0]), np.full((count, 1), 7.0), r,
-        np.array([MASS, compliance]), DT, width=WIDTH, n_noise=1, force=[0], rate_hz=rate,
+        derivative, measure, command, make_plant(np.array([MASS, compliance]), 1, WIDTH),
+        np.array([start, 0.0]), np.full((count, 1), 7.0), r, DT, force=[0], rate_hz=rate,
     )  # fmt: skip
 
 
@@ -68,8 +69,8 @@ def test_a_controller_is_late_saturates_and_sees_its_encoders():
     r = np.tile([0.0, -1e8, np.inf], (2000, 1))
     with pytest.raises(InputError, match="grows without bounds"):
         simulate_controlled(
-            derivative, measure, command, np.array([0.01, 0.0]), np.zeros((2000, 1)), r,
-            np.array([MASS, 0.0]), DT, width=WIDTH, n_noise=1, force=[0],
+            derivative, measure, command, make_plant(np.array([MASS, 0.0]), 1, WIDTH),
+            np.array([0.01, 0.0]), np.zeros((2000, 1)), r, DT, force=[0],
         )  # fmt: skip
 
 
@@ -83,8 +84,8 @@ def with_integral(y, r, s, out):
 def test_an_integral_part_takes_a_lasting_load_off_unless_it_is_full(limit, left):
     r = np.tile([0.0, STIFFNESS], (8001, 1))
     x, u, _ = simulate_controlled(
-        derivative, measure, with_integral, np.array([0.0, 0.0]), np.full((8001, 1), 5.0), r,
-        np.array([MASS, 0.0]), DT, width=WIDTH, n_noise=1, force=[0], limits=[(-limit, limit)],
+        derivative, measure, with_integral, make_plant(np.array([MASS, 0.0]), 1, WIDTH),
+        np.array([0.0, 0.0]), np.full((8001, 1), 5.0), r, DT, force=[0], limits=[(-limit, limit)],
     )  # fmt: skip
     # It starts where the recorded command of 5 N comes out, if it may.
     assert u[0, 0] == pytest.approx(5.0 if limit == 1.0 else -2.0, abs=1e-6)

@@ -5,7 +5,7 @@ import pytest
 from numba import njit, types
 
 from bampipe.errors import InputError
-from bampipe.estimate.simulation import simulate, simulate_tracking
+from bampipe.estimate.simulation import Arm, make_plant, simulate
 
 WIDTH = np.array([2.5e-4])
 
@@ -19,8 +19,8 @@ def slider(x, u, p, w, dx):
 
 
 def run(u, p, v0=0.0, **options):
-    x0 = np.array([0.0, v0])
-    return simulate(slider, x0, u, np.array(p), 0.002, width=WIDTH, n_noise=1, **options)
+    plant = make_plant(np.array(p), 1, WIDTH, **options)
+    return simulate(slider, plant, np.array([0.0, v0]), u, 0.002)[0]
 
 
 def test_friction_decays_stops_and_holds():
@@ -42,10 +42,10 @@ def test_a_smooth_force_keeps_its_strength_between_coarse_samples():
     u = np.zeros((len(t), 3))
     u[:, 0] = force * np.cos(frequency * t)
     speed = force / mass / frequency * np.sin(frequency * t)
-    p = np.array([mass, 0.0, 0.0])
+    plant = make_plant(np.array([mass, 0.0, 0.0]), 1, WIDTH)
 
     def moved(**options):
-        x = simulate(slider, np.zeros(2), u, p, 0.01, width=WIDTH, n_noise=1, **options)
+        x, _ = simulate(slider, plant, np.zeros(2), u, 0.01, **options)
         return speed @ x[:, 1] / (speed @ speed)
 
     assert moved() == pytest.approx(np.sinc(0.1) ** 2, abs=1e-3)
@@ -83,19 +83,17 @@ def recording(**options):
     return track(np.zeros((4000, 3)), [3.5, 10.0, 3.5], WANTED, rate, **options)
 
 
-def track(u, p, q_ref, qd_ref, **options):
-    start = np.array([q_ref[0, 0], qd_ref[0, 0]])
-    return simulate_tracking(
-        slider, start, u, np.array(p), 0.002, q_ref, qd_ref,
-        width=WIDTH, n_noise=1, force=[0], **options,
-    )  # fmt: skip
+def track(u, p, q_ref, qd_ref, rate=(), **options):
+    start, plant = np.array([q_ref[0, 0], qd_ref[0, 0]]), make_plant(np.array(p), 1, WIDTH)
+    arm = Arm(q_ref, qd_ref, [0], rate)
+    return simulate(slider, plant, start, u, 0.002, arm=arm, **options)
 
 
 def test_the_arm_follows_the_motion_it_wants_and_its_force_gives_it_again():
     x, u = recording()
     assert np.abs(x[:, 0] - WANTED[:, 0]).max() < 0.05
     assert np.abs(u[:, 0]).max() > 3.5
-    again = simulate(slider, x[0], u, np.array([3.5, 10.0, 3.5]), 0.002, width=WIDTH, n_noise=1)
+    again, _ = simulate(slider, make_plant(np.array([3.5, 10.0, 3.5]), 1, WIDTH), x[0], u, 0.002)
     np.testing.assert_allclose(again, x, atol=1e-12)
     again, total = track(u, [3.5, 10.0, 3.5], x[:, :1], x[:, 1:])
     np.testing.assert_allclose(again, x, atol=1e-9)

@@ -7,9 +7,8 @@ from bampipe.estimate import triangular
 from bampipe.estimate.unscented import join_roots
 
 # Compiled code alone calls what is compiled of them.
-append_rows, condition, covariance_of, rank_one_update = (
-    getattr(triangular, name).py_func
-    for name in ("append_rows", "condition", "covariance_of", "rank_one_update")
+append_rows, condition, covariance_of = (
+    getattr(triangular, name).py_func for name in ("append_rows", "condition", "covariance_of")
 )
 RNG = np.random.default_rng(2)
 
@@ -49,7 +48,7 @@ def test_an_update_and_a_root_where_nothing_was():
     upper, vector = np.triu(RNG.normal(size=(4, 4))) + 3.0 * np.eye(4), RNG.normal(size=4)
     upper[2] = 0.0
     expected, product = upper.T @ upper + np.outer(vector, vector), np.empty((4, 4))
-    rank_one_update(upper, 4, vector)
+    append_rows(upper, 4, vector[:, None].copy(), 1)
     covariance_of(upper, product)
     np.testing.assert_allclose(product, expected, atol=1e-13)
     spread = np.array([1e6, 1e-6, 3.0])

@@ -7,7 +7,7 @@ from motions import typical_parameters as typical
 from scipy.optimize import least_squares
 from small_arm import ARM
 
-from bampipe.estimate.simulation import simulate_tracking
+from bampipe.estimate.simulation import Arm, make_plant, simulate
 from bampipe.physics import Model, compile_model, registry
 from bampipe.physics.effect import unit_of
 
@@ -327,11 +327,10 @@ def test_an_arm_leads_the_motor_that_moves_the_axis_through_play():
     wanted, rate = 0.05 * (1.0 - np.cos(2.0 * t)), 0.1 * np.sin(2.0 * t)
     u = np.zeros((t.size, len(system.inputs)))
     start = np.concatenate([[0.0, 0.0], system.initial_memory(np.zeros(1), u[0], p)])
-    x, _ = simulate_tracking(
-        system.derivative, start, u, p, 2e-3, wanted[:, None], rate[:, None],
-        width=np.array([c.sign_width for c in device.coordinates]), n_noise=len(system.noise),
-        force=[system.inputs.index("force_motor")], moved_first=system.moved_first,
-    )  # fmt: skip
+    force = [system.inputs.index("force_motor")]
+    arm = Arm(wanted[:, None], rate[:, None], force, moved_first=system.moved_first)
+    plant = make_plant(p, len(system.noise), system.sign_widths)
+    x, _ = simulate(system.derivative, plant, start, u, 2e-3, arm=arm)
     gap = p[system.index("loose_drive.carriage.gap")]
     behind = x[:, 2] - x[:, 0]
     # The motor drags the carriage along from the ends of the gap, pressed as far as friction takes.
