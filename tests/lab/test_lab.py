@@ -22,7 +22,6 @@ from bampipe.phrases import lab as phrases
 from bampipe.results.compare import CompareResult
 from bampipe.results.diagnose import DiagnoseResult
 from bampipe.results.run import RunResult
-from bampipe.run import record
 from bampipe.run.accepted import accept
 
 ROOT = Path(__file__).parent.parent.parent
@@ -229,7 +228,7 @@ def test_a_result_that_was_edited_leaves_its_run_out(tmp_path: Path) -> None:
     path = runs / "s01/models/base/identify.json"
     outputs = {"models/base/identify.json": digest_file(path)}
     step = {"key": "0" * 64, "code": "0" * 64, "outputs": outputs}
-    write_result(runs / "s01", RunResult, schema=record.SCHEMA, stages={"identify:base": step})
+    write_result(runs / "s01", RunResult, stages={"identify:base": step})
     assert collect(runs, tmp_path / "lab", report=False).skipped == ()
     path.write_text(path.read_text().replace("4.", "5.", 1))
     (skipped,) = collect(runs, tmp_path / "lab", report=False).skipped
