@@ -82,16 +82,16 @@ def _judge(
     named = tuple(e for e in listed if e in selection.effects)
     sure = [e for e, p in listed.items() if p >= c.probability]
     open_question = [e for e, p in listed.items() if p < c.probability]
-    unknown = min(float(selection.probabilities.unknown[axis]), 1.0)
-    # At the floor, an unknown function follows errors of the bias, not the machine.
-    asked = unknown if against_floor == "above_floor" else 0.0
-    remains = asked >= c.probability
+    unknown = 0.0
+    if against_floor == "above_floor":  # at it, a function follows errors of the bias, or hum
+        unknown = min(float(selection.probabilities.unknown[axis]), 1.0)
+    remains = unknown >= c.probability
     verdict: Verdict
     if against_floor == "floor_missing":
         verdict = "no_verdict"
     elif remains and max(listed.values(), default=0.0) < 0.5:
         verdict = "unknown_effect"
-    elif open_question or 1.0 - c.probability <= asked < c.probability:
+    elif open_question or 1.0 - c.probability <= unknown < c.probability:
         verdict = "undecided"
     else:
         verdict = "missing" if sure else "nothing_missing"
