@@ -51,7 +51,7 @@ def write_emps(result: Mapping[str, Any]) -> str:
         ["Hz", "apparent mass, kg", "delay, ms"],
         [
             [f"{x['hz']:.0f}", f"{x['mass_kg']:.1f}", f"{x['delay_ms']:.2f}"]
-            for x in result["transfer"]
+            for x in result["transfer"][::2]
         ],
     )
     said = ""
