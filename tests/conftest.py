@@ -90,7 +90,7 @@ class Toy:
 
     @property
     def options(self) -> tuple[str, ...]:
-        """The pipeline and the run folders, as the command line is told."""
+        """Command-line options that select the pipeline and the folder of runs."""
         return ("--pipeline", str(self.pipeline_file), "--runs", str(self.runs))
 
     def start(

@@ -146,6 +146,7 @@ class SetCosts:
         """Return the costs with other numbers of independent samples."""
         other, likelihood = copy(self), replace(self.problem.likelihood, samples=samples)
         other._set_problem(replace(self.problem, likelihood=likelihood))
+        other._products_by_key = self._products_by_key  # of the same residual
         return other
 
     def _atom(self, key: Key) -> Atom:

@@ -88,10 +88,9 @@ def build_splines(costs: SetCosts, axis: int) -> Splines | None:
                 blocks.append(take_samples(thin, p.likelihood.samples[axis], 0))
     if not blocks:
         return None
-    choices = [len(_SIZES) * (len(blocks) + 1)] * len(blocks)
     vibration, frequencies = _find_vibration(costs, axis)
     blocks.append(vibration)
-    choices.append(choices[0] * frequencies)
+    choices = len(_SIZES) * len(blocks) * np.array([1] * (len(blocks) - 1) + [frequencies])
     ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
     x = np.concatenate(blocks, axis=1) * p.likelihood.root[axis][:, None]
     functions = tuple(np.arange(*pair) for pair in pairwise(ends))

@@ -16,7 +16,7 @@ from bampipe.run.verify import verify
 
 
 def run_toys(toy: Toy, limit: int | None = None) -> tuple[int, str]:
-    """Run the toys in another process; its exit code and what it says of errors."""
+    """Run the toy stages in another process; return its exit code and standard error."""
     process = toy.start(str(toy.session), "--quiet", limit=limit)
     said = process.communicate()[1]
     return process.returncode, said
