@@ -46,9 +46,9 @@ def move(m, law, goal, goal_rate, kick, log_at):
     ``kick`` (steps,) is added to the command after the controller, and is logged with it.
     """
     h = STEP
-    memory = np.zeros(1, MEMORY)[0]
+    memories = np.zeros(1, MEMORY)
     q, v = goal[0], 0.0
-    memory.cable = q
+    memories[0].cable = q
     load_q, load_v = q, 0.0
     command, delivered = 0.0, 0.0
     hold, late = round(m.hold / h), round(m.delay / h)
@@ -56,6 +56,7 @@ def move(m, law, goal, goal_rate, kick, log_at):
     out = np.zeros((len(log_at), 2))
     k_log = 0
     for k in range(len(goal)):
+        memory = memories[0]  # a record does not keep its array alive
         if k % hold == 0:
             command = m.velocity_gain * (
                 m.position_gain * (goal[k] - q) + m.feed_forward * goal_rate[k] - v
