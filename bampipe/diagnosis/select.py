@@ -202,7 +202,7 @@ def _fit_better(
 ) -> tuple[Fit | None, dict[tuple[str, ...], float]]:
     """Fit the sets ``better`` in turn until the fit of one is better than the current model.
 
-    A set with a larger held-out error is not better, even if its log evidence is.
+    A set that fits held-out trials worse is not better, even if its log evidence is.
 
     Returns:
         The better fit, if any, and the gains of the fits that are not better, nats, by effects.
@@ -222,10 +222,10 @@ def _fit_better(
             fits[members] = session.try_fit(wider, start_of(search, keys, wider))
         moved = fits[members]
         if moved is not None:
-            gain = gain_when_fitted(current, moved, search, keys)
+            gain, held_out = gains_when_fitted(current, moved, search, keys)
             if gain <= _LEAST_GAIN:
                 kept[effect_names(keys)] = gain
-            elif _held_out_error(moved) < _held_out_error(current) + NOTICEABLE:
+            elif held_out > -NOTICEABLE:
                 return moved, kept
         broken.append({*keys})
         if fresh:
@@ -269,38 +269,49 @@ def _leave_out(
 
 def _find_misleading(fit: Fit, probabilities: Probabilities, own: Sequence[str]) -> set[str]:
     """Return the effects that are less probable than not and raise the held-out error."""
-    out, least = set[str](), _held_out_error(fit)
+    out, least = set[str](), _log_squares(fit, fit.held_out_rows()).sum()
     while doubtful := [e for e in own if e not in out and probabilities.effects.get(e, 0.0) < 0.5]:
-        left, worst = min((_held_out_error(fit, {*out, e}), e) for e in doubtful)
+        left, worst = min(
+            (_log_squares(fit, fit.held_out_rows({*out, e})).sum(), e) for e in doubtful
+        )
         if left >= least:
             break
         out, least = {*out, worst}, left
     return out
 
 
-def _held_out_error(fit: Fit, without: Collection[str] = ()) -> float:
-    """Return the logarithm of the held-out error, summed over the axes."""
-    errors = fit.held_out_without(without) if without else fit.held_out_rmse
-    return float(np.sum(np.log(np.maximum(errors, 1e-300))))
+def _log_squares(fit: Fit, rows: Iterable[Array]) -> Array:
+    """Return half the log of the sum of squares of a residual, weighted as in ``fit``, by axis."""
+    weighted = (row * root for row, root in zip(rows, fit.likelihood.root, strict=True))
+    return 0.5 * np.log([max(float(row @ row), 1e-300) for row in weighted])
 
 
-def gain_when_fitted(before: Fit, after: Fit, search: Search, keys: Sequence[Key]) -> float:
-    """Return the log evidence that a set gains by its fit, under the weights of ``before``, nats.
+def gains_when_fitted(
+    before: Fit, after: Fit, search: Search, keys: Sequence[Key]
+) -> tuple[float, float]:
+    """Return what a set gains by its fit, under the weights of ``before``.
 
     ``before`` and ``after`` are fits without and with the set ``keys``.
+
+    Returns:
+        The log evidence, nats, and the log of the factor by which the error on held-out trials
+        falls beside that of the measured force, summed over the axes.
     """
     if any(len(a) != len(b) for a, b in zip(before.problem.y, after.problem.y, strict=True)):
-        return np.inf
-
-    def sum_squares(fit: Fit) -> Array:
-        rows = zip(fit.rows_beyond_bias, before.likelihood.root, strict=True)
-        return np.array([max(float(np.sum((left * root) ** 2)), 1e-300) for left, root in rows])
-
-    ratio = sum_squares(before) / sum_squares(after)
-    gained = 0.5 * float(before.problem.independent @ np.log(ratio))
+        return np.inf, np.inf
     volume = search.volume_where_fitted(keys, after.evidence)
-    taken = -np.inf if volume is None else float(volume.sum())
-    return gained + taken - search.solve(keys).penalty
+    if volume is None:
+        return -np.inf, -np.inf
+    seen, held_out = (
+        _log_squares(before, b) - _log_squares(before, a)
+        for b, a in (
+            (before.rows_beyond_bias, after.rows_beyond_bias),
+            (before.held_out_rows(), after.held_out_rows()),
+        )
+    )
+    independent = before.problem.independent
+    gain = float(independent @ seen + volume.sum()) - search.solve(keys).penalty
+    return gain, float(np.sum(held_out + volume / np.maximum(independent, 1e-300)))
 
 
 def _explore(search: Search, room: int, deep: int) -> Pool:

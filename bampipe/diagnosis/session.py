@@ -417,22 +417,37 @@ class Fit:
 
     def held_out_without(self, effects: Iterable[str] = ()) -> Array:
         """Return `held_out_rmse` without some of the model's effects."""
-        e, p, samples = self.evidence, self.problem, self.likelihood.samples
-        absent = p.removal(effects)
-        groups, group_of = np.unique(e.folds.groups, return_inverse=True)
-        parts = [group_of[here.trial] for here in samples]
+        e, samples = self.evidence, self.likelihood.samples
         plain = [take_samples(e.residual, here, axis) for axis, here in enumerate(samples)]
         slopes = [take_samples(e.slopes, here, axis) for axis, here in enumerate(samples)]
-        sums, squares, is_unseen = p.sums(), np.zeros(len(samples)), len(groups) > 1
+        squares = np.zeros(len(samples))
+        for parts, unknowns in self._solve_held_out(effects):
+            change = (self.problem.to_parameters @ unknowns)[: slopes[0].shape[1]]
+            for axis, part in enumerate(parts):
+                left = plain[axis][part] + slopes[axis][part] @ change
+                squares[axis] += float(np.sum(left**2))
+        return np.asarray(np.sqrt(squares / self.problem.count))
+
+    def held_out_rows(self, effects: Iterable[str] = ()) -> list[Array]:
+        """Return `rows_beyond_bias` on trials that no unknown has seen, without some effects."""
+        rows = [np.zeros_like(y) for y in self.problem.y]
+        for parts, unknowns in self._solve_held_out(effects):
+            left = self.problem.residual_rows(unknowns)
+            for row, part, here, root in zip(rows, parts, left, self.likelihood.root, strict=True):
+                row[part] = here[part] / root[part]
+        return rows
+
+    def _solve_held_out(self, effects: Iterable[str]) -> Iterator[tuple[list[Flags], Array]]:
+        """Yield the samples of each group of trials, by axis, and the unknowns without them."""
+        p, absent = self.problem, self.problem.removal(effects)
+        groups, group_of = np.unique(self.evidence.folds.groups, return_inverse=True)
+        parts = [group_of[here.trial] for here in self.likelihood.samples]
+        sums, is_unseen = p.sums(), len(groups) > 1
         for k, own in enumerate(zip(*p.sums_of(parts, len(groups)), strict=True)):
             xx, xy, yy = (whole - is_unseen * part for whole, part in zip(sums, own, strict=True))
             yy = np.maximum(yy, 1e-300)
             others = solve_bounded(p, xx, xy, yy, absent=absent, weight=self.solution.weight)
-            change = (p.to_parameters @ others.base)[: slopes[0].shape[1]]
-            for axis, part in enumerate(parts):
-                left = plain[axis][part == k] + slopes[axis][part == k] @ change
-                squares[axis] += float(np.sum(left**2))
-        return np.asarray(np.sqrt(squares / p.count))
+            yield [part == k for part in parts], others.base
 
 
 def rms(values: Array) -> float:

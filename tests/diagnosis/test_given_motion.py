@@ -14,7 +14,7 @@ from sessions import fit_from_priors
 import bampipe
 from bampipe.data.run_folder import RunFolder
 from bampipe.diagnosis.criteria import Criteria
-from bampipe.diagnosis.select import change_set, gain_when_fitted, open_search
+from bampipe.diagnosis.select import change_set, gains_when_fitted, open_search
 from bampipe.diagnosis.session import Session, system_of
 from bampipe.physics.recipe import Recipe
 from bampipe.physics.registry import device_from
@@ -65,7 +65,7 @@ def test_a_drive_that_hardly_acts_any_more_explains_nothing(tmp_path: Path) -> N
     with open_search(session, before, only=("drive_sag:joint",)) as search:
         assert search.volume_where_fitted(keys, same.evidence) == pytest.approx([0.0])
         assert search.volume_where_fitted(keys, weaker.evidence) is None
-        assert gain_when_fitted(before, small, search, keys) == -np.inf
+        assert gains_when_fitted(before, small, search, keys)[0] == -np.inf
     ends = [session.fit_plainly(weak, np.append(p, sag)) for sag in (0.0, 0.02, 1.0)]
     for end in ends:
         assert end.evidence.p[-1] == pytest.approx(ends[0].evidence.p[-1], rel=1e-3, abs=1e-6)
