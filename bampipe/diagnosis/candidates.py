@@ -22,7 +22,7 @@ class Candidate:
         is_joint: whether ``system`` also has the other effects of the model, because they interact.
         parameters: the parameters of the effect.
         linear_indices: indices of the strengths in which the residual is linear.
-        searched_indices: indices of the other free parameters, whose values are searched.
+        searched_indices: indices of the other free parameters whose values are searched.
     """
 
     name: str
@@ -84,5 +84,5 @@ def compile_candidate(model: Model) -> Candidate:
     free = [i for i, parameter in enumerate(parameters) if not parameter.fixed]
     strengths = () if system.moves_sensors else (i for i in free if parameters[i].strength)
     linear = tuple(i for i in strengths if is_linear[i])
-    searched = tuple(i for i in free if i not in linear)
+    searched = tuple(i for i in free if i not in linear and parameters[i].searched)
     return Candidate(item.name, system, is_joint, parameters, linear, searched)

@@ -41,7 +41,8 @@ _LIGHTEST = 6.0
 _TIME = (2.0, 3.0)
 """Settling times, from samples to durations of a trial."""
 _PARTS = {"travel": (0.02, 0.98), "upper half": (0.5, 0.98), "lower half": (0.02, 0.5)}
-"""Positions, as shares of the travel."""
+_PLACES_APART = 0.08
+"""Positions, and the distance of two on a grid, as shares of the travel."""
 _BEYOND = (0.52, 5.0)
 """Distances of positions beyond the travel from its middle, as shares of the travel. A force that
 rises towards a more distant position is a straight line on the travel."""
@@ -167,7 +168,7 @@ class MachineScale:
                 steepest, around = 1.0 / nearest, 0.5 * (low + high)
                 return SearchRange(-steepest, steepest, False, around, farthest)
             start, end = (low + share * (high - low) for share in _PARTS[parameter.within])
-            return SearchRange(start, end, False)
+            return SearchRange(start, end, False, largest_spacing=_PLACES_APART * (high - low))
         if parameter.shape and lower <= 0.0:
             low = lower if np.isfinite(lower) else parameter.prior - reach
             return SearchRange(low, upper if np.isfinite(upper) else parameter.prior + reach, False)

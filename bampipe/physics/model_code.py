@@ -51,7 +51,7 @@ def effects_code(model: Model) -> Generation:
         ],
         "driven": any(sp.diff(e, force) != 0 for e in added for force in forces),
         "force_fed": any(e.has(*forces) for e in equations.rates),
-        "moved_first": moved_first(equations, forces),
+        "moved_first": moved_first(model, equations, forces),
         "compensated": [i for i, e in enumerate(equations.compensation) if e != 0],
         "delays": equations.delays,
         "braked": any(brakes & e.free_symbols for e in (*added, *equations.rates)),
@@ -90,20 +90,21 @@ def whole_code(model: Model) -> Generation:
     return facts, sources | scalar_sources(equations, here, title)
 
 
-def moved_first(e: Equations, forces: list[Any]) -> list[list[int]]:
+def moved_first(model: Model, e: Equations, forces: list[Any]) -> list[list[int]]:
     """Return, by axis, the places in a state of the position and rate that a force acts on first.
 
-    They are those of the axis, or internal states of a motor that moves the axis through play.
+    They are those of the axis, or internal states of a part that moves the axis through play.
     """
-    n, found = len(e.q), []
-    for i, other in enumerate(e.other):
-        at = [i, n + i]
-        for place, rate in enumerate(e.rates):
-            if rate in e.z and other.has(e.z[place]):
-                through = e.z.index(rate)
-                if e.rates[through].has(*forces):
-                    at = [2 * n + place, 2 * n + through]
-        found.append(at)
+    n = len(e.q)
+    found = [[i, n + i] for i in range(n)]
+    axes = [coordinate.name for coordinate in model.device.coordinates]
+    for item in model.effects:
+        for state in item.effect.states:
+            place = e.z_names.index(f"{item.prefix}.{state.name}")
+            if (rate := e.rates[place]) in e.z and e.rates[e.z.index(rate)].has(*forces):
+                axis = axes.index(item.axes[0])
+                if e.other[axis].has(e.z[place]):
+                    found[axis] = [2 * n + place, 2 * n + e.z.index(rate)]
     return found
 
 

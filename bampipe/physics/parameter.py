@@ -58,6 +58,9 @@ class Parameter(NamedDeclaration):
         description="For a position on the axis: the part of the travel where the diagnosis looks;"
         " beyond: outside of it, on either side",
     )
+    searched: bool = Field(
+        default=True, description="Whether a diagnosis tries several values of it, not the prior"
+    )
     description: str = Field(default="", description="Meaning, in a few words")
 
     def cross_faults(self) -> Iterator[InputError]:
