@@ -40,7 +40,7 @@ _LIGHTEST = 6.0
 """Inertia of an axis over that of its lightest relevant part."""
 _TIME = (2.0, 3.0)
 """Settling times, from samples to durations of a trial."""
-_PARTS = {"travel": (0.02, 0.98), "upper half": (0.5, 0.98), "lower half": (0.02, 0.5)}
+_PARTS = {"travel": (0.02, 0.98), "upper part": (0.25, 0.98), "lower part": (0.02, 0.75)}
 _PLACES_APART = 0.08
 """Positions, and the distance of two on a grid, as shares of the travel."""
 _BEYOND = (0.52, 5.0)

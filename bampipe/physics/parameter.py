@@ -53,7 +53,7 @@ class Parameter(NamedDeclaration):
         default=None,
         description="Size at which the effect is clearly visible; strength 1 of the simulator",
     )
-    within: Literal["travel", "upper half", "lower half", "beyond"] | None = Field(
+    within: Literal["travel", "upper part", "lower part", "beyond"] | None = Field(
         default=None,
         description="For a position on the axis: the part of the travel where the diagnosis looks;"
         " beyond: outside of it, on either side",

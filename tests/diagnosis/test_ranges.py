@@ -42,8 +42,9 @@ def test_where_drives_are_late_and_stops_are_looked_for():
     beside = replace(AXIS, coordinates={**AXIS.coordinates, "tool": ("m", "N")})
     assert range_of(lag, "time_constant").low == pytest.approx(2e-4)
     assert range_of(lag, "time_constant", beside).low == pytest.approx(5e-4)
-    for stop in (range_of(f"{name}_stop:carriage", "position") for name in ("upper", "lower")):
-        assert (stop.low, stop.high) == pytest.approx((-0.045, 0.195))
+    upper, lower = (range_of(f"{name}_stop:carriage", "position") for name in ("upper", "lower"))
+    assert (upper.low, upper.high) == pytest.approx((0.0125, 0.195))
+    assert (lower.low, lower.high) == pytest.approx((-0.045, 0.1375))
     ends = range_of("gas_spring:carriage", "end")
     shares = np.linspace(0.0, 1.0, 21)
     found = np.array([ends.value_at(ends.interpolate(share)) for share in shares])
