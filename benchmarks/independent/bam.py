@@ -112,9 +112,9 @@ EFFECTS = (
 UNKNOWN = (
     "detent:yaw", "detent:pitch", "detent:extension", "rough_patch:yaw", "rough_patch:pitch",
     "rough_patch:extension", "winding_cable:yaw", "winding_cable:extension", "hum:yaw",
-    "slack_spring:yaw", "speed_band:extension", "tightening:pitch", "imbalance:yaw",
-    "sensor_hysteresis:x", "hose:yaw",
+    "speed_band:extension", "tightening:pitch", "imbalance:yaw", "sensor_hysteresis:x", "hose:yaw",
 )  # fmt: skip
+"""Not the spring with slack, which is the sum of two stops of the library."""
 
 
 @njit(cache=True)

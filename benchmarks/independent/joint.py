@@ -55,7 +55,8 @@ EFFECTS = (
     "actuator_delay", "actuator_lag:current", "drive_sag:joint",
 )  # fmt: skip
 BY_NAME = ("loose_load:joint", "loose_drive:joint")
-UNKNOWN = tuple(f"{name}:joint" for name in OUTSIDE)
+UNKNOWN = tuple(f"{name}:joint" for name in OUTSIDE if name != "slack_spring")
+"""A spring with slack is the sum of two stops of the library."""
 DEVICE = f"""schema = "bampipe.device/1"
 name = "joint"
 summary = "One joint of an arm, driven by a motor current"
