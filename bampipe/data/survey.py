@@ -109,7 +109,7 @@ _JOINED = {
 }
 _UNIT_WORDS = {
     "time": ("us", "ms", "ns", "s", "min"),
-    "position": ("rad", "deg", "mm", "cm", "um", "m"),
+    "position": ("mrad", "rad", "deg", "mm", "cm", "um", "m"),
     "velocity": ("rad/s", "deg/s", "mm/s", "m/s", "rpm"),
     "force": ("Nm", "kN", "N", "V", "kg", "g"),
     "current": ("mA", "A"),

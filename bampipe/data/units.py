@@ -21,7 +21,7 @@ _GRAVITY = 9.80665
 _POUND = 4.4482216152605
 _FACTORS: dict[str, tuple[str, float]] = {
     **{si: (si, 1.0) for si in ("s", "m", "rad", "N", "A", "V", "W", "Hz", "Pa", "T", "K", "kg")},
-    "min": ("s", 60.0), "h": ("s", 3600.0), "g": ("kg", 1e-3), "%": ("", 1e-2),
+    "min": ("s", 60.0), "h": ("s", 3600.0), "g": ("kg", 1e-3), "%": ("", 1e-2), "‰": ("", 1e-3),
     "deg": ("rad", math.pi / 180), "rev": ("rad", _TURN), "arcmin": ("rad", math.pi / 10_800),
     "arcsec": ("rad", math.pi / 648_000), "in": ("m", 0.0254), "ft": ("m", 0.3048),
     "gon": ("rad", math.pi / 200), "kgf": ("N", _GRAVITY), "gf": ("N", 1e-3 * _GRAVITY),
@@ -62,7 +62,7 @@ _BESIDE = re.compile(r"(?i)(?:\A|(?<=[./]))units?[./]|(?:\A|[ _./])units?\Z")
 _TOKEN = re.compile(
     r"(?P<number>(?<![^\W_])\d+(?:\.\d+)?(?:[eE]-?\d+)?|\.\d+)"
     r"|(?P<over>\s*(?:/|\bper\b)\s*)"
-    r"|(?P<word>[^\W\d_]+|%|[°º][A-Za-z]?)(?:(?:\^|\*\*)?(?P<power>-[1-4]|[2-4])(?![\d.]))?"
+    r"|(?P<word>[^\W\d_]+|[%‰]|[°º][A-Za-z]?)(?:(?:\^|\*\*)?(?P<power>-[1-4]|[2-4])(?![\d.]))?"
     r"|\s*[*·⋅・.\s-]\s*"
 )  # fmt: skip
 

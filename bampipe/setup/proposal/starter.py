@@ -151,6 +151,7 @@ def starter_device(
     item = re.search(r"\[([A-Za-z]\w*)\]", position)  # of a list, such as position[elbow]
     parts = [item[1]] if item and unit_named(item[1]) is None else []
     names = [w for p in (*parts, position) for w in words(p) if w not in taken and len(w) > 2]
+    names = [word for word in names if unit_named(word) is None]
     axis = names[0] if names else ("carriage" if linear else "joint")
     kind, qd = ("linear" if linear else "rotary"), f"qd_{axis}"
     torque, mass = KINDS[kind][1], "kg" if linear else "kg.m2"
