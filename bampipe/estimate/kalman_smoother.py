@@ -204,10 +204,10 @@ def _smooth(present, step, passed, variances):  # type: ignore[no-untyped-def]
 def _evidence(y, present, step, noise, x, p, skip):  # type: ignore[no-untyped-def]
     """Return sums of log S and v²/S over the innovations after ``skip``, and their count.
 
-    Once the covariance has settled, it is kept until a sample is missing.
+    Once the gains have settled, they are kept until a sample is missing.
     """
     n = x.shape[0]
-    work, gain = np.empty((n, n)), np.empty(n)
+    work, gain, before = np.empty((n, n)), np.empty(n), np.empty(n)
     logs, squares, count = 0.0, 0.0, 0
     settled, spread = False, 1.0
     for t in range(y.shape[0]):
@@ -222,9 +222,11 @@ def _evidence(y, present, step, noise, x, p, skip):  # type: ignore[no-untyped-d
             if not present[t]:
                 settled = False
                 continue
-            before = spread
+            before[:] = gain
             innovation, spread = _update(x, p, y[t], gain)
-            settled = t > 4 * n and abs(spread - before) < _SETTLED * spread
+            settled = t > 4 * n
+            for i in range(n):
+                settled &= abs(gain[i] - before[i]) < _SETTLED * abs(gain[i])
         if t >= skip:
             logs += np.log(spread)
             squares += innovation * innovation / spread

@@ -133,3 +133,15 @@ def test_what_is_smoothed_without_variances_is_the_same(order: int) -> None:
     wanted = whole.position, whole.velocity, whole.acceleration
     for found, expected in zip(ks.smooth_mean(signal, model), wanted, strict=True):
         assert np.abs(found - expected).max() < 1e-5 * np.std(expected)
+
+
+@pytest.mark.parametrize("order", ks.ORDERS)
+def test_the_likelihood_is_that_of_every_innovation(order: int) -> None:
+    """Of a slow motion, the variance of the innovations rests long before the gains settle."""
+    y = np.random.default_rng(0).standard_normal(6000)
+    step, noise = ks.transition(order)
+    given = (y - y[0], np.ones(len(y), dtype=bool), step, 1e-12 * noise)
+    logs, squares, _ = ks._evidence(*given, *ks._prior(given[0], order), 0)
+    *_, innovations, spreads = ks._filter(*given, *ks._prior(given[0], order))
+    assert logs == pytest.approx(np.log(spreads).sum(), rel=1e-6)
+    assert squares == pytest.approx((innovations**2 / spreads).sum(), rel=1e-6)
