@@ -1,6 +1,7 @@
 """``bampipe demo``: the whole loop on the session that ships for it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from bampipe.api.loop import LoopOptions, follow
@@ -26,14 +27,15 @@ def demonstrate(runs: Path, force: bool, listen: Listener, tell: Callable[[str],
     root = runs / session_id(session)
     chosen = pipeline.load()
     tell(f"1. {session}: an arm with a fault that its model lacks.")
-    run_session(Request(root, chosen, session=session, force=force, judge=True), listen)
+    request = Request(root, chosen, force=force)
+    run_session(replace(request, session=session, judge=True), listen)
     for axis, error in RunFolder(root).read(ValidateResult, models.BASE).axes.items():
         tell(
             f"   {axis}: error on unseen trials {error.held_out_rmse:.3g} {error.unit}, "
             f"sensor noise alone would leave {error.noise_floor:.3g} {error.unit}"
         )
     tell("2. Which effect is missing? Diagnose and extend the model until nothing is missing.")
-    options = LoopOptions(root, chosen.with_every_stage(), force, True, listen)
+    options = LoopOptions(replace(request, pipeline=chosen.with_every_stage()), listen)
     last = follow(options, models.BASE, lambda line: tell(f"   {line}"))
     tell("3. The error on unseen trials, model by model.")
     for rung in RunFolder(root).read(CompareResult).ladder:

@@ -106,6 +106,7 @@ def extend(
     from bampipe.results.identify import IdentifyResult
     from bampipe.run import batch, models
     from bampipe.run import pipeline as pipelines
+    from bampipe.run.request import Request
 
     batch.limit_threads(1)
     effects = others or []
@@ -119,10 +120,10 @@ def extend(
     if not auto and not effects:
         raise InputError("no effect named", remedy="`bampipe effects` lists them; or use --auto")
     root = places.find_run(first, runs)
-    pipeline = pipelines.whole(root)
+    request = Request(root, pipelines.whole(root), force=force, wait=not no_wait)
     parent = models.choose_model(root, model)
     with show.Watcher(quiet or json) as watcher:
-        options = loop.LoopOptions(root, pipeline, force, not no_wait, watcher)
+        options = loop.LoopOptions(request, watcher)
         if auto:
             tell = (lambda line: None) if json else show.say
             last = loop.follow(options, parent, tell, draft)
