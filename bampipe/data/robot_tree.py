@@ -123,7 +123,7 @@ class TreeJoint:
     offset: Array
     angles: tuple[float, float, float]
     axis: list[float]
-    limits: DriveLimits
+    limits: DriveLimits = DriveLimits()
     mimic: tuple[str, float, float] | None = None
 
 
@@ -234,22 +234,15 @@ def tree_of_tables(tables: Mapping[str, Mapping[str, Any]]) -> Tree:
         link, after = f"{name}_link", table.get("after")
         bodies[link] = Body.of_table(table)
         roll, pitch, yaw = (float(v) for v in table.get("rotation", (0.0,) * 3))
-        joints.append(
-            TreeJoint(
-                name,
-                str(table["kind"]),
-                f"{after}_link" if after else "base",
-                link,
-                Rotation.from_euler("xyz", (roll, pitch, yaw)).as_matrix(),
-                np.array(table.get("position", (0.0,) * 3), dtype=float),
-                (roll, pitch, yaw),
-                [float(v) for v in table.get("axis", (0.0, 0.0, 1.0))],
-                DriveLimits(),
-                (str(table["follows"]), float(table.get("ratio", 1)), float(table.get("zero", 0)))
-                if table.get("follows")
-                else None,
-            )
-        )
+        turn = Rotation.from_euler("xyz", (roll, pitch, yaw)).as_matrix()
+        offset = np.array(table.get("position", (0.0,) * 3), dtype=float)
+        axis = [float(v) for v in table.get("axis", (0.0, 0.0, 1.0))]
+        ends = f"{after}_link" if after else "base", link
+        joint = TreeJoint(name, str(table["kind"]), *ends, turn, offset, (roll, pitch, yaw), axis)
+        if other := table.get("follows"):
+            mimic = str(other), float(table.get("ratio", 1)), float(table.get("zero", 0))
+            joint = replace(joint, mimic=mimic)
+        joints.append(joint)
     return Tree(bodies, joints)
 
 
@@ -258,10 +251,8 @@ def fixed_joint(name: str, parent: str, child: str, turn: Array, offset: Array) 
     from scipy.spatial.transform import Rotation
 
     roll, pitch, yaw = (float(v) for v in Rotation.from_matrix(turn).as_euler("xyz"))
-    axis = [0.0, 0.0, 1.0]
-    return TreeJoint(
-        name, "fixed", parent, child, turn, offset, (roll, pitch, yaw), axis, DriveLimits()
-    )
+    frame = turn, offset, (roll, pitch, yaw)
+    return TreeJoint(name, "fixed", parent, child, *frame, [0.0, 0.0, 1.0])
 
 
 def identifier(name: str) -> str:

@@ -65,6 +65,7 @@ _HALVINGS = 11
 
 Family = Callable[[float], Correction]
 Corrections = tuple[Correction, ...]
+Trials = tuple[Sequence[Motion], Folds]
 
 
 @dataclass(frozen=True)
@@ -288,7 +289,7 @@ class Search:
         return len(self.signals.axes) <= MOST_AXES
 
     @cached_property
-    def screened(self) -> tuple[Sequence[Motion], Folds]:
+    def screened(self) -> Trials:
         """The part of the trials for all set-ups: two fitted trials and a braked one."""
         folds = self.folds
         fitted = [k for k, fits in enumerate(folds.fitted) if fits]
@@ -302,19 +303,14 @@ class Search:
         """Return the plausibility of a set-up on the trials; None if it cannot be computed."""
         key = tuple(id(one) for one in corrections)
         if key not in self._judged:
-            found = self._judge(corrections, self.motions, self.folds, 12)
+            found = self._judge(corrections, (self.motions, self.folds), 12)
             self._judged[key] = found, corrections
         return self._judged[key][0]
 
     def _judge(
-        self,
-        corrections: Corrections,
-        motions: Sequence[Motion],
-        folds: Folds,
-        steps: int,
-        posed: Sequence[int] = (),
+        self, corrections: Corrections, trials: Trials, steps: int, posed: Sequence[int] = ()
     ) -> Plausibility | None:
-        change = hypotheses.combine(self.signals, corrections)
+        (motions, folds), change = trials, hypotheses.combine(self.signals, corrections)
         with np.errstate(all="ignore"):
             changed = [change.of_motion(motion, self.signals) for motion in motions]
         return judge_setup(self.system, changed, change.of_band(self.band), folds, steps, posed)
@@ -324,7 +320,7 @@ class Search:
         if not _is_gross(correction, self.motions, self.signals):
             return math.inf
         self.tested += 1
-        found = self._judge((*chosen, correction), *self.screened, _SCREENING_STEPS)
+        found = self._judge((*chosen, correction), self.screened, _SCREENING_STEPS)
         return math.inf if found is None else found.score(RANKED_ERROR) + correction.cost
 
     def lacks_pose(self, best: Corrections) -> bool:
@@ -334,7 +330,7 @@ class Search:
         """
         axes = axes_without_pose(self.system, self.motions) if self.has_few_axes else []
         stated = self.judge(())
-        found = self._judge((), self.motions, self.folds, 12, axes) if axes else None
+        found = self._judge((), (self.motions, self.folds), 12, axes) if axes else None
         if found is None or stated is None:
             return False
         after = self.judge(best) if best else None
