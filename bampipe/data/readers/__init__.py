@@ -33,7 +33,7 @@ _FORMATS: tuple[tuple[tuple[str, ...], Reader, str, str], ...] = (
     ((".parquet",), parquet, "Parquet file", _AGAIN),
     ((".mat",), mat.READER, "MATLAB file", "save it again from MATLAB"),
     ((".h5", ".hdf5", ".hdf"), hdf5.READER, "HDF5 file", _AGAIN),
-    ((".json", ".jsonl", ".ndjson"), objects, "", ""),
+    ((".json", ".jsonl", ".ndjson"), objects.READER, "", ""),
     ((".tdms",), tdms.READER, "TDMS file", _AGAIN),
     ((".bag", ".db3"), bag, "bag", f"{_AGAIN}, with the message definitions in it"),
     ((".mcap",), bag, "MCAP file", f"{_AGAIN}, with the message definitions in it"),

@@ -56,6 +56,7 @@ _VALUES = ("values", "value", "data")
 """Fields that hold the name of a signal, and its samples."""
 Arrays = Mapping[str, Stored]
 """What a file holds, by name."""
+Opened = tuple[Arrays, tuple[str, ...]]
 
 
 def stored(array: np.ndarray | None, unit: str = "", kind: str = "") -> Stored:
@@ -249,20 +250,21 @@ class ArrayReader:
 
     Attributes:
         what: an array of such a file is called in messages.
-        opened: what a file holds, while it is open; for what is wanted of it, or to list it.
+        opened: what a file holds, while it is open, and what was left out, a sentence each; for
+            what is wanted of it, or to list it.
     """
 
     what: str
-    opened: Callable[[Path, Wanted | None], AbstractContextManager[Arrays]]
+    opened: Callable[[Path, Wanted | None], AbstractContextManager[Opened]]
 
     def read(self, path: Path, wanted: Wanted) -> RawTrial:
         """The wanted columns; `InputError` as `read_arrays`, or where the file is damaged."""
-        with self.opened(path, wanted) as arrays:
-            return read_arrays(arrays, wanted, self.what)
+        with self.opened(path, wanted) as (arrays, notes):
+            return replace(read_arrays(arrays, wanted, self.what), notes=notes)
 
     def columns(self, path: Path) -> dict[str, str]:
         """Names and units of the columns that were recorded together; see `columns_of_arrays`."""
-        with self.opened(path, None) as arrays:
+        with self.opened(path, None) as (arrays, _):
             return columns_of_arrays(arrays)
 
 
@@ -278,7 +280,7 @@ def _refuse_blocks(arrays: Arrays) -> None:
 
 
 @contextmanager
-def _opened(path: Path, wanted: Wanted | None) -> Iterator[Arrays]:
+def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     """The arrays of a file; the one of a ``.npy`` is called ``data``."""
     try:
         loaded = np.load(path, allow_pickle=False)
@@ -295,7 +297,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[Arrays]:
         found |= {label: stored(np.atleast_1d(part)) for label, part in parts.items()}
     if wanted is None:
         _refuse_blocks(found)
-    yield found
+    yield found, ()
 
 
 READER = ArrayReader("array", _opened)

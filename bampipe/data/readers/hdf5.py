@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from bampipe.data.readers import moments
-from bampipe.data.readers.arrays import LINK, ArrayReader, Stored, pick, split_index, stored
+from bampipe.data.readers.arrays import LINK, ArrayReader, Opened, Stored, pick, split_index, stored
 from bampipe.data.readers.trial import Wanted
 from bampipe.errors import InputError
 
@@ -25,7 +25,7 @@ _COLUMNS = ("columns", "channels", "names", "column_names", "labels", "fields")
 
 
 @contextmanager
-def opened(path: Path, wanted: Wanted | None) -> Iterator[dict[str, Stored]]:
+def opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     """What an HDF5 file holds."""
     import h5py  # heavy: only for these files
 
@@ -34,7 +34,7 @@ def opened(path: Path, wanted: Wanted | None) -> Iterator[dict[str, Stored]]:
         for column in wanted.columns if wanted else ():
             own, _ = split_index(column, known)  # a field of a struct of MATLAB is a path here
             known |= {own: known[at]} if (at := own.replace(".", "/")) in known else {}
-        yield known
+        yield known, ()
 
 
 READER = ArrayReader("dataset", opened)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bampipe.data.readers import hdf5
-from bampipe.data.readers.arrays import ArrayReader, Stored, called_signals, stored
+from bampipe.data.readers.arrays import ArrayReader, Opened, Stored, called_signals, stored
 from bampipe.data.readers.trial import Wanted
 from bampipe.errors import InputError
 
@@ -26,7 +26,7 @@ _MOST_FIELDS = 4096
 
 
 @contextmanager
-def _opened(path: Path, wanted: Wanted | None) -> Iterator[dict[str, Stored]]:
+def _opened(path: Path, wanted: Wanted | None) -> Iterator[Opened]:
     """The variables of a file; ``S.q`` is a field of ``S``. InputError of another version."""
     for column in wanted.datetimes if wanted else ():
         raise InputError(
@@ -37,7 +37,7 @@ def _opened(path: Path, wanted: Wanted | None) -> Iterator[dict[str, Stored]]:
     if _is_level_5(path):
         arrays, root = _arrays(path)
         whole = {f"{root}{label}": array for label, array in arrays.items()} if wanted else {}
-        yield whole | arrays
+        yield whole | arrays, ()
     else:
         with hdf5.opened(path, wanted) as known:
             yield known

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from bampipe.data.readers.arrays import ArrayReader, Stored
+from bampipe.data.readers.arrays import ArrayReader, Opened, Stored
 from bampipe.data.readers.trial import Wanted, need
 
 TIME = "@time"
 
 
 @contextmanager
-def _opened(path: Path, _: Wanted | None) -> Iterator[dict[str, Stored]]:
+def _opened(path: Path, _: Wanted | None) -> Iterator[Opened]:
     """The channels of a file, scaled as it says, by npTDMS, which would print pages on damage."""
     library = need("nptdms", "tdms")
     need("nptdms.log", "tdms").log_manager.set_level(logging.CRITICAL)
@@ -34,7 +34,7 @@ def _opened(path: Path, _: Wanted | None) -> Iterator[dict[str, Stored]]:
             step = channel.properties.get("wf_increment", 0.0)
             if isinstance(step, int | float) and step > 0.0:
                 found[label + TIME] = Stored(shape, "f", channel.time_track, "s")
-        yield found
+        yield found, ()
 
 
 def _read(channel: Any) -> np.ndarray:
