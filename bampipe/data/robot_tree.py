@@ -278,11 +278,15 @@ class LumpedBodies:
                 found.setdefault(joint.parent, []).append(joint)
         return found
 
-    def body_on(self, link: str) -> Body:
-        """The body of a link with all that is fixed to it or held still on it, in its frame."""
-        total = self.tree.bodies[link]
+    def body_on(self, link: str, held_only: bool = False) -> Body:
+        """The body of a link with all that is fixed to it or held still on it, in its frame.
+
+        ``held_only``: the part of it that is behind joints held still.
+        """
+        total = Body() if held_only else self.tree.bodies[link]
         for joint in self._behind.get(link, ()):
-            total = total.joined(self.body_on(joint.child).moved(joint.turn, joint.offset))
+            part = self.body_on(joint.child, held_only and joint.kind == "fixed")
+            total = total.joined(part.moved(joint.turn, joint.offset))
         return total
 
     def held_on(self, link: str) -> Iterator[TreeJoint]:
@@ -298,15 +302,6 @@ class LumpedBodies:
             if joint.kind == "fixed":
                 yield joint.child
                 yield from self.fixed_on(joint.child)
-
-    def body_held_on(self, link: str) -> Body:
-        """The part of `body_on` that is behind joints held still, in the frame of the link."""
-        total = Body()
-        for joint in self._behind.get(link, ()):
-            fixed = joint.kind == "fixed"
-            part = self.body_held_on(joint.child) if fixed else self.body_on(joint.child)
-            total = total.joined(part.moved(joint.turn, joint.offset))
-        return total
 
 
 def put_bodies(
@@ -326,7 +321,7 @@ def put_bodies(
     named = {joint.name: identifier(joint.name) for joint in moving}
     for joint in moving:
         own = bodies[named[joint.name]]
-        placed[joint.child] = own.without(lumped.body_held_on(joint.child))
+        placed[joint.child] = own.without(lumped.body_on(joint.child, held_only=True))
         placed |= {link: Body() for link in lumped.fixed_on(joint.child)}
     joints = [
         replace(joint, limits=limits[named[joint.name]]) if joint.name in named else joint
