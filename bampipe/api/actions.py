@@ -127,8 +127,7 @@ def extend(run: Run | Path_, effect: str | Sequence[str], model: str = "") -> Ru
     """
     opened = _open(run)
     effects = (effect,) if isinstance(effect, str) else tuple(effect)
-    options = loop.LoopOptions(_request(opened), ignore_event)
-    loop.extend(options, model or opened.model, effects)
+    loop.extend(_options(opened), model or opened.model, effects)
     return Run(opened.root)
 
 
@@ -139,8 +138,7 @@ def follow(run: Run | Path_, model: str = "") -> Run:
         The run, whose `Run.model` is the best one found.
     """
     opened = _open(run)
-    options = loop.LoopOptions(_request(opened), ignore_event)
-    loop.follow(options, model or opened.model, lambda line: None)
+    loop.follow(_options(opened), model or opened.model, lambda line: None)
     return Run(opened.root)
 
 
@@ -148,10 +146,10 @@ def _open(run: Run | Path_) -> Run:
     return run if isinstance(run, Run) else open_run(run)
 
 
-def _request(run: Run) -> Request:
-    """Return the request for any stage of a run."""
+def _options(run: Run) -> loop.LoopOptions:
+    """Return the request for any stage of a run, and a listener that does nothing."""
     batch.limit_threads(1)
-    return Request(run.root, pipelines.whole(run.root))
+    return loop.LoopOptions(Request(run.root, pipelines.whole(run.root)), ignore_event)
 
 
 def run_stage(run: Run | Path_, stage: str, model: str = "", **settings: object) -> dict[str, Any]:
@@ -175,6 +173,7 @@ def _run_stage(
 ) -> tuple[Run, list[dict[str, Any]]]:
     """Run one stage, for one model or each; return the run with its results, and summaries."""
     changed = {stage: settings} if settings else {}
-    request = replace(_request(_open(run)), settings=changed, first=stage, last=stage, model=model)
+    request = _options(_open(run)).request
+    request = replace(request, settings=changed, first=stage, last=stage, model=model)
     outcome = runner.run_session(request, ignore_event)
     return Run(request.root), [step.summary for step in outcome.steps]
